@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
 
 PAGE = 4096
-LINE = 64
+CACHE_LINE = 64
 """Bytes of a cache line. Blocks of two writers never share one."""
 
 HEAD_SIZE = PAGE
@@ -26,16 +26,16 @@ The ring is read many times a second, and an alarm is raised once per episode.
 """
 FAULT_ENTRY_SIZE = 256
 FAULT_ENTRIES = 64
-OPERATOR_HEAD_SIZE = LINE
+OPERATOR_HEAD_SIZE = CACHE_LINE
 OPERATOR_ENTRIES = 128
 CLOCK = "clock"
 """Name of the system controller, in slot 1.
 
 Its window holds the fault table, the operator table and the operators' mailboxes.
 """
-MAILBOX_HEAD_SIZE = 2 * LINE
+MAILBOX_HEAD_SIZE = 2 * CACHE_LINE
 SLOT_HEAD_SIZE = 64
-ALARM_SIZE = LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
+ALARM_SIZE = CACHE_LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
 """Bytes of one alarm ring: a cache line for its head, followed by the records."""
 
 
@@ -61,61 +61,61 @@ class AddressMap:
         self.traces: dict[str, int] = {}
         self.mailboxes: dict[str, int] = {}
         self._end = HEAD_SIZE
-        self.faults = self._take(FAULT_ENTRIES * FAULT_ENTRY_SIZE)
-        self.operator = self._take(OPERATOR_ENTRIES * operator_entry_size(layout))
-        self.alarms = {CLOCK: self._take(ALARM_SIZE)}
+        self.faults = self._reserve(FAULT_ENTRIES * FAULT_ENTRY_SIZE)
+        self.operator = self._reserve(OPERATOR_ENTRIES * compute_operator_entry_size(layout))
+        self.alarms = {CLOCK: self._reserve(ALARM_SIZE)}
         self._end_window(CLOCK, {CLOCK}, layout)
         for board in dict.fromkeys(task.board for task in layout.processes):
             tasks = [task for task in layout.processes if task.board == board]
             for task in tasks:
-                self.blocks[task.name] = self._take(BLOCK_SIZE)
-                self.traces[task.name] = self._take(trace_size(task))
-                self.alarms[task.name] = self._take(ALARM_SIZE)
+                self.blocks[task.name] = self._reserve(BLOCK_SIZE)
+                self.traces[task.name] = self._reserve(compute_trace_size(task))
+                self.alarms[task.name] = self._reserve(ALARM_SIZE)
             self._end_window(board, {task.name for task in tasks}, layout)
         # Semaphores follow the windows, each in a separate cache line.
-        self.wake = {task.name: self._take(LINE) for task in layout.processes}
-        self.done = {task.name: self._take(LINE) for task in layout.processes}
+        self.wake = {task.name: self._reserve(CACHE_LINE) for task in layout.processes}
+        self.done = {task.name: self._reserve(CACHE_LINE) for task in layout.processes}
         locked = [box.name for box in layout.mailboxes if box.protocol == "lock"]
-        self.locks = {name: self._take(LINE) for name in locked}
-        self.size = pages(self._end)
+        self.locks = {name: self._reserve(CACHE_LINE) for name in locked}
+        self.size = round_up_to_pages(self._end)
 
-    def _take(self, size: int) -> int:
+    def _reserve(self, size: int) -> int:
         """Reserve `size` bytes in separate cache lines and return their address."""
         address = self._end
-        self._end = _up(address + size, LINE)
+        self._end = _round_up(address + size, CACHE_LINE)
         return address
 
     def _end_window(self, board: str, writers: set[str], layout: Layout) -> None:
         """Place the mailboxes of a board's tasks and pad its window to a whole page."""
         for mailbox in layout.mailboxes:
             if mailbox.writer in writers:
-                self.mailboxes[mailbox.name] = self._take(mailbox_size(mailbox))
+                self.mailboxes[mailbox.name] = self._reserve(compute_mailbox_size(mailbox))
         start = self.windows[-1].address + self.windows[-1].size if self.windows else HEAD_SIZE
-        self._end = pages(self._end)
+        self._end = round_up_to_pages(self._end)
         self.windows.append(Window(board, start, self._end - start))
 
 
-def pages(size: int) -> int:
+def round_up_to_pages(size: int) -> int:
     """Return `size` bytes rounded up to whole pages."""
-    return _up(size, PAGE)
+    return _round_up(size, PAGE)
 
 
-def trace_size(task: TaskSpec) -> int:
+def compute_trace_size(task: TaskSpec) -> int:
     """Return the size of a task's trace ring, in bytes."""
     return task.depth * TRACE_RECORD_SIZE
 
 
-def slot_stride(mailbox: MailboxSpec) -> int:
+def compute_slot_stride(mailbox: MailboxSpec) -> int:
     """Return the distance from one slot of a mailbox to the next, in bytes."""
-    return _up(SLOT_HEAD_SIZE + mailbox.size, LINE)
+    return _round_up(SLOT_HEAD_SIZE + mailbox.size, CACHE_LINE)
 
 
-def mailbox_size(mailbox: MailboxSpec) -> int:
+def compute_mailbox_size(mailbox: MailboxSpec) -> int:
     """Return the size of a mailbox with its head and its slots, in bytes."""
-    return MAILBOX_HEAD_SIZE + mailbox.depth * slot_stride(mailbox)
+    return MAILBOX_HEAD_SIZE + mailbox.depth * compute_slot_stride(mailbox)
 
 
-def oldest_kept(head: int, depth: int) -> int:
+def compute_oldest_kept(head: int, depth: int) -> int:
     """Return the number of the oldest record in a ring that cannot be partly overwritten.
 
     The writer is at most one record ahead of its `head`. A concurrent reader copies a record first
@@ -125,13 +125,13 @@ def oldest_kept(head: int, depth: int) -> int:
     return head + 2 - depth
 
 
-def operator_entry_size(layout: Layout) -> int:
+def compute_operator_entry_size(layout: Layout) -> int:
     """Return the size of an operator table entry with room for the largest message, in bytes."""
-    return OPERATOR_HEAD_SIZE + _up(
-        max((m.size for m in layout.mailboxes if m.writer == CLOCK), default=0), LINE
+    return OPERATOR_HEAD_SIZE + _round_up(
+        max((m.size for m in layout.mailboxes if m.writer == CLOCK), default=0), CACHE_LINE
     )
 
 
-def _up(value: int, step: int) -> int:
+def _round_up(value: int, step: int) -> int:
     """Round `value` up to a multiple of `step`."""
     return -(-value // step) * step

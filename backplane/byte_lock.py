@@ -31,8 +31,8 @@ class ByteLock:
     def __init__(self, fd: int, address: int) -> None:
         self.reopen(fd)
         _OPEN.add(self)
-        self._take = _one_byte(fcntl.F_WRLCK, address)
-        self._unlock = _one_byte(fcntl.F_UNLCK, address)
+        self._take = _pack_lock_request(fcntl.F_WRLCK, address)
+        self._unlock = _pack_lock_request(fcntl.F_UNLCK, address)
 
     def reopen(self, fd: int) -> None:
         """Switch to another segment, open as `fd`. The lock is not taken in the new segment."""
@@ -66,7 +66,7 @@ class ByteLock:
 
 
 @contextmanager
-def locked(fd: int, address: int) -> Iterator[None]:
+def hold_lock(fd: int, address: int) -> Iterator[None]:
     """Hold a lock while an entry of a shared table is filled.
 
     A process that needs the lock at the same time spins until the entry is complete.
@@ -117,11 +117,11 @@ def reopen_all(fd: int) -> None:
 
 def is_locked(fd: int, address: int) -> bool:
     """Check whether the byte at a bus address is locked, without taking the lock."""
-    asked = _one_byte(fcntl.F_RDLCK, address)
+    asked = _pack_lock_request(fcntl.F_RDLCK, address)
     kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, asked))[0]
     return kind != fcntl.F_UNLCK
 
 
-def _one_byte(kind: int, address: int) -> bytes:
+def _pack_lock_request(kind: int, address: int) -> bytes:
     """Pack a `struct flock` that concerns one byte."""
     return _FLOCK.pack(kind, os.SEEK_SET, address, 1, 0)

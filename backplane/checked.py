@@ -16,19 +16,19 @@ E = TypeVar("E", bound=IntEnum)
 T = TypeVar("T")
 
 
-def as_named(kind: type[E], number: float) -> E:
+def to_enum(kind: type[E], number: float) -> E:
     """Convert a number to a member of an enum.
 
     Raises:
         DamageError: No member has this value.
     """
-    whole = as_whole(number)
+    whole = to_integer(number)
     if whole not in set(kind):
         raise DamageError(f"{whole} is not a value of {kind.__name__}")
     return kind(whole)
 
 
-def as_whole(number: float) -> int:
+def to_integer(number: float) -> int:
     """Convert a number to an integer.
 
     Raises:
@@ -39,17 +39,17 @@ def as_whole(number: float) -> int:
     return int(number)
 
 
-def pick(items: Sequence[T], index: int, what: str) -> T:
+def select_item(items: Sequence[T], index: int, noun: str) -> T:
     """Return the item that an index from shared memory selects.
 
     Args:
         items: The items.
         index: Index read from shared memory.
-        what: Noun for an item in the error message, such as "mailbox".
+        noun: Noun for an item in the error message, such as "mailbox".
 
     Raises:
         DamageError: The index is out of range.
     """
     if not 0 <= index < len(items):
-        raise DamageError(f"{index} is not the index of a {what}; there are {len(items)}")
+        raise DamageError(f"{index} is not the index of a {noun}; there are {len(items)}")
     return items[index]

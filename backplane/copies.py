@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rack.backplane import byte_lock
-from rack.backplane.segment import Segment, shm_path
+from rack.backplane.segment import Segment, get_shm_path
 from rack.backplane.words import Block, Box, System, TaskState
 
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -22,7 +22,7 @@ _int = ctypes.c_int
 _libc.mmap.argtypes = ctypes.c_void_p, ctypes.c_size_t, _int, _int, _int, ctypes.c_long
 _libc.mmap.restype = ctypes.c_void_p
 _MAP_FIXED = 0x10
-OF_LAUNCH = (
+LAUNCH_WORDS = (
     System.STATE,
     System.EPOCH_NS,
     System.PERIOD_NS,
@@ -52,7 +52,7 @@ def copy_memory(segment: Segment) -> int:
     return fd
 
 
-def fill_memory(segment: Segment, fd: int, tick: int) -> None:
+def restore_memory(segment: Segment, fd: int, tick: int) -> None:
     """Restore a copy into the segment of a rack that is being launched.
 
     The rack continues before `tick`, and none of its tasks may have started yet. A recorder sees
@@ -64,30 +64,30 @@ def fill_memory(segment: Segment, fd: int, tick: int) -> None:
         tick: First tick that the new rack runs.
     """
     words = segment.words
-    launch_words = [(at, words[at]) for at in OF_LAUNCH]
+    launch_words = [(at, words[at]) for at in LAUNCH_WORDS]
     start = 8 * System.STATE
     os.preadv(fd, [segment.bytes[start : segment.map.size]], start)
     for at, value in launch_words:
         words[at] = value
     words[System.FOLLOWER_TICK] = words[System.FOLLOWER_DRAINED] = tick - 1
     for task in segment.layout.processes:
-        block = segment.block(task.name)
+        block = segment.get_block(task.name)
         block[Block.STATE] = TaskState.ABSENT
         block[Block.TRACE_FIRST] = block[Block.TRACE_HEAD]
     for mailbox in segment.layout.mailboxes:
-        box = segment.box(mailbox.name)
+        box = segment.get_box(mailbox.name)
         box[Box.FIRST] = box[Box.HEAD]
     # Posts that were not taken have no meaning between two ticks.
     segment.initialize_semaphores()
 
 
-def leave(segment: Segment) -> None:
+def detach_segment(segment: Segment) -> None:
     """Detach a forked process from its segment: release the memory, the file and the locks.
 
     The process must not use the segment again before it calls `switch_segment`.
     """
     byte_lock.close_all()
-    _map(segment, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 0, -1)
+    _map_memory(segment, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 0, -1)
     file = os.fstat(segment.fd)
     nothing = os.open(os.devnull, os.O_RDONLY)
     # Python's `mmap` object has a descriptor of the segment, too.
@@ -98,20 +98,20 @@ def leave(segment: Segment) -> None:
     os.close(nothing)
 
 
-def enter(segment: Segment, rack: str) -> None:
+def switch_segment(segment: Segment, rack: str) -> None:
     """Redirect the views of `segment` to the segment of another rack with the same layout.
 
     No lock is taken and no mailbox is claimed.
     """
-    fd = os.open(shm_path(rack), os.O_RDWR)
+    fd = os.open(get_shm_path(rack), os.O_RDWR)
     segment.rack = rack
     os.dup2(fd, segment.fd)
     os.close(fd)
-    _map(segment, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, segment.fd)
+    _map_memory(segment, mmap.MAP_SHARED, mmap.PROT_READ | mmap.PROT_WRITE, segment.fd)
     byte_lock.reopen_all(segment.fd)
 
 
-def _map(segment: Segment, flags: int, rights: int, fd: int) -> None:
+def _map_memory(segment: Segment, flags: int, rights: int, fd: int) -> None:
     """Map a file, or anonymous memory for `fd` -1, at the address of a segment's memory."""
     place = ctypes.addressof(ctypes.c_char.from_buffer(segment.bytes))
     size = segment.map.size

@@ -10,7 +10,7 @@ from importlib import import_module
 from typing import Any
 
 
-def on_first_use(package: str, places: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
+def build_lazy_getattr(package: str, places: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
     """Build the module-level `__getattr__` of a package that imports its names on first use.
 
     Args:

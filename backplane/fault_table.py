@@ -13,7 +13,7 @@ from enum import IntEnum
 from time import monotonic_ns
 
 from rack.backplane.address_map import FAULT_ENTRIES, FAULT_ENTRY_SIZE
-from rack.backplane.byte_lock import locked
+from rack.backplane.byte_lock import hold_lock
 from rack.backplane.errors import FaultTableError
 from rack.backplane.segment import Segment
 from rack.backplane.words import System, Word
@@ -83,22 +83,22 @@ class FaultEntry:
         address = segment.map.faults + index * FAULT_ENTRY_SIZE
         self.index = index
         self.words = segment.words[address // 8 : (address + FAULT_ENTRY_SIZE) // 8]
-        self.parameters = segment.view(address + 8 * FAULT_WORDS, 8 * PARAMETERS).cast("d")
+        self.parameters = segment.get_bytes(address + 8 * FAULT_WORDS, 8 * PARAMETERS).cast("d")
 
-    def acted(self, tick: int, shows: bool = True) -> None:
+    def record_action(self, tick: int, must_be_found: bool = True) -> None:
         """Record one action of the fault.
 
         Args:
             tick: Tick of the action. The first action also sets `struck_tick` and `struck_ns`.
-            shows: True if a detector is required to notice this action. Only such actions are
-                counted.
+            must_be_found: True if a detector is required to notice this action. Only such actions
+                are counted.
         """
         if self.struck_tick < 0:
             self.struck_ns = monotonic_ns()
             self.struck_tick = tick
-        if shows and not self.count:
+        if must_be_found and not self.count:
             self.hidden = tick - self.struck_tick
-        self.count += shows
+        self.count += must_be_found
 
 
 class FaultTable:
@@ -117,13 +117,13 @@ class FaultTable:
         """
         return self._words[System.FAULTS]
 
-    def add(self, injection: Injection) -> FaultEntry:
+    def add_fault(self, injection: Injection) -> FaultEntry:
         """Fill a free entry. The fault begins when the clock finds it due.
 
         Raises:
             FaultTableError: The table is full.
         """
-        with locked(self._segment.fd, self._segment.map.faults):
+        with hold_lock(self._segment.fd, self._segment.map.faults):
             entry = next((e for e in self.entries if e.stage == Stage.FREE), None)
             if entry is None:
                 raise FaultTableError(
@@ -141,20 +141,20 @@ class FaultTable:
             self._words[System.INJECTED] += 1
         return entry
 
-    def disarm(self, entry: FaultEntry) -> None:
+    def disarm_fault(self, entry: FaultEntry) -> None:
         """Keep a waiting fault from beginning. `free_entry` may be called after the next tick."""
         # The order matters: without a condition and with a tick in the past, the fault would begin
         # at once.
         entry.tick = NEVER
         entry.when_box = -1
 
-    def free(self, entry: FaultEntry) -> bool:
+    def free_entry(self, entry: FaultEntry) -> bool:
         """Free the entry of a disarmed fault. Returns False if the clock has already begun it."""
         if entry.stage != Stage.WAITING:
             return False
         entry.stage = Stage.FREE
         return True
 
-    def staged(self, stages: Sequence[Stage]) -> list[FaultEntry]:
+    def list_entries(self, stages: Sequence[Stage]) -> list[FaultEntry]:
         """Return the entries in one of the given stages."""
         return [e for e in self.entries if e.stage in stages]

@@ -16,13 +16,13 @@ Sampled = Literal["time-slice", "double-buffer", "lock", "interrupt"]
 PROTOCOLS: tuple[Sampled, ...] = ("time-slice", "double-buffer", "lock", "interrupt")
 Protocol = Literal[Sampled, "queue"]
 
-BY_TICKS: tuple[Protocol, ...] = ("time-slice", "queue", "interrupt")
+TICK_PROTOCOLS: tuple[Protocol, ...] = ("time-slice", "queue", "interrupt")
 """Protocols under which messages become visible at ticks fixed in advance."""
 
 Role = Literal["executor", "planner", "host"]
 """Kind of task. A "host" is a host board: it has no rate, and the clock does not release it."""
 
-KIND = re.compile(r"[<>|]?[biufcSUV]\d+")
+KIND_PATTERN = re.compile(r"[<>|]?[biufcSUV]\d+")
 """Pattern of numpy type strings that a field may have.
 
 A layout may come from another user's segment. An object type would make numpy interpret a number in
@@ -39,7 +39,7 @@ class TickGrid(NamedTuple):
     every: int
     phase: int = 0
 
-    def since(self, tick: int) -> int:
+    def find_tick(self, tick: int) -> int:
         """Return the first tick of the grid at `tick` or later. `tick` must not be negative."""
         return tick + (self.phase - tick) % self.every
 
@@ -117,7 +117,7 @@ class FieldSpec:
     length: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        if not KIND.fullmatch(self.kind):
+        if not KIND_PATTERN.fullmatch(self.kind):
             raise ValueError(f"a field cannot have the kind {self.kind}")
 
 
@@ -175,7 +175,7 @@ class MailboxSpec:
     @property
     def is_by_ticks(self) -> bool:
         """True if ticks alone decide when its messages become visible."""
-        return self.protocol in BY_TICKS
+        return self.protocol in TICK_PROTOCOLS
 
     @property
     def is_repeatable(self) -> bool:
@@ -227,7 +227,7 @@ class TaskSpec:
 
     def count_unfinished(self, done: int, tick: int) -> int:
         """Count the releases after `done` that should have been finished by `tick`."""
-        return max(0, (tick - self.slice - self.grid.since(done + 1)) // self.every + 1)
+        return max(0, (tick - self.slice - self.grid.find_tick(done + 1)) // self.every + 1)
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ class Layout:
         hosts = {host.name for host in self.hosts}
         return tuple(mailbox for mailbox in self.mailboxes if mailbox.writer not in hosts)
 
-    def pacers(self, host: TaskSpec) -> set[str]:
+    def find_pacers(self, host: TaskSpec) -> set[str]:
         """Return the bus adapters that pace a host board's program in lockstep.
 
         The set is empty for an external host board.
@@ -271,7 +271,7 @@ class Layout:
             if {task.name, host.name} <= {box.writer, *box.readers} and not host.is_external
         }
 
-    def mailbox(self, name: str) -> MailboxSpec:
+    def find_mailbox(self, name: str) -> MailboxSpec:
         """Return the mailbox with this name.
 
         Raises:
@@ -279,7 +279,7 @@ class Layout:
         """
         return {m.name: m for m in self.mailboxes}[name]
 
-    def index(self, mailbox: str) -> int:
+    def find_mailbox_index(self, mailbox: str) -> int:
         """Return the index of the mailbox with this name.
 
         Raises:
@@ -287,7 +287,7 @@ class Layout:
         """
         return [box.name for box in self.mailboxes].index(mailbox)
 
-    def task(self, name: str) -> TaskSpec:
+    def find_task(self, name: str) -> TaskSpec:
         """Return the task or host board with this name.
 
         Raises:
@@ -295,7 +295,7 @@ class Layout:
         """
         return {t.name: t for t in self.processes}[name]
 
-    def due(self, task: TaskSpec) -> int:
+    def compute_due_ticks(self, task: TaskSpec) -> int:
         """Return the ticks from a release until the task's first message is required."""
         sent = [
             m.interrupt.due
@@ -304,7 +304,7 @@ class Layout:
         ]
         return min([task.every, *sent])
 
-    def interrupting(self, slot: int) -> list[MailboxSpec]:
+    def list_interrupting_mailboxes(self, slot: int) -> list[MailboxSpec]:
         """Return the mailboxes that interrupt the board in a slot.
 
         They are ordered by the slot of their sender.
@@ -312,9 +312,9 @@ class Layout:
         mailboxes = [
             m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots
         ]
-        return sorted(mailboxes, key=lambda mailbox: self.task(mailbox.writer).slot)
+        return sorted(mailboxes, key=lambda mailbox: self.find_task(mailbox.writer).slot)
 
-    def handler(self, slot: int) -> str:
+    def find_interrupt_task(self, slot: int) -> str:
         """Return the task that serves the interrupts of the board in a slot, its first task.
 
         Raises:
@@ -322,24 +322,24 @@ class Layout:
         """
         return next(task.name for task in self.tasks if task.slot == slot)
 
-    def read_grid(self, mailbox: MailboxSpec, reader: str) -> TickGrid:
+    def find_read_grid(self, mailbox: MailboxSpec, reader: str) -> TickGrid:
         """Return the ticks at which a task reads a mailbox. A planner reads at its releases.
 
         Raises:
             KeyError: There is no such task.
         """
         exchanged = (e.grid for e in mailbox.exchanges if e.task == reader)
-        return max(exchanged, default=self.task(reader).grid)
+        return max(exchanged, default=self.find_task(reader).grid)
 
 
-SPARE = 2
+SPARE_SLOTS = 2
 """Slots of a host board's mailbox in addition to the messages that may wait.
 
 One is being written, and one is being copied by the bus adapter.
 """
 
 
-def depth_for(span_ticks: int, every: int) -> int:
+def compute_depth(span_ticks: int, every: int) -> int:
     """Return the number of slots that hold the messages of `span_ticks` ticks.
 
     Args:

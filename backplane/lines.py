@@ -13,7 +13,7 @@ class UtilityLines:
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
         self._slots = sorted({task.slot for task in segment.layout.tasks})
-        self._blocks = {task.name: segment.block(task.name) for task in segment.layout.tasks}
+        self._blocks = {task.name: segment.get_block(task.name) for task in segment.layout.tasks}
 
     def release_sysfail(self, slot: int) -> None:
         """Release SYSFAIL for a slot whose board has passed its self-test."""
@@ -44,7 +44,7 @@ class UtilityLines:
         return bool(self._words[System.EMERGENCY_STOP])
 
     @property
-    def bad_inputs(self) -> list[str]:
+    def reset_obstacles(self) -> list[str]:
         """Reasons why the latch must not be reset: asserted utility lines and lost boards."""
         reasons = [f"SYSFAIL of slot {slot}" for slot in self.sysfail]
         reasons += ["ACFAIL"] if self.acfail else []
@@ -63,6 +63,6 @@ class UtilityLines:
             EmergencyStopError: An input is bad, so the latch stays set. The error lists all bad
                 inputs.
         """
-        if bad := self.bad_inputs:
+        if bad := self.reset_obstacles:
             raise EmergencyStopError(f"the emergency stop stays latched: {', '.join(bad)}")
         self._words[System.EMERGENCY_STOP] = 0

@@ -32,9 +32,9 @@ _POPULATE_READ = 22
 _POPULATE_WRITE = 23
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_MAX = -4
-RESERVE = 4 << 20
+HEAP_RESERVE = 4 << 20
 """Heap kept in addition to the heap in use, in bytes."""
-GAP = 16
+MAX_GAP_PAGES = 16
 """Number of unused pages between used ones that are touched too.
 
 One call takes as long as touching some pages.
@@ -67,7 +67,10 @@ def note_used_files() -> None:
     A fork does not inherit the mapping of these pages.
     """
     _FILES[:] = [
-        stretch for _, rights, pages in _mappings() if rights[:2] == "r-" for stretch in pages
+        stretch
+        for _, rights, pages in _iterate_mappings()
+        if rights[:2] == "r-"
+        for stretch in pages
     ]
 
 
@@ -78,9 +81,9 @@ def touch_memory() -> None:
     """
     _libc.mallopt(_M_TRIM_THRESHOLD, -1)
     _libc.mallopt(_M_MMAP_MAX, 0)
-    reserve = ctypes.create_string_buffer(RESERVE)
+    reserve = ctypes.create_string_buffer(HEAP_RESERVE)
     del reserve
-    for span, rights, stretches in _mappings():
+    for span, rights, stretches in _iterate_mappings():
         if rights == "rw-s":
             stretches = [span]  # the segment: all of it
         elif rights[1] != "w":
@@ -91,24 +94,24 @@ def touch_memory() -> None:
         _libc.madvise(first, last - first, _POPULATE_READ)
 
 
-def _mappings() -> Iterator[tuple[tuple[int, int], str, list[tuple[int, int]]]]:
+def _iterate_mappings() -> Iterator[tuple[tuple[int, int], str, list[tuple[int, int]]]]:
     """Yield span, access rights and resident stretches of every readable mapping."""
     with Path("/proc/self/pagemap").open("rb", buffering=0) as pagemap:
         for line in Path("/proc/self/maps").read_text().splitlines():
             addresses, rights, *_ = line.split(maxsplit=2)
             start, end = (int(address, 16) for address in addresses.split("-"))
             if rights[0] == "r" and start < _USER_END:
-                yield (start, end), rights, list(_used(pagemap.fileno(), start, end))
+                yield (start, end), rights, list(_iterate_resident(pagemap.fileno(), start, end))
 
 
-def _used(pagemap: int, start: int, end: int) -> Iterator[tuple[int, int]]:
+def _iterate_resident(pagemap: int, start: int, end: int) -> Iterator[tuple[int, int]]:
     """Yield the resident stretches of a mapping as pairs of addresses."""
     page = mmap.PAGESIZE
     entries = np.frombuffer(os.pread(pagemap, (end - start) // page * 8, start // page * 8), "u8")
     pages = np.flatnonzero(entries >> _PRESENT)
     if not len(pages):
         return
-    breaks = np.flatnonzero(np.diff(pages) > GAP)
+    breaks = np.flatnonzero(np.diff(pages) > MAX_GAP_PAGES)
     firsts = pages[np.append(0, breaks + 1)]
     lasts = pages[np.append(breaks, len(pages) - 1)] + 1
     for first, last in zip(firsts.tolist(), lasts.tolist(), strict=True):

@@ -84,7 +84,7 @@ def field(
     return Field("", stored, unit, doc, sizes, length, default=default)
 
 
-def _named(declared: Field, name: str, hint: Any) -> Field:
+def _complete_field(declared: Field, name: str, hint: Any) -> Field:
     """Complete a declared field with its name and its annotation.
 
     Raises:
@@ -97,14 +97,14 @@ def _named(declared: Field, name: str, hint: Any) -> Field:
     usual, permitted = _KINDS[python]
     kind = declared.kind or usual
     if np.dtype(kind).kind not in permitted:
-        raise ValueError(f"numpy type '{kind}' does not hold {_name(hint)}")
+        raise ValueError(f"numpy type '{kind}' does not hold {_format_hint(hint)}")
     if (python is np.ndarray) != bool(declared.shape):
-        raise ValueError(f"shape {declared.shape} does not suit {_name(hint)}")
+        raise ValueError(f"shape {declared.shape} does not suit {_format_hint(hint)}")
     unit = hint if python is IntEnum else _UNITS.get(python, declared.unit)
     if unit == _UNSTATED:
         raise ValueError('has no unit; the unit of a pure number is "1"')
     default = declared.default
-    if default is not None and not _holds(kind, default):
+    if default is not None and not _can_store(kind, default):
         raise ValueError(f"default {default!r} does not fit numpy type '{kind}'")
     return replace(declared, name=name, kind=kind, unit=unit, python=python)
 
@@ -164,7 +164,7 @@ class Message:
                         "must be annotated, without leading '_', and not named like an attribute"
                         " of Message"
                     )
-                fields[name] = _named(declared, name, hints[name])
+                fields[name] = _complete_field(declared, name, hints[name])
             except (TypeError, ValueError) as error:
                 raise MailboxError(
                     f"message class {cls.__name__}: field '{name}': {error}"
@@ -173,7 +173,7 @@ class Message:
         cls.message_type = MessageType(known_as, version, tuple(fields.values()))
 
     def __new__(cls, dtype: np.dtype, buffer: memoryview | None = None) -> Self:  # noqa: D102  # as the class
-        message: Self = object.__new__(_resolved(cls, dtype))  # type: ignore[arg-type]
+        message: Self = object.__new__(_build_class(cls, dtype))  # type: ignore[arg-type]
         return message
 
     def __init__(self, dtype: np.dtype, buffer: memoryview | None = None) -> None:
@@ -192,7 +192,7 @@ class Message:
         Raises:
             MailboxError: A size is missing.
         """
-        return cls(cls.message_type.dtype(sizes))
+        return cls(cls.message_type.build_dtype(sizes))
 
     def clear(self) -> None:
         """Set every byte to zero."""
@@ -209,14 +209,14 @@ class Message:
             try:
                 self._views[name][...] = value
             except KeyError:
-                raise AttributeError(self._unknown(name)) from None
+                raise AttributeError(self._describe_unknown_field(name)) from None
             except UnicodeEncodeError:
                 self._views[name][...] = value.encode("ascii", "replace")
 
         def __getattr__(self, name: str) -> Any:
-            raise AttributeError(self._unknown(name))
+            raise AttributeError(self._describe_unknown_field(name))
 
-    def _unknown(self, name: str) -> str:
+    def _describe_unknown_field(self, name: str) -> str:
         """Describe an access to an unknown field, with the nearest field name."""
         names = self.record.dtype.names or ()
         near = get_close_matches(name, names, 1)
@@ -236,17 +236,17 @@ class AnyMessage(Message):
         def __setattr__(self, name: str, value: Any) -> None: ...
 
 
-def integer(doc: str, kind: str = "u4") -> Any:
+def integer_field(doc: str, kind: str = "u4") -> Any:
     """Declare an integer field without a unit, such as a count or an index."""
     return field(kind, unit="1", doc=doc)
 
 
-def text_of(content: bytes | bytearray) -> str:
+def decode_text(content: bytes | bytearray) -> str:
     """Decode a text field for display, with control characters escaped."""
-    return printable(content.decode("ascii", "replace"))
+    return escape_text(content.decode("ascii", "replace"))
 
 
-def printable(text: str) -> str:
+def escape_text(text: str) -> str:
     """Return a text with control characters as escapes.
 
     Texts come from other racks and from users' levels and end up on terminals, which would execute
@@ -257,12 +257,12 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
-def reason_of(status: Message) -> str:
+def get_reason(status: Message) -> str:
     """Return the reason in a level's status. Empty if a user's status has no such field."""
     return str(getattr(status, "reason", ""))
 
 
-def state_name(state: int | None, otherwise: str = "") -> str:
+def format_state(state: int | None, otherwise: str = "") -> str:
     """Return the name of a level's state in lower case.
 
     Args:
@@ -272,7 +272,7 @@ def state_name(state: int | None, otherwise: str = "") -> str:
     return State(state).name.lower() if state in set(State) else otherwise or str(state)
 
 
-def copied(message: B) -> B:
+def copy_message(message: B) -> B:
     """Return a copy of a message that does not share memory with it."""
     copy: B = object.__new__(type(message))
     copy.__init__(message.record.dtype, memoryview(bytearray(message.raw)))  # type: ignore[misc]
@@ -286,23 +286,23 @@ def fill_counts(record: Any, counts: Iterable[float]) -> None:
     """
     kinds = (kind for kind, *_ in record.dtype.fields.values())
     record[...] = tuple(
-        min(count, _greatest(kind)) for count, kind in zip(counts, kinds, strict=True)
+        min(count, _find_maximum(kind)) for count, kind in zip(counts, kinds, strict=True)
     )
 
 
 @cache
-def _greatest(kind: np.dtype) -> float:
+def _find_maximum(kind: np.dtype) -> float:
     """Return the largest value that a numpy type can store."""
     return np.iinfo(kind).max if kind.kind in "iu" else np.inf
 
 
 @cache
-def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
+def _build_class(cls: type[B], dtype: np.dtype) -> type[B]:
     """Return a subclass of a message class with a property for each scalar of this dtype."""
     declared = {field.name: field for field in cls.message_type.fields}
     columns = {name: dtype[name] for name in dtype.names or ()}
     body = {
-        name: _scalar(name, column, declared.get(name))
+        name: _build_scalar_property(name, column, declared.get(name))
         for name, column in columns.items()
         if not (column.shape or column.names)
     }
@@ -312,10 +312,10 @@ def _resolved(cls: type[B], dtype: np.dtype) -> type[B]:
     return resolved_class  # type: ignore[no-any-return]
 
 
-def _scalar(name: str, dtype: np.dtype, declared: Field | None) -> property:
+def _build_scalar_property(name: str, dtype: np.dtype, declared: Field | None) -> property:
     """Build the property that reads a scalar field as a plain Python value."""
     if dtype.kind == "S":
-        return property(lambda self: text_of(self._views[name].item()))
+        return property(lambda self: decode_text(self._views[name].item()))
     if declared is not None and declared.python is bool:
         return property(lambda self: self._views[name].item() != 0)
     if declared is not None and not isinstance(declared.unit, str):
@@ -324,12 +324,12 @@ def _scalar(name: str, dtype: np.dtype, declared: Field | None) -> property:
     return property(lambda self: self._views[name].item())
 
 
-def _name(hint: Any) -> str:
+def _format_hint(hint: Any) -> str:
     """Return the name of an annotation for an error message."""
     return str(getattr(hint, "__name__", hint))
 
 
-def _holds(kind: str, value: Any) -> bool:
+def _can_store(kind: str, value: Any) -> bool:
     """Check whether a numpy type stores a value without changing it."""
     try:
         stored = np.array(value, kind)

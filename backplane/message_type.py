@@ -51,7 +51,7 @@ class MessageType:
     version: int
     fields: tuple[Field, ...]
 
-    def dtype(self, sizes: Mapping[str, int]) -> np.dtype:
+    def build_dtype(self, sizes: Mapping[str, int]) -> np.dtype:
         """Return the numpy dtype with every symbolic size filled in.
 
         Padding is explicit in numpy's aligned layout, zeroed at creation and never written, so
@@ -63,12 +63,16 @@ class MessageType:
         Raises:
             MailboxError: `sizes` lacks a size.
         """
-        return np.dtype([self._column(f, sizes) for f in self.fields], align=True)
+        return np.dtype([self._build_column(f, sizes) for f in self.fields], align=True)
 
-    def _column(self, field: Field, sizes: Mapping[str, int]) -> tuple[str, Any, tuple[int, ...]]:
+    def _build_column(
+        self, field: Field, sizes: Mapping[str, int]
+    ) -> tuple[str, Any, tuple[int, ...]]:
         """Return the entry of the numpy dtype for one field: name, type and shape."""
         kind = (
-            field.kind.dtype(sizes) if isinstance(field.kind, MessageType) else np.dtype(field.kind)
+            field.kind.build_dtype(sizes)
+            if isinstance(field.kind, MessageType)
+            else np.dtype(field.kind)
         )
         missing = [s for s in field.shape if isinstance(s, str) and s not in sizes]
         if missing:

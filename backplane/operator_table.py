@@ -18,8 +18,12 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 
-from rack.backplane.address_map import OPERATOR_ENTRIES, OPERATOR_HEAD_SIZE, operator_entry_size
-from rack.backplane.byte_lock import ByteLock, locked
+from rack.backplane.address_map import (
+    OPERATOR_ENTRIES,
+    OPERATOR_HEAD_SIZE,
+    compute_operator_entry_size,
+)
+from rack.backplane.byte_lock import ByteLock, hold_lock
 from rack.backplane.errors import OperatorTableError
 from rack.backplane.segment import Segment
 from rack.backplane.words import System, Word
@@ -79,18 +83,18 @@ class RequestEntry:
     heard = Word(7)  # tick at which the client of a lease was last heard
 
     def __init__(self, segment: Segment, index: int) -> None:
-        size = operator_entry_size(segment.layout)
+        size = compute_operator_entry_size(segment.layout)
         address = segment.map.operator + index * size
         self.index = index
         self.words = segment.words[address // 8 : (address + OPERATOR_HEAD_SIZE) // 8]
-        self.message = segment.view(address + OPERATOR_HEAD_SIZE, size - OPERATOR_HEAD_SIZE)
+        self.message = segment.get_bytes(address + OPERATOR_HEAD_SIZE, size - OPERATOR_HEAD_SIZE)
 
     @property
     def is_leased(self) -> bool:
         """True if the command was issued under a lease that has not been released."""
         return self.client == Client.LEASES and self.stage == RequestStage.GIVEN
 
-    def becomes(self, issued: Request) -> bool:
+    def can_become(self, issued: Request) -> bool:
         """Check whether this request can become the given issued command."""
         return (
             self.mailbox == issued.mailbox
@@ -107,7 +111,7 @@ class OperatorTable:
         self._words = segment.words
         self.entries = [RequestEntry(segment, index) for index in range(OPERATOR_ENTRIES)]
 
-    def add(self, request: Request) -> RequestEntry:
+    def add_request(self, request: Request) -> RequestEntry:
         """Fill a free entry, or reuse the entry of the command that was issued longest ago.
 
         The clock issues the command when it is due.
@@ -115,11 +119,13 @@ class OperatorTable:
         Raises:
             OperatorTableError: All entries wait for their ticks.
         """
-        with locked(self._segment.fd, self._segment.map.operator):
-            return self._fill(request, Client.NONE)
+        with hold_lock(self._segment.fd, self._segment.map.operator):
+            return self._fill_entry(request, Client.NONE)
 
     @contextmanager
-    def claim(self, request: Request, client: Client = Client.WAITS) -> Iterator[RequestEntry]:
+    def claim_request(
+        self, request: Request, client: Client = Client.WAITS
+    ) -> Iterator[RequestEntry]:
         """Add a request on behalf of this process.
 
         At the end of the `with` block the request is withdrawn unless it has been issued.
@@ -128,16 +134,16 @@ class OperatorTable:
             OperatorTableError: All entries wait for their ticks.
         """
         with ExitStack() as stack:
-            with locked(self._segment.fd, self._segment.map.operator):
+            with hold_lock(self._segment.fd, self._segment.map.operator):
                 ticket = self._words[System.REQUESTED] + 1
                 # This lock shows that the client is alive while the request waits.
                 lock = stack.enter_context(closing(ByteLock(self._segment.fd, _CLAIMS + ticket)))
                 lock.take()
-                entry = self._fill(request, client)
-            stack.callback(self.withdraw, entry, ticket)
+                entry = self._fill_entry(request, client)
+            stack.callback(self.withdraw_request, entry, ticket)
             yield entry
 
-    def withdraw(self, entry: RequestEntry, ticket: int) -> bool:
+    def withdraw_request(self, entry: RequestEntry, ticket: int) -> bool:
         """Withdraw a request that is still waiting. Returns False if it was issued."""
         if entry.ticket != ticket or entry.stage != RequestStage.WAITING:
             return False
@@ -149,48 +155,48 @@ class OperatorTable:
         """Check whether a request is waiting and its client, if it has one, is alive."""
         if entry.stage != RequestStage.WAITING:
             return False
-        return not entry.client or self.client_lives(entry)
+        return not entry.client or self.is_client_alive(entry)
 
-    def client_lives(self, entry: RequestEntry) -> bool:
+    def is_client_alive(self, entry: RequestEntry) -> bool:
         """Check whether the client of a request is alive."""
         return self._segment.is_locked(_CLAIMS + entry.ticket)
 
-    def leased(self) -> list[RequestEntry]:
+    def list_leased(self) -> list[RequestEntry]:
         """Return the requests that were issued under a lease that has not been released."""
         return [entry for entry in self.entries if entry.is_leased]
 
-    def hear(self, entry: RequestEntry, ticket: int) -> bool:
+    def record_heartbeat(self, entry: RequestEntry, ticket: int) -> bool:
         """Record that the client of a lease is alive. Returns False if the lease was released."""
         entry.heard = self._words[System.TICK]
         return entry.ticket == ticket and entry.client == Client.LEASES
 
-    def release(self, entry: RequestEntry) -> None:
+    def release_lease(self, entry: RequestEntry) -> None:
         """Release the lease of a request. The end of its client then has no effect."""
         entry.client = Client.WAITS
 
-    def waiting(self) -> list[RequestEntry]:
+    def list_waiting(self) -> list[RequestEntry]:
         """Return the waiting requests in the order in which they were added."""
         entries = [entry for entry in self.entries if self.is_waiting(entry)]
         return sorted(entries, key=lambda entry: entry.ticket)
 
-    def lacking(self, requests: Sequence[Request]) -> list[Request]:
+    def find_missing(self, requests: Sequence[Request]) -> list[Request]:
         """Return the commands of a run that are not waiting in the table.
 
         Args:
             requests: Commands of the run in the order of issue, each with the tick at which it
                 was issued. A command that was added late was issued after its requested tick.
         """
-        waiting = sorted(self.waiting(), key=lambda entry: entry.tick)
+        waiting = sorted(self.list_waiting(), key=lambda entry: entry.tick)
         missing = []
         for request in requests:
-            entry = next((entry for entry in waiting if entry.becomes(request)), None)
+            entry = next((entry for entry in waiting if entry.can_become(request)), None)
             if entry is None:
                 missing.append(request)
             else:
                 waiting.remove(entry)
         return missing
 
-    def _fill(self, request: Request, client: Client) -> RequestEntry:
+    def _fill_entry(self, request: Request, client: Client) -> RequestEntry:
         """Fill an entry. The caller holds the lock of the table.
 
         Raises:

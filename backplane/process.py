@@ -17,42 +17,42 @@ from struct import Struct
 from time import process_time_ns
 from typing import NamedTuple
 
-GONE = "ZX"
+ENDED_STATES = "ZX"
 """States of a process that has ended."""
-WAITING = "SD"
+WAITING_STATES = "SD"
 """States of a process that waits."""
 _TICKS_A_SECOND = os.sysconf("SC_CLK_TCK")
-STOPPED = "Tt"
+STOPPED_STATES = "Tt"
 """States of a process stopped by a signal or a debugger."""
 
 
-def start_time(pid: int) -> int:
+def read_start_time(pid: int) -> int:
     """Return the start time of a process, in kernel clock ticks since boot.
 
     The result is 0 if the process does not exist or is a zombie.
     """
-    fields = _stat(pid)
-    return int(fields[19]) if fields and fields[0] not in GONE else 0
+    fields = _read_stat(pid)
+    return int(fields[19]) if fields and fields[0] not in ENDED_STATES else 0
 
 
-def state_of(pid: int) -> str:
+def read_state(pid: int) -> str:
     """Return the kernel's letter for the state of a process.
 
     It is R, S, D, T (stopped) or Z (dead, not reaped), and X if the process does not exist.
     """
-    return (_stat(pid) or "X")[0]
+    return (_read_stat(pid) or "X")[0]
 
 
-def processor_ns(pid: int) -> int:
+def read_processor_ns(pid: int) -> int:
     """Return the processor time used by a process, in ns, to about 10 ms.
 
     The result is 0 if the process does not exist.
     """
-    fields = _stat(pid)
+    fields = _read_stat(pid)
     return (int(fields[11]) + int(fields[12])) * (1_000_000_000 // _TICKS_A_SECOND) if fields else 0
 
 
-def _stat(pid: int) -> list[str]:
+def _read_stat(pid: int) -> list[str]:
     """Return the fields of /proc/<pid>/stat after the command name, empty if there is none."""
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
@@ -70,11 +70,11 @@ def is_alive(pid: int, started: int = 0) -> bool:
         started: Start time of the expected process, because pids are reused. 0 accepts any
             process.
     """
-    start = start_time(pid) if pid > 0 else 0
+    start = read_start_time(pid) if pid > 0 else 0
     return bool(start) and started in (0, start)
 
 
-def readable(fd: int, timeout_s: float) -> bool:
+def wait_readable(fd: int, timeout_s: float) -> bool:
     """Wait until a descriptor is readable, or the process of a pidfd has ended.
 
     Unlike `select`, this accepts descriptors above 1023.
@@ -96,7 +96,7 @@ def compute_until(processor_time_ns: int) -> None:
         pass
 
 
-def pin(core: int) -> None:
+def pin_to_core(core: int) -> None:
     """Pin the calling process to one core.
 
     Raises:
@@ -150,18 +150,18 @@ def take_core(core: int, priority: int, reservation: Reservation | None = None) 
             scheduling.
     """
     everywhere = os.sched_getaffinity(0)
-    pin(core)
+    pin_to_core(core)
     if reservation is not None:
         # A pinned process is admitted only if the kernel does not add up reservations.
         for cores in ({core}, everywhere):
             os.sched_setaffinity(0, cores)
-            if _reserve(reservation):
+            if _reserve_time(reservation):
                 return DEADLINE
-        pin(core)
+        pin_to_core(core)
     return priority if set_priority(priority) else 0
 
 
-def _reserve(reservation: Reservation) -> bool:
+def _reserve_time(reservation: Reservation) -> bool:
     """Switch to SCHED_DEADLINE. Returns False if the system refuses."""
     runtime_ns, period_ns = reservation
     times = runtime_ns, period_ns, period_ns
@@ -171,7 +171,7 @@ def _reserve(reservation: Reservation) -> bool:
     return number is not None and _libc.syscall(number, 0, attributes, 0) == 0
 
 
-def wake_up_exactly() -> None:
+def disable_timer_slack() -> None:
     """Let the calling process sleep without the kernel's timer slack.
 
     To save power, the kernel wakes ordinary processes up to 50 us late.
@@ -180,7 +180,7 @@ def wake_up_exactly() -> None:
 
 
 @contextmanager
-def cores_kept_awake() -> Iterator[str]:
+def keep_cores_awake() -> Iterator[str]:
     """Keep idle cores from sleeping. Yields why the system refuses, or an empty text.
 
     A sleeping core takes 20 us or more to wake up. A core that is kept awake spins. If a host gives
@@ -200,7 +200,7 @@ def cores_kept_awake() -> Iterator[str]:
         yield refusal
 
 
-def mapped_and_locked(pid: int) -> tuple[int, int]:
+def read_memory_sizes(pid: int) -> tuple[int, int]:
     """Return how many bytes a process has mapped and how many are locked.
 
     Both are 0 if the process does not exist.
@@ -212,7 +212,7 @@ def mapped_and_locked(pid: int) -> tuple[int, int]:
     return mapped, locked
 
 
-def refusal(error: OSError) -> str:
+def describe_refusal(error: OSError) -> str:
     """Explain why the system refused a process or a file, with the limit that was reached."""
     limits = {
         errno.EAGAIN: ("processes", "u", RLIMIT_NPROC),
@@ -239,7 +239,7 @@ def set_priority(priority: int) -> bool:
     return True
 
 
-COPY = "copy:"
+COPY_PREFIX = "copy:"
 """Prefix of the names of processes that belong to a snapshot."""
 
 
@@ -261,12 +261,12 @@ def adopt_orphans() -> None:
     _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
-def how_ended(status: int) -> str:
+def describe_end(status: int) -> str:
     """Describe how a process ended. A negative exit status stands for a signal."""
     return f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
 
 
-def children_of(parent: int) -> set[int]:
+def list_children(parent: int) -> set[int]:
     """Return the children of a process, including zombies that are not reaped."""
     pids = [int(entry.name) for entry in Path("/proc").glob("[0-9]*")]
-    return {pid for pid in pids if _stat(pid)[1:2] == [str(parent)]}
+    return {pid for pid in pids if _read_stat(pid)[1:2] == [str(parent)]}

@@ -47,7 +47,7 @@ def read_regular_file(path: Path, limit_bytes: int) -> bytes:
     check_regular_file(path, limit_bytes)
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
     with os.fdopen(os.open(path, flags), "rb") as file:
-        _check(path, os.fstat(file.fileno()), limit_bytes)
+        _check_status(path, os.fstat(file.fileno()), limit_bytes)
         pieces = []
         size = 0
         # Files of /proc and files that are being written may contain more bytes than their size.
@@ -69,10 +69,10 @@ def check_regular_file(path: Path, limit_bytes: int) -> None:
         RefusedFileError: The file is not a regular file, or it is too large.
         OSError: The file does not exist, or its folder cannot be searched.
     """
-    _check(path, path.stat(), limit_bytes)
+    _check_status(path, path.stat(), limit_bytes)
 
 
-def _check(path: Path, status: os.stat_result, limit_bytes: int) -> None:
+def _check_status(path: Path, status: os.stat_result, limit_bytes: int) -> None:
     """Raise `RefusedFileError` unless a status describes a regular file within the limit."""
     if not stat.S_ISREG(status.st_mode):
         kind = _KINDS[stat.S_IFMT(status.st_mode)]

@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.address_map import oldest_kept
+from rack.backplane.address_map import compute_oldest_kept
 from rack.backplane.errors import DamageError
 
-MOST = 1 << 48
+MAX_COUNT = 1 << 48
 """Upper bound of a valid record count. No ring is written this often."""
 
 
-class Drained(NamedTuple):
+class NewRows(NamedTuple):
     """Rows read from a ring, oldest first, and the number of rows lost.
 
     A lost row was overwritten before it was read.
@@ -45,32 +45,32 @@ class Ring:
         self.before = self._taken = before
 
     @property
-    def waiting(self) -> int:
+    def waiting_count(self) -> int:
         """Number of records written and not yet read."""
-        return self._written - self._taken
+        return self._written_count - self._taken
 
     @property
-    def _written(self) -> int:
+    def _written_count(self) -> int:
         """Number of records written.
 
         Raises:
             DamageError: The number is impossible.
         """
-        if not 0 <= (count := self._head[0]) < MOST:
+        if not 0 <= (count := self._head[0]) < MAX_COUNT:
             raise DamageError(f"a ring cannot have {count} records")
         return count
 
-    def resume(self, taken: int) -> None:
+    def resume_after(self, taken: int) -> None:
         """Continue after the first `taken` records, which another reader has read."""
         self._taken = taken
 
-    def drain(self) -> Drained:
+    def read_new_rows(self) -> NewRows:
         """Read every record written since the last call."""
-        head = self._written
+        head = self._written_count
         first = max(self._taken + 1, head - self._depth + 1)
         rows = self._rows[np.arange(first, head + 1) % self._depth].view(self._dtype)
         # The writer may have overwritten the oldest rows during the copy.
-        torn = max(0, oldest_kept(self._written, self._depth) - first)
+        torn = max(0, compute_oldest_kept(self._written_count, self._depth) - first)
         lost = first - self._taken - 1 + min(torn, len(rows))
         self._taken = head
-        return Drained(rows[torn:], lost)
+        return NewRows(rows[torn:], lost)

@@ -21,12 +21,18 @@ from zlib import crc32
 
 import posix_ipc
 
-from rack.backplane.address_map import BLOCK_SIZE, HEAD_SIZE, MAILBOX_HEAD_SIZE, AddressMap, pages
+from rack.backplane.address_map import (
+    BLOCK_SIZE,
+    HEAD_SIZE,
+    MAILBOX_HEAD_SIZE,
+    AddressMap,
+    round_up_to_pages,
+)
 from rack.backplane.byte_lock import ProcessLock, is_locked
 from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
 from rack.backplane.layout import Layout, TaskSpec
-from rack.backplane.semaphores import initialize
+from rack.backplane.semaphores import initialize_all
 from rack.backplane.words import Block, Head, Run, System
 
 if TYPE_CHECKING:
@@ -39,9 +45,9 @@ TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which the C library's `shm_open` keeps its names."""
-LOOK_S = 0.02
+POLL_S = 0.02
 """Time between two checks of the lock of a launcher that is about to end."""
-_LIFE = 8 * Head.LAUNCHER_PID
+_LAUNCHER_LOCK = 8 * Head.LAUNCHER_PID
 """Bus address on which the launcher holds a lock for as long as it lives."""
 PROCESSOR = "x86_64"
 """Processor architecture on which stores become visible to other cores in program order.
@@ -49,7 +55,7 @@ PROCESSOR = "x86_64"
 Rings and control blocks need this order, and so do mailboxes where Python accesses them (see
 `rack.backplane.mailbox.slots`). Racks have not been tested on other architectures.
 """
-TRY = "RACK_TRY_PROCESSOR"
+TRY_VARIABLE = "RACK_TRY_PROCESSOR"
 """Environment variable that permits other processors with 64 bits, for a trial."""
 
 
@@ -143,15 +149,15 @@ class Segment:
             if sys.maxsize < 1 << 32:
                 raise SegmentError(f"{here}, without atomic access to 64 bits")
             why = f"the backplane's memory order is proved for {PROCESSOR} alone"
-            if not os.environ.get(TRY):
-                raise SegmentError(f"{here}; {why}; set {TRY}=1 to try it")
+            if not os.environ.get(TRY_VARIABLE):
+                raise SegmentError(f"{here}; {why}; set {TRY_VARIABLE}=1 to try it")
             sys.stderr.write(f"{here}; {why}, and this one is untested\n")
         texts = [encode_json(asdict(layout)).encode(), config.encode(), published.encode()]
         places = AddressMap(layout)
-        size = pages(places.size + sum(len(t) for t in texts))
+        size = round_up_to_pages(places.size + sum(len(t) for t in texts))
         try:
             fd = os.open(SHM_FOLDER, os.O_TMPFILE | os.O_RDWR, 0o600)
-            life = ProcessLock(fd, _LIFE)
+            life = ProcessLock(fd, _LAUNCHER_LOCK)
         except OSError as error:
             raise SegmentError(f"rack '{layout.rack}': {SHM_FOLDER}: {error.strerror}") from None
         try:
@@ -169,7 +175,7 @@ class Segment:
             life.take()
             # With a descriptor, which absolute paths do not need, the link leads to the file, not
             # to its path in /proc.
-            os.link(f"/proc/self/fd/{fd}", shm_path(layout.rack), src_dir_fd=fd)
+            os.link(f"/proc/self/fd/{fd}", get_shm_path(layout.rack), src_dir_fd=fd)
         except OSError as error:
             os.close(fd)
             life.close()
@@ -204,7 +210,7 @@ class Segment:
             self.bytes[address : address + len(text)] = text
             address += len(text)
         for process in self.layout.processes:
-            block = self.block(process.name)
+            block = self.get_block(process.name)
             block[Block.RELEASED] = block[Block.DONE] = -1
         for task in self.layout.tasks:
             self.words[System.SYSFAIL + task.slot] = 1
@@ -221,7 +227,7 @@ class Segment:
     def initialize_semaphores(self) -> None:
         """Initialize all semaphores. No process may be waiting on them."""
         places = self.map
-        initialize(
+        initialize_all(
             self.bytes, (*places.wake.values(), *places.done.values()), places.locks.values()
         )
 
@@ -250,8 +256,8 @@ class Segment:
             SegmentError: There is no such segment, it belongs to another user, or it is not a
                 segment.
         """
-        if (kind := stranger(rack)) is not None:
-            raise SegmentError(f"rack '{rack}': {shm_path(rack)} is a {kind}, not a segment")
+        if (kind := find_foreign_kind(rack)) is not None:
+            raise SegmentError(f"rack '{rack}': {get_shm_path(rack)} is a {kind}, not a segment")
         try:
             shm = posix_ipc.SharedMemory(_shm_name(rack))
         except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
@@ -261,7 +267,7 @@ class Segment:
                 else "does not exist"
             )
             raise SegmentError(
-                f"rack '{rack}' {why}; racks: {', '.join(racks()) or 'none'}"
+                f"rack '{rack}' {why}; racks: {', '.join(list_racks()) or 'none'}"
             ) from None
         status = os.fstat(shm.fd)
         if os.getuid() not in (status.st_uid, 0) or status.st_size < HEAD_SIZE:
@@ -292,7 +298,7 @@ class Segment:
             if crc32(b"".join(texts)) != self.words[Head.CHECK]:
                 raise ValueError("the texts in its head are damaged")
             layout, self.config, self.published = (text.decode() for text in texts)
-            self.layout = layout_of(json.loads(layout))
+            self.layout = restore_layout(json.loads(layout))
             self.map = AddressMap(self.layout)
             if self.map.size != self.words[Head.LAYOUT_AT]:
                 raise ValueError(f"the layout cannot have {self.map.size} bytes")
@@ -301,11 +307,11 @@ class Segment:
                 f"rack '{self.rack}': the layout is damaged or from another program: {error}"
             ) from None
 
-    def view(self, address: int, size: int) -> memoryview:
+    def get_bytes(self, address: int, size: int) -> memoryview:
         """Return the bytes at a bus address."""
         return self.bytes[address : address + size]
 
-    def block(self, task: str) -> memoryview:
+    def get_block(self, task: str) -> memoryview:
         """Return a task's control block as words (`words.Block`).
 
         Raises:
@@ -319,13 +325,13 @@ class Segment:
 
         Releases after its last cycle count as skipped once their time is over.
         """
-        block = self.block(task.name)
+        block = self.get_block(task.name)
         skipped = block[Block.SKIPPED] + task.count_unfinished(block[Block.DONE], tick)
         return CycleCounts(
             block[Block.MISSED], skipped, task.count_unfinished(-1, tick), task.within_cycles
         )
 
-    def box(self, mailbox: str) -> memoryview:
+    def get_box(self, mailbox: str) -> memoryview:
         """Return the head of a mailbox as words (`words.Box`).
 
         Raises:
@@ -365,7 +371,7 @@ class Segment:
     @property
     def launcher_is_alive(self) -> bool:
         """True if the process that created the segment is still running."""
-        return is_locked(self.fd, _LIFE)
+        return is_locked(self.fd, _LAUNCHER_LOCK)
 
     def await_launcher(self, timeout_s: float) -> bool:
         """Wait until the launcher has ended or closed the rack. Returns False on timeout."""
@@ -373,7 +379,7 @@ class Segment:
         while self.launcher_is_alive:
             if time.monotonic() >= deadline:
                 return False
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
         return True
 
     @property
@@ -382,18 +388,18 @@ class Segment:
         return self.words[System.STATE] == Run.STOPPED or not self.launcher_is_alive
 
     @property
-    def has_its_name(self) -> bool:
+    def is_named(self) -> bool:
         """True if the rack's name still leads to this segment.
 
         Another launch may have replaced it.
         """
         try:
-            named = shm_path(self.rack).stat()
+            named = get_shm_path(self.rack).stat()
         except FileNotFoundError:
             return False
         return os.path.samestat(named, os.fstat(self.fd))
 
-    def release(self) -> None:
+    def release_launcher_lock(self) -> None:
         """Release the launcher's lock. The rack then counts as dead."""
         if self._life is not None:
             self._life.close()
@@ -403,31 +409,31 @@ class Segment:
 
         The mapping lasts as long as there are views of it.
         """
-        self.release()
+        self.release_launcher_lock()
         if self.fd >= 0:
             os.close(self.fd)
             self.fd = -1
 
 
-def racks() -> list[str]:
+def list_racks() -> list[str]:
     """Return the names of the racks that have a segment, whether they are running or not."""
     return sorted(path.name.removeprefix(PREFIX) for path in SHM_FOLDER.glob(f"{PREFIX}*"))
 
 
-def stranger(rack: str) -> str | None:
+def find_foreign_kind(rack: str) -> str | None:
     """Return the kind of a foreign entry under a rack's name, such as "directory".
 
     The result is None for a regular file, or if there is no entry.
     """
     try:
-        mode = shm_path(rack).lstat().st_mode
+        mode = get_shm_path(rack).lstat().st_mode
     except OSError:  # no such file, or an impossible name
         return None
     kinds = {stat.S_IFDIR: "directory", stat.S_IFLNK: "symbolic link"}
     return None if stat.S_ISREG(mode) else kinds.get(stat.S_IFMT(mode), "special file")
 
 
-def unlink(rack: str) -> None:
+def unlink_segment(rack: str) -> None:
     """Remove a rack's segment by name. A segment that does not exist is no error.
 
     Raises:
@@ -443,7 +449,7 @@ def unlink(rack: str) -> None:
         ) from None
 
 
-def shm_path(rack: str) -> Path:
+def get_shm_path(rack: str) -> Path:
     """Return the path of a rack's segment."""
     return SHM_FOLDER / f"{PREFIX}{rack}"
 
@@ -458,29 +464,29 @@ def _shm_name(rack: str) -> str:
     return f"/{PREFIX}{rack}"
 
 
-def layout_of(plain: dict[str, Any]) -> Layout:
+def restore_layout(plain: dict[str, Any]) -> Layout:
     """Restore a layout from plain data made by `dataclasses.asdict`.
 
     Recordings of earlier versions lack some fields, which then get their defaults.
     """
-    layout: Layout = _restored(Layout, plain)
+    layout: Layout = _restore_value(Layout, plain)
     return layout
 
 
-def _restored(kind: Any, plain: Any) -> Any:
+def _restore_value(kind: Any, plain: Any) -> Any:
     """Convert plain data to an instance of a dataclass or to a tuple, recursively."""
     if isinstance(plain, list):
         inner, *_ = get_args(kind)
-        return tuple([_restored(inner, entry) for entry in plain])
+        return tuple([_restore_value(inner, entry) for entry in plain])
     if isinstance(plain, dict):
         # The first argument of an optional type is the type that is not None.
         record, *_ = get_args(kind) or (kind,)
-        types = _types_of(record)
-        return record(**{name: _restored(types[name], entry) for name, entry in plain.items()})
+        types = _get_types(record)
+        return record(**{name: _restore_value(types[name], entry) for name, entry in plain.items()})
     return plain
 
 
 @cache
-def _types_of(record: type) -> dict[str, Any]:
+def _get_types(record: type) -> dict[str, Any]:
     """Return the types of a dataclass's fields."""
     return get_type_hints(record)

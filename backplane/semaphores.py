@@ -72,27 +72,27 @@ class Semaphore:
         _sem_getvalue(ctypes.addressof(self._place), ctypes.addressof(count))
         return count.value
 
-    def bind(self, deadline_ns: int) -> None:
+    def set_deadline(self, deadline_ns: int) -> None:
         """Set the time at which waits end, in ns of CLOCK_MONOTONIC."""
         self._deadline[0], self._deadline[1] = divmod(deadline_ns, 1_000_000_000)
 
-    def take(self) -> bool:
+    def try_acquire(self) -> bool:
         """Obtain the semaphore without waiting. Returns False if that is impossible."""
         return not self._try()
 
     def acquire(self, timeout_s: float) -> bool:
         """Obtain the semaphore within `timeout_s`. Returns False on timeout."""
-        if self.take():
+        if self.try_acquire():
             return True
         deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
-        self.bind(deadline_ns)
+        self.set_deadline(deadline_ns)
         while self.wait():
             if time.monotonic_ns() >= deadline_ns:
                 return False
         return True
 
 
-def initialize(memory: memoryview, wake_and_done: Iterable[int], locks: Iterable[int]) -> None:
+def initialize_all(memory: memoryview, wake_and_done: Iterable[int], locks: Iterable[int]) -> None:
     """Create the semaphores of a rack.
 
     Args:
@@ -105,12 +105,12 @@ def initialize(memory: memoryview, wake_and_done: Iterable[int], locks: Iterable
             Semaphore(memory, address).initialize(value)
 
 
-def wake_semaphore(segment: MappedMemory, task: str) -> Semaphore:
+def get_wake_semaphore(segment: MappedMemory, task: str) -> Semaphore:
     """Return the semaphore that wakes a task."""
     return Semaphore(segment.bytes, segment.map.wake[task])
 
 
-def done_semaphore(segment: MappedMemory, task: str) -> Semaphore:
+def get_done_semaphore(segment: MappedMemory, task: str) -> Semaphore:
     """Return the semaphore on which lockstep waits for a task.
 
     The task posts it with each report, and the crate posts it to report the loss of the task.
@@ -118,6 +118,6 @@ def done_semaphore(segment: MappedMemory, task: str) -> Semaphore:
     return Semaphore(segment.bytes, segment.map.done[task])
 
 
-def lock_semaphore(segment: MappedMemory, mailbox: str) -> Semaphore:
+def get_lock_semaphore(segment: MappedMemory, mailbox: str) -> Semaphore:
     """Return the semaphore that guards a mailbox."""
     return Semaphore(segment.bytes, segment.map.locks[mailbox])

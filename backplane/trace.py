@@ -17,7 +17,7 @@ from struct import Struct
 
 import numpy as np
 
-from rack.backplane.address_map import TRACE_RECORD_SIZE, oldest_kept
+from rack.backplane.address_map import TRACE_RECORD_SIZE, compute_oldest_kept
 from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
@@ -66,9 +66,9 @@ class TraceWriter:
     """Writing end of a task's trace ring."""
 
     def __init__(self, segment: Segment, task: str) -> None:
-        spec = segment.layout.task(task)
-        self._block = segment.block(task)
-        self._ring = segment.view(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE)
+        spec = segment.layout.find_task(task)
+        self._block = segment.get_block(task)
+        self._ring = segment.get_bytes(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE)
         self._mask = spec.depth - 1
         self._count = self._block[Block.TRACE_HEAD]
 
@@ -79,11 +79,11 @@ class TraceWriter:
         self._block[Block.TRACE_HEAD] = count
 
 
-def trace_ring(segment: Segment, task: str) -> Ring:
+def open_trace_ring(segment: Segment, task: str) -> Ring:
     """Open the reading end of a task's trace ring. Its rows have dtype `RECORD`."""
-    spec = segment.layout.task(task)
-    block = segment.block(task)
-    memory = segment.view(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE)
+    spec = segment.layout.find_task(task)
+    block = segment.get_block(task)
+    memory = segment.get_bytes(segment.map.traces[task], spec.depth * TRACE_RECORD_SIZE)
     return Ring(
         memory,
         RECORD,
@@ -96,43 +96,43 @@ class CycleRecord:
     """Trace of one task, as used by the readers of its mailboxes."""
 
     def __init__(self, segment: Segment, task: str) -> None:
-        self._block = segment.block(task)
+        self._block = segment.get_block(task)
         self._words = segment.words
         self._first = segment.map.traces[task] // 8
-        self._depth = segment.layout.task(task).depth
+        self._depth = segment.layout.find_task(task).depth
 
     @property
-    def finished(self) -> int:
+    def finished_tick(self) -> int:
         """Newest release whose cycle has ended with every access done.
 
         It is -1 if there is no such cycle or it is not known.
         """
         count = self._block[Block.TRACE_HEAD]
-        at = self._at(count)
+        at = self._get_index(count)
         flags = self._words[at + _FLAGS]
         tick = self._words[at + _TICK]
-        return tick if count and not flags & _BUS_ERROR and self._keeps(count) else -1
+        return tick if count and not flags & _BUS_ERROR and self._is_kept(count) else -1
 
-    def ended_ns(self, tick: int) -> int | None:
+    def find_end_ns(self, tick: int) -> int | None:
         """Return the end of the cycle released at `tick`, in ns of CLOCK_MONOTONIC.
 
         The result is None if the ring has no record of the cycle.
         """
         count = self._block[Block.TRACE_HEAD]
         for number in range(count, max(0, count - self._depth), -1):
-            at = self._at(number)
+            at = self._get_index(number)
             record_tick = self._words[at + _TICK]
             ended_ns = self._words[at + _END]
-            if not self._keeps(number) or record_tick < tick:
+            if not self._is_kept(number) or record_tick < tick:
                 return None
             if record_tick == tick:
                 return ended_ns
         return None
 
-    def _keeps(self, number: int) -> bool:
+    def _is_kept(self, number: int) -> bool:
         """Check whether the record with this number cannot be partly overwritten."""
-        return number >= oldest_kept(self._block[Block.TRACE_HEAD], self._depth)
+        return number >= compute_oldest_kept(self._block[Block.TRACE_HEAD], self._depth)
 
-    def _at(self, number: int) -> int:
+    def _get_index(self, number: int) -> int:
         """Return the index of the first word of the record with this number."""
         return self._first + number % self._depth * _RECORD

@@ -11,7 +11,7 @@ from enum import IntEnum
 from typing import Protocol
 
 
-class OnWords(Protocol):
+class HasWords(Protocol):
     """Object that consists of words of shared memory."""
 
     words: memoryview
@@ -23,14 +23,14 @@ class Word:
     def __init__(self, index: int) -> None:
         self._index = index
 
-    def __get__(self, owner: OnWords, kind: type) -> int:
+    def __get__(self, owner: HasWords, kind: type) -> int:
         return owner.words[self._index]
 
-    def __set__(self, owner: OnWords, value: int) -> None:
+    def __set__(self, owner: HasWords, value: int) -> None:
         owner.words[self._index] = value
 
 
-def switch(tick: int, is_on: bool) -> int:
+def encode_switch(tick: int, is_on: bool) -> int:
     """Return the value of a word that switches on, or off, at `tick`.
 
     Before that tick the opposite state holds, so all readers agree on the state by ticks alone,
@@ -39,7 +39,7 @@ def switch(tick: int, is_on: bool) -> int:
     return 2 * tick + is_on
 
 
-def is_on(word: int, tick: int) -> bool:
+def is_switched_on(word: int, tick: int) -> bool:
     """Check whether a switch word (see `encode_switch`) is on at `tick`."""
     return bool(word & 1) == (tick >= word >> 1)
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rack.backplane.exports import on_first_use
+from rack.backplane.exports import build_lazy_getattr
 
 if TYPE_CHECKING:
     from rack.boards.config import load
@@ -56,4 +56,4 @@ _PLACES = {
 }
 
 if not TYPE_CHECKING:  # a type checker would take every misspelt name for one of these
-    __getattr__ = on_first_use(__name__, _PLACES)
+    __getattr__ = build_lazy_getattr(__name__, _PLACES)

@@ -13,13 +13,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-LONGEST_VALUE = 80
-LONGEST_PLACE = 120
-LONGEST_REASON = 1000
-CANNOT_GO_ON = 4
+MAX_VALUE_LENGTH = 80
+MAX_PLACE_LENGTH = 120
+MAX_REASON_LENGTH = 1000
+UNRECOVERABLE_STATUS = 4
 """Exit status of a board that a restart would not help."""
 
-UNKEPT = "no snapshots: "
+NO_SNAPSHOTS_PREFIX = "no snapshots: "
 """Prefix of the note of a run that takes no snapshots. The reason follows."""
 
 
@@ -67,8 +67,11 @@ class Mistake:
 
     def __str__(self) -> str:
         """Return the mistake as one line."""
-        value = "" if self.value is None else f" = {shown(self.value)}"
-        return f"{one_line(self.place, LONGEST_PLACE)}{value}: {one_line(self.why, LONGEST_REASON)}"
+        value = "" if self.value is None else f" = {format_value(self.value)}"
+        return (
+            f"{to_one_line(self.place, MAX_PLACE_LENGTH)}{value}: "
+            f"{to_one_line(self.why, MAX_REASON_LENGTH)}"
+        )
 
 
 Mistakes = Iterator[Mistake]
@@ -86,7 +89,7 @@ class ConfigError(BoardError):
         super().__init__("\n".join(str(mistake) for mistake in self.mistakes), 2)
 
 
-def shown(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Format a config value as in TOML, shortened to one line."""
     value = list(value) if isinstance(value, tuple) else value
     try:
@@ -97,10 +100,10 @@ def shown(value: Any) -> str:
             text = f'"{value}"'
     except ValueError:  # Python refuses to print integers of thousands of digits
         text = f"an integer of {value.bit_length()} bits"
-    return one_line(text, LONGEST_VALUE)
+    return to_one_line(text, MAX_VALUE_LENGTH)
 
 
-def one_line(text: str, longest: int) -> str:
+def to_one_line(text: str, longest: int) -> str:
     """Format text as one line of at most `longest` characters, without control characters."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text[: 2 * longest].split()))
     return text if len(text) <= longest else f"{text[: longest - 3]}..."

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.message import AnyMessage, State, reason_of, state_name
+from rack.backplane.message import AnyMessage, State, format_state, get_reason
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
@@ -32,7 +32,7 @@ OfRun = Literal[
 ]
 OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
 EventKind = OfRun | OfFaults
-CONTINUES = "continues"
+CONTINUATION_CODE = "continues"
 """Code of the event with the first tick of a run that continues another one."""
 
 
@@ -72,12 +72,12 @@ NO_TORQUE = "no torque"
 
 Brakes that engage on a demand (`DEMANDED`) have their cause in other events.
 """
-HELD_MS = 5e3
+MAX_HOLD_MS = 5e3
 """Time without interruption for which an arm may be braked, or a level held, in ms.
 
 A longer time without a known cause makes a run fail.
 """
-HELD_PART = 0.5
+MAX_BRAKED_FRACTION = 0.5
 """Share of a run for which an arm may be braked in total without a known cause."""
 
 
@@ -90,7 +90,7 @@ class Braking:
     lasted_ms: float
 
 
-def brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking, ...]:
+def list_brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking, ...]:
     """List every engagement of the brakes in a run, except at the start.
 
     Args:
@@ -113,19 +113,20 @@ def brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking
     )
 
 
-def braked_text(found: Sequence[Braking]) -> str:
+def format_brakings(brakings: Sequence[Braking]) -> str:
     """Describe how often and how long brakes were engaged, and why.
 
     Args:
-        found: At least one engagement.
+        brakings: At least one engagement.
     """
-    longest = max(found, key=lambda braking: braking.lasted_ms)
-    total_ms = sum(braking.lasted_ms for braking in found)
+    longest = max(brakings, key=lambda braking: braking.lasted_ms)
+    total_ms = sum(braking.lasted_ms for braking in brakings)
     times = f"{total_ms:g} ms in all, longest {longest.lasted_ms:g} ms at tick {longest.since}"
     reasons = ", ".join(
-        f"{why} ({count})" for why, count in Counter(braking.why for braking in found).most_common()
+        f"{why} ({count})"
+        for why, count in Counter(braking.why for braking in brakings).most_common()
     )
-    return f"brakes engaged {len(found)} time{'s' * (len(found) > 1)}, {times}: {reasons}"
+    return f"brakes engaged {len(brakings)} time{'s' * (len(brakings) > 1)}, {times}: {reasons}"
 
 
 Cause = Literal[
@@ -186,12 +187,12 @@ class Outcome:
         return f"{self.cause}: {faults or self.reason or f'after {self.ticks} ticks'}"
 
     @property
-    def worked(self) -> bool:
+    def is_success(self) -> bool:
         """True if the run succeeded."""
         return not self.failure
 
 
-def order_key(entry: Mapping[str, Any]) -> float:
+def get_event_order(entry: Mapping[str, Any]) -> float:
     """Return the sort key of an entry in an event log, its tick.
 
     Some events are known late: a board that drives an arm reports after its return when the brakes
@@ -211,7 +212,7 @@ class Journal:
         self.segment: Segment | None = None
         self._on_event = on_event
 
-    def add(
+    def add_event(
         self,
         kind: EventKind,
         board: str,
@@ -236,9 +237,9 @@ class Journal:
         stamp_ns = now_ns if at_ns is None else now_ns - time.monotonic_ns() + at_ns
         if tick is None:
             tick = self._tick
-        self.keep(Event(stamp_ns, tick, kind, board, text, code, subject=subject))
+        self.record_event(Event(stamp_ns, tick, kind, board, text, code, subject=subject))
 
-    def keep(self, event: Event) -> None:
+    def record_event(self, event: Event) -> None:
         """Record an event and pass it on."""
         self.events.append(event)
         if self._on_event:
@@ -252,16 +253,16 @@ class Journal:
         return self.segment.words[System.TICK]
 
 
-def statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
+def iterate_statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
     """Yield board and last status of every level whose status has the given field."""
     for box in segment.layout.mailboxes:
         if box.name.endswith(".status") and field in (declared.name for declared in box.fields):
             status = open_observer(segment, box.name).peek()
-            if status.is_there:
+            if status.has_message:
                 yield box.writer, status.message
 
 
-def arm_states(segment: Segment) -> Iterator[tuple[str, AnyMessage]]:
+def iterate_arm_states(segment: Segment) -> Iterator[tuple[str, AnyMessage]]:
     """Yield board and last state of every arm or hand."""
     for box in segment.layout.mailboxes:
         if box.message == "arm_state":
@@ -277,40 +278,40 @@ class Ending:
         self._silent = silent
         self._observer = None if ends_run is None else open_observer(segment, ends_run)
 
-    def final_state(self) -> tuple[str, str]:
+    def find_final_state(self) -> tuple[str, str]:
         """Return the last state of the level that ends the run, and the reason."""
         if self._observer is None:
             return "", ""
         status = self._observer.peek().message
-        silent_s = self._silence() * self._segment.layout.clock_ns * 1e-9
+        silent_s = self._compute_silent_ticks() * self._segment.layout.clock_ns * 1e-9
         reason = (
             f"'{self._ends_run}' has not been written for {silent_s:g} s"
             if silent_s
-            else reason_of(status)
+            else get_reason(status)
         )
-        return state_name(status.state), reason
+        return format_state(status.state), reason
 
-    def latched(self) -> list[str]:
+    def list_latched_faults(self) -> list[str]:
         """Describe the latched faults of levels and arms, one line each.
 
         A level has one if its last status reports an error, except for the level that ends the run.
         An arm has one if it counted violations or contacts that its level does not report.
         """
         reported = {
-            board: f"level '{board}': {reason_of(status) or f'error {status.error}'}"
-            for board, status in statuses(self._segment, "error")
+            board: f"level '{board}': {get_reason(status) or f'error {status.error}'}"
+            for board, status in iterate_statuses(self._segment, "error")
             if status.error and f"{board}.status" != self._ends_run
         }
         counted = {
             board: f"arm of '{board}': limits exceeded in {state.violations} substeps,"
             f" {state.touches} unintended contacts"
-            for board, state in arm_states(self._segment)
+            for board, state in iterate_arm_states(self._segment)
             if state.violations or state.touches
         }
         return [*(counted | reported).values()]
 
-    def held(
-        self, events: Sequence[Event], found: Sequence[Braking], ran_ms: float
+    def find_long_holds(
+        self, events: Sequence[Event], brakings: Sequence[Braking], ran_ms: float
     ) -> Iterator[str]:
         """Yield a line for each reason why a hold was too long for a successful run.
 
@@ -320,7 +321,7 @@ class Ending:
 
         Args:
             events: Events of the run.
-            found: Engagements of the brakes.
+            brakings: Engagements of the brakes.
             ran_ms: Length of the run.
         """
         segment = self._segment
@@ -329,34 +330,37 @@ class Ending:
         ):
             return
         tick_ms = segment.layout.clock_ns * 1e-6
-        hands = dict(statuses(segment, "tension"))
+        hands = dict(iterate_statuses(segment, "tension"))
         braked = {
             name: message
-            for name, message in (*arm_states(segment), *statuses(segment, "braked"))
-            if message.braked and name not in hands and not found
+            for name, message in (
+                *iterate_arm_states(segment),
+                *iterate_statuses(segment, "braked"),
+            )
+            if message.braked and name not in hands and not brakings
         }
         unreleased = []
         for name, message in braked.items():
-            since = segment.block(name)[Block.LEVEL_SINCE]
-            why = reason_of(message) or NO_TORQUE
+            since = segment.get_block(name)[Block.LEVEL_SINCE]
+            why = get_reason(message) or NO_TORQUE
             unreleased.append(Braking(why, since, ran_ms - since * tick_ms))
         held = []
-        for name, status in statuses(segment, "state"):
-            block = segment.block(name)
+        for name, status in iterate_statuses(segment, "state"):
+            block = segment.get_block(name)
             lasted_ms = ran_ms - block[Block.LEVEL_SINCE] * tick_ms
-            if block[Block.LEVEL_STATE] == State.HOLDING and lasted_ms > HELD_MS:
+            if block[Block.LEVEL_STATE] == State.HOLDING and lasted_ms > MAX_HOLD_MS:
                 held.append(
                     f"level '{name}' held for {lasted_ms:g} ms without a known cause:"
-                    f" {reason_of(status) or 'no reason given'}"
+                    f" {get_reason(status) or 'no reason given'}"
                 )
-        counted = [braking for braking in found if braking.why != DEMANDED] or unreleased
+        counted = [braking for braking in brakings if braking.why != DEMANDED] or unreleased
         times = [braking.lasted_ms for braking in counted]
-        if max(times, default=0.0) > HELD_MS or sum(times) > HELD_PART * ran_ms:
-            yield f"held without a known cause, in {ran_ms:g} ms: {braked_text(counted)}"
+        if max(times, default=0.0) > MAX_HOLD_MS or sum(times) > MAX_BRAKED_FRACTION * ran_ms:
+            yield f"held without a known cause, in {ran_ms:g} ms: {format_brakings(counted)}"
         elif not any(box.name.startswith("lan.") for box in segment.layout.mailboxes):
             yield from held
 
-    def ends(self, goals: Mapping[int, GoalConfig]) -> tuple[ObjectEnd, ...]:
+    def find_object_ends(self, goals: Mapping[int, GoalConfig]) -> tuple[ObjectEnd, ...]:
         """Return the final positions of objects that have goals, as sensed last.
 
         The result is empty if no level senses them.
@@ -367,26 +371,29 @@ class Ending:
         for box in self._segment.layout.mailboxes:
             if (
                 box.message == "scene"
-                and (scene := open_observer(self._segment, box.name).peek()).is_there
+                and (scene := open_observer(self._segment, box.name).peek()).has_message
             ):
                 rows = scene.message.position
-                return tuple(ObjectEnd.of(goal, rows[row].tolist()) for row, goal in goals.items())
+                return tuple(
+                    ObjectEnd.compare_with_goal(goal, rows[row].tolist())
+                    for row, goal in goals.items()
+                )
         return ()
 
-    def cause(self) -> Cause:
+    def find_cause(self) -> Cause:
         """Return the cause of the end of a run that was not stopped."""
         if self._observer is None or self._ends_run is None:
             return "time over"
         status = self._observer.peek().message
-        fields = self._segment.layout.mailbox(self._ends_run).fields
-        if status.state != State.ERROR and not self._silence():
+        fields = self._segment.layout.find_mailbox(self._ends_run).fields
+        if status.state != State.ERROR and not self._compute_silent_ticks():
             return "task done" if status.state == State.DONE else "time over"
         # The field `moves` of a status counts the moves of its program. A refused one has none.
         counts_moves = any(field.name == "moves" and not field.shape for field in fields)
         is_refused = counts_moves and not status.moves
         return "task refused" if is_refused else "task failed"
 
-    def _silence(self) -> int:
+    def _compute_silent_ticks(self) -> int:
         """Return the ticks since the last status of the level that ends the run.
 
         The result is 0 while the silence is permitted, or if the level has ended.
@@ -395,7 +402,7 @@ class Ending:
         reading = self._observer.peek()
         if reading.message.state in (State.DONE, State.ERROR):
             return 0
-        newest = self._observer.newest if reading.is_there else 0
+        newest = self._observer.newest if reading.has_message else 0
         ticks = self._segment.words[System.TICK] - newest
         return ticks if ticks > self._silent else 0
 
@@ -411,7 +418,7 @@ class ObjectEnd:
     tolerance_mm: float
 
     @classmethod
-    def of(cls, goal: GoalConfig, ended: Sequence[float]) -> Self:
+    def compare_with_goal(cls, goal: GoalConfig, ended: Sequence[float]) -> Self:
         """Compare the final position of an object with its goal, in m."""
         off_mm = round(1e3 * math.dist(ended, goal.position), 3)
         return cls(goal.object, goal.position, ended, off_mm, goal.tolerance_mm)

@@ -17,17 +17,17 @@ if TYPE_CHECKING:
     # A tool that inspects a running rack must not import the levels.
     from rack.boards.wiring import Source
 
-EXCHANGE = "exchange"
+EXCHANGE_PORT = "exchange"
 """Name of the port and of the message type."""
-AGE = "age"
-TAKEN = "taken"
+AGE_SUFFIX = "age"
+TAKEN_SUFFIX = "taken"
 """Suffix of the names of fields with arrivals. `AGE_SUFFIX` is the suffix for ages."""
 _NEW = Verdict.NEW  # for the hot path
 NEVER = -1
 """Tick of arrival before the first message."""
 
 
-def exchange_message(reads: Mapping[str, Source]) -> type[Message]:
+def build_exchange_message(reads: Mapping[str, Source]) -> type[Message]:
     """Create the message class for a board that reads these ports.
 
     It has two fields for each mailbox.
@@ -41,9 +41,9 @@ def exchange_message(reads: Mapping[str, Source]) -> type[Message]:
     for port, source in reads.items():
         labels = [port] if isinstance(source, str) else [f"{port}_{board}" for board in source]
         for label in labels:
-            fields[f"{label}_{AGE}"] = field(unit="tick", doc=age)
-            fields[f"{label}_{TAKEN}"] = field(unit="tick", doc=taken)
-    return make_message(EXCHANGE, 1, Message, fields)
+            fields[f"{label}_{AGE_SUFFIX}"] = field(unit="tick", doc=age)
+            fields[f"{label}_{TAKEN_SUFFIX}"] = field(unit="tick", doc=taken)
+    return make_message(EXCHANGE_PORT, 1, Message, fields)
 
 
 @dataclass(frozen=True)
@@ -54,18 +54,18 @@ class PortAge:
     taken: int
 
 
-def ages_of(exchange: Message) -> dict[str, PortAge]:
+def list_port_ages(exchange: Message) -> dict[str, PortAge]:
     """Return age and arrival of the inputs that have a message in use, by label."""
     names = exchange.record.dtype.names or ()
     values = iter(exchange.raw.cast("q"))
-    labels = [name.removesuffix(f"_{AGE}") for name in names[::2]]
+    labels = [name.removesuffix(f"_{AGE_SUFFIX}") for name in names[::2]]
     ports = {
         label: PortAge(age, taken) for label, age, taken in zip(labels, values, values, strict=True)
     }
     return {label: port for label, port in ports.items() if port.taken != NEVER}
 
 
-class Taken(NamedTuple):
+class MonitoredPort(NamedTuple):
     """The last reading of one mailbox, `readings[key]`, and its reader."""
 
     readings: Mapping[str, Reading[AnyMessage]]
@@ -79,14 +79,14 @@ class ExchangeRecord:
     The inputs are in the order of `build_exchange_message`.
     """
 
-    def __init__(self, inputs: Sequence[Taken], message: Message) -> None:
+    def __init__(self, inputs: Sequence[MonitoredPort], message: Message) -> None:
         self._inputs = tuple(inputs)
         # Age and arrival of each input alternate.
         self._values = message.raw.cast("q")
         for at in range(len(self._inputs)):
             self._values[2 * at + 1] = NEVER
 
-    def fill(self, tick: int) -> None:
+    def fill_message(self, tick: int) -> None:
         """Record the messages in use, after the reads of the cycle released at `tick`."""
         values = self._values
         at = 0

@@ -14,17 +14,17 @@ Source = str | Mapping[str, str]
 """Source of a port: a mailbox, or mailboxes by board."""
 
 
-Rows = Sequence[tuple[int, int, bytes]]
+EntityRows = Sequence[tuple[int, int, bytes]]
 """Messages of a mailbox in a recorded run, oldest first.
 
 Each row has the tick at which the message was written, the tick of the information on which it
 depends, and its bytes. A mailbox whose messages repeat has only rows for changes.
 """
-Entries = Mapping[str, Rows]
+ExchangedEntries = Mapping[str, EntityRows]
 """Messages that an adapter wrote in a recorded run, by port."""
 
 
-def mailboxes_of(source: Source) -> tuple[str, ...]:
+def list_mailboxes(source: Source) -> tuple[str, ...]:
     """Return the mailboxes of a port."""
     return (source,) if isinstance(source, str) else tuple(source.values())
 
@@ -109,7 +109,7 @@ class TaskWiring:
     guards_clock: bool
     sent: tuple[str, ...]
     fails_self_test: bool
-    entries: Entries | None
+    entries: ExchangedEntries | None
     transfer: BusTimes
     exchange: Mapping[str, ExchangeSpec]
     reservation: Reservation | None

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rack.backplane.exports import on_first_use
+from rack.backplane.exports import build_lazy_getattr
 
 if TYPE_CHECKING:
     from rack.backplane.message import Command, Message, State, Status, field
@@ -160,4 +160,4 @@ _PLACES = {
 
 # A type checker would accept every misspelt name if it saw `__getattr__`.
 if not TYPE_CHECKING:
-    __getattr__ = on_first_use(__name__, _PLACES)
+    __getattr__ = build_lazy_getattr(__name__, _PLACES)

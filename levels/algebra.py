@@ -70,7 +70,7 @@ def norm(vector: ArrayLike) -> float:
     return float(mujoco.mju_norm(vector))
 
 
-def each(function: Callable[[float], float], values: Array) -> Array:
+def apply_elementwise(function: Callable[[float], float], values: Array) -> Array:
     """Apply a function of `math` to every element of `values`; the shape stays the same."""
     return np.fromiter(map(function, values.ravel().tolist()), float, values.size).reshape(
         values.shape

@@ -30,9 +30,9 @@ from typing import Any, Generic, ParamSpec, TypeVar
 
 import numpy as np
 
-DIGEST = 16
+DIGEST_BYTES = 16
 """Length of a digest, bytes."""
-CURE = "set XDG_CACHE_HOME to a folder that can be written"
+CACHE_HINT = "set XDG_CACHE_HOME to a folder that can be written"
 _P = ParamSpec("_P")
 _R = TypeVar("_R", covariant=True)
 _A = ParamSpec("_A")
@@ -65,7 +65,7 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
         """
         return self._function(*args, **kwargs)
 
-    def load(self) -> Callable[_P, _R]:
+    def load_machine_code(self) -> Callable[_P, _R]:
         """Return the compiled function.
 
         It is compiled, or read from the cache, at its first call with given argument types.
@@ -75,7 +75,7 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
         return self._machine
 
     def _build(self) -> Any:
-        return _jit(self)
+        return _compile_function(self)
 
     def preload(self) -> None:
         """Load the machine code for the types given in `compiled_for`, if any."""
@@ -83,13 +83,13 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
             from numba import from_dtype
             from numba.core.sigutils import normalize_signature
 
-            machine: Any = self.load()
+            machine: Any = self.load_machine_code()
             types, _ = normalize_signature(f"({self._types},)")  # type: ignore[no-untyped-call]
             if self._records is not None:
                 types = (from_dtype(self._records)[::1], *types)
             machine.compile(types)
 
-    def source(self) -> Iterator[bytes]:
+    def iterate_source(self) -> Iterator[bytes]:
         """Yield everything that determines the machine code.
 
         This includes instructions, constants, and the values of names, also in functions that are
@@ -98,13 +98,13 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
         function: Any = self._function
         code = function.__code__
         known = function.__globals__
-        yield from _instructions(code, function.__doc__)
+        yield from _iterate_instructions(code, function.__doc__)
         yield repr(function.__defaults__).encode()
         for name in code.co_names:
             # Other names are attributes or builtins.
             if name in known:
                 yield name.encode()
-                yield from _value(known[name])
+                yield from _iterate_value(known[name])
 
 
 class c_function(compiled[..., Any]):  # noqa: N801  # stands for a function
@@ -122,7 +122,7 @@ class c_function(compiled[..., Any]):  # noqa: N801  # stands for a function
         self._key = name, arguments
         self._library = library
 
-    def source(self) -> Iterator[bytes]:
+    def iterate_source(self) -> Iterator[bytes]:
         """Yield what a caller's code depends on: it finds the function by name."""
         yield repr(self._key).encode()
 
@@ -157,7 +157,7 @@ def preload(*modules: ModuleType) -> None:
                 function.preload()
 
 
-def _jit(marked: compiled[..., Any]) -> Any:
+def _compile_function(marked: compiled[..., Any]) -> Any:
     """Compile a function. Marked functions that it calls are replaced by their compiled form."""
     from numba import config, njit
 
@@ -179,11 +179,11 @@ def _jit(marked: compiled[..., Any]) -> Any:
     machine = njit(error_model="numpy")(bound)
     name = f"{function.__module__}.{function.__qualname__}"
     # numba creates the attribute at run time.
-    machine._cache = _Kept(name, _digest(b"".join(marked.source())))  # type: ignore[attr-defined]
+    machine._cache = _CodeCache(name, _compute_digest(b"".join(marked.iterate_source())))  # type: ignore[attr-defined]
     return machine
 
 
-class _Kept:
+class _CodeCache:
     """Cache of the machine code of one function, which numba consults before it compiles.
 
     Each tuple of types has its own file, which begins with a digest of the rest. Files are replaced
@@ -201,14 +201,14 @@ class _Kept:
         target.refresh()
         # Without a home folder, or permission to read it, there is no cache.
         with suppress(OSError):
-            path = self._path(types, target.codegen())
+            path = self._build_path(types, target.codegen())
             if path.is_file():
                 content = path.read_bytes()
-                code = content[DIGEST:]
+                code = content[DIGEST_BYTES:]
                 # Damaged machine code must never run.
-                if content[:DIGEST] == _digest(code):
+                if content[:DIGEST_BYTES] == _compute_digest(code):
                     return CompileResult._rebuild(target, *pickle.loads(code))  # type: ignore[no-untyped-call]
-                _say(f"{path} is damaged; the function is compiled again")
+                _print_once(f"{path} is damaged; the function is compiled again")
         if on_compile is not None:
             on_compile(self._name)
         return None
@@ -225,11 +225,11 @@ class _Kept:
             return
         code: bytes = dumps(result._reduce())  # type: ignore[no-untyped-call]
         try:
-            path = self._path(types, result.codegen)
+            path = self._build_path(types, result.codegen)
             partial_file = path.with_name(f"{path.name}.{os.urandom(8).hex()}")
             path.parent.mkdir(parents=True, exist_ok=True)
             try:
-                partial_file.write_bytes(_digest(code) + code)
+                partial_file.write_bytes(_compute_digest(code) + code)
                 partial_file.replace(path)
             finally:
                 partial_file.unlink(missing_ok=True)
@@ -237,35 +237,35 @@ class _Kept:
                 if not old.name.startswith(f"{self._name}-{self._source}-"):
                     old.unlink(missing_ok=True)
         except OSError as error:
-            _say(
+            _print_once(
                 "compiled code cannot be saved, so every launch compiles it again:"
-                f" {error.filename}: {error.strerror}; {CURE}"
+                f" {error.filename}: {error.strerror}; {CACHE_HINT}"
             )
 
-    def _path(self, types: Any, codegen: Any) -> Path:
+    def _build_path(self, types: Any, codegen: Any) -> Path:
         """Return the path of the file for a tuple of types."""
         from numba import __version__
 
         build = repr((__version__, sys.version, types, codegen.magic_tuple())).encode()
-        return _folder() / f"{self._name}-{self._source}-{_digest(build).hex()}"
+        return _find_cache_folder() / f"{self._name}-{self._source}-{_compute_digest(build).hex()}"
 
 
-def _instructions(code: CodeType, docstring: str | None = None) -> Iterator[bytes]:
+def _iterate_instructions(code: CodeType, docstring: str | None = None) -> Iterator[bytes]:
     """Yield the bytecode, names and constants of a function, without its docstring."""
     yield code.co_code
     yield repr((code.co_names, code.co_varnames)).encode()
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
-            yield from _instructions(constant)
+            yield from _iterate_instructions(constant)
         elif constant != docstring:
             yield repr(constant).encode()
 
 
-def _value(value: object) -> Iterator[bytes]:
+def _iterate_value(value: object) -> Iterator[bytes]:
     """Yield a representation of a value that compiled code uses as a constant."""
     match value:
         case compiled():
-            yield from value.source()
+            yield from value.iterate_source()
         case ModuleType(__name__="math" | "numpy" as name):
             yield name.encode()
         case np.ndarray():
@@ -277,7 +277,7 @@ def _value(value: object) -> Iterator[bytes]:
 
 
 @cache
-def _folder() -> Path:
+def _find_cache_folder() -> Path:
     """Return the folder of the code that is compiled from this checkout.
 
     Raises:
@@ -287,15 +287,15 @@ def _folder() -> Path:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nasrem-rack"
     except RuntimeError:
         raise FileNotFoundError(errno.ENOENT, "the user has no home folder", "~") from None
-    return home / _digest(bytes(Path(__file__).parent)).hex()
+    return home / _compute_digest(bytes(Path(__file__).parent)).hex()
 
 
-def _digest(content: bytes) -> bytes:
-    return blake2b(content, digest_size=DIGEST).digest()
+def _compute_digest(content: bytes) -> bytes:
+    return blake2b(content, digest_size=DIGEST_BYTES).digest()
 
 
 @cache
-def _say(text: str) -> None:
+def _print_once(text: str) -> None:
     """Print a line to stderr, once per process."""
     sys.stderr.write(f"{text}\n")
     sys.stderr.flush()

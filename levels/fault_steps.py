@@ -20,7 +20,7 @@ Key = tuple[str, int, int, int]
 Sample = Any
 """A `rack.levels.arm.Sensed`. It is not imported because that would import MuJoCo."""
 
-APART = np.array([[1e-2], [1e-2]])
+STUCK_SENSOR_ERROR = np.array([[1e-2], [1e-2]])
 """Error of a stuck sensor, rad and rad/s, from which it counts as wrong.
 
 While a joint creeps, a stuck sensor need not be detected earlier.
@@ -69,11 +69,11 @@ class ActiveFault:
         """Return a parameter of the fault."""
         return self.fault.parameters[parameter]
 
-    def draw(self, tick: int) -> np.random.Generator:
+    def build_generator(self, tick: int) -> np.random.Generator:
         """Return the random generator of a tick; a restarted board draws the same numbers."""
         return np.random.default_rng((self.fault.seed, tick))
 
-    def first(self, sample: Sample) -> Sample:
+    def recall_first_sample(self, sample: Sample) -> Sample:
         """Return the sample with which the fault began."""
         if self.key not in self.kept:
             copy = sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
@@ -125,43 +125,43 @@ ARM_STEPS = (SensorStep, MotorStep, CommandStep)
 """Classes of steps that act on an arm, as `Executor.faults` names them."""
 
 
-def position_nan(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
+def set_position_nan(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Make positions NaN."""
     return sample._replace(position=np.where(fault.joints, np.nan, sample.position)), True
 
 
-def position_biased(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
+def bias_position(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Add `size`, rad, to positions."""
     return sample._replace(position=sample.position + fault["size"] * fault.joints), True
 
 
-def position_noisy(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
+def add_position_noise(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Add noise of standard deviation `size`, rad, to positions."""
-    noise = fault["size"] * fault.draw(sample.tick).standard_normal(len(fault.joints))
+    noise = fault["size"] * fault.build_generator(sample.tick).standard_normal(len(fault.joints))
     return sample._replace(position=sample.position + noise * fault.joints), True
 
 
-def sample_missing(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
+def repeat_last_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
     """Repeat the sample of the cycle before the fault."""
-    first = fault.first(sample)
+    first = fault.recall_first_sample(sample)
     return first._replace(tick=first.tick - fault.every), True
 
 
-def sample_stuck(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool | None]:
+def freeze_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool | None]:
     """Keep positions and velocities as they were when the fault began."""
-    first = fault.first(sample)
+    first = fault.recall_first_sample(sample)
     truth = (sample.position, sample.velocity)
     stuck = np.where(fault.joints, (first.position, first.velocity), truth)
     off = np.abs(stuck - truth)
-    is_apart = bool((off > APART).any()) if off.any() else None
+    is_apart = bool((off > STUCK_SENSOR_ERROR).any()) if off.any() else None
     return sample._replace(position=stuck[0], velocity=stuck[1]), is_apart
 
 
-def torque_nan(torque: Array, limits: Array, fault: ActiveFault) -> Array:
+def set_torque_nan(torque: Array, limits: Array, fault: ActiveFault) -> Array:
     """Make torques NaN."""
     return np.full_like(torque, np.nan)
 
 
-def torque_excessive(torque: Array, limits: Array, fault: ActiveFault) -> Array:
+def exceed_torque(torque: Array, limits: Array, fault: ActiveFault) -> Array:
     """Command `factor` times the limit, in the direction of the torque."""
     return fault["factor"] * np.copysign(limits, torque)

@@ -69,14 +69,14 @@ class Bus(Protocol):
     def tasks(self) -> list[str]:
         """Names of the tasks of the crate."""
 
-    def address(self, name: str) -> int:
+    def find_address(self, name: str) -> int:
         """Return the bus address of a mailbox, or of the control block of a task.
 
         Raises:
             LookupError: No mailbox or task has this name.
         """
 
-    def words(self, address: int, count: int = 1) -> list[int]:
+    def read_words(self, address: int, count: int = 1) -> list[int]:
         """Return 8-byte words of the crate's memory, starting at a bus address.
 
         `rack check` prints the addresses. Any word may be read without a message, whichever board
@@ -86,7 +86,7 @@ class Bus(Protocol):
             ValueError: The address is not aligned to a word, or the words extend beyond the memory.
         """
 
-    def finish(self) -> None:
+    def declare_done(self) -> None:
         """Declare that the program has done its work, like returning from `run`."""
 
 
@@ -140,7 +140,7 @@ class ProgramInput(InputPort[M]):
         """Return the declaration. Raises `LevelError` if no board has connected the program."""
         if program is None:
             return self
-        raise self.not_connected()
+        raise self.build_connection_error()
 
 
 class ProgramOutput(Output[M]):
@@ -160,7 +160,7 @@ class ProgramOutput(Output[M]):
         """Return the declaration. Raises `LevelError` if no board has connected the program."""
         if program is None:
             return self
-        raise self.not_connected()
+        raise self.build_connection_error()
 
 
 class HostProgram:
@@ -197,6 +197,6 @@ class HostProgram:
         while not bus.is_over:
             bus.wait(1.0)
 
-    def names(self, bus: Bus) -> Mapping[str, Any]:
+    def list_prompt_names(self, bus: Bus) -> Mapping[str, Any]:
         """Return objects that an interactive prompt offers by name, besides `bus` and `program`."""
         return {}

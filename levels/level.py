@@ -96,7 +96,7 @@ from typing import Any, ClassVar, NamedTuple, Self
 from pydantic import ValidationError, model_validator
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.mailbox.queue import ALL
+from rack.backplane.mailbox.queue import UNLIMITED
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Demand
@@ -112,11 +112,11 @@ from rack.levels.operator import (
     Orders,
 )
 from rack.levels.ports import (
+    ConfiguredPorts,
     FindingKind,
     Input,
     InputPort,
     Inputs,
-    MadePorts,
     Output,
     QueuedOutput,
     Sender,
@@ -128,13 +128,14 @@ from rack.levels.tables import (
     RobotConfig,
     SceneConfig,
     Table,
-    frozen,
-    live_keys,
+    freeze_lists,
+    list_live_keys,
     read_params,
     set_live,
 )
 
 __all__ = [
+    "ConfiguredPorts",
     "Demand",
     "Executor",
     "Fault",
@@ -143,7 +144,6 @@ __all__ = [
     "Input",
     "Inputs",
     "LevelContext",
-    "MadePorts",
     "Output",
     "Pace",
     "Planner",
@@ -156,7 +156,7 @@ __all__ = [
 ]
 
 
-Misfits = Iterable[tuple[str, Any, str]]
+Mismatches = Iterable[tuple[str, Any, str]]
 """Key, value and reason of each table entry that is inconsistent with something else."""
 
 
@@ -167,9 +167,9 @@ class Program(Table):
     @classmethod
     def _with_frozen_tables(cls, table: Any) -> Any:
         """Freeze the lists in tables with user-defined names, too."""
-        return frozen(table)
+        return freeze_lists(table)
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
+    def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
         """Yield each entry that does not suit arm or scene, as key, value and reason.
 
         A key is the path of the entry, such as "action[0].object". `robot` is None for a rack
@@ -199,12 +199,13 @@ class Program(Table):
                 )
             ) from error
         if misfits := [
-            f"task.{key} = {value!r}: {why}" for key, value, why in program.misfits(robot, scene)
+            f"task.{key} = {value!r}: {why}"
+            for key, value, why in program.find_mismatches(robot, scene)
         ]:
             raise ProgramError("\n".join(misfits))
         return program
 
-    def goals(self) -> Iterable[GoalConfig]:
+    def list_goals(self) -> Iterable[GoalConfig]:
         """Yield the final positions of the objects, in the order of the program.
 
         They are checked when the program reports that it is done.
@@ -304,7 +305,7 @@ class LevelSection:
         if self.params is not None:
             self.settings = read_params(self.params, context.params)
 
-    def input_table(self, port: str) -> dict[str, Any]:
+    def find_input_table(self, port: str) -> dict[str, Any]:
         """Return the dict into which the board stores the readings of a port, by name.
 
         Raises:
@@ -350,20 +351,20 @@ class LevelSection:
         The board then holds SYSFAIL, and the launch fails.
         """
 
-    def room(self, port: str) -> int:
+    def max_messages(self, port: str) -> int:
         """Return the maximum number of messages to take from each queue that `port` reads.
 
         Called before each read. The default is no maximum.
         """
-        return ALL
+        return UNLIMITED
 
     def close(self) -> None:
         """Release resources of the level. Called once, after the last cycle or plan."""
 
 
-OPERATOR = Input(OperatorCommand, "own.operator")
+OPERATOR_PORT = Input(OperatorCommand, "own.operator")
 """Port by which a board sets live parameters of a level that does not declare `operator`."""
-OPERATOR.name = "operator"
+OPERATOR_PORT.name = "operator"
 
 
 class Executor(LevelSection, ABC):
@@ -385,7 +386,7 @@ class Executor(LevelSection, ABC):
     """
     finding_kinds: ClassVar[Mapping[str, FindingKind]] = {}
     """Findings that the level may raise, by name, collected from the class and its bases."""
-    made_last: ClassVar[Executor | None] = None
+    last_constructed: ClassVar[Executor | None] = None
     """The executor that was constructed last in this process.
 
     A board constructs one executor, which then constructs what it drives.
@@ -406,7 +407,7 @@ class Executor(LevelSection, ABC):
         # Callbacks of the driven mechanism, which complete each cycle, given the `ArmState`.
         self.complete_cycle: list[Callable[[ArmState | None], None]] = []
         self._live_orders = Orders(self.commands)
-        Executor.made_last = self
+        Executor.last_constructed = self
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -414,13 +415,13 @@ class Executor(LevelSection, ABC):
         for name, kind in cls.finding_kinds.items():
             if kind.mistake:
                 raise LevelError(f"class {cls.__name__}: finding '{name}' {kind.mistake}")
-        if "operator" not in cls.inputs and live_keys(cls.params):
+        if "operator" not in cls.inputs and list_live_keys(cls.params):
             if hasattr(cls, "operator"):
                 raise LevelError(
                     f"class {cls.__name__}: attribute 'operator' has the name of the port that sets"
                     " live parameters; rename the attribute"
                 )
-            cls.inputs = {**cls.inputs, OPERATOR.name: OPERATOR}
+            cls.inputs = {**cls.inputs, OPERATOR_PORT.name: OPERATOR_PORT}
             cls.commands = {Operation.SET: ()}
 
     def raise_finding(
@@ -456,26 +457,28 @@ class Executor(LevelSection, ABC):
     @property
     def is_set_by_board(self) -> bool:
         """True if the board handles the operator's settings of live parameters for the level."""
-        return self.inputs.get(OPERATOR.name) is OPERATOR
+        return self.inputs.get(OPERATOR_PORT.name) is OPERATOR_PORT
 
     def take_settings(self, tick: int) -> None:
         """Set live parameters as the operator commands, and answer in the status.
 
         Called by the board before `process`. Only an `AnsweringStatus` can answer.
         """
-        self._live_orders.take(OPERATOR.__get__(self, type(self)), self._set)
+        self._live_orders.take_commands(
+            OPERATOR_PORT.__get__(self, type(self)), self._set_parameter
+        )
         status = vars(self).get("status")
         if isinstance(status, AnsweringStatus):
-            self._live_orders.report(status)
+            self._live_orders.fill_status(status)
 
-    def _set(self, command: OperatorCommand) -> None:
+    def _set_parameter(self, command: OperatorCommand) -> None:
         """Set a live parameter, or refuse the command."""
         self.settings, why = set_live(self.settings, command.name)
         if why:
-            self._live_orders.refuse(why)
+            self._live_orders.refuse_newest(why)
 
     @classmethod
-    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+    def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the names of an operator's settings, and of the level's alarms by number.
 
         `params` may be invalid.
@@ -483,9 +486,9 @@ class Executor(LevelSection, ABC):
         return ()
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield each disagreement with the neighbours, before the launch.
 
         Args:
@@ -500,7 +503,7 @@ class Executor(LevelSection, ABC):
         return ()
 
     @classmethod
-    def wording(
+    def list_operation_names(
         cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig
     ) -> Sequence[str]:
         """Return the names that an operator may give with an operation.
@@ -512,17 +515,19 @@ class Executor(LevelSection, ABC):
             params: Parameters of the level.
             scene: The `[scene]` table.
         """
-        return cls.names(params)
+        return cls.list_names(params)
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
+    def build_ports(
+        cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
+    ) -> ConfiguredPorts:
         """Return the ports that a config creates by `params`.
 
         Args:
             params: Parameters of the level, which may be invalid.
             types: Message class of each mailbox that a class declares.
         """
-        return MadePorts()
+        return ConfiguredPorts()
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the injected faults by `faults`, which are all faults active from now on."""

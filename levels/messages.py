@@ -12,11 +12,11 @@ from typing import Any, Protocol
 
 from numpy import ndarray
 
-from rack.backplane.message import Message, field, integer
+from rack.backplane.message import Message, field, integer_field
 from rack.backplane.words import Demand
 from rack.levels.operator import AnsweringStatus, RelayedCommand
 
-WINDOW = 8
+WINDOW_MOVES = 8
 """Elemental moves in one task command.
 
 There are enough that the level below never waits for a cycle of the task level.
@@ -27,12 +27,12 @@ WAYPOINTS = 24
 """Maximum number of joint-space points of a path."""
 MOVES = 96
 """Maximum number of elemental moves of a task program."""
-SECTIONS_A_LINE = 8
+SECTIONS_PER_LINE = 8
 """Sections of constant jerk for one line of a path and the corner after it.
 
 Seven sections change the speed, and one keeps it.
 """
-SECTIONS = SECTIONS_A_LINE * (WAYPOINTS - 1)
+SECTIONS = SECTIONS_PER_LINE * (WAYPOINTS - 1)
 """Maximum number of sections of constant jerk of a trajectory."""
 
 
@@ -84,7 +84,7 @@ class SegmentKind(IntEnum):
     GRIPPER = 2
 
 
-def per_joint(unit: str, doc: str) -> Any:
+def joint_field(unit: str, doc: str) -> Any:
     """Declare a field with one number for each joint of the arm."""
     return field(unit=unit, doc=doc, shape="joints")
 
@@ -92,13 +92,13 @@ def per_joint(unit: str, doc: str) -> Any:
 class ElementalMove(Message, version=1):
     """One elemental move of a program."""
 
-    id: int = integer("serial of the move, rising by one from 1 (0: empty)")
-    action: int = integer("index of the program's action that it serves", "u2")
+    id: int = integer_field("serial of the move, rising by one from 1 (0: empty)")
+    action: int = integer_field("index of the program's action that it serves", "u2")
     verb: Verb = field(doc="what to do")
-    object: int = integer("row of the object concerned in the world model (-1: none)", "i2")
+    object: int = integer_field("row of the object concerned in the world model (-1: none)", "i2")
     position: ndarray = field(unit="m", doc="tool position at the end", shape=3)
     quaternion: ndarray = field(unit="1", doc="tool orientation at the end", shape=4)
-    joints: ndarray = per_joint("rad", "where MOVE_JOINTS ends; with `posture`, near the end")
+    joints: ndarray = joint_field("rad", "where MOVE_JOINTS ends; with `posture`, near the end")
     posture: bool = field(doc="1: select the configuration nearest to `joints` at the pose")
     by: float = field(unit="s", doc="simulated time by which it must be done (0: any time)")
 
@@ -106,13 +106,13 @@ class ElementalMove(Message, version=1):
 class TaskPlan(Message, version=1):
     """The task level's plan, from planner to executor: the program as elemental moves."""
 
-    id: int = integer("serial of the plan")
+    id: int = integer_field("serial of the plan")
     error: Error = field("u2", doc="why the program is refused (0: not refused)")
     reason: str = field(doc="the refusal, readable")
     earliest: float = field(
         unit="s", doc="with TOO_LATE: the earliest time at which it could be done"
     )
-    count: int = integer("moves that follow", "u2")
+    count: int = integer_field("moves that follow", "u2")
     moves: ndarray = field(ElementalMove, doc="the program, decomposed", shape=MOVES)
 
 
@@ -120,19 +120,21 @@ class TaskCommand(RelayedCommand, version=2):
     """Command from the task level to the elemental move level: the next moves of the plan."""
 
     hold: bool = field(doc="1: ramp to rest and stay, whatever is under way")
-    count: int = integer("moves that follow; id is the newest one's", "u2")
-    moves: ndarray = field(ElementalMove, doc="a window on the plan, oldest first", shape=WINDOW)
+    count: int = integer_field("moves that follow; id is the newest one's", "u2")
+    moves: ndarray = field(
+        ElementalMove, doc="a window on the plan, oldest first", shape=WINDOW_MOVES
+    )
 
 
 class TaskStatus(AnsweringStatus, version=2):
     """Status of the task level."""
 
-    action: int = integer("actions done", "u2")
-    actions: int = integer("actions of the program", "u2")
-    moves_done: int = integer("elemental moves done", "u2")
-    moves: int = integer("elemental moves of the plan; 0 before there is one", "u2")
-    first: int = integer("id under which the plan's first move is handed down")
-    detour: int = integer("id of the move that an operator requested instead (0: none)")
+    action: int = integer_field("actions done", "u2")
+    actions: int = integer_field("actions of the program", "u2")
+    moves_done: int = integer_field("elemental moves done", "u2")
+    moves: int = integer_field("elemental moves of the plan; 0 before there is one", "u2")
+    first: int = integer_field("id under which the plan's first move is handed down")
+    detour: int = integer_field("id of the move that an operator requested instead (0: none)")
 
 
 OPERATED = field(doc="1: an operator keeps this level, or one below it, from its normal work")
@@ -141,16 +143,16 @@ OPERATED = field(doc="1: an operator keeps this level, or one below it, from its
 class MoveStatus(AnsweringStatus, version=3):
     """Status of the elemental move level."""
 
-    done: int = integer("newest elemental move done (0: none yet)")
-    current: int = integer("elemental move under way (0: none)")
+    done: int = integer_field("newest elemental move done (0: none yet)")
+    current: int = integer_field("elemental move under way (0: none)")
     progress: float = field(unit="1", doc="part of its path done, 0 to 1")
     verb: Verb = field(doc="of the move under way")
-    held: int = integer("row of the object in the gripper (-1: none)", "i2")
-    planned: int = integer("newest elemental move whose path is ready (0: none yet)")
-    end: ndarray = per_joint("rad", "joint positions at the end of that path")
-    replan: int = integer("open request to replan the current move from `start` (0: none)")
-    start: ndarray = per_joint("rad", "joint positions where that motion holds")
-    replans: int = integer("number of replans because of an obstacle")
+    held: int = integer_field("row of the object in the gripper (-1: none)", "i2")
+    planned: int = integer_field("newest elemental move whose path is ready (0: none yet)")
+    end: ndarray = joint_field("rad", "joint positions at the end of that path")
+    replan: int = integer_field("open request to replan the current move from `start` (0: none)")
+    start: ndarray = joint_field("rad", "joint positions where that motion holds")
+    replans: int = integer_field("number of replans because of an obstacle")
     operated: bool = OPERATED
     resting: bool = field(
         doc="1: the arm rests, and the level that moves it has the operator's newest command"
@@ -160,12 +162,12 @@ class MoveStatus(AnsweringStatus, version=3):
 class MovePlan(Message, version=1):
     """The elemental move level's plan, from planner to executor: a path for one move."""
 
-    move: int = integer("elemental move that the plan serves")
-    replan: int = integer("request that it answers (0: the first plan of the move)")
+    move: int = integer_field("elemental move that the plan serves")
+    replan: int = integer_field("request that it answers (0: the first plan of the move)")
     error: Error = field("u2", doc="why there is no plan (0: there is a plan)")
     reason: str = field(doc="the error, readable")
     kind: SegmentKind = field(doc="path or gripper")
-    count: int = integer("waypoints that follow", "u2")
+    count: int = integer_field("waypoints that follow", "u2")
     waypoints: ndarray = field(
         unit="rad", doc="collision-free path in joint space", shape=(WAYPOINTS, "joints")
     )
@@ -179,12 +181,12 @@ class MovePlan(Message, version=1):
 class MoveSegment(Message, version=1, message="segment"):
     """One segment of a move: a path, or a motion of the gripper."""
 
-    id: int = integer("serial of the segment, rising by one from 1 (0: empty)")
-    move: int = integer("elemental move that it serves")
+    id: int = integer_field("serial of the segment, rising by one from 1 (0: empty)")
+    move: int = integer_field("elemental move that it serves")
     kind: SegmentKind = field(doc="path or gripper")
-    object: int = integer("object held, or to be grasped (-1: none)", "i2")
+    object: int = integer_field("object held, or to be grasped (-1: none)", "i2")
     touch: bool = field(doc="1: the object may touch supports and fingers (approach, depart)")
-    count: int = integer("waypoints that follow", "u2")
+    count: int = integer_field("waypoints that follow", "u2")
     waypoints: ndarray = field(
         unit="rad",
         doc="path in joint space, from where the motion starts",
@@ -200,29 +202,29 @@ class MoveCommand(RelayedCommand, version=2):
     """Command from the elemental move level to the primitive level: the next segments."""
 
     hold: bool = field(doc="1: ramp to rest on the path and stay")
-    count: int = integer("segments that follow; id is the newest one's", "u2")
+    count: int = integer_field("segments that follow; id is the newest one's", "u2")
     segments: ndarray = field(MoveSegment, doc="segments to do, oldest first", shape=SEGMENTS)
 
 
 class PrimitiveStatus(AnsweringStatus, version=3):
     """Status of the primitive level."""
 
-    done: int = integer("newest segment done (0: none yet)")
-    current: int = integer("segment under way (0: none)")
+    done: int = integer_field("newest segment done (0: none yet)")
+    current: int = integer_field("segment under way (0: none)")
     progress: float = field(unit="1", doc="part of the segment's path done, 0 to 1")
     blocked: bool = field(doc="1: motion holds because of an obstacle")
     resting: bool = field(doc="1: commanded velocity is zero")
     operated: bool = OPERATED
-    held: int = integer("row of the object in the gripper (-1: none)", "i2")
+    held: int = integer_field("row of the object in the gripper (-1: none)", "i2")
     opening: float = field(unit="m or rad", doc="gripper joint position, measured")
-    position: ndarray = per_joint("rad", "joint positions commanded last")
+    position: ndarray = joint_field("rad", "joint positions commanded last")
     earliest: float = field(
         unit="s", doc="with TOO_LATE: the earliest time at which it could be done"
     )
     ends: float = field(
         unit="s", doc="simulated time at which the segment under way should be done (0: not known)"
     )
-    wants: int = integer("segment for which the planner is to compute a trajectory (0: none)")
+    wants: int = integer_field("segment for which the planner is to compute a trajectory (0: none)")
     begin: float = field(
         unit="rad", doc="path parameter at which that trajectory is to begin, from rest"
     )
@@ -231,7 +233,7 @@ class PrimitiveStatus(AnsweringStatus, version=3):
 class TrajectoryPlan(Message, version=1, message="trajectory"):
     """The primitive level's plan, from planner to executor: the timing of a path."""
 
-    segment: int = integer("segment that it serves")
+    segment: int = integer_field("segment that it serves")
     error: Error = field("u2", doc="why there is no trajectory (0: there is one)")
     reason: str = field(doc="the error, readable")
     begin: float = field(unit="rad", doc="path parameter at which it begins")
@@ -239,7 +241,7 @@ class TrajectoryPlan(Message, version=1, message="trajectory"):
     earliest: float = field(
         unit="s", doc="simulated time at which the segment could be done at the earliest"
     )
-    count: int = integer("sections that follow", "u2")
+    count: int = integer_field("sections that follow", "u2")
     sections: ndarray = field(
         unit="s, 1, 1/s, 1/s2, 1/s3",
         doc="start, s, ds, dds, jerk of the path parameter",
@@ -253,12 +255,12 @@ class JointCommand(RelayedCommand, version=2, message="joint_set_point"):
     due: int = field(
         unit="tick", doc="tick at which the set point applies (0: no set point yet, hold)"
     )
-    position: ndarray = per_joint("rad", "joint positions")
-    velocity: ndarray = per_joint("rad/s", "joint velocities")
-    acceleration: ndarray = per_joint("rad/s2", "joint accelerations")
+    position: ndarray = joint_field("rad", "joint positions")
+    velocity: ndarray = joint_field("rad/s", "joint velocities")
+    acceleration: ndarray = joint_field("rad/s2", "joint accelerations")
     opening: float = field(unit="m or rad", doc="gripper joint position to go to")
     force: float = field(unit="N or N m", doc="largest gripper force")
-    held: int = integer("row of the object in the gripper (-1: none)", "i2")
+    held: int = integer_field("row of the object in the gripper (-1: none)", "i2")
 
 
 class ArmSetPoint(Protocol):
@@ -279,7 +281,7 @@ class ServoPlan(Message, version=1):
         doc="joint-space inertia, the object held included",
         shape=("joints", "joints"),
     )
-    held: int = integer("object included (-1: none)", "i2")
+    held: int = integer_field("object included (-1: none)", "i2")
     payload_mass: float = field(unit="kg", doc="mass in the gripper")
     payload_offset: ndarray = field(unit="m", doc="its centre, in the frame of the tool", shape=3)
 
@@ -287,13 +289,15 @@ class ServoPlan(Message, version=1):
 class DrivenArm(AnsweringStatus):
     """Base class for the status of a level that drives an arm."""
 
-    position: ndarray = per_joint("rad", "joint positions, measured; estimated for suspect sensors")
-    velocity: ndarray = per_joint("rad/s", "joint velocities, likewise")
-    torque: ndarray = per_joint(
+    position: ndarray = joint_field(
+        "rad", "joint positions, measured; estimated for suspect sensors"
+    )
+    velocity: ndarray = joint_field("rad/s", "joint velocities, likewise")
+    torque: ndarray = joint_field(
         "N m", "torque given to the arm in this cycle, after the limit gate"
     )
-    target: ndarray = per_joint("rad", "set point of the joints in this cycle")
-    target_velocity: ndarray = per_joint("rad/s", "likewise")
+    target: ndarray = joint_field("rad", "set point of the joints in this cycle")
+    target_velocity: ndarray = joint_field("rad/s", "likewise")
     opening: float = field(unit="m or rad", doc="gripper joint position, measured")
     opening_velocity: float = field(unit="m/s or rad/s", doc="gripper joint velocity, measured")
     grip_force: float = field(unit="N or N m", doc="force given to the gripper")
@@ -303,12 +307,12 @@ class DrivenArm(AnsweringStatus):
     )
     braked: bool = field(doc="1: the brakes are engaged")
     demand: Demand = field(doc="stop that the rack's safety demands in this cycle")
-    clipped: int = integer("cycles in which the limit gate cut a torque or a set point")
-    touches: int = integer("unintended contacts, counted at every substep")
-    violations: int = integer(
+    clipped: int = integer_field("cycles in which the limit gate cut a torque or a set point")
+    touches: int = integer_field("unintended contacts, counted at every substep")
+    violations: int = integer_field(
         "substeps in which the arm drove a position, velocity or torque beyond its limit"
     )
-    pushed: int = integer("substeps in which a blow pushed a joint beyond a limit")
+    pushed: int = integer_field("substeps in which a blow pushed a joint beyond a limit")
     slowed: bool = field(doc="1: speeds are scaled down by robot.bring_up, until the release of it")
 
 
@@ -320,19 +324,19 @@ class ArmState(Message, version=3):
     """State of the arm, from which a restarted board continues."""
 
     tick: int = field(unit="tick", doc="tick that the state belongs to")
-    clipped: int = integer("cycles in which the limit gate cut a command")
-    touches: int = integer("unintended contacts")
-    violations: int = integer("substeps in which the arm broke a limit")
-    pushed: int = integer("substeps in which a blow pushed a joint beyond a limit")
+    clipped: int = integer_field("cycles in which the limit gate cut a command")
+    touches: int = integer_field("unintended contacts")
+    violations: int = integer_field("substeps in which the arm broke a limit")
+    pushed: int = integer_field("substeps in which a blow pushed a joint beyond a limit")
     struck: int = field(
         "i4", unit="tick", doc="ticks for which the motion is still attributed to a blow"
     )
     waited: int = field("i4", unit="tick", doc="ticks since the last command")
     braked: bool = field(doc="1: the brakes are engaged")
-    rest: ndarray = per_joint("rad", "where engaged brakes hold the joints")
-    position: ndarray = per_joint("rad", "joint positions as the servo level estimates them")
-    velocity: ndarray = per_joint("rad/s", "joint velocities, likewise")
-    doubt: ndarray = per_joint("rad", "largest error of those positions")
+    rest: ndarray = joint_field("rad", "where engaged brakes hold the joints")
+    position: ndarray = joint_field("rad", "joint positions as the servo level estimates them")
+    velocity: ndarray = joint_field("rad/s", "joint velocities, likewise")
+    doubt: ndarray = joint_field("rad", "largest error of those positions")
     kept: int = field(
         unit="tick",
         doc="ticks for which faults have kept the arm from its set points: see ArmParams.patience",
@@ -356,7 +360,7 @@ class Scene(Message, version=1):
 class WorldState(Message, version=1, message="world_model"):
     """Poses of bodies in the world model."""
 
-    revision: int = integer(
+    revision: int = integer_field(
         "rises when a body starts to move and when it rests again (0: nothing sensed)"
     )
     position: ndarray = field(unit="m", doc="body origins", shape=("bodies", 3))

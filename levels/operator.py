@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import REASON_BYTES, AnyMessage, Command, Status, field, integer
+from rack.backplane.message import REASON_BYTES, AnyMessage, Command, Status, field, integer_field
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,7 +26,7 @@ MAX_JOINTS = 16
 
 It is fixed, because an operator's mailbox has the same layout in every rack.
 """
-NAME_BYTES = 64
+MAX_NAME_BYTES = 64
 """Maximum length of a name in a command, bytes."""
 
 
@@ -65,9 +65,9 @@ SETTINGS = (Operation.MODIFY, Operation.TABLE, Operation.SET)
 
 Each gives the name of what it sets.
 """
-DRIVES = (Operation.ENABLE, Operation.DISABLE, Operation.RESET, Operation.RELEASE)
+DRIVE_OPERATIONS = (Operation.ENABLE, Operation.DISABLE, Operation.RESET, Operation.RELEASE)
 """Operations on the arm itself, which do not replace the command in force either."""
-NAMED = (*SETTINGS, Operation.DO)
+NAMED_OPERATIONS = (*SETTINGS, Operation.DO)
 """Operations that give a name: see `Executor.list_operation_names`."""
 
 
@@ -85,15 +85,17 @@ class OperatorCommand(Command, version=2):
 
     what: Operation = field(doc="what to do")
     goal: Goal = field(doc="form of the goal")
-    count: int = integer("joints that follow", "u1")
+    count: int = integer_field("joints that follow", "u1")
     joints: np.ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
     position: np.ndarray = field(unit="m", doc="of the tool, for goals pose and direction", shape=3)
     quaternion: np.ndarray = field(unit="1", doc="of the tool, for goal pose", shape=4)
     direction: np.ndarray = field(unit="1", doc="of the tool's z axis, for goal direction", shape=3)
-    name: str = field(f"S{NAME_BYTES}", doc="what a setting sets, or the level's own command to do")
+    name: str = field(
+        f"S{MAX_NAME_BYTES}", doc="what a setting sets, or the level's own command to do"
+    )
 
 
-RESTS_ON = integer(
+RESTS_ON = integer_field(
     "newest operator's command, at this level or above, on which this is based (0: none)"
 )
 
@@ -114,7 +116,7 @@ class AnsweringStatus(Status):
     """Base class for statuses that answer an operator."""
 
     operator: int = RESTS_ON
-    order: int = integer("operator's command that this answers, new or not (0: none yet)")
+    order: int = integer_field("operator's command that this answers, new or not (0: none yet)")
     answer: Answer = field(doc="this level's answer to it")
     standing: Operation = field(
         doc="operator's operation in force (0: none, the level does its normal work)"
@@ -123,7 +125,7 @@ class AnsweringStatus(Status):
 
 
 Commands = Mapping[Operation, Sequence[Goal]]
-HOLDABLE: Commands = {Operation.HOLD: (), Operation.RESUME: ()}
+HOLD_COMMANDS: Commands = {Operation.HOLD: (), Operation.RESUME: ()}
 """The commands of a level that an operator can only hold and resume."""
 
 EFFECTS = {
@@ -142,20 +144,20 @@ ABOVE_LOST = "no command from the level above: held until its board is back"
 BELOW_LOST = "no status from the level below: waiting for its board"
 
 
-def listed(commands: Commands) -> str:
+def format_commands(commands: Commands) -> str:
     """Return the commands of a level as text, such as "hold, resume, goto joints|pose"."""
     return ", ".join(
-        f"{operation.name.lower()} {goal_names(goals)}".rstrip()
+        f"{operation.name.lower()} {format_goals(goals)}".rstrip()
         for operation, goals in commands.items()
     )
 
 
-def goal_names(goals: Sequence[Goal]) -> str:
+def format_goals(goals: Sequence[Goal]) -> str:
     """Return goals as one word, such as "joints|pose"."""
     return "|".join(goal.name.lower() for goal in goals)
 
 
-def described(what: int, goal: int) -> str:
+def describe_command(what: int, goal: int) -> str:
     """Return a command, valid or not, as text, such as "goto pose"."""
     names = [
         kind(number).name.lower() if number in set(kind) else str(number)
@@ -164,7 +166,7 @@ def described(what: int, goal: int) -> str:
     return " ".join(names[: 1 + (goal != Goal.NONE)])
 
 
-class _Told(NamedTuple):
+class _CommandAnswer(NamedTuple):
     """A command and the answer to it."""
 
     serial: int
@@ -187,9 +189,9 @@ class Orders:
         self.standing = Operation.NONE
         self.serial = 0  # newest command. 0 if none yet
         self.basis = 0  # newest command that was not refused. 0 if none yet
-        self._in_force = _Told(0, Answer.NONE)  # newest one neither refused nor a setting
+        self._in_force = _CommandAnswer(0, Answer.NONE)  # newest one neither refused nor a setting
         self._before = self.basis, self.standing, self._in_force
-        self._news: list[_Told] = []  # answers that no status has shown
+        self._news: list[_CommandAnswer] = []  # answers that no status has shown
         self._shown = self._in_force
 
     @property
@@ -203,16 +205,16 @@ class Orders:
         return self._in_force.answer
 
     @property
-    def stands(self) -> bool:
+    def is_in_force(self) -> bool:
         """True if a command keeps the level from its normal work."""
         return self.standing is not Operation.NONE
 
     @property
-    def holds(self) -> bool:
+    def is_holding(self) -> bool:
         """True if the operation in force is HOLD."""
         return self.standing is Operation.HOLD
 
-    def take(
+    def take_commands(
         self,
         operator: Reading[OperatorCommand],
         judge: Callable[[OperatorCommand], None] | None = None,
@@ -233,15 +235,15 @@ class Orders:
         taken = False
         for message in (*operator.earlier, operator.message):
             replaced = self.in_force
-            if self._take_up(message):
-                taken = taken or message.what not in (*SETTINGS, *DRIVES)
+            if self._accept_command(message):
+                taken = taken or message.what not in (*SETTINGS, *DRIVE_OPERATIONS)
                 if judge is not None:
                     judge(message)
             if self.in_force != replaced:
                 self._news = [answer for answer in self._news if answer.serial != replaced]
         return taken
 
-    def _take_up(self, message: OperatorCommand) -> bool:
+    def _accept_command(self, message: OperatorCommand) -> bool:
         """Accept or refuse a new command; return True if it is accepted."""
         # A clock board that is restarted while it gives a command gives it again.
         if message.id <= self.serial:
@@ -253,62 +255,62 @@ class Orders:
         if operation not in self._commands or goal not in (
             self._commands[Operation(operation)] or (Goal.NONE,)
         ):
-            self.refuse(
-                f"{described(operation, goal)} is not a command of this level; permitted:"
-                f" {listed(self._commands)}"
+            self.refuse_newest(
+                f"{describe_command(operation, goal)} is not a command of this level; permitted:"
+                f" {format_commands(self._commands)}"
             )
             return False
         self.basis = self.serial
         is_done = operation in (Operation.RESUME, Operation.RELEASE, *SETTINGS)
-        answer = _Told(self.serial, Answer.DONE if is_done else Answer.TAKEN)
-        if operation not in (*SETTINGS, *DRIVES):
+        answer = _CommandAnswer(self.serial, Answer.DONE if is_done else Answer.TAKEN)
+        if operation not in (*SETTINGS, *DRIVE_OPERATIONS):
             self.standing = (
                 Operation.NONE if operation == Operation.RESUME else Operation(operation)
             )
             self._in_force = answer
-        self._tell(answer)
+        self._queue_answer(answer)
         return True
 
-    def refuse(self, why: str) -> None:
+    def refuse_newest(self, why: str) -> None:
         """Refuse the command just accepted. The command before it is in force again."""
         self.basis, self.standing, self._in_force = self._before
-        self._tell(_Told(self.serial, Answer.REFUSED, why))
+        self._queue_answer(_CommandAnswer(self.serial, Answer.REFUSED, why))
 
-    def fail(self, why: str) -> None:
+    def abandon_command(self, why: str) -> None:
         """Abandon the command in force. The level holds instead."""
         self.standing = Operation.HOLD
-        self._answer(Answer.REFUSED, why)
+        self._answer_command_in_force(Answer.REFUSED, why)
 
-    def under_way(self) -> None:
+    def report_under_way(self) -> None:
         """Report that a RESUME is not completed yet."""
-        self._answer(Answer.TAKEN)
+        self._answer_command_in_force(Answer.TAKEN)
 
-    def done(self) -> None:
+    def report_done(self) -> None:
         """Report that the command in force is done. It remains in force."""
         if self.answer is Answer.TAKEN:
-            self._answer(Answer.DONE)
+            self._answer_command_in_force(Answer.DONE)
 
-    def takes_time(self) -> None:
+    def report_setting_started(self) -> None:
         """Report that the setting just accepted is not done yet; `report_drives_done` follows."""
-        self._tell(_Told(self.serial, Answer.TAKEN))
+        self._queue_answer(_CommandAnswer(self.serial, Answer.TAKEN))
 
-    def drives_done(self, serial: int) -> None:
+    def report_drives_done(self, serial: int) -> None:
         """Report that a command to the arm's drives, or a setting that took time, is done."""
-        self._tell(_Told(serial, Answer.DONE))
+        self._queue_answer(_CommandAnswer(serial, Answer.DONE))
 
-    def keeps(self, board: str) -> str:
+    def format_reason(self, board: str) -> str:
         """Return why an operator keeps level `board` from its normal work. Empty if none does."""
         if self.answer is Answer.REFUSED:
             return f"{board} held, `resume` releases it: {self._in_force.objection}"
         effect = EFFECTS.get(self.standing)
         return f"{board} {effect} by the operator: `resume` releases it" if effect else ""
 
-    def _answer(self, answer: Answer, why: str = "") -> None:
+    def _answer_command_in_force(self, answer: Answer, why: str = "") -> None:
         """Change the answer to the command in force."""
-        self._in_force = _Told(self.in_force, answer, why)
-        self._tell(self._in_force)
+        self._in_force = _CommandAnswer(self.in_force, answer, why)
+        self._queue_answer(self._in_force)
 
-    def _tell(self, answer: _Told) -> None:
+    def _queue_answer(self, answer: _CommandAnswer) -> None:
         """Queue an answer for the status. It replaces an older answer to the same command."""
         for at, waiting in enumerate(self._news):
             if waiting.serial == answer.serial:
@@ -316,25 +318,25 @@ class Orders:
                 return
         self._news.append(answer)
 
-    def rests_on(self, above: int) -> int:
+    def find_basis(self, above: int) -> int:
         """Return the newest operator's command on which this cycle is based.
 
         `above` is the command on which the command from the level above is based.
         """
         return max(self.basis, above)
 
-    def report(self, status: AnsweringStatus, above: int = 0) -> None:
+    def fill_status(self, status: AnsweringStatus, above: int = 0) -> None:
         """Fill the fields of `AnsweringStatus`. For `above` see `find_basis`."""
         if self._news:
             self._shown = self._news.pop(0)
-        status.operator = self.rests_on(above)
+        status.operator = self.find_basis(above)
         status.order = self._shown.serial
         status.answer = self._shown.answer
         status.standing = self.standing
         status.objection = self._shown.objection
 
 
-def answered(status: AnsweringStatus | AnyMessage) -> int:
+def find_answered_serial(status: AnsweringStatus | AnyMessage) -> int:
     """Return the newest command that a level had accepted when it wrote this status.
 
     A restarted board uses it so that it does not execute a command twice.
@@ -343,7 +345,7 @@ def answered(status: AnsweringStatus | AnyMessage) -> int:
     return max(status.order, status.operator)
 
 
-def joints_of(
+def read_joint_goal(
     message: OperatorCommand, names: Sequence[str], ranges: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the joint positions of an `OperatorCommand`, (joints,), rad.

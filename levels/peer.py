@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-from rack.backplane.message import Message, field, integer
+from rack.backplane.message import Message, field, integer_field
 
 DRIFT_PPM = 100
 """Maximum difference between the rates of two clocks, since each crystal is within 50 ppm."""
@@ -30,8 +30,8 @@ class PeerPresence(Message, version=1, message="peer"):
     launch: int = field(
         unit="1", doc="number of the present or last launch (0: none, or in lockstep)"
     )
-    launches: int = integer("its launches seen so far: a number above 1 means restarts")
-    losses: int = integer("how often it was lost")
+    launches: int = integer_field("its launches seen so far: a number above 1 means restarts")
+    losses: int = integer_field("how often it was lost")
     since: int = field(unit="tick", doc="tick since which it is present or lost")
     offset: float = field(unit="s", doc="its CLOCK_MONOTONIC minus ours; 0 in lockstep")
     uncertainty: float = field(
@@ -40,12 +40,14 @@ class PeerPresence(Message, version=1, message="peer"):
     round_trip: float = field(
         unit="s", doc="shortest recent round trip; -1 if not measured yet, 0 in lockstep"
     )
-    steps: int = integer("number of detected steps of its clock or ours, as when a machine sleeps")
+    steps: int = integer_field(
+        "number of detected steps of its clock or ours, as when a machine sleeps"
+    )
     ahead: float = field(unit="s", doc="its simulated time minus ours, at the same instant")
     speed: float = field(unit="1", doc="its simulated seconds per real second")
 
 
-def peer_port(rack: str) -> str:
+def format_peer_port(rack: str) -> str:
     """Return the name of the adapter's port for a rack.
 
     Hyphens become underscores, because names of mailboxes must not contain hyphens.

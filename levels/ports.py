@@ -37,7 +37,7 @@ class Port(Generic[M]):
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
 
-    def not_connected(self) -> LevelError:
+    def build_connection_error(self) -> LevelError:
         """Return the error for using the port before a board has connected it."""
         return LevelError(f"port '{self.name}': no board has connected it to a mailbox")
 
@@ -190,7 +190,7 @@ class SentOutput(Output[M]):
         """Return the declaration. Raises `LevelError` if no board has connected the level."""
         if level is None:
             return self
-        raise self.not_connected()
+        raise self.build_connection_error()
 
 
 class QueuedOutput(SentOutput[M]):
@@ -213,7 +213,7 @@ class TimedOutput(SentOutput[M]):
         self.max_age_s = max_age_s
 
 
-class MadePorts(NamedTuple):
+class ConfiguredPorts(NamedTuple):
     """Ports that a config creates, in addition to the ports that a class declares.
 
     `is_whole` is False if some are unknown.
@@ -252,12 +252,12 @@ class FindingKind:
         """Description of the mistake in the declaration. Empty if it is valid."""
         if not self.unit or not self.doc:
             return 'needs a unit ("1": a plain number) and a meaning, doc="..."'
-        if self.name.upper() in RESERVED:
+        if self.name.upper() in RESERVED_NAMES:
             return "has the name of another kind of event; rename it"
         return ""
 
 
-RESERVED = frozenset((*Alarm.__members__, "BEGINS", "ENDS", "DIED", "RESTART"))
+RESERVED_NAMES = frozenset((*Alarm.__members__, "BEGINS", "ENDS", "DIED", "RESTART"))
 """Names that no finding may have: alarms, and events of boards and faults."""
 
 

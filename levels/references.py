@@ -12,17 +12,17 @@ from functools import cache
 from types import ModuleType
 from typing import TypeVar
 
-from rack.backplane.process import die_with_parent, how_ended, readable
+from rack.backplane.process import describe_end, die_with_parent, wait_readable
 
 T = TypeVar("T")
 SLOW_S = 2.0
 """Duration of an import after which the user is told that it continues, s."""
-IMPORT_S = 60.0
+MAX_IMPORT_S = 60.0
 """Duration of an import after which the module is refused, s."""
-IMPORTED = 117
+IMPORTED_STATUS = 117
 """Exit status of a child that has completed an import. Few modules exit with it themselves."""
 
-MOVED = {
+MOVED_REFERENCES = {
     "rack.boards.adapters": "rack.boards.host",
     "rack.levels.arm.sharing": "rack.levels.systems.coordination.sharing_arm",
     "rack.levels.cell": "rack.levels.systems.coordination",
@@ -46,16 +46,16 @@ Configs of users and of recorded runs name the old places.
 """
 
 
-def current(reference: str) -> str:
+def resolve_moved(reference: str) -> str:
     """Return the present name of "package.module:Name"."""
-    for old, new in MOVED.items():
+    for old, new in MOVED_REFERENCES.items():
         remainder = reference.removeprefix(old)
         if remainder != reference and remainder[:1] in ("", ".", ":"):
             return new + remainder
     return reference
 
 
-def module_and_name(reference: str, is_tried: bool = True) -> tuple[ModuleType, str]:
+def import_reference(reference: str, is_tried: bool = True) -> tuple[ModuleType, str]:
     """Import the module that "package.module:Name" names.
 
     Args:
@@ -69,10 +69,10 @@ def module_and_name(reference: str, is_tried: bool = True) -> tuple[ModuleType, 
     Raises:
         LookupError: The module cannot be imported.
     """
-    module, _, name = current(reference).partition(":")
+    module, _, name = resolve_moved(reference).partition(":")
     is_new = module not in sys.modules and not module.startswith("rack.")
     try:
-        if is_tried and is_new and (reason := _trial(module)):
+        if is_tried and is_new and (reason := _try_import(module)):
             raise ImportError(reason)
         return importlib.import_module(module), name
     # A user's module may raise anything while it is imported.
@@ -91,7 +91,7 @@ def find_class(reference: str, base: type[T], is_tried: bool = True) -> type[T]:
     Raises:
         LookupError: The class is missing, abstract, or no subclass of `base`.
     """
-    module, name = module_and_name(reference, is_tried)
+    module, name = import_reference(reference, is_tried)
     named = getattr(module, name, None)
     if not isinstance(named, type) or not issubclass(named, base):
         kinds = [
@@ -111,7 +111,7 @@ def find_class(reference: str, base: type[T], is_tried: bool = True) -> type[T]:
 
 # A config is checked for many mistakes, and each may need the module.
 @cache
-def _trial(module: str) -> str:
+def _try_import(module: str) -> str:
     """Import a module in a child process; return why it must not be imported in this process.
 
     Empty if it may be imported. An exception that the module raises is no reason against it.
@@ -130,19 +130,19 @@ def _trial(module: str) -> str:
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             with suppress(Exception, SystemExit):
                 importlib.import_module(module)
-            os._exit(IMPORTED)
+            os._exit(IMPORTED_STATUS)
         finally:
             os._exit(1)
     ended = os.pidfd_open(child)
     try:
-        if not readable(ended, SLOW_S):
-            sys.stderr.write(f"still importing '{module}'; it may take {IMPORT_S:g} s\n")
+        if not wait_readable(ended, SLOW_S):
+            sys.stderr.write(f"still importing '{module}'; it may take {MAX_IMPORT_S:g} s\n")
             sys.stderr.flush()
-        is_over = readable(ended, IMPORT_S - SLOW_S)
+        is_over = wait_readable(ended, MAX_IMPORT_S - SLOW_S)
     finally:
         os.kill(child, signal.SIGKILL)
         status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
         os.close(ended)
     if not is_over:
-        return f"it did not finish within {IMPORT_S:g} s"
-    return "" if status == IMPORTED else f"it ended the process: {how_ended(status)}"
+        return f"it did not finish within {MAX_IMPORT_S:g} s"
+    return "" if status == IMPORTED_STATUS else f"it ended the process: {describe_end(status)}"

@@ -34,14 +34,14 @@ from rack.levels.references import find_class
 
 T = TypeVar("T")
 
-MOST = 1e9
+MAX_VALUE = 1e9
 """Bound of all quantities of an arm in SI units, and of all times of a run.
 
 Sums and squares of such values stay finite. pydantic keeps one bound of each kind, so a field with
 narrower bounds uses `le` and `ge`."""
-MOST_JOINTS = 16
+MAX_JOINTS = 16
 """Maximum number of joints of an arm."""
-Positive = Annotated[float, Field(gt=0, lt=MOST, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, lt=MAX_VALUE, allow_inf_nan=False)]
 Finite = Annotated[float, Field(gt=-1e9, lt=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Vector = tuple[Finite, Finite, Finite]
@@ -78,24 +78,24 @@ class Table(BaseModel):
         if not isinstance(table, dict):
             return table
         # Dicts with keys that the user chooses are not changed.
-        return {k: v if isinstance(v, dict) else frozen(v) for k, v in table.items()}
+        return {k: v if isinstance(v, dict) else freeze_lists(v) for k, v in table.items()}
 
 
-def keys_of(kind: type[BaseModel]) -> dict[str, FieldInfo]:
+def describe_keys(kind: type[BaseModel]) -> dict[str, FieldInfo]:
     """Return the fields of a table by their keys, each with its description.
 
     A field without a description takes the text below it. pydantic can look for such texts itself
     (`use_attribute_docstrings`), but does so for every class when it is defined, so that each start
     of a rack would take 0.2 s longer.
     """
-    below = ChainMap(*(_texts_below(base) for base in kind.__mro__ if issubclass(base, Table)))
+    below = ChainMap(*(_find_field_texts(base) for base in kind.__mro__ if issubclass(base, Table)))
     for name, field in kind.model_fields.items():
         field.description = field.description or below.get(name)
     return {field.alias or name: field for name, field in kind.model_fields.items()}
 
 
 @cache
-def _texts_below(table: type[Table]) -> dict[str, str]:
+def _find_field_texts(table: type[Table]) -> dict[str, str]:
     """Return the texts below the fields of a class in its source, by field."""
     texts = {}
     # A class typed at a prompt has no source.
@@ -109,11 +109,11 @@ def _texts_below(table: type[Table]) -> dict[str, str]:
     return texts
 
 
-def frozen(value: Any) -> Any:
+def freeze_lists(value: Any) -> Any:
     """Return a TOML value with tuples instead of lists, also inside tables."""
     if isinstance(value, dict):
-        return {key: frozen(item) for key, item in value.items()}
-    return tuple(map(frozen, value)) if isinstance(value, list) else value
+        return {key: freeze_lists(item) for key, item in value.items()}
+    return tuple(map(freeze_lists, value)) if isinstance(value, list) else value
 
 
 Params = TypeVar("Params", bound=Table)
@@ -136,7 +136,7 @@ def read_params(kind: type[Params], params: Mapping[str, Any]) -> Params:
         ) from error
 
 
-def live_keys(kind: type[Table] | None) -> tuple[str, ...]:
+def list_live_keys(kind: type[Table] | None) -> tuple[str, ...]:
     """Return the names of the params that may be set while the level runs."""
     fields = {} if kind is None else kind.model_fields
     return tuple(key for key, field in fields.items() if field.json_schema_extra == LIVE)
@@ -166,14 +166,14 @@ def set_live(params: Params, setting: str) -> tuple[Params, str]:
     kind = type(params)
     try:
         key, value = read_setting(setting)
-        if key not in (live := live_keys(kind)):
+        if key not in (live := list_live_keys(kind)):
             return params, f"params.{key} is not live; live: {', '.join(live) or 'none'}"
         return read_params(kind, {**dict(params), key: value}), ""
     except LevelError as error:
         return params, str(error)
 
 
-def named_class(reference: str, base: type[T]) -> type[T]:
+def validate_class(reference: str, base: type[T]) -> type[T]:
     """Return the subclass of `base` that "package.module:Class" names.
 
     Raises:
@@ -208,9 +208,9 @@ class CalibrationConfig(Table):
     position before"""
 
 
-DAMPING_S = 0.03
+GRIPPER_DAMPING_S = 0.03
 """Default damping of a gripper's loop, divided by its stiffness, s."""
-STILL_PARTS = 20
+STILL_DIVISOR = 20
 """Divisor of the gripper's travel that yields its threshold of motion.
 
 The opening may be a length or an angle, so the threshold is relative.
@@ -254,7 +254,7 @@ class GripperConfig(Table):
     planned motion"""
 
     @model_validator(mode="after")
-    def _opens(self) -> GripperConfig:
+    def _check_travel(self) -> GripperConfig:
         if self.open == self.closed:
             raise ValueError(f"open and closed are both {self.open:g}: the gripper does not move")
         return self
@@ -268,15 +268,15 @@ class GripperConfig(Table):
     def gains(self) -> tuple[float, float]:
         """Stiffness and damping of the position loop, N/m and N s/m, or N m/rad and N m s/rad."""
         stiffness = self.stiffness or 2.0 * self.force / self.travel
-        return stiffness, self.damping or DAMPING_S * stiffness
+        return stiffness, self.damping or GRIPPER_DAMPING_S * stiffness
 
     @property
-    def still(self) -> float:
+    def rest_threshold(self) -> float:
         """Motion of the driven joint that counts as none, m or rad.
 
         The same in one second is the speed that counts as rest.
         """
-        return self.travel / STILL_PARTS
+        return self.travel / STILL_DIVISOR
 
 
 class WristConfig(Table):
@@ -343,7 +343,7 @@ class RobotConfig(Table):
 
     model: Path = Field(strict=False)
     """MJCF file of the arm and its cell; relative to the config"""
-    joints: tuple[str, ...] = Field((), min_length=1, max_length=MOST_JOINTS)
+    joints: tuple[str, ...] = Field((), min_length=1, max_length=MAX_JOINTS)
     """MJCF joints of the arm, base to tool; default: those with an actuator, without the
     gripper's"""
     tool: str = Field("", min_length=1)
@@ -403,7 +403,7 @@ class RobotConfig(Table):
     """keys of this table whose values were guessed, such as gripper.force; an arm that is not
     simulated is not enabled until each is confirmed by removing it here"""
 
-    def misfits(self) -> Iterator[tuple[str, Any, str]]:
+    def find_length_mismatches(self) -> Iterator[tuple[str, Any, str]]:
         """Yield key, values and reason for every list that does not have one value per joint."""
         joints = len(self.joints)
         keys = ("home", "start", "velocity", "acceleration", "jerk", "torque", "position")
@@ -419,7 +419,7 @@ class RobotConfig(Table):
 
     @field_validator("guessed")
     @classmethod
-    def _are_keys(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_guessed(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         for name in names:
             if name.partition(".")[0] not in cls.model_fields:
                 raise ValueError(

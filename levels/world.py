@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from rack.levels.algebra import Array, each
+from rack.levels.algebra import Array, apply_elementwise
 from rack.levels.level import Executor, Input, LevelContext, Output
 from rack.levels.messages import Scene, WorldState
 from rack.levels.tables import Positive, Table, read_params
@@ -68,13 +68,13 @@ class WorldModel(Executor):
             model.revision = tick + 1
         else:
             self._interval = tick - self._seen_tick
-            if self._follow(poses, model.velocity, self._interval * self.context.tick_s):
+            if self._update_velocity(poses, model.velocity, self._interval * self.context.tick_s):
                 model.revision = tick + 1
         model.position = scene.position
         model.quaternion = scene.quaternion
         model.sensed = self._seen_tick = tick
 
-    def _follow(self, poses: Array, velocity: Array, elapsed_s: float) -> bool:
+    def _update_velocity(self, poses: Array, velocity: Array, elapsed_s: float) -> bool:
         """Update the velocities from new poses.
 
         Args:
@@ -87,11 +87,13 @@ class WorldModel(Executor):
         """
         p = self._params
         slow_turn = p.turned / p.resting * elapsed_s
-        is_slow = (distances(poses, self._last) / elapsed_s < p.slow) & (
-            turns(poses, self._last) < slow_turn
+        is_slow = (compute_distances(poses, self._last) / elapsed_s < p.slow) & (
+            compute_angles(poses, self._last) < slow_turn
         )
         self._slow_s = np.where(is_slow, self._slow_s + elapsed_s, 0.0)
-        is_away = (distances(poses, self._rest) > p.moved) | (turns(poses, self._rest) > p.turned)
+        is_away = (compute_distances(poses, self._rest) > p.moved) | (
+            compute_angles(poses, self._rest) > p.turned
+        )
         rests = self._moving & (self._slow_s >= p.resting)
         changes = rests | (~self._moving & is_away)
         self._rest[rests] = poses[rests]
@@ -102,16 +104,16 @@ class WorldModel(Executor):
         return bool(changes.any())
 
 
-def distances(poses: Array, others: Array) -> Array:
+def compute_distances(poses: Array, others: Array) -> Array:
     """Return the distances between corresponding poses, m; both are (bodies, 7)."""
     x, y, z = (poses - others)[:, :3].T
     return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
-def turns(poses: Array, others: Array) -> Array:
+def compute_angles(poses: Array, others: Array) -> Array:
     """Return the angles between the orientations of corresponding poses, rad.
 
     Both are (bodies, 7). The quaternions q and -q are the same orientation.
     """
     w, x, y, z = (poses * others)[:, 3:].T
-    return 2.0 * each(math.acos, np.minimum(np.abs(w + x + y + z), 1.0))
+    return 2.0 * apply_elementwise(math.acos, np.minimum(np.abs(w + x + y + z), 1.0))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import cast
 
-from rack.backplane.mailbox.queue import ALL
+from rack.backplane.mailbox.queue import UNLIMITED
 from rack.levels.level import Executor, LevelContext
 
 
@@ -14,9 +14,9 @@ class BareLevel(Executor):
 
     def __init__(self) -> None:
         super().__init__(cast(LevelContext, SimpleNamespace(sizes={})))
-        self.most = ALL
+        self.most = UNLIMITED
 
-    def room(self, port: str) -> int:
+    def max_messages(self, port: str) -> int:
         return self.most
 
     def process(self, tick: int) -> None:

@@ -14,7 +14,7 @@ from time import monotonic, perf_counter, sleep
 
 import numpy as np
 
-from rack.backplane.process import processor_ns, set_priority
+from rack.backplane.process import read_processor_ns, set_priority
 from rack.boards.config import load
 from rack.levels.arm import DriveState
 from rack.levels.robot.cell import build_cell
@@ -64,7 +64,7 @@ def main() -> None:
     costs = []
     ages: Counter[int] = Counter()
     start_s = monotonic()
-    used_ns = [processor_ns(drive.pid or 0) for drive in drives]
+    used_ns = [read_processor_ns(drive.pid or 0) for drive in drives]
     while len(costs) < CYCLES and monotonic() < start_s + MOST_S:
         due = int((monotonic() - start_s) / tick_s) + 1
         sleep(max(0.0, start_s + due * tick_s - monotonic()))
@@ -78,7 +78,9 @@ def main() -> None:
         else:
             arm.brake()
     taken_s = monotonic() - start_s
-    share = np.mean([processor_ns(d.pid or 0) - n for d, n in zip(drives, used_ns, strict=True)])
+    share = np.mean(
+        [read_processor_ns(d.pid or 0) - n for d, n in zip(drives, used_ns, strict=True)]
+    )
     if not costs:
         sys.exit(f"the drives were not on within {MOST_S:g} s: {arm.fault or 'no fault'}")
     median, high = 1e3 * np.percentile(costs, (50, 99))

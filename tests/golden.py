@@ -19,7 +19,7 @@ from pathlib import Path
 
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.crate.line import environment
+from rack.boards.crate.line import build_environment
 
 FILE = Path(__file__).with_suffix(".toml")
 OFTEN = (
@@ -104,7 +104,7 @@ def machine() -> dict[str, str]:
     """Return what the bits depend on, in the environment of the boards."""
     libm = subprocess.run(
         [sys.executable, "-c", PROBE],
-        env=environment(),
+        env=build_environment(),
         capture_output=True,
         text=True,
         check=True,

@@ -14,9 +14,9 @@ from rack.backplane.layout import Protocol
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.interrupt import open_inbox
 from rack.backplane.mailbox.protocols import LockReader
-from rack.backplane.segment import SHM_FOLDER, Segment, unlink
+from rack.backplane.segment import SHM_FOLDER, Segment, unlink_segment
 from rack.backplane.trace import FIELDS, Flag, TraceWriter
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.backplane.words import Block
 from rack.boards.faults.kind import KINDS
 from rack.boards.run import port_tables, ports
@@ -57,13 +57,13 @@ class WritingTask:
     """The task `writer`: each of its messages holds its release tick in every place."""
 
     def __init__(self, segment: Segment, is_compiled: bool = True) -> None:
-        self.every = segment.layout.task("writer").every
+        self.every = segment.layout.find_task("writer").every
         alarms = AlarmWriter(segment, "writer")
         self.level = BareLevel()
         inputs = InputPorts(segment, self.level, {}, alarms)
         with accesses(is_compiled):
             self.ports = OutputPorts(segment, self.level, {"point": NAME}, alarms, inputs)
-        self._block, self._trace = segment.block("writer"), TraceWriter(segment, "writer")
+        self._block, self._trace = segment.get_block("writer"), TraceWriter(segment, "writer")
 
     def cycle(self, tick: int, now: int | None = None) -> bool:
         """Write, trace the cycle, say that it is done; the clock stands at `now`, or its end has
@@ -91,7 +91,7 @@ class ReadingTask:
     """The task `reader`; `seen` is what its reads gave."""
 
     def __init__(self, segment: Segment, is_compiled: bool = True) -> None:
-        self.every = segment.layout.task("reader").every
+        self.every = segment.layout.find_task("reader").every
         self.level = BareLevel()
         with accesses(is_compiled):
             self.ports = InputPorts(
@@ -109,7 +109,7 @@ class ReadingTask:
         reading: Reading[Any] = self.level.ports["point"]
         row = reading.message.row
         assert (row == reading.message.id).all(), "half a message, or a forged one"
-        released = reading.message.id if reading.is_there else -1
+        released = reading.message.id if reading.has_message else -1
         self.seen.append(Seen(tick, released, reading.verdict.name, reading.is_lost))
         return reading
 
@@ -126,7 +126,7 @@ class Link:
         self.reader = ReadingTask(segment, is_compiled)
         self.active: list[FaultEntry] = []
         self._reader_first = reader_first
-        self._rings = {name: alarm_ring(segment, name) for name in ("writer", "reader")}
+        self._rings = {name: open_alarm_ring(segment, name) for name in ("writer", "reader")}
 
     def close(self) -> None:
         """Give back what the tasks and the bus hold."""
@@ -147,33 +147,33 @@ class Link:
         """Write with one more fault from now on."""
         defaults = [p.default or 0.0 for p in KINDS[kind].parameters]
         given = (*parameters, *defaults[len(parameters) :])
-        entry = FaultTable(self.segment).add(
+        entry = FaultTable(self.segment).add_fault(
             Injection(KINDS[kind].number, 0, mailbox, seed=seed, parameters=given)
         )
         self.active.append(entry)
-        self.writer.ports.apply(self.active)
+        self.writer.ports.apply_faults(self.active)
         return entry
 
     def heal(self) -> None:
         """Write without faults from now on."""
         self.active.clear()
-        self.writer.ports.apply([])
+        self.writer.ports.apply_faults([])
 
     def written(self) -> list[tuple[int, int, int]]:
         """Return release tick, serial and first visible tick of every message in a slot, oldest
         first."""
-        rows = MailboxRing(self.segment, NAME).drain().rows
+        rows = MailboxRing(self.segment, NAME).read_new_rows().rows
         return [(int(row["tick"]), int(row["serial"]), int(row["visible_at"])) for row in rows]
 
     def rung(self, task: str) -> list[tuple[object, ...]]:
         """Return what a task has rung since the last call, but for the time."""
-        rows = self._rings[task].drain().rows
+        rows = self._rings[task].read_new_rows().rows
         names = [name for name in rows.dtype.names or () if name != "time_ns"]
         return [tuple(row) for row in rows[names].tolist()]
 
     def alarms(self, task: str = "reader") -> list[tuple[int, Alarm]]:
         """Return tick and code of what a task has rung since the last call."""
-        rows = self._rings[task].drain().rows
+        rows = self._rings[task].read_new_rows().rows
         return [(int(row["tick"]), Alarm(row["code"])) for row in rows]
 
 
@@ -244,5 +244,5 @@ def links(rack: str) -> Iterator[MakeLink]:
     yield make
     for found in made:
         found.close()
-        unlink(found.segment.rack)
+        unlink_segment(found.segment.rack)
     assert not [path.name for path in SHM_FOLDER.iterdir() if rack in path.name]

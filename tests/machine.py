@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.process import DEADLINE, Reservation, take_core
-from rack.tools.recording.cores import STAT, STEAL
+from rack.tools.recording.cores import STAT, STEAL_COLUMN
 from tests.network_lab import Lab
 
 WAIT_S = 600.0
@@ -49,7 +49,7 @@ def obtains_deadlines() -> bool:
 def stolen() -> int:
     """Return how long the hypervisor has held cores back since the machine began, in the kernel's
     steps of 10 ms."""
-    return int(STAT.read_text().split(maxsplit=STEAL + 1)[STEAL])
+    return int(STAT.read_text().split(maxsplit=STEAL_COLUMN + 1)[STEAL_COLUMN])
 
 
 needs_fifo = pytest.mark.skipif(not obtains_fifo(), reason="needs real-time priorities")

@@ -20,9 +20,9 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Self
 
-from rack.backplane.process import is_alive, readable, start_time
+from rack.backplane.process import is_alive, read_start_time, wait_readable
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import finished
+from rack.tools.lab.benches.harness import run_program
 
 PREFIX = "rack-lab"
 NAMESPACES = Path("/run/netns")
@@ -46,7 +46,7 @@ class Lab:
         if not 1 <= machines <= MOST_MACHINES:
             raise ValueError(f"{machines} machines: permitted are 1 to {MOST_MACHINES}")
         pid = os.getpid()
-        lab = f"{PREFIX}-{pid}-{start_time(pid)}-{next(_NUMBERS)}"
+        lab = f"{PREFIX}-{pid}-{read_start_time(pid)}-{next(_NUMBERS)}"
         self._hub = f"{lab}-hub"
         self._names = [f"{lab}-{number}" for number in range(machines)]
         self._started: list[subprocess.Popen[Any]] = []
@@ -159,7 +159,7 @@ def _call(argv: Sequence[str], lines: Iterable[str] = ()) -> str:
     """Run a command with these lines as its input, and return what it prints. Raises `Failure`."""
     called = f"network lab: {' '.join(argv)}"
     text = "".join(f"{line}\n" for line in lines)
-    done = finished(called, argv, PATIENCE_S, text=text)
+    done = run_program(called, argv, PATIENCE_S, text=text)
     if done.returncode:
         why = " ".join(done.stderr.split()) or f"exit status {done.returncode}"
         raise Failure(f"{called}: {why}")
@@ -236,6 +236,6 @@ def _await_end(pid: int) -> None:
     except ProcessLookupError:
         return
     try:
-        readable(pidfd, 0.1)
+        wait_readable(pidfd, 0.1)
     finally:
         os.close(pidfd)

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rack.boards.config import load
-from rack.boards.config.reference import KeyTable, find_tables, key_tables
+from rack.boards.config.reference import KeyTable, find_tables, list_key_tables
 
 PAGE = Path(__file__).parents[1] / "configs" / "REFERENCE.md"
 HEAD = """# All keys of a config
@@ -35,7 +35,7 @@ def is_on_page(name: str) -> bool:
 
 
 def _lines() -> Iterator[str]:
-    for table in key_tables(load("nasrem")):
+    for table in list_key_tables(load("nasrem")):
         yield from _table(table)
 
 

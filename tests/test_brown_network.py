@@ -61,7 +61,7 @@ def configs(name: str, folder: Path, more: str = "") -> list[Path]:
     return found
 
 
-class Ran(NamedTuple):
+class RunContext(NamedTuple):
     """A run of both racks: digests of servo rack and general machine, and mailboxes."""
 
     digests: list[str]
@@ -79,7 +79,7 @@ class Ran(NamedTuple):
         return float(np.abs(self.values("arm.status", "target_velocity", first, last)).max())
 
 
-def ran(name: str, folder: Path) -> Ran:
+def ran(name: str, folder: Path) -> RunContext:
     racks = [load(path, ["clock.mode=lockstep"]) for path in configs(name, folder, LINK_OUT)]
     with running(racks) as (servo, general):
         for rack in (servo, general):
@@ -87,12 +87,12 @@ def ran(name: str, folder: Path) -> Ran:
         watch([servo, general])
         found = [ended(servo), ended(general)]
         names = "arm.status", "shoulder.status", "supervisor.status", "supervisor.command"
-        boxes = {box: MailboxRing(servo.segment, box).drain().rows for box in names}
-        rows = MailboxRing(general.segment, "modifications.status").drain().rows
+        boxes = {box: MailboxRing(servo.segment, box).read_new_rows().rows for box in names}
+        rows = MailboxRing(general.segment, "modifications.status").read_new_rows().rows
     assert [one.outcome.cause for one in found] == ["time over"] * 2, [one.texts for one in found]
     shown = zip(rows["tick"], rows["message"]["order"], rows["message"]["answer"], strict=True)
     answers = [(int(tick), int(order), int(answer)) for tick, order, answer in shown]
-    return Ran([one.outcome.digest for one in found], boxes, answers)
+    return RunContext([one.outcome.digest for one in found], boxes, answers)
 
 
 @pytest.fixture(scope="module")
@@ -102,13 +102,13 @@ def name() -> str:
 
 
 @pytest.fixture(scope="module")
-def run(name: str, tmp_path_factory: pytest.TempPathFactory) -> Ran:
+def run(name: str, tmp_path_factory: pytest.TempPathFactory) -> RunContext:
     return ran(name, tmp_path_factory.mktemp("brown"))
 
 
 @pytest.mark.slow
 def test_a_modification_of_the_general_machine_is_put_in_over_the_network_without_a_step(
-    run: Ran,
+    run: RunContext,
 ) -> None:
     # Commanded at 1.2 s; on each of its ways it waits for a cycle of 20 ms and two of 10 ms.
     reasons = run.values("shoulder.status", "reason", 1200, 1300)
@@ -126,7 +126,9 @@ def test_a_modification_of_the_general_machine_is_put_in_over_the_network_withou
 
 
 @pytest.mark.slow
-def test_while_the_link_is_out_the_servo_rack_extrapolates_holds_and_then_goes_on(run: Ran) -> None:
+def test_while_the_link_is_out_the_servo_rack_extrapolates_holds_and_then_goes_on(
+    run: RunContext,
+) -> None:
     status = run.boxes["supervisor.status"]
     held = status["tick"][status["message"]["reason"] == HELD.encode()]
     # The last reference before the fault, five made up, and the time of the link.
@@ -140,7 +142,7 @@ def test_while_the_link_is_out_the_servo_rack_extrapolates_holds_and_then_goes_o
 
 
 @pytest.mark.thorough
-def test_both_racks_repeat_bit_for_bit(run: Ran, name: str, tmp_path: Path) -> None:
+def test_both_racks_repeat_bit_for_bit(run: RunContext, name: str, tmp_path: Path) -> None:
     assert ran(name, tmp_path).digests == run.digests
 
 
@@ -166,7 +168,7 @@ def test_one_command_runs_both_to_the_end_of_the_program(tmp_path: Path) -> None
         SNAPSHOTS.check("lockstep", digests)
 
 
-class Launched:
+class LaunchedProcess:
     """`rack run` of both racks in lockstep, until the general machine runs."""
 
     def __init__(self, folder: Path, name: str, *words: str) -> None:
@@ -196,9 +198,9 @@ class Launched:
 
 
 @contextmanager
-def launched(folder: Path, name: str, *words: str) -> Iterator[Launched]:
+def launched(folder: Path, name: str, *words: str) -> Iterator[LaunchedProcess]:
     """Launch both; should they still run at the end, both are killed."""
-    both = Launched(folder, name, *words)
+    both = LaunchedProcess(folder, name, *words)
     try:
         yield both
     finally:

@@ -20,7 +20,10 @@ def test_both_racks_see_the_same_table_and_part() -> None:
         one, other = (c.model.geom(geom) for c in (puma, k1607))
         np.testing.assert_array_equal(one.size, other.size)
         np.testing.assert_array_equal(one.friction, other.friction)
-    for data, others in ((puma.start(), k1607.start()), (k1607.start(), puma.start())):
+    for data, others in (
+        (puma.build_start_data(), k1607.build_start_data()),
+        (k1607.build_start_data(), puma.build_start_data()),
+    ):
         for name in ("table", "part"):
             np.testing.assert_array_equal(data.geom(name).xpos, others.geom(name).xpos)
     np.testing.assert_array_equal(

@@ -29,11 +29,11 @@ def test_a_board_reserves_twice_its_budget_in_each_of_its_cycles_by_deadlines_al
     found = {task.task: task.reservation for task in rack.tasks}
     assert found["arm"] == Reservation(800_000, 4_000_000)
     assert found["trajectory"] == Reservation(3_300_000, 40_000_000)
-    assert rack.clock(None).reservation == Reservation(200_000, 4_000_000)
+    assert rack.build_clock_wiring(None).reservation == Reservation(200_000, 4_000_000)
     for settings in ((), (EARLIEST, "clock.mode=lockstep")):
         rack = resolve(load("chimera", settings))
         assert {task.reservation for task in rack.tasks} == {None}
-        assert rack.clock(None).reservation is None
+        assert rack.build_clock_wiring(None).reservation is None
 
 
 MISTAKES = {
@@ -67,7 +67,7 @@ def test_boards_are_scheduled_by_their_deadlines_and_the_launch_says_so(rack_nam
     with Rack(load("chimera", [f"name={rack_name}", EARLIEST])) as rack:
         assert rack.run(0.2).cause == "time over"
         names = [task.name for task in rack.segment.layout.tasks]
-        assert {rack.segment.block(name)[Block.PRIORITY] for name in names} == {DEADLINE}
+        assert {rack.segment.get_block(name)[Block.PRIORITY] for name in names} == {DEADLINE}
         said = [event.text for event in rack.events if event.kind == "ready"]
     cores = "on any core" if len(os.sched_getaffinity(0)) > 1 else "on their cores"
     what = f"earliest deadline first by SCHED_DEADLINE, {cores}"

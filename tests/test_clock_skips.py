@@ -11,8 +11,8 @@ from rack.boards import Rack
 from rack.boards.config import load, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event
-from rack.tools.faults.ending import strikes
-from rack.tools.faults.judge import Circumstances, FaultVerdict, judge
+from rack.tools.faults.ending import list_strikes
+from rack.tools.faults.judge import Circumstances, FaultVerdict, judge_faults
 
 pytestmark = pytest.mark.thorough
 
@@ -48,14 +48,14 @@ def ran(config: RackConfig) -> Skipped:
     guards = [task.task for task in resolve(config).tasks if task.guards_clock]
     with Rack(config, share=True) as rack:
         rack.run((FIRST + APART * len(LENGTHS) + AFTER) * config.clock_ns * 1e-9)
-        layout, struck = rack.segment.layout, strikes(rack.segment, ())
+        layout, struck = rack.segment.layout, list_strikes(rack.segment, ())
     misses = [event for event in rack.events if event.kind == "miss"]
     alarms = {
         guard: [e for e in misses if (e.board, e.code) == (guard, "clock_skipped")]
         for guard in guards
     }
     circumstances = Circumstances(layout, 0, is_lockstep=config.clock.mode == "lockstep")
-    return Skipped(judge(struck, rack.events, circumstances), alarms, misses)
+    return Skipped(judge_faults(struck, rack.events, circumstances), alarms, misses)
 
 
 @RACKS

@@ -34,7 +34,7 @@ def test_an_order_of_the_workstation_comes_to_the_fingers_as_interrupts() -> Non
         rack.stop("seen enough")
         plan = open_observer(rack.segment, "adapter.plan").peek().message
         tensions = [
-            MailboxRing(rack.segment, f"{finger}.command").drain().rows
+            MailboxRing(rack.segment, f"{finger}.command").read_new_rows().rows
             for finger in ("index", "thumb")
         ]
     # Each finger is on its side of the can, and both sensed the hand a tick before they commanded.

@@ -60,7 +60,7 @@ def test_restarted_board_goes_on_with_the_hand_as_it_was(tmp_path: Path) -> None
     assert result.recording == "complete"
     run = Recording(tmp_path / "run")
     tick, position, stopped = (
-        run.signal("hand.status", name) for name in ("tick", "position", "stopped")
+        run.read_signal("hand.status", name) for name in ("tick", "position", "stopped")
     )
     gap = int(np.diff(tick).argmax())
     assert tick[gap] * 5e-4 == pytest.approx(KILLED_S, abs=0.005)

@@ -70,6 +70,6 @@ def test_hardware_that_nobody_enables_stays_disabled_through_a_kill_and_the_run_
     outcome, events, servo = ran(1.5, 'fault=[{ kind = "kill", board = "servo", at = 0.5 }]')
     why = f"disabled; to enable: rack command {NAME} servo enable"
     assert (servo.state, servo.error, servo.reason) == (State.HOLDING, Error.DISABLED, why)
-    assert not outcome.worked
+    assert not outcome.is_success
     assert f"level 'servo': {why}" in outcome.faults
     assert "brakes_opened" not in [event.code for event in events]

@@ -40,8 +40,12 @@ def test_brakings_while_each_block_is_lowered_count_as_no_touch_and_each_is_put_
     config = load("ibm", [f"name=test-ibm-{os.getpid()}", "clock.mode=lockstep"], str(script))
     assert run_rack(config, None, tmp_path / "run", Display()).recording == "complete"
     recording = Recording(tmp_path / "run")
-    ticks, current = (recording.signal("motion.status", field) for field in ("tick", "current"))
-    braked = recording.signal("arm.status", "tick")[recording.signal("arm.status", "braked") == 1]
+    ticks, current = (
+        recording.read_signal("motion.status", field) for field in ("tick", "current")
+    )
+    braked = recording.read_signal("arm.status", "tick")[
+        recording.read_signal("arm.status", "braked") == 1
+    ]
     for request in GUARDED:
         lowering = ticks[current == request]
         assert len(set(braked) & set(range(lowering[0] + 1000, lowering[-1] - 500)))

@@ -39,7 +39,7 @@ def test_a_stalled_planner_leaves_the_arm_holding_at_its_last_goal_without_a_ste
     assert run_rack(config, SECONDS, tmp_path / "run", Display()).recording == "complete"
     run = Recording(tmp_path / "run")
     tick, done, resting, state = (
-        run.signal("trajectory.status", name) for name in ("tick", "done", "resting", "state")
+        run.read_signal("trajectory.status", name) for name in ("tick", "done", "resting", "state")
     )
     stalled = (tick >= 2300) & (tick < 2900)
     assert (done[stalled] == 1).all()
@@ -47,7 +47,8 @@ def test_a_stalled_planner_leaves_the_arm_holding_at_its_last_goal_without_a_ste
     assert (state[stalled] == State.DONE).all()
     assert done[-1] >= 3
     position, target, violations, touches = (
-        run.signal("arm.status", name) for name in ("position", "target", "violations", "touches")
+        run.read_signal("arm.status", name)
+        for name in ("position", "target", "violations", "touches")
     )
     assert np.abs(position - target).max() < 2e-3
     assert violations[-1] == touches[-1] == 0

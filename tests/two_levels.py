@@ -74,7 +74,7 @@ class CountProgram(Program):
 
     count: tuple[int, ...] = pydantic.Field((), description="counts to reach, one after the other")
 
-    def misfits(
+    def find_mismatches(
         self, robot: RobotConfig | None, scene: SceneConfig
     ) -> Iterator[tuple[str, Any, str]]:
         """Refuse negative counts, for a reason that depends on the scene."""

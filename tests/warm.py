@@ -31,7 +31,7 @@ from threading import Lock
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from rack.boards.crate.line import environment
+from rack.boards.crate.line import build_environment
 from tests.processes import children_of
 
 LIBRARIES = {
@@ -88,7 +88,7 @@ class Stock:
             [sys.executable, "-u", "-m", "tests.warm", str(theirs.fileno()), module],
             pass_fds=(theirs.fileno(),),
             stdin=subprocess.DEVNULL,
-            env=environment(),
+            env=build_environment(),
         )
         theirs.close()
         self.pid = self._process.pid

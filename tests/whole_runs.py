@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from rack.backplane.fault_table import FAULT_WORDS, FaultTable, Stage
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
-from rack.backplane.trace import trace_ring
+from rack.backplane.trace import open_trace_ring
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
@@ -59,11 +59,11 @@ def counted(segment: Segment) -> dict[str, object]:
     layout = segment.layout
     cycles = {}
     for task in layout.tasks:
-        rows = trace_ring(segment, task.name).drain().rows
+        rows = open_trace_ring(segment, task.name).read_new_rows().rows
         cycles[task.name] = {name: rows[name] for name in TIMELESS}
     return {
         "tasks": {
-            task.name: [segment.block(task.name)[word] for word in OF_TASK]
+            task.name: [segment.get_block(task.name)[word] for word in OF_TASK]
             for task in layout.processes
         },
         "system": [segment.words[word] for word in OF_SYSTEM],
@@ -80,7 +80,7 @@ def whole_run(config: RackConfig, seconds: float) -> Mapping[str, object]:
         counts = counted(rack.segment)
         struck = [
             [*(entry.words[word] for word in STRIKE), *entry.parameters]
-            for entry in FaultTable(rack.segment).staged(tuple(Stage)[1:])
+            for entry in FaultTable(rack.segment).list_entries(tuple(Stage)[1:])
         ]
         # A busy machine makes a launch wait for its boards.
         heard = [event for event in rack.events if event.kind != "waiting"]

@@ -76,7 +76,7 @@ COMMANDS = {
     },
 }
 """All commands with one line of help, grouped by purpose."""
-SOURCES = {
+COMMAND_SOURCES = {
     "resume": "rack.tools.commands.pause:resume",
     "list": "rack.tools.commands.list:list_racks",
     "set": "rack.tools.commands.set:set_param",
@@ -90,9 +90,9 @@ Any other command is the function of its name in the module of its name.
 """
 MAX_ARGUMENT = 4096
 """Maximum number of characters, as in the longest path. Longer values belong in the config file."""
-COMPLETION = "_RACK_COMPLETE"
+COMPLETION_VARIABLE = "_RACK_COMPLETE"
 """Environment variable of a shell that asks for the completion of a command line."""
-USAGE = (
+USAGE_ERRORS = (
     errno.ENAMETOOLONG,
     errno.ENOENT,
     errno.ENOTDIR,
@@ -112,21 +112,21 @@ def main() -> None:
             " SCHED_FIFO"
         )
     # Handle signals before anything else: imports take longer than many commands.
-    INTERRUPT.catch()
+    INTERRUPT.install_handlers()
     _open_closed_streams()
     try:
         try:
             run_commands()
         except OSError:
             # If the error was one of stdout, this reports it.
-            _flush("\n")
+            _flush_stdout("\n")
             raise
         finally:
-            _flush()
+            _flush_stdout()
     except Interrupted:
         return
     finally:
-        INTERRUPT.settle()
+        INTERRUPT.exit_if_signalled()
 
 
 class ClosedInput(TextIOBase):
@@ -160,17 +160,17 @@ def _open_closed_streams() -> None:
 
 def run_commands() -> None:
     """Run the command line in this process, without handling signals."""
-    from rack.tools.console.answer import Failure, as_failure, fail
+    from rack.tools.console.answer import Failure, convert_errors, exit_with_failure
 
     arguments = sys.argv[1:]
     if sys.flags.optimize > 1 and "--help" in arguments:
         print("help lacks its texts: PYTHONOPTIMIZE=2 (python -OO) removes them", file=sys.stderr)
     try:
         _check_arguments(arguments)
-        with as_failure(), _head_start(arguments) as crate:
-            sys.exit(commands()(prog_name="rack", obj=crate, standalone_mode=False))
+        with convert_errors(), _start_crate_early(arguments) as crate:
+            sys.exit(build_commands()(prog_name="rack", obj=crate, standalone_mode=False))
     except Failure as failure:
-        fail(str(failure), failure.status)
+        exit_with_failure(str(failure), failure.status)
     except OSError as error:
         _fail_on_system_error(error)
     except Exception as error:
@@ -178,7 +178,7 @@ def run_commands() -> None:
         if not hasattr(error, "show"):
             raise
         error.show(usage := StringIO())
-        fail(usage.getvalue().rstrip(), 2)
+        exit_with_failure(usage.getvalue().rstrip(), 2)
 
 
 def _fail_on_system_error(error: OSError) -> NoReturn:
@@ -186,21 +186,21 @@ def _fail_on_system_error(error: OSError) -> NoReturn:
 
     Raises it again if no input explains it.
     """
-    from rack.backplane.process import refusal
-    from rack.boards.errors import shown
-    from rack.tools.console.answer import fail
+    from rack.backplane.process import describe_refusal
+    from rack.boards.errors import format_value
+    from rack.tools.console.answer import exit_with_failure
 
     if error.filename is not None:
-        status = 2 if error.errno in USAGE else 1
-        fail(f"{shown(str(error.filename))}: {error.strerror}", status)
+        status = 2 if error.errno in USAGE_ERRORS else 1
+        exit_with_failure(f"{format_value(str(error.filename))}: {error.strerror}", status)
     if Path("/proc/self/cwd").readlink().name.endswith(" (deleted)"):
-        fail("the working folder has been removed; change to another one", 2)
+        exit_with_failure("the working folder has been removed; change to another one", 2)
     if error.errno not in (errno.EAGAIN, errno.EMFILE):
         raise error
-    fail(refusal(error), 1)
+    exit_with_failure(describe_refusal(error), 1)
 
 
-def _flush(text: str = "") -> None:
+def _flush_stdout(text: str = "") -> None:
     """Print a text and everything that is still buffered."""
     try:
         print(end=text, flush=True)
@@ -213,7 +213,7 @@ def _flush(text: str = "") -> None:
         sys.exit(1)
 
 
-def _head_start(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | None]:
+def _start_crate_early(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | None]:
     """Start the crate of `rack run`, whose slow imports then run on another core.
 
     Other commands get an empty context.
@@ -222,18 +222,18 @@ def _head_start(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | 
         arguments[:1] != ["run"]
         or len(arguments) == 1
         or "--help" in arguments
-        or COMPLETION in os.environ
+        or COMPLETION_VARIABLE in os.environ
     ):
         return nullcontext()
-    from rack.boards.crate.line import NO_WINDOWS, SINGLE_THREADED, CrateLine, WarmCrate
+    from rack.boards.crate.line import NO_WINDOWS, ONE_THREAD, CrateLine, WarmCrate
 
-    os.environ.update(SINGLE_THREADED | NO_WINDOWS)
+    os.environ.update(ONE_THREAD | NO_WINDOWS)
     return (
         WarmCrate() if any(argument.startswith("--from") for argument in arguments) else CrateLine()
     )
 
 
-def commands() -> TyperGroup:
+def build_commands() -> TyperGroup:
     """Build the command line. Its commands are loaded when they are used."""
     import typer
     from typer.core import TyperCommand, TyperGroup
@@ -254,7 +254,7 @@ def commands() -> TyperGroup:
 
         def make_context(self, *given: Any, **named: Any) -> Any:
             """Load the command, which replaces this object."""
-            return _loaded(str(self.name)).make_context(*given, **named)
+            return _load_command(str(self.name)).make_context(*given, **named)
 
     def show_version(is_asked: bool) -> None:
         from importlib.metadata import version
@@ -274,7 +274,7 @@ def commands() -> TyperGroup:
     ) -> None:
         """Declare the options before a command."""
 
-    app = _app(
+    app = _create_app(
         cls=Grouped,
         add_completion=True,
         no_args_is_help=True,
@@ -296,22 +296,22 @@ def commands() -> TyperGroup:
     return group
 
 
-def _app(add_completion: bool = False, **settings: Any) -> typer.Typer:
+def _create_app(add_completion: bool = False, **settings: Any) -> typer.Typer:
     """Create a typer application with plain-text help."""
     import typer
 
     return typer.Typer(add_completion=add_completion, rich_markup_mode=None, **settings)
 
 
-def _loaded(name: str) -> Any:
+def _load_command(name: str) -> Any:
     """Import a command by its name."""
     import typer
 
-    source = SOURCES.get(name, f"rack.tools.commands.{name}:{name}")
+    source = COMMAND_SOURCES.get(name, f"rack.tools.commands.{name}:{name}")
     path, _, attribute = source.partition(":")
     command = getattr(import_module(path), attribute)
     if not isinstance(command, typer.Typer):
-        app = _app()
+        app = _create_app()
         app.command(name)(command)
         command = app
     return typer.main.get_command(command)
@@ -319,18 +319,19 @@ def _loaded(name: str) -> Any:
 
 def _check_arguments(arguments: list[str]) -> None:
     """Reject arguments that no command can use. Raises `Failure`."""
-    from rack.boards.errors import shown
+    from rack.boards.errors import format_value
     from rack.tools.console.answer import Failure
 
     for at, argument in enumerate(arguments, 1):
         if len(argument) > MAX_ARGUMENT:
             raise Failure(
-                f"argument {at} = {shown(argument)}: has {len(argument)} characters; must be at"
+                f"argument {at} = {format_value(argument)}: has {len(argument)} "
+                "characters; must be at"
                 f" most {MAX_ARGUMENT}",
                 2,
             )
         if any("\ud800" <= c <= "\udfff" for c in argument):
-            raise Failure(f"argument {at} = {shown(argument)}: must be UTF-8", 2)
+            raise Failure(f"argument {at} = {format_value(argument)}: must be UTF-8", 2)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from itertools import groupby
 from typing import Protocol
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.clock.released_task import ReleasedTask, Watchdog, by_priority
+from rack.backplane.clock.released_task import ReleasedTask, Watchdog, sort_by_priority
 from rack.backplane.clock.wake import CHECK_S
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
@@ -31,28 +31,28 @@ LEAD_NS = 300_000
 
 It covers the clock's wake-up and its work in a tick.
 """
-LATE_PART = 2
+LATE_DIVISOR = 2
 """Divisor of the tick that gives the delay from which a core counts as taken away.
 
 It applies to the clock's wake-up, and to time in which nothing runs although tasks are due.
 """
-LEAD_PART = 3
+LEAD_DIVISOR = 3
 """Divisor of the tick that limits the time by which the clock is ahead."""
 
-Ended = Callable[[int], int | None]
+FindEndTick = Callable[[int], int | None]
 """Function called before every tick. Returns the tick at which the run stops, once known."""
 
 
 class Controller(Protocol):
     """Work of the system controller at every tick, apart from releasing tasks."""
 
-    def begin(self, tick: int) -> None:
+    def begin_tick(self, tick: int) -> None:
         """Do the work that is due before the tasks of `tick` are released."""
 
-    def released(self, tick: int) -> None:
+    def finish_release(self, tick: int) -> None:
         """Do the work that is due after the release."""
 
-    def rests_until(self, tick: int) -> int:
+    def find_next_work_tick(self, tick: int) -> int:
         """Return the first tick after `tick` that needs `begin_tick`, as far as is known."""
 
 
@@ -67,9 +67,11 @@ class ClockDriver(ABC):
         is_flooded: True if a fault makes a task write more than the rings are made for.
     """
 
-    def __init__(self, segment: Segment, ended: Ended, alarms: AlarmWriter | None = None) -> None:
+    def __init__(
+        self, segment: Segment, ended: FindEndTick, alarms: AlarmWriter | None = None
+    ) -> None:
         self.words = segment.words
-        self.tasks = [ReleasedTask(segment, task) for task in by_priority(segment.layout)]
+        self.tasks = [ReleasedTask(segment, task) for task in sort_by_priority(segment.layout)]
         self.processes = [
             *self.tasks,
             *(ReleasedTask(segment, host) for host in segment.layout.hosts),
@@ -86,7 +88,7 @@ class ClockDriver(ABC):
         self._ended = ended
         self._segment = segment
 
-    def begin(self, tick: int) -> bool:
+    def begin_tick(self, tick: int) -> bool:
         """Publish `tick` and do the work that is due before its releases.
 
         Returns:
@@ -94,7 +96,7 @@ class ClockDriver(ABC):
         """
         self.words[System.TICK] = tick
         if self.controller is not None:
-            self.controller.begin(tick)
+            self.controller.begin_tick(tick)
         if not self.skip:
             return True
         self.skip -= 1
@@ -109,22 +111,22 @@ class ClockDriver(ABC):
         self.words[System.SKIPPED_FROM] = first
         self.words[System.CLOCK_SKIPPED] += ticks
 
-    def due(self, tick: int, last: int) -> list[ReleasedTask]:
+    def list_due_tasks(self, tick: int, last: int) -> list[ReleasedTask]:
         """Return the tasks with a release in (last, tick], in the order of their releases."""
         due_tasks: list[ReleasedTask] = []
         for every, phase, tasks in self._groups:
             release = tick - (tick - phase) % every
             if release > last:
-                due_tasks += [task for task in tasks if task.is_free(release)]
+                due_tasks += [task for task in tasks if task.can_take_release(release)]
         return due_tasks
 
-    def check(self, released: list[ReleasedTask], tick: int) -> None:
+    def check_tasks(self, released: list[ReleasedTask], tick: int) -> None:
         """Do the work that is due after the release of these tasks."""
         for task in released:
             if task.missed:
                 self.watchdog.check(task, tick)
         if self.controller is not None:
-            self.controller.released(tick)
+            self.controller.finish_release(tick)
 
     @property
     def first_tick(self) -> int:
@@ -135,11 +137,11 @@ class ClockDriver(ABC):
         return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
     @property
-    def first_end(self) -> int:
+    def first_end_tick(self) -> int:
         """First tick before which the run may end."""
         return 0
 
-    def settle(self) -> None:
+    def wait_until_settled(self) -> None:
         """In lockstep, wait until each task has finished the work of its release, including plans.
 
         Call it before a change of data that tasks read at any time rather than as of a tick. In
@@ -176,7 +178,7 @@ class ClockDriver(ABC):
         # answer.
         end_tick = self._ended(tick)
         if not stop and end_tick is not None:
-            stop = words[System.STOP_TICK] = max(end_tick, self.first_end, 1)
+            stop = words[System.STOP_TICK] = max(end_tick, self.first_end_tick, 1)
         return bool(stop) and tick >= stop
 
     @property
@@ -184,7 +186,7 @@ class ClockDriver(ABC):
         """True if the launcher is alive."""
         return self._segment.launcher_is_alive
 
-    def end(self) -> None:
+    def end_run(self) -> None:
         """End the run, and wake every task so that it notices."""
         self.words[System.STATE] = Run.STOPPED
         for task in self.tasks:
@@ -197,13 +199,15 @@ class RealtimeDriver(ClockDriver):
     A late clock skips ticks and counts them.
     """
 
-    def __init__(self, segment: Segment, ended: Ended, alarms: AlarmWriter | None = None) -> None:
+    def __init__(
+        self, segment: Segment, ended: FindEndTick, alarms: AlarmWriter | None = None
+    ) -> None:
         super().__init__(segment, ended, alarms)
         self._epoch_ns = self.words[System.EPOCH_NS]
         self._period_ns = self.words[System.PERIOD_NS]
         leads = any(task.sleeps for task in self.tasks)
         self._woke_ns = 0
-        self._lead_ns = min(LEAD_NS, self._period_ns // LEAD_PART) if leads else 0
+        self._lead_ns = min(LEAD_NS, self._period_ns // LEAD_DIVISOR) if leads else 0
 
     def run(self) -> None:
         """Make ticks until the run is over or the launcher has ended."""
@@ -218,22 +222,22 @@ class RealtimeDriver(ClockDriver):
         tick = self._sleep_until_next(last)
         words[System.STATE] = Run.RUNNING
         while not self.is_over(tick):
-            if self.begin(tick):
-                self._release(tick, last)
+            if self.begin_tick(tick):
+                self._release_tasks(tick, last)
                 if tick // beat != last // beat and not self.launcher_is_alive:
                     break
                 last = tick
             tick = self._sleep_until_next(tick)
-        self._sleep_until(self._time_of(tick))
-        self.end()
+        self._sleep_until(self._compute_grid_point(tick))
+        self.end_run()
 
-    def _release(self, tick: int, last: int) -> None:
+    def _release_tasks(self, tick: int, last: int) -> None:
         """Give every task its release in (last, tick].
 
         Tasks that sleep by themselves get it in advance, the others at the grid point.
         """
-        due = self.due(tick, last)
-        point = self._time_of(tick)
+        due = self.list_due_tasks(tick, last)
+        point = self._compute_grid_point(tick)
         sleeping = [task for task in due if task.sleeps]
         for task in sleeping:
             task.release(tick)
@@ -241,7 +245,7 @@ class RealtimeDriver(ClockDriver):
         if now >= point or tick > last + 1:
             for task in sleeping:
                 # The task has already looked for its release, found none, and is sleeping again.
-                if now >= self._time_of(task.block[Block.RELEASED]):
+                if now >= self._compute_grid_point(task.block[Block.RELEASED]):
                     task.wake()
         if len(sleeping) < len(due):
             self._sleep_until(point)
@@ -250,9 +254,9 @@ class RealtimeDriver(ClockDriver):
                     task.release(tick)
                     if task.is_posted:
                         task.wake()
-        self.check(due, tick)
+        self.check_tasks(due, tick)
 
-    def _time_of(self, tick: int) -> int:
+    def _compute_grid_point(self, tick: int) -> int:
         """Return the grid point of a tick, in ns of CLOCK_MONOTONIC."""
         return self._epoch_ns + tick * self._period_ns
 
@@ -271,7 +275,7 @@ class RealtimeDriver(ClockDriver):
         Returns:
             The newest tick that is due to begin, at least `tick` + 1.
         """
-        due_ns = self._time_of(tick + 1)
+        due_ns = self._compute_grid_point(tick + 1)
         has_ticked = self._woke_ns
         self._sleep_until(due_ns - self._lead_ns)
         self._woke_ns = time.monotonic_ns()
@@ -285,6 +289,6 @@ class RealtimeDriver(ClockDriver):
             self.count_skipped(tick + 1, skipped)
         # Before its first tick, at the start or after a restart, a late clock does not prove that
         # its core was taken away.
-        if has_ticked and (late_ns := self._woke_ns - due_ns) > self._period_ns // LATE_PART:
-            self.alarms.ring(next_tick, Alarm.CLOCK_LATE, value=late_ns, since=tick + 1)
+        if has_ticked and (late_ns := self._woke_ns - due_ns) > self._period_ns // LATE_DIVISOR:
+            self.alarms.raise_alarm(next_tick, Alarm.CLOCK_LATE, value=late_ns, since=tick + 1)
         return next_tick

@@ -19,22 +19,22 @@ import sys
 import time
 from collections.abc import Callable
 
-from rack.backplane.clock.driver import ClockDriver, Ended
+from rack.backplane.clock.driver import ClockDriver, FindEndTick
 from rack.backplane.clock.released_task import ReleasedTask
 from rack.backplane.clock.wake import CHECK_S
-from rack.backplane.process import GONE, STOPPED, state_of
+from rack.backplane.process import ENDED_STATES, STOPPED_STATES, read_state
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Run, System
 
-IDLE_S = 30.0
+MAX_RECORDER_WAIT_S = 30.0
 """Maximum wait for a recorder that is stopped, or dead and not replaced.
 
 Its launcher replaces it much sooner.
 """
-BATCH = 8
+MAX_BATCH_TICKS = 8
 """Maximum number of ticks in a batch. Requests of the host in between take effect after it."""
-LOOK_S = 0.001
+POLL_S = 0.001
 """Time between checks of recorder and host.
 
 They post no semaphore, because they must not be able to disturb the clock.
@@ -52,7 +52,7 @@ class LockstepDriver(ClockDriver):
     def __init__(
         self,
         segment: Segment,
-        ended: Ended,
+        ended: FindEndTick,
         one_at_a_time: bool,
         history_ticks: int,
         alarms: AlarmWriter | None = None,
@@ -79,7 +79,7 @@ class LockstepDriver(ClockDriver):
         self._last = self._next - 1
 
     @property
-    def first_end(self) -> int:
+    def first_end_tick(self) -> int:
         """The next tick. A run that continues another may begin after its end."""
         return self._next
 
@@ -87,20 +87,20 @@ class LockstepDriver(ClockDriver):
         """Make ticks until the run is over or the launcher has ended."""
         self.words[System.STATE] = Run.RUNNING
         # A restarted clock does not know the end of a batch.
-        self.settle()
-        while self._begins(tick := self._next):
-            if not self.begin(tick):
+        self.wait_until_settled()
+        while self._wait_for_tick(tick := self._next):
+            if not self.begin_tick(tick):
                 self._next = tick + 1
                 continue
-            due = self.due(tick, self._last)
-            end = self._batch_end(due, tick)
-            if not self._step(due, tick, end):
+            due = self.list_due_tasks(tick, self._last)
+            end = self._find_batch_end(due, tick)
+            if not self._run_ticks(due, tick, end):
                 break
             self._last = self.words[System.TICK] = end - 1
             self._next = end
-        self.end()
+        self.end_run()
 
-    def _begins(self, tick: int) -> bool:
+    def _wait_for_tick(self, tick: int) -> bool:
         """Wait for everything that `tick` must wait for. Returns False if the run ends."""
         # Nothing has been done for this tick yet, so a run that continues from the snapshot begins
         # with it.
@@ -109,7 +109,7 @@ class LockstepDriver(ClockDriver):
             self._wait_for_step(tick) and not self.is_over(tick) and self._wait_for_follower(tick)
         )
 
-    def _batch_end(self, due: list[ReleasedTask], tick: int) -> int:
+    def _find_batch_end(self, due: list[ReleasedTask], tick: int) -> int:
         """Return the tick before which nothing happens except cycles of the only executor due.
 
         The result is the next tick if there is more to do.
@@ -122,7 +122,7 @@ class LockstepDriver(ClockDriver):
         if alone.spec.every > 1 or alone.spec.role != "executor" or alone.is_stopped:
             return tick + 1
         words = self.words
-        end = min(tick + BATCH, self._snapshot_at, controller.rests_until(tick))
+        end = min(tick + MAX_BATCH_TICKS, self._snapshot_at, controller.find_next_work_tick(tick))
         if stop := words[System.STOP_TICK]:
             end = min(end, stop)
         if (hold := words[System.HOLD_AT]) > 0:
@@ -131,10 +131,10 @@ class LockstepDriver(ClockDriver):
             if end <= tick + 1:
                 break
             if task is not alone:
-                end = min(end, task.next_event(tick))
+                end = min(end, task.find_next_event(tick))
         return max(end, tick + 1)
 
-    def _step(self, due: list[ReleasedTask], tick: int, end: int) -> bool:
+    def _run_ticks(self, due: list[ReleasedTask], tick: int, end: int) -> bool:
         """Run one tick, or a batch that ends before `end`.
 
         Returns:
@@ -147,7 +147,7 @@ class LockstepDriver(ClockDriver):
                 task.wake()
             if one_at_a_time and not self.await_state(task, task.is_settled):
                 return False
-        self.check(due, tick)
+        self.check_tasks(due, tick)
         # Wait until the next tick may begin.
         order = self._last_first
         slowest = None
@@ -156,7 +156,7 @@ class LockstepDriver(ClockDriver):
                 continue
             if task.is_finished(end):
                 # Take its report all the same. Otherwise the semaphore would overflow.
-                task.done.take()
+                task.done.try_acquire()
             else:
                 slowest = task
                 if not self.await_state(task, lambda task=task: task.is_finished(end)):  # type: ignore[misc]
@@ -166,7 +166,7 @@ class LockstepDriver(ClockDriver):
             order.insert(0, slowest)
         return True
 
-    def settle(self) -> None:
+    def wait_until_settled(self) -> None:
         """Wait until every task has finished the work of its release, including plans."""
         for task in self.tasks:
             self.await_state(task, task.is_settled)
@@ -185,17 +185,17 @@ class LockstepDriver(ClockDriver):
         while not condition():
             # The bound may stem from an earlier wait. A timeout that comes early only costs one
             # extra check.
-            if wait() and not self._look_around(task):
+            if wait() and not self._check_after_timeout(task):
                 return False
         return True
 
-    def _look_around(self, task: ReleasedTask) -> bool:
+    def _check_after_timeout(self, task: ReleasedTask) -> bool:
         """Check for a stopped task after a wait without a report. Returns False to end the run."""
         if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
             return False
         # A signal may have stopped the process, and lockstep must not wait for it.
         task.check_stopped()
-        task.done.bind(time.monotonic_ns() + int(CHECK_S * 1e9))
+        task.done.set_deadline(time.monotonic_ns() + int(CHECK_S * 1e9))
         return True
 
     def _wait_for_follower(self, tick: int) -> bool:
@@ -205,17 +205,17 @@ class LockstepDriver(ClockDriver):
         """
         words = self.words
         since = time.monotonic()
-        while (pid := words[System.FOLLOWER_PID]) and self._is_ahead(tick):
-            if state_of(pid) not in (*STOPPED, *GONE):
+        while (pid := words[System.FOLLOWER_PID]) and self._is_recorder_behind(tick):
+            if read_state(pid) not in (*STOPPED_STATES, *ENDED_STATES):
                 since = time.monotonic()
-            elif time.monotonic() - since > IDLE_S:
+            elif time.monotonic() - since > MAX_RECORDER_WAIT_S:
                 words[System.FOLLOWER_PID] = 0
             if words[System.STOP_REQUEST] or not self.launcher_is_alive:
                 return False
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
         return True
 
-    def _is_ahead(self, tick: int) -> bool:
+    def _is_recorder_behind(self, tick: int) -> bool:
         """Check whether the recorder must catch up before `tick`.
 
         Flooded rings hold little more than one tick.
@@ -233,11 +233,11 @@ class LockstepDriver(ClockDriver):
         words = self.words
         if not 0 < words[System.HOLD_AT] <= tick + 1:
             return True
-        self.settle()
+        self.wait_until_settled()
         words[System.HELD] = tick + 1
         while 0 < words[System.HOLD_AT] <= tick + 1 and not words[System.STOP_REQUEST]:
             if not self.launcher_is_alive:
                 return False
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
         words[System.HELD] = 0
         return True

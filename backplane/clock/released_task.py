@@ -11,9 +11,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rack.backplane.layout import Layout, TaskSpec
-from rack.backplane.process import STOPPED, WAITING, processor_ns, state_of
+from rack.backplane.process import STOPPED_STATES, WAITING_STATES, read_processor_ns, read_state
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import done_semaphore, wake_semaphore
+from rack.backplane.semaphores import get_done_semaphore, get_wake_semaphore
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, TaskState
 
@@ -22,7 +22,7 @@ RELEASES_MISSED = 4
 
 Three gave one false alarm in 24,000 cycles at 400 Hz.
 """
-LEAST_NS = 1_000_000_000
+MIN_HANG_NS = 1_000_000_000
 """Minimum processor time, or waiting time, before a task counts as hanging."""
 
 
@@ -45,7 +45,7 @@ class ReleasedTask:
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
         self.spec = spec
         self.index = segment.layout.processes.index(spec)
-        self.block = segment.block(spec.name)
+        self.block = segment.get_block(spec.name)
         self.sleeps = spec.wake == "timer"
         self.is_posted = spec.wake != "poll"
         self.missed = 0
@@ -53,12 +53,12 @@ class ReleasedTask:
         self.deadline = self.block[Block.DEADLINE]
         self._every = spec.every
         self._phase = spec.phase
-        self._early = spec.every - segment.layout.due(spec)
+        self._early = spec.every - segment.layout.compute_due_ticks(spec)
         self._done = self.block[Block.DONE]
-        self.wake: Callable[[], object] = wake_semaphore(segment, spec.name).release
-        self.done = done_semaphore(segment, spec.name)
+        self.wake: Callable[[], object] = get_wake_semaphore(segment, spec.name).release
+        self.done = get_done_semaphore(segment, spec.name)
 
-    def is_free(self, release: int) -> bool:
+    def can_take_release(self, release: int) -> bool:
         """Check whether the task can take a release.
 
         It cannot while it works on a plan or is lost.
@@ -92,7 +92,7 @@ class ReleasedTask:
         block[Block.FIRST] = release
         block[Block.RELEASED] = newest
 
-    def next_event(self, tick: int) -> int:
+    def find_next_event(self, tick: int) -> int:
         """Return the first tick after `tick` that must wait for the task or releases it."""
         if self.deadline > tick:
             return self.deadline
@@ -110,7 +110,7 @@ class ReleasedTask:
 
     def check_stopped(self) -> None:
         """Check whether a signal has stopped its process."""
-        self.is_stopped = state_of(self.block[Block.PID]) in STOPPED
+        self.is_stopped = read_state(self.block[Block.PID]) in STOPPED_STATES
 
     @property
     def is_lost(self) -> bool:
@@ -135,12 +135,12 @@ class ReleasedTask:
         """True if a lost task will not be restarted."""
         return self.block[Block.STATE] == TaskState.GIVEN_UP
 
-    def lose(self, tick: int) -> None:
+    def mark_lost(self, tick: int) -> None:
         """Stop releasing the task until its new process has rejoined."""
         self.block[Block.STATE] = TaskState.ABSENT
         self.block[Block.LOST] = tick + 1
 
-    def rejoin(self) -> None:
+    def admit_new_process(self) -> None:
         """Admit the task's new process. The next release on the grid is its first."""
         block = self.block
         block[Block.DONE] = block[Block.RELEASED]
@@ -150,7 +150,7 @@ class ReleasedTask:
         block[Block.LOST] = 0
 
 
-def by_priority(layout: Layout) -> list[TaskSpec]:
+def sort_by_priority(layout: Layout) -> list[TaskSpec]:
     """Return the tasks in the order in which the clock releases them.
 
     Executors come first, by rate, followed by planners.
@@ -173,26 +173,33 @@ class Watchdog:
         spec = task.spec
         if missed == 1:
             late = Alarm.LATE if spec.role == "executor" else Alarm.PLAN_LATE
-            self._alarms.ring(tick, late, task.index, missed, task.block[Block.DONE])
+            self._alarms.raise_alarm(tick, late, task.index, missed, task.block[Block.DONE])
         if missed < RELEASES_MISSED:
             return
         if missed == RELEASES_MISSED:
-            self._used_ns[task.index] = processor_ns(task.block[Block.PID])
-        if self._hangs(task):
+            self._used_ns[task.index] = read_processor_ns(task.block[Block.PID])
+        if self._is_hanging(task):
             self.losses += 1
-            task.lose(tick)
-            self._alarms.ring(tick, Alarm.HANG, task.index, missed, tick - missed * spec.every)
+            task.mark_lost(tick)
+            self._alarms.raise_alarm(
+                tick, Alarm.HANG, task.index, missed, tick - missed * spec.every
+            )
         elif missed == RELEASES_MISSED:
-            self._alarms.ring(tick, Alarm.STARVED, task.index, missed, tick - missed * spec.every)
+            self._alarms.raise_alarm(
+                tick, Alarm.STARVED, task.index, missed, tick - missed * spec.every
+            )
 
-    def _hangs(self, task: ReleasedTask) -> bool:
+    def _is_hanging(self, task: ReleasedTask) -> bool:
         """Check whether a task that has missed several releases is proved to hang."""
         spec = task.spec
         pid = task.block[Block.PID]
-        state = state_of(pid)
-        if state in STOPPED:
+        state = read_state(pid)
+        if state in STOPPED_STATES:
             return True
-        bound_ns = max(LEAST_NS, RELEASES_MISSED * spec.slice * self._period_ns)
+        bound_ns = max(MIN_HANG_NS, RELEASES_MISSED * spec.slice * self._period_ns)
         if task.missed * spec.every * self._period_ns <= bound_ns:
             return False
-        return state in WAITING or processor_ns(pid) - self._used_ns.get(task.index, 0) > bound_ns
+        return (
+            state in WAITING_STATES
+            or read_processor_ns(pid) - self._used_ns.get(task.index, 0) > bound_ns
+        )

@@ -27,7 +27,7 @@ class SystemClock:
         """True if the run is over."""
         return self._words[System.STATE] == Run.STOPPED
 
-    def now(self) -> int:
+    def compute_tick(self) -> int:
         """Return the current tick.
 
         In real time it is computed from the grid, because the clock board may be late. In lockstep
@@ -42,15 +42,15 @@ class SystemClock:
         """Time from tick to tick, in ns of the wall clock."""
         return self._words[System.PERIOD_NS]
 
-    def time_of(self, tick: int) -> int:
+    def compute_time_ns(self, tick: int) -> int:
         """Return the time of a tick, in ns of CLOCK_MONOTONIC."""
         return self._words[System.EPOCH_NS] + tick * self._words[System.PERIOD_NS]
 
 
-def ticks_of(
+def compute_period_ticks(
     rate_hz: float,
     clock_ns: int,
-    what: str,
+    subject: str,
     of: tuple[str, str] = ("clock", "tick"),
     fastest_hz: float = inf,
 ) -> int:
@@ -59,7 +59,7 @@ def ticks_of(
     Args:
         rate_hz: Rate, rounded to four digits or more, such as 57.14 Hz for 400 Hz / 7.
         clock_ns: Length of a tick.
-        what: Name of the thing that has the rate, for the error message.
+        subject: Name of the thing that has the rate, for the error message.
         of: Words of the error message for the grid and for one step of it.
         fastest_hz: Highest rate that the error message may suggest.
 
@@ -72,11 +72,11 @@ def ticks_of(
     ticks = clock_hz / rate_hz if rate_hz > 0 else inf
     if ticks == inf:
         raise ClockError(
-            f"{what}: {rate_hz:g} Hz is not a rate; valid rates are {clock_hz:g} Hz divided by a"
+            f"{subject}: {rate_hz:g} Hz is not a rate; valid rates are {clock_hz:g} Hz divided by a"
             " whole number"
         )
     # A rate above the clock's rate has only one neighbour.
-    nearest = {n: rate_text(clock_hz / n) for n in (int(ticks) + 1, int(ticks)) if n >= 1}
+    nearest = {n: format_rate(clock_hz / n) for n in (int(ticks) + 1, int(ticks)) if n >= 1}
     for every in sorted(nearest, key=lambda n: abs(n - ticks)):
         if abs(ticks - every) <= 1e-6 * ticks or rate_hz == float(nearest[every]):
             return every
@@ -86,10 +86,10 @@ def ticks_of(
         if float(rate) <= fastest_hz
     )
     raise ClockError(
-        f"{what}: {rate_hz:g} Hz does not divide the {clock_hz:g} Hz {grid}; nearest: {rates}"
+        f"{subject}: {rate_hz:g} Hz does not divide the {clock_hz:g} Hz {grid}; nearest: {rates}"
     )
 
 
-def rate_text(rate_hz: float) -> str:
+def format_rate(rate_hz: float) -> str:
     """Format a rate in Hz with the digits that `compute_period_ticks` needs to find its period."""
     return f"{rate_hz:.4g}"

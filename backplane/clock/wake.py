@@ -22,9 +22,9 @@ from collections.abc import Callable
 from time import monotonic_ns, sleep
 
 from rack.backplane.clock.system_clock import SystemClock
-from rack.backplane.process import GONE, STOPPED, WAITING, state_of
+from rack.backplane.process import ENDED_STATES, STOPPED_STATES, WAITING_STATES, read_state
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.semaphores import get_wake_semaphore
 from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Run, System
 
@@ -32,9 +32,9 @@ from rack.backplane.words import Block, Run, System
 _STOPPED = int(Run.STOPPED)
 CHECK_S = 0.25
 """Time after which a wait checks whether the launcher is still alive."""
-NEAR_NS = 25_000_000
+MAX_SLEEP_NS = 25_000_000
 """Longest sleep that cannot be interrupted."""
-SPINS = 100_000
+POLLS_PER_CHECK = 100_000
 """Number of polls between two checks of the launcher, which take some milliseconds."""
 
 
@@ -61,19 +61,19 @@ class NextCycle:
             clock_alarms: Ring for the alarm about a silent clock. None to leave the clock
                 unchecked.
         """
-        self._spec = spec = segment.layout.task(task)
+        self._spec = spec = segment.layout.find_task(task)
         self._words = segment.words
-        self._block = segment.block(task)
-        self._semaphore = wake_semaphore(segment, task)
+        self._block = segment.get_block(task)
+        self._semaphore = get_wake_semaphore(segment, task)
         self._segment = segment
         is_lockstep = bool(segment.words[System.LOCKSTEP])
         self._sleeps = spec.wake == "timer" and not is_lockstep
         self._is_posted = not self._sleeps and spec.wake != "poll"
         self._pause: Callable[[], bool] = self._block_on_semaphore
         if self._sleeps:
-            self._pause = self._sleep
+            self._pause = self._sleep_until_release
         elif spec.wake == "poll":
-            self._pause = self._spin
+            self._pause = self._poll_release
         elif is_lockstep:
             self._pause = self._await_post
         self._takes_batches = is_lockstep and spec.role == "executor"
@@ -85,7 +85,7 @@ class NextCycle:
         # until the task has rejoined.
         self._block[Block.RELEASED] = self._block[Block.DONE]
         self._due = self._block[Block.DONE] + 1
-        self.hold_until(self._due)
+        self.skip_until(self._due)
         self._slack = 0
         self.skipped = 0
         self.copy: Callable[[], None] | None = None
@@ -107,7 +107,7 @@ class NextCycle:
             # Read the task's release, not the clock's tick, because in lockstep the task may be
             # released later in a tick.
             newest = block[Block.RELEASED]
-            if self._sleeps and newest >= self._due and self._is_ahead(newest):
+            if self._sleeps and newest >= self._due and self._is_before_grid_point(newest):
                 # A task woken late may find that the next release has been given too. The previous
                 # one must be taken first.
                 newest -= self._spec.every
@@ -115,16 +115,16 @@ class NextCycle:
                 if is_posted and newest != self._newest:
                     # Take the post of this release, or of its batch, for which the task has not
                     # waited. Otherwise the semaphore would overflow within weeks.
-                    self._semaphore.take()
+                    self._semaphore.try_acquire()
                 self._newest = newest
-                return self._take(newest)
+                return self._take_release(newest)
             if block[Block.COPY] > 0 and self.copy is not None:
                 self.copy()
             if is_over or not self._pause():
                 return None
             is_posted = False
 
-    def _take(self, newest: int) -> int:
+    def _take_release(self, newest: int) -> int:
         """Take the oldest release that has not passed."""
         every = self._spec.every
         expected = self._due
@@ -134,16 +134,16 @@ class NextCycle:
         self._due = release + every
         self._slack = every * (self._spec.within_cycles - 1)
         if self._silent_clock is not None:
-            self._silent_clock.has_ticked()
+            self._silent_clock.end_silence()
         return release
 
-    def _is_ahead(self, release: int) -> bool:
+    def _is_before_grid_point(self, release: int) -> bool:
         """Check whether the grid point of a release is still to come."""
         return (
             monotonic_ns() < self._words[System.EPOCH_NS] + release * self._words[System.PERIOD_NS]
         )
 
-    def _sleep(self) -> bool:
+    def _sleep_until_release(self) -> bool:
         """Sleep until the grid point of the next release.
 
         If that has passed, sleep until the task's next grid point or a late release.
@@ -156,17 +156,17 @@ class NextCycle:
         if epoch := words[System.EPOCH_NS]:
             point = epoch + self._due * words[System.PERIOD_NS]
             step = self._spec.every * words[System.PERIOD_NS]
-            if now < point < now + NEAR_NS:
+            if now < point < now + MAX_SLEEP_NS:
                 sleep((point - now) * 1e-9)
                 return True
             is_due = now < point <= bound
             if point <= now:
                 point += ((now - point) // step + 1) * step
             deadline = min(bound, point)
-        self._semaphore.bind(deadline)
+        self._semaphore.set_deadline(deadline)
         if not self._semaphore.wait() or is_due or self._block[Block.RELEASED] >= self._due:
             return True
-        return self._look_around()
+        return self._check_after_timeout()
 
     def _await_post(self) -> bool:
         # The bound may stem from an earlier wait. A timeout that comes early only costs one extra
@@ -174,28 +174,28 @@ class NextCycle:
         """Wait for the semaphore in lockstep. Returns False if the launcher has ended."""
         if not self._semaphore.wait():
             return True
-        self._semaphore.bind(monotonic_ns() + int(CHECK_S * 1e9))
-        return self._look_around()
+        self._semaphore.set_deadline(monotonic_ns() + int(CHECK_S * 1e9))
+        return self._check_after_timeout()
 
     def _block_on_semaphore(self) -> bool:
         """Wait for the semaphore in real time. Returns False if the launcher has ended."""
         bound = int(CHECK_S * 1e9)
         if self._silent_clock is not None and self._has_begun:
-            bound = min(bound, self._silent_clock.patience_ns(self._due))
-        self._semaphore.bind(monotonic_ns() + bound)
-        return not self._semaphore.wait() or self._look_around()
+            bound = min(bound, self._silent_clock.compute_patience_ns(self._due))
+        self._semaphore.set_deadline(monotonic_ns() + bound)
+        return not self._semaphore.wait() or self._check_after_timeout()
 
-    def _spin(self) -> bool:
+    def _poll_release(self) -> bool:
         """Poll for the release. Returns False if the launcher has ended."""
         block = self._block
         due = self._due
-        for _ in range(SPINS):
+        for _ in range(POLLS_PER_CHECK):
             if block[Block.RELEASED] >= due:
                 return True
         os.sched_yield()
         return self._segment.launcher_is_alive
 
-    def _look_around(self) -> bool:
+    def _check_after_timeout(self) -> bool:
         """Check the clock after a wait without a release.
 
         Returns:
@@ -210,12 +210,12 @@ class NextCycle:
         """True if a release has passed. Before the first one the clock may not have started."""
         return self._due > self._spec.phase
 
-    def hold_until(self, tick: int) -> None:
+    def skip_until(self, tick: int) -> None:
         """Take no release before `tick`. A planner keeps the time slice of its plan this way."""
-        self._due = max(self._due, self._spec.grid.since(tick))
+        self._due = max(self._due, self._spec.grid.find_tick(tick))
 
 
-CLOCK_TICKS = 2
+CLOCK_PATIENCE_TICKS = 2
 """Ticks after a missing release before the clock is checked."""
 CLOCK_SILENT_S = 0.5
 """Time without a tick after which a clock whose process waits counts as stopped.
@@ -234,33 +234,35 @@ class SilentClock:
         self._is_reported = False
         self._waited_at = -1
 
-    def has_ticked(self) -> None:
+    def end_silence(self) -> None:
         """Record a release, which ends an episode of silence."""
         self._is_reported = False
 
-    def patience_ns(self, expected: int) -> int:
+    def compute_patience_ns(self, expected: int) -> int:
         """Return the time to wait before the next check, in ns.
 
         Args:
             expected: Tick of the next release.
         """
-        late = self._clock.time_of(expected + CLOCK_TICKS) - monotonic_ns()
-        return late if late > 0 else CLOCK_TICKS * self._clock.period_ns
+        late = self._clock.compute_time_ns(expected + CLOCK_PATIENCE_TICKS) - monotonic_ns()
+        return late if late > 0 else CLOCK_PATIENCE_TICKS * self._clock.period_ns
 
     def check(self) -> None:
         """Raise one alarm if the process of the clock is stopped, dead, or silent for too long."""
-        now = self._clock.now()
+        now = self._clock.compute_tick()
         newest = self._words[System.TICK]
-        if now - newest < CLOCK_TICKS:
+        if now - newest < CLOCK_PATIENCE_TICKS:
             self._is_reported = False
             return
         silent_s = (now - newest) * self._clock.period_ns * 1e-9
         clock = self._words[System.CLOCK_PID]
-        state = state_of(clock)
+        state = read_state(clock)
         # A clock that could run is only late. Check a waiting one twice, because after a pause of
         # the whole machine it may be about to wake.
-        waits = silent_s > CLOCK_SILENT_S and state in WAITING
-        has_stopped = state in STOPPED + GONE or (waits and self._waited_at == newest)
+        waits = silent_s > CLOCK_SILENT_S and state in WAITING_STATES
+        has_stopped = state in STOPPED_STATES + ENDED_STATES or (
+            waits and self._waited_at == newest
+        )
         self._waited_at = newest if waits else -1
         # A new tick, or the end of the run, proves that the clock was running.
         if (
@@ -270,4 +272,6 @@ class SilentClock:
             and not self._clock.is_stopped
         ):
             self._is_reported = True
-            self._alarms.ring(now, Alarm.CLOCK_STOPPED, clock, value=now - newest, since=newest)
+            self._alarms.raise_alarm(
+                now, Alarm.CLOCK_STOPPED, clock, value=now - newest, since=newest
+            )

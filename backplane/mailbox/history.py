@@ -14,10 +14,16 @@ from hashlib import blake2b
 import numpy as np
 from xxhash import xxh3_64_intdigest as xxh3
 
-from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
+from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, compute_slot_stride
 from rack.backplane.layout import MailboxSpec
-from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_MASK, Slots, epoch_of, message_dtype
-from rack.backplane.ring import Drained, Ring
+from rack.backplane.mailbox.slots import (
+    CHECKED_FROM,
+    EPOCH_MASK,
+    Slots,
+    build_message_dtype,
+    get_epoch,
+)
+from rack.backplane.ring import NewRows, Ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, System
 
@@ -41,24 +47,24 @@ class MailboxRing(Ring):
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
-        spec = segment.layout.mailbox(name)
+        spec = segment.layout.find_mailbox(name)
         address = segment.map.mailboxes[name]
-        self._stride = slot_stride(spec)
-        self._box = segment.box(name)
-        memory = segment.view(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
+        self._stride = compute_slot_stride(spec)
+        self._box = segment.get_box(name)
+        memory = segment.get_bytes(address + MAILBOX_HEAD_SIZE, spec.depth * self._stride)
         head = self._box[Box.HEAD : Box.HEAD + 1]
-        super().__init__(memory, row_dtype(spec), head, self._box[Box.FIRST])
+        super().__init__(memory, build_row_dtype(spec), head, self._box[Box.FIRST])
         self._covered = slice(CHECKED_FROM, SLOT_HEAD_SIZE + spec.size)
 
-    def drain(self) -> Drained:
+    def read_new_rows(self) -> NewRows:
         """Read every good message written since the last call."""
-        rows, lost = super().drain()
+        rows, lost = super().read_new_rows()
         if not len(rows):
-            return Drained(rows, lost)
+            return NewRows(rows, lost)
         serials = np.arange(self._taken - len(rows), self._taken) + 1
         holder = self._box[Box.CLAIMANT]
         signatures = rows["epoch"]
-        lawful = (signatures == holder) | ((signatures & EPOCH_MASK) < epoch_of(holder))
+        lawful = (signatures == holder) | ((signatures & EPOCH_MASK) < get_epoch(holder))
         if not lawful[-1]:
             # This message was forged. The lawful writer will overwrite it, so read the row again.
             self._taken -= 1
@@ -74,23 +80,23 @@ class MailboxRing(Ring):
         )
         if not good.all():
             rows = rows[good]
-        return Drained(rows, lost)
+        return NewRows(rows, lost)
 
 
-def row_dtype(spec: MailboxSpec) -> np.dtype:
+def build_row_dtype(spec: MailboxSpec) -> np.dtype:
     """Return the type of one row of a mailbox's ring, including padding."""
-    message = message_dtype(spec.fields, spec.size)
+    message = build_message_dtype(spec.fields, spec.size)
     return np.dtype(
         {
             "names": [*HEAD_WORDS, "message"],
             "formats": [*HEAD_WORDS.values(), message],
             "offsets": range(0, SLOT_HEAD_SIZE + 8, 8),
-            "itemsize": slot_stride(spec),
+            "itemsize": compute_slot_stride(spec),
         }
     )
 
 
-def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
+def find_chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
     """Return serial and chained checksum of the newest message of every timed mailbox.
 
     Args:
@@ -104,7 +110,9 @@ def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
         oldest = max(0, head - slots.depth)
         # A lost, damaged or forged message has no valid chain, so use an earlier message.
         while serial > oldest and not (
-            slots.visible_at(serial) < until and slots.fetch(serial) and slots.is_lawful(0)
+            slots.read_visible_tick(serial) < until
+            and slots.fetch_message(serial)
+            and slots.is_lawful(0)
         ):
             serial -= 1
         chain = slots.chain if serial > oldest else 0
@@ -112,7 +120,7 @@ def chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
     return chain_by_mailbox
 
 
-def digest(segment: Segment, until: int | None = None) -> str:
+def compute_digest(segment: Segment, until: int | None = None) -> str:
     """Compute the digest of a run, 32 hexadecimal digits.
 
     Args:
@@ -121,6 +129,6 @@ def digest(segment: Segment, until: int | None = None) -> str:
     """
     stop = segment.words[System.STOP_TICK] if until is None else until
     total = blake2b(digest_size=16)
-    for name, (serial, chain) in sorted(chains(segment, stop).items()):
+    for name, (serial, chain) in sorted(find_chains(segment, stop).items()):
         total.update(f"{name} {serial} {chain} ".encode())
     return total.hexdigest()

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rack.backplane.layout import SPARE, FieldSpec
+from rack.backplane.layout import SPARE_SLOTS, FieldSpec
 from rack.backplane.mailbox.mailbox import DoubleBufferWriter
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.message import AnyMessage
@@ -31,7 +31,7 @@ class HostWriter(DoubleBufferWriter):
         super().__init__(segment, name)
         self._box = self.slots.box
 
-    def send(self, tick: int) -> bool:
+    def send_message(self, tick: int) -> bool:
         """Publish `message`, written at `tick`.
 
         Returns:
@@ -47,7 +47,7 @@ class HostReader:
     """The adapter's end of a ring."""
 
     def __init__(self, segment: Segment, name: str) -> None:
-        self.spec = spec = segment.layout.mailbox(name)
+        self.spec = spec = segment.layout.find_mailbox(name)
         self._slots = Slots(segment, spec)
         self._box = self._slots.box
         self.refused = 0
@@ -56,21 +56,21 @@ class HostReader:
         """Number of messages that were replaced by a newer one before they were taken."""
 
     @property
-    def waiting(self) -> int:
+    def waiting_count(self) -> int:
         """Number of waiting messages, at most the number of slots."""
         return min(max(0, self._box[Box.HEAD] - self._box[Box.TAKEN]), self.spec.depth)
 
     @property
-    def full(self) -> int:
+    def full_count(self) -> int:
         """Number of times the writer found the ring full."""
         return self._box[Box.REFUSED]
 
     @property
-    def written(self) -> int:
+    def written_tick(self) -> int:
         """Tick at which the message taken last was written."""
         return self._slots.tick
 
-    def take(self) -> AnyMessage | None:
+    def take_oldest(self) -> AnyMessage | None:
         """Take the oldest waiting message. Returns None if it is bad.
 
         The message is valid until the next call.
@@ -78,10 +78,10 @@ class HostReader:
         head = self._box[Box.HEAD]
         oldest = self._box[Box.TAKEN] + 1
         # Waiting messages are overwritten only by a writer that breaks the rules.
-        serial = max(oldest, head - self.spec.depth + SPARE)
+        serial = max(oldest, head - self.spec.depth + SPARE_SLOTS)
         self.superseded += serial - oldest
         self._box[Box.TAKEN] = serial
-        return self._fetched(serial)
+        return self._fetch_good(serial)
 
     def take_newest(self, most: int) -> AnyMessage | None:
         """Take all waiting messages, and return the newest good one.
@@ -92,20 +92,20 @@ class HostReader:
         Returns:
             None if none of these is good.
         """
-        waiting = self.waiting
+        waiting = self.waiting_count
         head = self._box[Box.HEAD]
         self._box[Box.TAKEN] = head
         for back in range(min(waiting, most)):
-            if (message := self._fetched(head - back)) is not None:
+            if (message := self._fetch_good(head - back)) is not None:
                 self.superseded += waiting - back - 1
                 return message
         return None
 
-    def _fetched(self, serial: int) -> AnyMessage | None:
+    def _fetch_good(self, serial: int) -> AnyMessage | None:
         """Return the message of a serial. A bad one is counted as refused and gives None."""
         slots = self._slots
         if (
-            slots.fetch(serial)
+            slots.fetch_message(serial)
             and slots.is_lawful(0)
             and is_proper(slots.message.record, self.spec.fields)
         ):

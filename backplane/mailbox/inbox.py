@@ -28,7 +28,7 @@ class Inbox:
         self._free_ns = 0
         self._starts: deque[int] = deque()
 
-    def arrive(self, at_ns: int, service_ns: int) -> int | None:
+    def add_message(self, at_ns: int, service_ns: int) -> int | None:
         """Let a message arrive, not before the previous one.
 
         Args:
@@ -82,12 +82,12 @@ class Burst(NamedTuple):
     waiting: int | None
     longest_ns: int | None
 
-    def fits(self, depth: int) -> bool:
+    def fits_depth(self, depth: int) -> bool:
         """Check whether an inbox with `depth` places never loses a message."""
         return self.waiting is not None and self.waiting <= depth
 
 
-def burst_of(sources: Sequence[InterruptSource]) -> Burst:
+def compute_burst(sources: Sequence[InterruptSource]) -> Burst:
     """Compute the worst case of an inbox with these sources.
 
     It is the critical instant of a first-in-first-out server.
@@ -98,19 +98,19 @@ def burst_of(sources: Sequence[InterruptSource]) -> Burst:
     inbox = Inbox(sys.maxsize)
     free_ns = 0
     longest_ns = 0
-    for at_ns, service_ns in merge(*(_arrivals(source) for source in sources)):
+    for at_ns, service_ns in merge(*(_iterate_arrivals(source) for source in sources)):
         # Arrivals of one instant belong together. The first busy period ends when an arrival finds
         # the handler idle.
         if at_ns and at_ns >= free_ns:
             break
-        end_ns = inbox.arrive(at_ns, service_ns)
+        end_ns = inbox.add_message(at_ns, service_ns)
         assert end_ns is not None, "it has room for all"
         free_ns = end_ns
         longest_ns = max(longest_ns, end_ns - at_ns)
     return Burst(load, inbox.most_waiting, longest_ns)
 
 
-def _arrivals(source: InterruptSource) -> Iterator[tuple[int, int]]:
+def _iterate_arrivals(source: InterruptSource) -> Iterator[tuple[int, int]]:
     """Yield the arrivals of a source from time 0 on, each with its service time, in ns."""
     at_ns = 0
     while True:

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from rack.backplane.address_map import oldest_kept
+from rack.backplane.address_map import compute_oldest_kept
 from rack.backplane.layout import InterruptSpec, MailboxSpec
 from rack.backplane.mailbox.inbox import Inbox
 from rack.backplane.mailbox.mailbox import MAX_STEP_BACK, Reader, Reading, Writer
@@ -40,18 +40,18 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Slot
 
 
-def how_sent(spec: MailboxSpec) -> InterruptSpec:
+def get_interrupt_spec(spec: MailboxSpec) -> InterruptSpec:
     """Return how the messages of a mailbox of protocol interrupt are sent."""
     assert spec.interrupt is not None, f"mailbox '{spec.name}' is of protocol {spec.protocol}"
     return spec.interrupt
 
 
-def sent_ns(spec: MailboxSpec, clock_ns: int) -> int:
+def compute_send_offset_ns(spec: MailboxSpec, clock_ns: int) -> int:
     """Return the time from a message's earliest visibility tick to the instant of sending.
 
     The time is negative.
     """
-    return how_sent(spec).sent_ns - spec.delay * clock_ns
+    return get_interrupt_spec(spec).sent_ns - spec.delay * clock_ns
 
 
 class InterruptWriter(Writer):
@@ -62,9 +62,9 @@ class InterruptWriter(Writer):
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
-        self._due = how_sent(self.spec).due
+        self._due = get_interrupt_spec(self.spec).due
 
-    def visible_at(self, tick: int, now: int | None) -> int:
+    def compute_visible_tick(self, tick: int, now: int | None) -> int:
         """Return the earliest tick at which the message is visible.
 
         A late message is sent in the tick that writes it.
@@ -77,7 +77,7 @@ class InterruptLine:
     """One mailbox that interrupts a board, as seen by that board."""
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
-        self.service_ns = how_sent(spec).service_ns
+        self.service_ns = get_interrupt_spec(spec).service_ns
         self.lost = 0
         """Number of messages lost at this board because too many waited."""
         self.served: deque[int] = deque(maxlen=MAX_STEP_BACK)
@@ -87,12 +87,12 @@ class InterruptLine:
         self._heads = slots.heads
         self._mask = slots.mask
         self._clock_ns = segment.layout.clock_ns
-        self._sent_ns = sent_ns(spec, self._clock_ns)
+        self._sent_ns = compute_send_offset_ns(spec, self._clock_ns)
         self._passed = self._signature = self._missing = self._suspect = 0
         self._last_ns = 0
 
     @property
-    def found(self) -> int:
+    def newest_serial(self) -> int:
         """Serial of the newest message that a reader must judge.
 
         It was served, lost on its way, or not sent by the writer.
@@ -100,7 +100,9 @@ class InterruptLine:
         served = self.served
         return max(served[-1] if served else 0, self._missing, self._suspect)
 
-    def collect(self, until_ns: int, number: int, arrivals: list[tuple[int, int, int]]) -> None:
+    def collect_arrivals(
+        self, until_ns: int, number: int, arrivals: list[tuple[int, int, int]]
+    ) -> None:
         """Append the messages sent up to an instant to `arrivals`.
 
         Args:
@@ -116,13 +118,13 @@ class InterruptLine:
         if serial > head:
             return
         self._slots.fence()
-        serial = max(serial, oldest_kept(head, self._slots.depth))
+        serial = max(serial, compute_oldest_kept(head, self._slots.depth))
         while serial <= head:
             words = heads[serial & mask]
             if words[Slot.SERIAL] != serial:
                 # The slot was never filled, so the message raises no interrupt.
                 self._missing = serial
-            elif words[Slot.EPOCH] != self._signature and not self._accepts(serial):
+            elif words[Slot.EPOCH] != self._signature and not self._accept_writer(serial):
                 # The true message will replace it, under the same serial.
                 self._suspect = serial
                 break
@@ -135,10 +137,10 @@ class InterruptLine:
             serial += 1
         self._passed = serial - 1
 
-    def _accepts(self, serial: int) -> bool:
+    def _accept_writer(self, serial: int) -> bool:
         """Check whether a message comes from the holder of the claim, or an earlier holder."""
         slots = self._slots
-        if not slots.copy(serial) or not slots.is_lawful(self._signature):
+        if not slots.copy_slot(serial) or not slots.is_lawful(self._signature):
             return False
         self._signature = slots.signature
         return True
@@ -153,9 +155,9 @@ class BoardInbox:
     """
 
     def __init__(self, segment: Segment, slot: int) -> None:
-        boxes = segment.layout.interrupting(slot)
+        boxes = segment.layout.list_interrupting_mailboxes(slot)
         self.lines = {box.name: InterruptLine(segment, box) for box in boxes}
-        self.inbox = Inbox(min(how_sent(box).depth for box in boxes))
+        self.inbox = Inbox(min(get_interrupt_spec(box).depth for box in boxes))
         self.count = 0
         """Number of messages served."""
         self.service_ns = 0
@@ -167,7 +169,7 @@ class BoardInbox:
         # Messages that have arrived and are not yet served: end of the service, line and serial.
         self._in_service: deque[tuple[int, InterruptLine, int]] = deque()
 
-    def advance(self, tick: int) -> None:
+    def advance_to(self, tick: int) -> None:
         """Process all arrivals and services up to the release at `tick`."""
         if tick <= self._tick:
             return
@@ -175,11 +177,11 @@ class BoardInbox:
         until_ns = tick * self._clock_ns
         arrivals: list[tuple[int, int, int]] = []
         for number, line in enumerate(self._lines):
-            line.collect(until_ns, number, arrivals)
+            line.collect_arrivals(until_ns, number, arrivals)
         if len(arrivals) > 1:
             arrivals.sort()
         for at_ns, number, serial in arrivals:
-            self._arrive(at_ns, self._lines[number], serial)
+            self._add_arrival(at_ns, self._lines[number], serial)
         in_service = self._in_service
         while in_service and in_service[0][0] <= until_ns:
             _, line, serial = in_service.popleft()
@@ -187,11 +189,11 @@ class BoardInbox:
             self.count += 1
             self.service_ns += line.service_ns
 
-    def _arrive(self, at_ns: int, line: InterruptLine, serial: int) -> None:
+    def _add_arrival(self, at_ns: int, line: InterruptLine, serial: int) -> None:
         # A late message cannot be inserted before messages that have already been served.
         """Add the arrival of a message to the inbox, or count the message as lost."""
         self._newest_ns = max(self._newest_ns, at_ns)
-        end_ns = self.inbox.arrive(self._newest_ns, line.service_ns)
+        end_ns = self.inbox.add_message(self._newest_ns, line.service_ns)
         if end_ns is None:
             line.lost += 1
         else:
@@ -200,8 +202,8 @@ class BoardInbox:
 
 def open_inbox(segment: Segment, task: str) -> BoardInbox | None:
     """Open the inbox of a task's board. Returns None if nothing interrupts the board."""
-    slot = segment.layout.task(task).slot
-    return BoardInbox(segment, slot) if segment.layout.interrupting(slot) else None
+    slot = segment.layout.find_task(task).slot
+    return BoardInbox(segment, slot) if segment.layout.list_interrupting_mailboxes(slot) else None
 
 
 class InterruptReader(Reader):
@@ -215,14 +217,14 @@ class InterruptReader(Reader):
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message served by the release at `tick`, with its verdict."""
         self.accesses += 1
-        self._inbox.advance(tick)
-        return self._take(self._line.found, tick)
+        self._inbox.advance_to(tick)
+        return self._accept(self._line.newest_serial, tick)
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
         """Accept the newest unread good message that was served before a bad one."""
         for older in reversed(self._line.served):
             if self.serial < older < serial:
-                if self._obtain(older):
+                if self._fetch_good(older):
                     return self._new
-                self._blame(older)
+                self._count_bad_message(older)
         return self._unchanged

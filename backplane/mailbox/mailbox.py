@@ -23,12 +23,12 @@ from weakref import WeakSet
 from rack.backplane.address_map import SLOT_HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import MailboxError
-from rack.backplane.mailbox.slots import Slots, claim, epoch_of, pid_of
+from rack.backplane.mailbox.slots import Slots, build_signature, get_epoch, get_pid
 from rack.backplane.message import AnyMessage, Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Word
 
-NOT_YET = 1 << 62
+NO_MESSAGE_TICK = 1 << 62
 """Tick of the newest message before the first one has come.
 
 The resulting age is negative, so the message is never too old.
@@ -72,7 +72,7 @@ class Reading(NamedTuple, Generic[M]):
         return self.verdict is Verdict.NEW
 
     @property
-    def is_there(self) -> bool:
+    def has_message(self) -> bool:
         """True if any message has come yet."""
         return self.verdict is not Verdict.NONE
 
@@ -85,7 +85,7 @@ class Writer:
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
-        self.spec = spec = segment.layout.mailbox(name)
+        self.spec = spec = segment.layout.find_mailbox(name)
         self.slots = Slots(segment, spec)
         self._delay = spec.delay
         self._due = spec.delay  # ticks from a release until its message must be written
@@ -100,14 +100,14 @@ class Writer:
         self.intruder = 0
         """Process that has published since this writer's last message but one, 0 for none."""
         # The claim is in the segment, even if the slots publish to another head.
-        self._claimed = segment.box(name)
+        self._claimed = segment.get_box(name)
         self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
-        self.claim()
+        self.claim_mailbox()
         self.slots.clear_unpublished()
-        self.slots.resume(self.slots.signature)
+        self.slots.resume_writing(self.slots.signature)
         _WRITERS.add(self)
 
-    def claim(self) -> None:
+    def claim_mailbox(self) -> None:
         """Claim the mailbox in a new epoch.
 
         Raises:
@@ -119,9 +119,9 @@ class Writer:
             self._claim.close()
             raise MailboxError(f"mailbox '{self.spec.name}' already has a writer (process {pid})")
         box[Box.WRITER_PID] = os.getpid()
-        box[Box.EPOCH] = epoch = epoch_of(box[Box.EPOCH] + 1)
+        box[Box.EPOCH] = epoch = get_epoch(box[Box.EPOCH] + 1)
         # Epoch and process are stored at once, so that no reader sees half a claim.
-        box[Box.CLAIMANT] = self.slots.signature = claim(epoch, os.getpid())
+        box[Box.CLAIMANT] = self.slots.signature = build_signature(epoch, os.getpid())
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
         """Publish `message`.
@@ -138,15 +138,15 @@ class Writer:
         Returns:
             False if the message is too late.
         """
-        visible_at = self.visible_at(tick, now)
-        is_whole = self.publish(tick, visible_at, tick if basis is None else basis)
+        visible_at = self.compute_visible_tick(tick, now)
+        is_whole = self.publish_message(tick, visible_at, tick if basis is None else basis)
         return is_whole and self.is_in_time(tick, now)
 
     def is_in_time(self, tick: int, now: int | None) -> bool:
         """Check whether a message released at `tick` and written at `now` is in time."""
         return now is None or now < tick + self._due
 
-    def visible_at(self, tick: int, now: int | None) -> int:
+    def compute_visible_tick(self, tick: int, now: int | None) -> int:
         """Return the tick from which a message is visible.
 
         Args:
@@ -159,7 +159,9 @@ class Writer:
         cycle = min(self.spec.every, self._delay)
         return now + cycle - (now - self.spec.phase) % cycle
 
-    def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
+    def publish_message(
+        self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()
+    ) -> bool:
         """Publish `message`.
 
         Args:
@@ -171,18 +173,18 @@ class Writer:
         Returns:
             False if the access timed out.
         """
-        self.intruder = self.slots.publish(tick, visible_at, basis, damage)
+        self.intruder = self.slots.publish_message(tick, visible_at, basis, damage)
         return True
 
-    def lose(self) -> None:
+    def lose_message(self) -> None:
         """Publish a serial without its message, to inject a loss."""
-        self.slots.lose()
+        self.slots.publish_gap()
 
-    def outgoing(self) -> Iterator[None]:
+    def iterate_outgoing(self) -> Iterator[None]:
         """Put each message of the cycle into `message` in turn. Only queues have several."""
         yield
 
-    def show(self) -> None:
+    def show_published(self) -> None:
         """Make published messages visible to readers. Under this protocol they already are."""
 
     @property
@@ -200,10 +202,10 @@ _WRITERS: WeakSet[Writer] = WeakSet()
 """Writers of this process that have claimed their mailboxes."""
 
 
-def claim_again() -> None:
+def reclaim_mailboxes() -> None:
     """Claim the mailboxes of this process in a segment that has replaced another."""
     for writer in _WRITERS:
-        writer.claim()
+        writer.claim_mailbox()
 
 
 @dataclass(slots=True)
@@ -221,11 +223,11 @@ class ReadStatistics:
 
 # A reader's state is private memory that the reader shares with compiled code. It consists of five
 # words and the last good message with its head: see `words.Slot`.
-JUDGED = 3
+JUDGED_SERIAL = 3
 """Index in a reader's state of the newest serial that its `MessageWatch` has judged."""
 JUDGED_TICK = 4
 """Index in a reader's state of that message's release tick."""
-GOOD = 40
+GOOD_OFFSET = 40
 """Offset of the last good message in a reader's state, in bytes."""
 
 
@@ -255,11 +257,11 @@ class Reader:
     visible = Word(12)
 
     def __init__(self, segment: Segment, name: str) -> None:
-        self.spec = segment.layout.mailbox(name)
+        self.spec = segment.layout.find_mailbox(name)
         self.slots = slots = Slots(segment, self.spec)
         # The last good message has a separate buffer, which a corrupt copy never reaches.
-        state = memoryview(bytearray(GOOD + len(slots.record)))
-        good = Slots(segment, self.spec, state[GOOD:])
+        state = memoryview(bytearray(GOOD_OFFSET + len(slots.record)))
+        good = Slots(segment, self.spec, state[GOOD_OFFSET:])
         """Last good message, with the head of its slot."""
         self.good = good.record
         """The last good message, with the head of its slot."""
@@ -267,11 +269,11 @@ class Reader:
         self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}
         self._new = self._readings[Verdict.NEW]
         self._unchanged = self._readings[Verdict.NONE]
-        self.words = state[: GOOD + SLOT_HEAD_SIZE].cast("q")
-        self.newest = NOT_YET
+        self.words = state[: GOOD_OFFSET + SLOT_HEAD_SIZE].cast("q")
+        self.newest = NO_MESSAGE_TICK
         self.statistics = ReadStatistics()
 
-    def reading(self, is_new: bool) -> Reading[AnyMessage]:
+    def get_reading(self, is_new: bool) -> Reading[AnyMessage]:
         """Return the last good message with verdict NEW or OLD.
 
         The verdict is NONE if `is_new` is False and no message has come yet.
@@ -287,31 +289,31 @@ class Reader:
             slots.fence()
             # Older messages are overwritten. A serial beyond the slots fails when it is fetched.
             oldest = max(self.serial, serial - slots.depth)
-            while serial > oldest and slots.visible_at(serial) > tick:
+            while serial > oldest and slots.read_visible_tick(serial) > tick:
                 serial -= 1
-        return self._take(serial, tick)
+        return self._accept(serial, tick)
 
-    def _take(self, serial: int, tick: int) -> Reading[AnyMessage]:
+    def _accept(self, serial: int, tick: int) -> Reading[AnyMessage]:
         """Accept the message found by a read, unless it is the last good one."""
         self.found = serial
         if serial == self.serial:
             return self._unchanged
-        return self._new if self._obtain(serial) else self._take_older(serial, tick)
+        return self._new if self._fetch_good(serial) else self._accept_older(serial, tick)
 
-    def _take_older(self, serial: int, tick: int) -> Reading[AnyMessage]:
+    def _accept_older(self, serial: int, tick: int) -> Reading[AnyMessage]:
         """Judge a bad message, and accept the newest good one before it."""
         # The reader is too late, and the slot is being overwritten.
-        if not self.slots.keeps(serial):
-            return self._cut_off()
+        if not self.slots.is_kept(serial):
+            return self._count_timeout()
         self.statistics.bad_reads += 1
-        self._blame(serial)
+        self._count_bad_message(serial)
         return self._step_back(serial, tick)
 
-    def _obtain(self, serial: int) -> bool:
+    def _fetch_good(self, serial: int) -> bool:
         """Accept a message as the last good one. Returns False if it is not good."""
         self.transfers += 1
         slots = self.slots
-        if not slots.fetch(serial):
+        if not slots.fetch_message(serial):
             return False
         if slots.signature != self._signature:
             if not slots.is_lawful(self._signature):
@@ -325,24 +327,24 @@ class Reader:
         slots = self.slots
         tries = MAX_STEP_BACK
         for older in range(serial - 1, max(self.serial, serial - slots.depth), -1):
-            if slots.holds(older) and slots.visible_at(older) <= tick:
-                if self._obtain(older):
+            if slots.has_message(older) and slots.read_visible_tick(older) <= tick:
+                if self._fetch_good(older):
                     return self._new
-                self._blame(older)
+                self._count_bad_message(older)
                 tries -= 1
                 if not tries:
                     break
         return self._unchanged
 
-    def _blame(self, serial: int) -> None:
+    def _count_bad_message(self, serial: int) -> None:
         """Count the fault of the message fetched last.
 
         A message whose slot contains another message is lost, which its watch counts.
         """
         slots = self.slots
-        if not slots.keeps(serial):
+        if not slots.is_kept(serial):
             return
-        if not slots.is_sound:
+        if not slots.passes_check:
             # An empty slot, as at the start, has serial 0.
             self.statistics.corrupt += slots.serial != 0
         elif slots.serial == serial:
@@ -351,35 +353,35 @@ class Reader:
     def _count_forged(self) -> None:
         """Count the message fetched last as forged, and record the process that it names."""
         self.statistics.forged += 1
-        self.statistics.forger = pid_of(self.slots.signature)
+        self.statistics.forger = get_pid(self.slots.signature)
 
-    def _cut_off(self) -> Reading[AnyMessage]:
+    def _count_timeout(self) -> Reading[AnyMessage]:
         """Count a read that timed out, and return the last good message with BUS_ERROR."""
         self.statistics.bus_errors += 1
         self.statistics.bad_reads += 1
         verdict = Verdict.BUS_ERROR if self.serial else Verdict.NONE
         return self._readings[verdict]
 
-    def with_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
+    def add_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
         """Add the good messages after serial `before` to a reading, oldest first.
 
         Messages that are no longer in the slots are missing.
         """
         if self.serial <= before + 1:
             return reading
-        return reading._replace(earlier=tuple(self.slots.between(before, self.serial)))
+        return reading._replace(earlier=tuple(self.slots.iterate_between(before, self.serial)))
 
     def peek(self) -> Reading[AnyMessage]:
         """Return the newest complete message at once, under any protocol, for the host side."""
         head = self.slots.box[0]
         self.slots.fence()
-        return self._take(head, NOT_YET)
+        return self._accept(head, NO_MESSAGE_TICK)
 
 
 class DoubleBufferWriter(Writer):
     """Writer under protocol double-buffer, whose message is visible once complete."""
 
-    def visible_at(self, tick: int, now: int | None) -> int:
+    def compute_visible_tick(self, tick: int, now: int | None) -> int:
         """Return the tick at which the message is written, since it is visible at once."""
         return tick if now is None else now
 

@@ -23,9 +23,9 @@ from rack.backplane.mailbox.mailbox import (
 )
 from rack.backplane.mailbox.queue import QueueReader, QueueWriter
 from rack.backplane.message import AnyMessage
-from rack.backplane.process import GONE, STOPPED, state_of
+from rack.backplane.process import ENDED_STATES, STOPPED_STATES, read_state
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import lock_semaphore
+from rack.backplane.semaphores import get_lock_semaphore
 from rack.backplane.words import Box
 
 LOCK_WAIT_S = 0.002
@@ -44,9 +44,9 @@ class MailboxLock:
     """
 
     def __init__(self, segment: Segment, name: str, wait_s: float = LOCK_WAIT_S) -> None:
-        self._semaphore = lock_semaphore(segment, name)
+        self._semaphore = get_lock_semaphore(segment, name)
         self._owner = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.OWNER)
-        self._box = segment.box(name)
+        self._box = segment.get_box(name)
         self._wait_s = wait_s
         self.held_up = 0
 
@@ -55,7 +55,11 @@ class MailboxLock:
         if not self._semaphore.acquire(self._wait_s):
             holder = self._box[Box.OWNER]
             # The holder may have released the lock and ended since the wait.
-            if holder and state_of(holder) in GONE + STOPPED and self._box[Box.OWNER] == holder:
+            if (
+                holder
+                and read_state(holder) in ENDED_STATES + STOPPED_STATES
+                and self._box[Box.OWNER] == holder
+            ):
                 self.held_up += 1
         # After a timeout, the kernel's lock is free if the semaphore's holder is dead, and one of
         # several waiters gets it. After a successful wait the kernel's lock may still be taken, if
@@ -83,7 +87,9 @@ class LockWriter(DoubleBufferWriter):
         super().__init__(segment, name)
         self.lock = MailboxLock(segment, name)
 
-    def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
+    def publish_message(
+        self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()
+    ) -> bool:
         """Publish `message` inside the critical section.
 
         Args:
@@ -101,7 +107,7 @@ class LockWriter(DoubleBufferWriter):
             self.bus_errors += 1
             return False
         try:
-            return super().publish(tick, visible_at, basis, damage)
+            return super().publish_message(tick, visible_at, basis, damage)
         finally:
             self.lock.release()
 
@@ -127,7 +133,7 @@ class LockReader(Reader):
             statistics.held_up = self.lock.held_up
             statistics.bad_reads += 1
         if not obtained:
-            return self._cut_off()
+            return self._count_timeout()
         try:
             return self.peek()
         finally:
@@ -159,7 +165,7 @@ def open_writer(segment: Segment, name: str) -> Writer:
     Raises:
         MailboxError: The mailbox has another writer.
     """
-    return WRITERS[segment.layout.mailbox(name).protocol](segment, name)
+    return WRITERS[segment.layout.find_mailbox(name).protocol](segment, name)
 
 
 def open_reader(
@@ -175,7 +181,7 @@ def open_reader(
     """
     if inbox is not None and name in inbox.lines:
         return InterruptReader(segment, name, inbox)
-    protocol = segment.layout.mailbox(name).protocol
+    protocol = segment.layout.find_mailbox(name).protocol
     if asynchronous and protocol == "time-slice":
         protocol = "double-buffer"
     return READERS[protocol](segment, name)
@@ -186,4 +192,4 @@ def open_observer(segment: Segment, name: str) -> Reader:
 
     The clock and the host side use observers.
     """
-    return OBSERVERS[segment.layout.mailbox(name).protocol](segment, name)
+    return OBSERVERS[segment.layout.find_mailbox(name).protocol](segment, name)

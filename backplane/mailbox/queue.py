@@ -33,8 +33,8 @@ from struct import Struct
 
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
-from rack.backplane.mailbox.slots import pid_of
-from rack.backplane.message import AnyMessage, Message, copied, field
+from rack.backplane.mailbox.slots import get_pid
+from rack.backplane.message import AnyMessage, Message, copy_message, field
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 
@@ -50,16 +50,16 @@ class QueueTaken(Message, version=1):
 
 # Plain integers for the hot path.
 _PUT_POSITION = Struct("@2q").pack_into
-ALL = 1 << 62
+UNLIMITED = 1 << 62
 """Room for every message."""
 
 
-def taken_name(queue: str) -> str:
+def get_position_mailbox(queue: str) -> str:
     """Return the name of the mailbox in which a queue's reader writes its position."""
     return f"{queue}_taken"
 
 
-def is_position(spec: MailboxSpec) -> bool:
+def is_position_mailbox(spec: MailboxSpec) -> bool:
     """Check whether a mailbox contains the position of a queue's reader.
 
     The board writes such a mailbox, not the level.
@@ -67,14 +67,16 @@ def is_position(spec: MailboxSpec) -> bool:
     return spec.message == QueueTaken.message_type.name
 
 
-def queues_of(layout: Layout) -> list[MailboxSpec]:
+def list_queues(layout: Layout) -> list[MailboxSpec]:
     """Return the queues between tasks.
 
     The rings of host boards are not by ticks, so they have no position and are not included.
     """
     names = {box.name for box in layout.mailboxes}
     return [
-        box for box in layout.mailboxes if box.protocol == "queue" and taken_name(box.name) in names
+        box
+        for box in layout.mailboxes
+        if box.protocol == "queue" and get_position_mailbox(box.name) in names
     ]
 
 
@@ -99,14 +101,14 @@ class QueueWriter(Writer):
         self._pending: list[bytes] = []
         self._shown_at = 0
 
-    def room(self) -> int:
+    def count_free_places(self) -> int:
         """Return the number of messages that can still be sent in this cycle."""
         unread = self.serial - self.taken + self.held + len(self._pending)
         return max(0, self.spec.capacity - unread)
 
     def send(self, basis: int | None = None) -> bool:
         """Put a copy of the message into the queue. Returns False if the queue is full."""
-        if not self.room():
+        if not self.count_free_places():
             self.refused += 1
             self._shared[Box.REFUSED] += 1
             return False
@@ -129,23 +131,23 @@ class QueueWriter(Writer):
             return True
         if basis is None:
             basis = tick
-        visible_at = self.visible_at(tick, now)
-        for _ in self.outgoing():
-            self.slots.publish(tick, visible_at, basis)
-        self.show()
+        visible_at = self.compute_visible_tick(tick, now)
+        for _ in self.iterate_outgoing():
+            self.slots.publish_message(tick, visible_at, basis)
+        self.show_published()
         return self.is_in_time(tick, now)
 
-    def visible_at(self, tick: int, now: int | None) -> int:
+    def compute_visible_tick(self, tick: int, now: int | None) -> int:
         """Return the tick from which messages, including lost ones, are visible."""
-        self._shown_at = super().visible_at(tick, now)
+        self._shown_at = super().compute_visible_tick(tick, now)
         return self._shown_at
 
-    def outgoing(self) -> Iterator[None]:
+    def iterate_outgoing(self) -> Iterator[None]:
         """Put each message of the cycle into `message` in turn, then restore its content."""
         slots = self.slots
         present = bytes(self.message.raw)
         if self._shared[Box.HEAD] != slots.box[Box.HEAD]:
-            self.intruder = pid_of(slots.heads[(self.serial + 1) & slots.mask][Slot.EPOCH])
+            self.intruder = get_pid(slots.heads[(self.serial + 1) & slots.mask][Slot.EPOCH])
         pending = self._pending
         self._pending = []
         for content in pending:
@@ -153,7 +155,9 @@ class QueueWriter(Writer):
             yield
         self.message.raw[:] = present
 
-    def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> bool:
+    def publish_message(
+        self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()
+    ) -> bool:
         """Publish `message`, without showing it to readers before `show_published` is called.
 
         Args:
@@ -162,19 +166,19 @@ class QueueWriter(Writer):
             basis: Tick of the oldest information on which the message depends.
             damage: Bits to flip, see `Slots.publish_message`.
         """
-        self.slots.publish(tick, visible_at, basis, damage)
+        self.slots.publish_message(tick, visible_at, basis, damage)
         return True
 
-    def lose(self) -> None:
+    def lose_message(self) -> None:
         """Publish a serial without its message, to inject a loss.
 
         The reader finds the gap at the tick at which the message would be visible.
         """
         slots = self.slots
         slots.heads[(self.serial + 1) & slots.mask][Slot.VISIBLE_AT] = self._shown_at
-        slots.lose()
+        slots.publish_gap()
 
-    def show(self) -> None:
+    def show_published(self) -> None:
         """Make all published messages visible, by one store each to observers and the reader."""
         self._shared[Box.HEAD] = serial = self.serial
         self._shared[Box.SENT] = serial
@@ -191,20 +195,20 @@ class QueueReader(Reader):
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
-        self._position = Writer(segment, taken_name(name))
-        written = Reader(segment, taken_name(name)).peek().message.taken
+        self._position = Writer(segment, get_position_mailbox(name))
+        written = Reader(segment, get_position_mailbox(name)).peek().message.taken
         taken, rest = divmod(self.slots.box[Box.POSITION], 3)
         self.taken = written if rest else max(written, taken)
         self._farthest = self.spec.delay + self.spec.every
         # Until a new message comes, readings contain the last message taken.
-        if self.taken and self._obtain(self.taken):
+        if self.taken and self._fetch_good(self.taken):
             self.transfers = 0
 
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Take every message visible at `tick`."""
-        return self.take(tick, ALL)
+        return self.take_messages(tick, UNLIMITED)
 
-    def take(self, tick: int, most: int, now: int | None = None) -> Reading[AnyMessage]:
+    def take_messages(self, tick: int, most: int, now: int | None = None) -> Reading[AnyMessage]:
         """Take the messages visible at `tick`, oldest first, and publish the position.
 
         Args:
@@ -223,20 +227,20 @@ class QueueReader(Reader):
         head = box[Box.HEAD]
         last = min(box[Box.SENT], self.taken + slots.depth)
         slots.fence()
-        if head > last and slots.fetch(head) and not slots.is_lawful(self._signature):
+        if head > last and slots.fetch_message(head) and not slots.is_lawful(self._signature):
             # Count a forged message without taking it, since the writer's next message will replace
             # it.
             self.statistics.bad_reads += 1
             self._count_forged()
-        while count < most and self._sees(self.taken + 1, last, tick):
-            before = copied(self.message) if count else None
-            if not self._obtain(self.taken + 1):
+        while count < most and self._can_take(self.taken + 1, last, tick):
+            before = copy_message(self.message) if count else None
+            if not self._fetch_good(self.taken + 1):
                 # Count the fault of the message fetched last, which is not good.
                 statistics = self.statistics
                 statistics.bad_reads += 1
                 if slots.serial != self.taken + 1:
                     statistics.lost += 1
-                elif not slots.is_sound:
+                elif not slots.passes_check:
                     statistics.corrupt += 1
                 else:
                     self._count_forged()
@@ -246,7 +250,7 @@ class QueueReader(Reader):
                 count += 1
             self.taken += 1
         newest = self.taken
-        while self._sees(newest + 1, last, tick):
+        while self._can_take(newest + 1, last, tick):
             newest += 1
         box[Box.POSITION] = 3 * self.taken
         position = self._position
@@ -256,15 +260,17 @@ class QueueReader(Reader):
             return self._unchanged
         return self._new._replace(earlier=tuple(earlier)) if earlier else self._new
 
-    def _sees(self, serial: int, last: int, tick: int) -> bool:
+    def _can_take(self, serial: int, last: int, tick: int) -> bool:
         """Check whether a serial can be taken or skipped now.
 
         A message that is visible too far ahead cannot be good, so it is not waited for.
         """
         if serial > last:
             return False
-        ticks_ahead = self.slots.visible_at(serial) - tick
-        return ticks_ahead <= 0 or (ticks_ahead > self._farthest and not self.slots.fetch(serial))
+        ticks_ahead = self.slots.read_visible_tick(serial) - tick
+        return ticks_ahead <= 0 or (
+            ticks_ahead > self._farthest and not self.slots.fetch_message(serial)
+        )
 
     def close(self) -> None:
         """Release the claim of the reader's position."""

@@ -36,9 +36,14 @@ from typing import Any
 import numpy as np
 from xxhash import xxh3_64_intdigest as xxh3
 
-from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, oldest_kept, slot_stride
+from rack.backplane.address_map import (
+    MAILBOX_HEAD_SIZE,
+    SLOT_HEAD_SIZE,
+    compute_oldest_kept,
+    compute_slot_stride,
+)
 from rack.backplane.layout import FieldSpec, MailboxSpec
-from rack.backplane.message import AnyMessage, copied
+from rack.backplane.message import AnyMessage, copy_message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, Word
 
@@ -54,7 +59,7 @@ EPOCH_BITS = 32
 EPOCH_MASK = (1 << EPOCH_BITS) - 1
 
 
-def claim(epoch: int, pid: int) -> int:
+def build_signature(epoch: int, pid: int) -> int:
     """Build a writer's signature from the epoch of its claim and its process id.
 
     The process id is in the upper half.
@@ -62,34 +67,34 @@ def claim(epoch: int, pid: int) -> int:
     return epoch | pid << EPOCH_BITS
 
 
-def epoch_of(signature: int) -> int:
+def get_epoch(signature: int) -> int:
     """Return the epoch in a writer's signature."""
     return signature & EPOCH_MASK
 
 
-def pid_of(signature: int) -> int:
+def get_pid(signature: int) -> int:
     """Return the process id in a writer's signature."""
     return signature >> EPOCH_BITS
 
 
-def message_dtype(fields: tuple[FieldSpec, ...], size: int) -> np.dtype:
+def build_message_dtype(fields: tuple[FieldSpec, ...], size: int) -> np.dtype:
     """Return the numpy dtype of a mailbox's message, from its layout."""
     return np.dtype(
         {
             "names": [f.name for f in fields],
-            "formats": [_format(f) for f in fields],
+            "formats": [_build_field_format(f) for f in fields],
             "offsets": [f.offset for f in fields],
             "itemsize": size,
         }
     )
 
 
-def _format(field: FieldSpec) -> tuple[str | np.dtype, tuple[int, ...]]:
+def _build_field_format(field: FieldSpec) -> tuple[str | np.dtype, tuple[int, ...]]:
     """Return the numpy type and the shape of one field."""
     if not field.fields:
         return field.kind, field.shape
     # The kind of a group, "V<bytes>", contains its size.
-    return message_dtype(field.fields, int(field.kind[1:])), field.shape
+    return build_message_dtype(field.fields, int(field.kind[1:])), field.shape
 
 
 class Slots:
@@ -120,10 +125,10 @@ class Slots:
         self, segment: Segment, spec: MailboxSpec, record: memoryview | None = None
     ) -> None:
         self.spec = spec
-        dtype = message_dtype(spec.fields, spec.size)
+        dtype = build_message_dtype(spec.fields, spec.size)
         address = segment.map.mailboxes[spec.name]
-        stride = slot_stride(spec)
-        self.box = segment.box(spec.name)
+        stride = compute_slot_stride(spec)
+        self.box = segment.get_box(spec.name)
         self.depth = spec.depth
         self.mask = spec.depth - 1
         self.record = record or memoryview(bytearray(SLOT_HEAD_SIZE + spec.size))
@@ -131,7 +136,7 @@ class Slots:
         self.message: AnyMessage = kind(dtype, self.record[SLOT_HEAD_SIZE:])
         first = address + MAILBOX_HEAD_SIZE
         self.places = [
-            segment.view(first + i * stride, len(self.record)) for i in range(spec.depth)
+            segment.get_bytes(first + i * stride, len(self.record)) for i in range(spec.depth)
         ]
         self.heads = [place[:SLOT_HEAD_SIZE].cast("q") for place in self.places]
         self.words = self.record[:SLOT_HEAD_SIZE].cast("Q")
@@ -144,7 +149,7 @@ class Slots:
         Python needs no instruction for this on x86-64. Boards replace it with a compiled fence.
         """
 
-    def resume(self, signature: int) -> None:
+    def resume_writing(self, signature: int) -> None:
         """Prepare a writer to continue after the newest published message."""
         # Ignore the sign, so that a flipped sign bit does not make a writer fail.
         self.serial = head = self.box[Box.HEAD] & (UNSIGNED >> 1)
@@ -152,7 +157,7 @@ class Slots:
         # A serial may be lost. The chain continues from the newest message that is in its slot.
         self.chain = 0
         for serial in range(head, max(0, head - self.depth - 1), -1):
-            if self.holds(serial):
+            if self.has_message(serial):
                 self.chain = self.heads[serial & self.mask][_CHECK] & UNSIGNED
                 break
 
@@ -166,7 +171,9 @@ class Slots:
             if words[_SERIAL] > head:
                 words[_SERIAL] = 0
 
-    def publish(self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()) -> int:
+    def publish_message(
+        self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()
+    ) -> int:
         """Copy the local message into the next slot and publish it.
 
         An intruder is a process that has published since this writer's last message. Its message is
@@ -204,29 +211,29 @@ class Slots:
         box[0] = serial
         return intruder
 
-    def lose(self) -> None:
+    def publish_gap(self) -> None:
         """Publish a serial without filling its slot."""
         self.serial += 1
         self.fence()
         self.box[0] = self.serial
 
-    def holds(self, serial: int) -> bool:
+    def has_message(self, serial: int) -> bool:
         """Check whether the slot of a serial contains its message, not an older or newer one."""
         return self.heads[serial & self.mask][_SERIAL] == serial
 
-    def keeps(self, serial: int) -> bool:
+    def is_kept(self, serial: int) -> bool:
         """Check whether the slot of a serial has not been reused.
 
         If so, a copy made before this call is a copy of that message.
         """
         self.fence()
-        return serial >= oldest_kept(self.box[0], self.depth)
+        return serial >= compute_oldest_kept(self.box[0], self.depth)
 
-    def visible_at(self, serial: int) -> int:
+    def read_visible_tick(self, serial: int) -> int:
         """Return the tick from which the message in the slot of a serial is visible."""
         return self.heads[serial & self.mask][_VISIBLE]
 
-    def load(self, serial: int) -> None:
+    def load_slot(self, serial: int) -> None:
         """Copy the slot of a serial into the local record, without any check."""
         place = self.places[serial & self.mask]
         # If this is the signature of the wanted message, the slot contains all of the message.
@@ -234,28 +241,28 @@ class Slots:
         self.fence()
         self.record[SIGNED_FROM:] = place[SIGNED_FROM:]
 
-    def fetch(self, serial: int) -> bool:
+    def fetch_message(self, serial: int) -> bool:
         """Copy a message into the local record. Returns False if it is torn or another message."""
-        self.load(serial)
-        return self.serial == serial and self.is_sound
+        self.load_slot(serial)
+        return self.serial == serial and self.passes_check
 
-    def between(self, before: int, newest: int) -> Iterator[AnyMessage]:
+    def iterate_between(self, before: int, newest: int) -> Iterator[AnyMessage]:
         """Yield a copy of each good message between two serials that is still in its slot."""
         for serial in range(max(before + 1, newest - self.mask), newest):
-            if self.fetch(serial) and self.is_lawful(0):
-                yield copied(self.message)
+            if self.fetch_message(serial) and self.is_lawful(0):
+                yield copy_message(self.message)
 
-    def copy(self, serial: int) -> bool:
+    def copy_slot(self, serial: int) -> bool:
         """Copy the slot of a serial as `load_slot` does.
 
         Returns:
             False if the slot was reused during the copy.
         """
-        self.load(serial)
-        return self.keeps(serial)
+        self.load_slot(serial)
+        return self.is_kept(serial)
 
     @property
-    def is_sound(self) -> bool:
+    def passes_check(self) -> bool:
         """True if the message in the local record passes its check."""
         return self.chain == xxh3(self.covered, self.words[_CHAIN])
 
@@ -267,6 +274,6 @@ class Slots:
         """
         signature = self.signature
         holder = self.box[Box.CLAIMANT]
-        return signature in (known, holder) or epoch_of(known) < epoch_of(signature) < epoch_of(
+        return signature in (known, holder) or get_epoch(known) < get_epoch(signature) < get_epoch(
             holder
         )

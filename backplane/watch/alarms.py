@@ -12,7 +12,7 @@ from time import monotonic_ns
 
 import numpy as np
 
-from rack.backplane.address_map import ALARM_DEPTH, ALARM_RECORD_SIZE, LINE
+from rack.backplane.address_map import ALARM_DEPTH, ALARM_RECORD_SIZE, CACHE_LINE
 from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
 
@@ -33,9 +33,9 @@ PEER = -2
 """Subject of a demand on the arm that is caused by the loss of another rack."""
 
 
-BY_DEMAND = -1
-NO_TORQUE = -2
-AT_START = -3
+BRAKED_BY_DEMAND = -1
+BRAKED_WITHOUT_TORQUE = -2
+BRAKED_AT_START = -3
 """Reasons for engaged brakes that no error describes.
 
 The brakes engaged on a demand (`BRAKED_BY_DEMAND`), because no torque came in time
@@ -141,13 +141,13 @@ class AlarmWriter:
     def __init__(self, segment: Segment, task: str, attention: int | None = None) -> None:
         address = segment.map.alarms[task]
         self._head = segment.words[address // 8 : address // 8 + 1]
-        first = address + LINE
+        first = address + CACHE_LINE
         self._slots = np.frombuffer(
-            segment.view(first, ALARM_DEPTH * ALARM_RECORD_SIZE), dtype=RECORD
+            segment.get_bytes(first, ALARM_DEPTH * ALARM_RECORD_SIZE), dtype=RECORD
         )
         self._attention = attention
 
-    def ring(
+    def raise_alarm(
         self,
         tick: int,
         code: Alarm,
@@ -183,11 +183,11 @@ class AlarmWriter:
             eventfd_write(self._attention, 1)
 
 
-def alarm_ring(segment: Segment, task: str) -> Ring:
+def open_alarm_ring(segment: Segment, task: str) -> Ring:
     """Open the reading end of an alarm ring. Its rows have dtype `RECORD`."""
     address = segment.map.alarms[task]
     head = segment.words[address // 8 : address // 8 + 1]
-    memory = segment.view(address + LINE, ALARM_DEPTH * ALARM_RECORD_SIZE)
+    memory = segment.get_bytes(address + CACHE_LINE, ALARM_DEPTH * ALARM_RECORD_SIZE)
     return Ring(memory, RECORD, head)
 
 
@@ -202,12 +202,12 @@ class Episodes:
     """
 
     def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:
-        self._subject = segment.layout.index(name)
-        self._clean_ticks = CLEAN_READS * segment.layout.mailbox(name).every
+        self._subject = segment.layout.find_mailbox_index(name)
+        self._clean_ticks = CLEAN_READS * segment.layout.find_mailbox(name).every
         self._alarms = alarms
         self._last: dict[Alarm, tuple[int, int]] = {}
 
-    def find(
+    def record_finding(
         self, code: Alarm, access: int, tick: int, value: float = 0.0, since: int | None = None
     ) -> None:
         """Record a finding, and raise its alarm if it begins an episode.
@@ -220,12 +220,14 @@ class Episodes:
             since: Tick since which the condition holds. None if it is not known.
         """
         if not self.is_open(code, access, tick):
-            self.ring(code, tick, value, since)
+            self.raise_alarm(code, tick, value, since)
         self._last[code] = access, tick
 
-    def ring(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
+    def raise_alarm(
+        self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None
+    ) -> None:
         """Raise an alarm at once, if the caller knows that an episode begins."""
-        self._alarms.ring(tick, code, self._subject, value, since)
+        self._alarms.raise_alarm(tick, code, self._subject, value, since)
 
     def is_open(self, code: Alarm, access: int, tick: int) -> bool:
         """Check whether an episode is still open."""

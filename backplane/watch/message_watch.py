@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from xxhash import xxh3_64_intdigest as xxh3
 
-from rack.backplane.address_map import oldest_kept
-from rack.backplane.mailbox.mailbox import JUDGED, JUDGED_TICK, Reader
+from rack.backplane.address_map import compute_oldest_kept
+from rack.backplane.mailbox.mailbox import JUDGED_SERIAL, JUDGED_TICK, Reader
 from rack.backplane.mailbox.queue import QueueReader
 from rack.backplane.mailbox.slots import CHECKED_FROM, UNSIGNED
 from rack.backplane.segment import Segment
@@ -33,7 +33,7 @@ class MessageWatch:
         late_from: Delay from release to visibility from which a message is late, in ticks.
     """
 
-    seen = Word(JUDGED)
+    seen = Word(JUDGED_SERIAL)
     newest = Word(JUDGED_TICK)
 
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
@@ -50,46 +50,46 @@ class MessageWatch:
         self.late_from = self._spec.delay + self._is_sliced
         self._held_up = 0
 
-    def judge(self, tick: int) -> None:
+    def judge_messages(self, tick: int) -> None:
         """Judge the messages found by the read at `tick`."""
         newest_serial = self._reader.found
         if self.seen < 0:
-            self._begin(newest_serial)
+            self._start_after(newest_serial)
         elif newest_serial > self.seen:
             if newest_serial - self.seen > 1 and self._is_babble(newest_serial, tick):
-                self._begin(newest_serial)
+                self._start_after(newest_serial)
             else:
-                self._walk(newest_serial, tick)
+                self._judge_up_to(newest_serial, tick)
         if self._reader.statistics.held_up != self._held_up:
             self._held_up = self._reader.statistics.held_up
-            self._find(Alarm.LOCKED, tick)
+            self._record_finding(Alarm.LOCKED, tick)
 
-    def _begin(self, serial: int) -> None:
+    def _start_after(self, serial: int) -> None:
         """Start judging after a serial. Earlier messages are not judged."""
         self.seen = serial
-        if serial and self._copies(serial):
+        if serial and self._copy_message(serial):
             self.newest = self._slots.tick
 
-    def _copies(self, serial: int) -> bool:
+    def _copy_message(self, serial: int) -> bool:
         """Copy a message into the local record. Returns False if it is missing or not trusted."""
-        return self._slots.fetch(serial) and self._slots.keeps(serial)
+        return self._slots.fetch_message(serial) and self._slots.is_kept(serial)
 
     def _is_babble(self, newest_serial: int, tick: int) -> bool:
         """Check whether there are at least two messages more than releases."""
         slots = self._slots
-        if not slots.keeps(newest_serial):
+        if not slots.is_kept(newest_serial):
             # The message is already overwritten. A writer of one message per cycle is slower.
             newest_serial = slots.box[0]
-        if not self._copies(newest_serial):
+        if not self._copy_message(newest_serial):
             return False
         count = newest_serial - self.seen
         cycles = (slots.tick - self.newest) // self._spec.every
         if count <= cycles + 1:
             return False
-        self._find(Alarm.BABBLE, tick, count / max(1, cycles))
+        self._record_finding(Alarm.BABBLE, tick, count / max(1, cycles))
         return True
 
-    def _walk(self, newest_serial: int, tick: int) -> None:
+    def _judge_up_to(self, newest_serial: int, tick: int) -> None:
         """Judge the messages one by one, up to the newest one found."""
         slots = self._slots
         mask = slots.mask
@@ -97,7 +97,7 @@ class MessageWatch:
         late = self.late_from
         # A late reader cannot judge messages that are overwritten.
         for serial in range(
-            max(self.seen + 1, oldest_kept(slots.box[0], slots.depth)), newest_serial + 1
+            max(self.seen + 1, compute_oldest_kept(slots.box[0], slots.depth)), newest_serial + 1
         ):
             head = slots.heads[serial & mask]
             released = head[Slot.TICK]
@@ -110,7 +110,7 @@ class MessageWatch:
                     or xxh3(slots.places[serial & mask][CHECKED_FROM:], head[Slot.CHAIN] & UNSIGNED)
                     == head[Slot.CHECK] & UNSIGNED
                 )
-                and slots.keeps(serial)
+                and slots.is_kept(serial)
             ):
                 self.newest = released
             elif not self._judge_odd(serial, tick):
@@ -121,41 +121,43 @@ class MessageWatch:
         """Judge an unusual message. Returns False if it is too early to judge."""
         slots = self._slots
         # Copy a torn message twice, because the true message may be overwriting a forged one.
-        if not slots.copy(serial) or not (slots.is_sound or slots.copy(serial)):
+        if not slots.copy_slot(serial) or not (slots.passes_check or slots.copy_slot(serial)):
             return True
         expected = self.newest + self._spec.every
-        if slots.serial == serial and slots.is_sound:
+        if slots.serial == serial and slots.passes_check:
             self._judge_time(slots.tick, slots.visible, tick)
-        elif slots.serial == 0 or slots.is_sound:
+        elif slots.serial == 0 or slots.passes_check:
             # The slot is empty or contains another complete message, so this message is lost. It
             # is not missing before the first tick at which it would have been visible.
             if self._is_sliced and expected + self._spec.delay > tick:
                 return False
             self.newest = expected
-            self._find(Alarm.GAP, tick, 1)
+            self._record_finding(Alarm.GAP, tick, 1)
         else:
             if slots.serial == serial:
                 # The release tick may be damaged too, but no release is later than now.
                 self.newest = max(self.newest, min(slots.tick, tick))
-            self._find(Alarm.DAMAGED, tick)
+            self._record_finding(Alarm.DAMAGED, tick)
         return True
 
     def _judge_time(self, released: int, visible: int, tick: int) -> None:
         """Judge the release and the arrival of the message in the local record."""
         if released < self.newest:
-            self._find(Alarm.DISORDER, tick, self.newest - released, since=released)
+            self._record_finding(Alarm.DISORDER, tick, self.newest - released, since=released)
         elif visible - released >= self.late_from:
             # A message published after the end of its cycle was held back, not just finished late.
-            ended_ns = self._cycles.ended_ns(released)
+            ended_ns = self._cycles.find_end_ns(released)
             if ended_ns is not None and self._slots.stamp_ns > ended_ns:
-                self._find(
+                self._record_finding(
                     Alarm.HELD_BACK, tick, visible - released - self._spec.delay, since=released
                 )
         self.newest = max(released, self.newest)
 
-    def _find(self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None) -> None:
+    def _record_finding(
+        self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None
+    ) -> None:
         """Record a finding of the current read."""
-        self._episodes.find(code, self._reader.accesses, tick, value, since)
+        self._episodes.record_finding(code, self._reader.accesses, tick, value, since)
 
 
 class QueueWatch(MessageWatch):
@@ -170,7 +172,7 @@ class QueueWatch(MessageWatch):
         self._lost = 0
         self.seen = reader.taken
 
-    def judge(self, tick: int) -> None:
+    def judge_messages(self, tick: int) -> None:
         """Judge the messages taken by the read at `tick`."""
         queue = self._queue
         slots = self._slots
@@ -182,10 +184,10 @@ class QueueWatch(MessageWatch):
             released = head[Slot.TICK]
             if self.newest <= released > head[Slot.VISIBLE_AT] - self.late_from:
                 self.newest = released
-            elif slots.copy(serial):
+            elif slots.copy_slot(serial):
                 self._judge_time(released, head[Slot.VISIBLE_AT], tick)
         self.seen = queue.taken
         if queue.statistics.lost != self._lost:
             lost = queue.statistics.lost - self._lost
             self._lost = queue.statistics.lost
-            self._find(Alarm.GAP, tick, lost)
+            self._record_finding(Alarm.GAP, tick, lost)

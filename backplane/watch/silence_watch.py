@@ -12,13 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rack.backplane.mailbox.interrupt import BoardInbox
-from rack.backplane.mailbox.mailbox import NOT_YET, Reader
-from rack.backplane.mailbox.slots import pid_of
-from rack.backplane.process import GONE, STOPPED, state_of
+from rack.backplane.mailbox.mailbox import NO_MESSAGE_TICK, Reader
+from rack.backplane.mailbox.slots import get_pid
+from rack.backplane.process import ENDED_STATES, STOPPED_STATES, read_state
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, Episodes
 from rack.backplane.watch.message_watch import LONG_AGO, MessageWatch
-from rack.backplane.words import Block, Box, is_on
+from rack.backplane.words import Block, Box, is_switched_on
 
 MUTE_CYCLES = 3
 """Age, in cycles of the writer, from which silence is investigated. An age of two is normal."""
@@ -43,9 +43,9 @@ class ReadingTask:
         self.since = 0
         self.troubles = 0
         self._last = LONG_AGO
-        self._step = NOT_YET
+        self._step = NO_MESSAGE_TICK
 
-    def reads(self, tick: int) -> None:
+    def record_read(self, tick: int) -> None:
         """Record a read at `tick`, and detect pauses from the distance to the last read."""
         step = tick - self._last
         if step != self._step:
@@ -67,15 +67,15 @@ class SilenceWatch(MessageWatch):
     ) -> None:
         super().__init__(segment, reader, episodes)
         spec = reader.spec
-        is_periodic = segment.layout.task(spec.writer).role == "executor"
+        is_periodic = segment.layout.find_task(spec.writer).role == "executor"
         if spec.max_age:
             self.quiet = 0
         else:
-            self.quiet = MUTE_CYCLES * spec.every if is_periodic else NOT_YET
+            self.quiet = MUTE_CYCLES * spec.every if is_periodic else NO_MESSAGE_TICK
         self._lost_after = self.quiet + spec.delay
         self._stale_after = STALE_CYCLES * spec.every
         self._task = task
-        self._block = segment.block(spec.writer)
+        self._block = segment.get_block(spec.writer)
         self._reported: dict[Alarm, int] = {}
 
     def is_lost(self, tick: int) -> bool:
@@ -85,19 +85,19 @@ class SilenceWatch(MessageWatch):
         """
         if max_age := self._reader.spec.max_age:
             box = self._slots.box
-            is_old = tick - self._reader.basis > max_age and not is_on(box[Box.KEPT], tick)
-            return is_old or is_on(box[Box.VOID], tick) or self.is_writer_lost(tick)
+            is_old = tick - self._reader.basis > max_age and not is_switched_on(box[Box.KEPT], tick)
+            return is_old or is_switched_on(box[Box.VOID], tick) or self.is_writer_lost(tick)
         newest = self._reader.newest
         age = tick - newest
         if age >= self.quiet:
-            pid = pid_of(self._slots.box[Box.CLAIMANT])
+            pid = get_pid(self._slots.box[Box.CLAIMANT])
             # The loss may already be marked, and a new process may exist that has not cycled yet.
             if age >= self._stale_after and (
-                self._block[Block.LOST] or state_of(pid) in GONE + STOPPED
+                self._block[Block.LOST] or read_state(pid) in ENDED_STATES + STOPPED_STATES
             ):
-                self._report(Alarm.STALE, tick, age)
+                self._report_silence(Alarm.STALE, tick, age)
             elif self._is_mute(tick):
-                self._report(Alarm.MUTE, tick, age)
+                self._report_silence(Alarm.MUTE, tick, age)
             if tick - max(newest, self._task.since) >= self._lost_after:
                 return True
         return self.is_writer_lost(tick)
@@ -106,7 +106,7 @@ class SilenceWatch(MessageWatch):
         """Check whether the writer is lost, however old its messages are."""
         # A loss counts from the next tick on. Within its tick the answer would depend on which
         # process is faster.
-        return self._reader.newest != NOT_YET and 0 < self._block[Block.LOST] <= tick
+        return self._reader.newest != NO_MESSAGE_TICK and 0 < self._block[Block.LOST] <= tick
 
     def _is_mute(self, tick: int) -> bool:
         """Check whether the writer has finished a writing release without its message."""
@@ -118,20 +118,20 @@ class SilenceWatch(MessageWatch):
             # The writer sends messages, but they come late.
             return False
         # The order matters, because a writer publishes before it reports the cycle as finished.
-        finished = self._cycles.finished
+        finished = self._cycles.finished_tick
         slots = self._slots
         head = slots.box[0]
         # A serial without a message counts as written: the message was lost, not suppressed.
         spec = self._reader.spec
         due = finished - (finished + spec.ahead - spec.phase) % spec.every
         # The writer may not have run that release: it was dead, late, or not released by the clock.
-        if self._cycles.ended_ns(due) is None:
+        if self._cycles.find_end_ns(due) is None:
             return False
-        return slots.copy(head) and slots.serial == head and slots.tick < due
+        return slots.copy_slot(head) and slots.serial == head and slots.tick < due
 
-    def _report(self, code: Alarm, tick: int, age: int) -> None:
+    def _report_silence(self, code: Alarm, tick: int, age: int) -> None:
         """Raise the alarm once per last good message. The next good message ends the episode."""
         serial = self._reader.serial
         if self._reported.get(code) != serial:
             self._reported[code] = serial
-            self._episodes.ring(code, tick, age, tick - age + self._reader.spec.every)
+            self._episodes.raise_alarm(code, tick, age, tick - age + self._reader.spec.every)

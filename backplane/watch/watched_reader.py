@@ -10,7 +10,7 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import TickGrid
 from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
 from rack.backplane.mailbox.protocols import open_reader
-from rack.backplane.mailbox.queue import ALL, QueueReader
+from rack.backplane.mailbox.queue import UNLIMITED, QueueReader
 from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
@@ -19,15 +19,15 @@ from rack.backplane.watch.silence_watch import ReadingTask, SilenceWatch
 from rack.backplane.words import Block
 
 
-def watched(
+def open_watched(
     segment: Segment,
     name: str,
     alarms: AlarmWriter,
     task: ReadingTask,
     *,
-    room: Callable[[], int] = lambda: ALL,
+    count_room: Callable[[], int] = lambda: UNLIMITED,
     asynchronous: bool = False,
-) -> Watched:
+) -> MailboxWatcher:
     """Open a mailbox for a task, with the checks that suit its writer.
 
     Messages of the clock have no period, so their silence is not checked.
@@ -37,19 +37,19 @@ def watched(
         name: Name of the mailbox.
         alarms: Alarm ring of the task.
         task: The reading task.
-        room: Returns the number of messages to take from a queue. Called before each read.
+        count_room: Returns the number of messages to take from a queue. Called before each read.
         asynchronous: True to read each message as soon as it is complete, under any protocol
             except queue.
     """
-    spec = segment.layout.mailbox(name)
+    spec = segment.layout.find_mailbox(name)
     if spec.protocol == "queue":
-        return WatchedQueue(segment, QueueReader(segment, name), alarms, task, room)
+        return WatchedQueue(segment, QueueReader(segment, name), alarms, task, count_room)
     reader = open_reader(segment, name, asynchronous, task.inbox)
     kind = SporadicReader if spec.writer == CLOCK else WatchedReader
     return kind(segment, reader, alarms, task)
 
 
-class Watched(ABC):
+class MailboxWatcher(ABC):
     """Base of readers that watch a mailbox for a task and raise the task's alarms about it."""
 
     def __init__(
@@ -77,19 +77,19 @@ class Watched(ABC):
         """True if the last read failed or found a bad message."""
         return self._statistics.bad_reads != self._reported.bad_reads
 
-    def _report(self, tick: int) -> None:
+    def _report_bad_read(self, tick: int) -> None:
         """Count a bad read for the task, and raise alarms for a damaged or forged message."""
         statistics = self._statistics
         accesses = self.reader.accesses
         self._task.troubles += 1
         if statistics.corrupt != self._reported.corrupt:
-            self._episodes.find(Alarm.DAMAGED, accesses, tick)
+            self._episodes.record_finding(Alarm.DAMAGED, accesses, tick)
         if statistics.forged != self._reported.forged:
-            self._episodes.find(Alarm.MASQUERADE, accesses, tick, statistics.forger)
+            self._episodes.record_finding(Alarm.MASQUERADE, accesses, tick, statistics.forger)
         self._reported = copy(statistics)
 
 
-class WatchedReader(Watched):
+class WatchedReader(MailboxWatcher):
     """Reader of a mailbox that is written by ticks. A clean read costs a few comparisons more."""
 
     def __init__(
@@ -97,7 +97,7 @@ class WatchedReader(Watched):
     ) -> None:
         super().__init__(segment, reader, alarms, task)
         self.watch = SilenceWatch(segment, reader, self._episodes, task)
-        self.writer = segment.block(reader.spec.writer)
+        self.writer = segment.get_block(reader.spec.writer)
         """Control block of the mailbox's writer."""
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
@@ -108,14 +108,14 @@ class WatchedReader(Watched):
         """
         reader = self.reader
         reading = reader.read(tick)
-        return self.conclude(
+        return self.judge_reading(
             tick,
             reading,
             is_odd=self._has_trouble or reader.found != self.watch.seen,
             is_silent=tick - reader.newest >= self.watch.quiet or self.writer[Block.LOST] > 0,
         )
 
-    def conclude(
+    def judge_reading(
         self, tick: int, reading: Reading[AnyMessage], *, is_odd: bool, is_silent: bool
     ) -> Reading[AnyMessage]:
         """Judge the result of a read, and return the reading for the level.
@@ -127,9 +127,9 @@ class WatchedReader(Watched):
             is_silent: True if the writer's silence must be judged.
         """
         if is_odd:
-            self.watch.judge(tick)
+            self.watch.judge_messages(tick)
         if self._has_trouble:
-            self._report(tick)
+            self._report_bad_read(tick)
         if is_silent and self.watch.is_lost(tick):
             return self._lost[reading.verdict]
         return reading
@@ -139,7 +139,7 @@ class WatchedReader(Watched):
         return self.watch.is_writer_lost(tick)
 
 
-class SporadicReader(Watched):
+class SporadicReader(MailboxWatcher):
     """Reader of an operator's mailbox, written by the clock, whose silence proves nothing.
 
     A command may leave part of an earlier one in force, so none is skipped: the newest comes with
@@ -152,15 +152,15 @@ class SporadicReader(Watched):
         before = self.reader.serial
         reading = self.reader.read(tick)
         if self._has_trouble:
-            self._report(tick)
-        return self.reader.with_earlier(reading, before)
+            self._report_bad_read(tick)
+        return self.reader.add_earlier(reading, before)
 
     def is_writer_lost(self, tick: int) -> bool:
         """Return False: a lost clock releases no board, so silence proves nothing."""
         return False
 
 
-class WatchedQueue(Watched):
+class WatchedQueue(MailboxWatcher):
     """Reader of a queue, which takes as many messages as the task has room for.
 
     Silence proves nothing, because a queue is written on demand. Only a writer found dead or
@@ -175,21 +175,21 @@ class WatchedQueue(Watched):
         reader: QueueReader,
         alarms: AlarmWriter,
         task: ReadingTask,
-        room: Callable[[], int],
+        count_room: Callable[[], int],
     ) -> None:
         super().__init__(segment, reader, alarms, task)
         self._messages = QueueWatch(segment, reader, self._episodes)
-        self._room = room
-        self._writer = segment.block(reader.spec.writer)
+        self._room = count_room
+        self._writer = segment.get_block(reader.spec.writer)
 
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Take the messages visible at `tick`, and check whether their writer is lost."""
         reader = self.reader
-        reading = reader.take(tick, self._room(), self._task.now())
+        reading = reader.take_messages(tick, self._room(), self._task.now())
         if self._has_trouble or reader.taken != self._messages.seen:
-            self._messages.judge(tick)
+            self._messages.judge_messages(tick)
         if self._has_trouble:
-            self._report(tick)
+            self._report_bad_read(tick)
         return reading._replace(is_lost=True) if self.is_writer_lost(tick) else reading
 
     def is_writer_lost(self, tick: int) -> bool:
@@ -206,7 +206,7 @@ class GridReader:
     ticks as before.
     """
 
-    def __init__(self, watched: Watched, grid: TickGrid) -> None:
+    def __init__(self, watched: MailboxWatcher, grid: TickGrid) -> None:
         self.reader = watched.reader
         self._watched, self._every, self._phase = watched, *grid
         repeated = [

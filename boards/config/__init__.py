@@ -18,40 +18,40 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rack.backplane.exports import on_first_use
+from rack.backplane.exports import build_lazy_getattr
 
 if TYPE_CHECKING:
-    from rack.boards.config.files import CONFIGS, FAULTS, names
-    from rack.boards.config.layout import shared_out
-    from rack.boards.config.loader import load, loads, read_stored
-    from rack.boards.config.resolved import Resolved, resolve, wire
+    from rack.boards.config.files import CONFIGS, FAULTS, list_names
+    from rack.boards.config.layout import list_replaced_cores
+    from rack.boards.config.loader import load, load_text, read_stored
+    from rack.boards.config.resolved import Resolved, resolve, resolve_layout
     from rack.boards.config.schema import RackConfig
-    from rack.boards.config.timing import budgets, rack_timing
+    from rack.boards.config.timing import build_rack_timing, read_budgets
 
 __all__ = [
     "CONFIGS",
     "FAULTS",
     "RackConfig",
     "Resolved",
-    "budgets",
+    "build_rack_timing",
+    "list_names",
+    "list_replaced_cores",
     "load",
-    "loads",
-    "names",
-    "rack_timing",
+    "load_text",
+    "read_budgets",
     "read_stored",
     "resolve",
-    "shared_out",
-    "wire",
+    "resolve_layout",
 ]
 _PLACES = {
-    "rack.boards.config.files": ("CONFIGS", "FAULTS", "names"),
-    "rack.boards.config.layout": ("shared_out",),
-    "rack.boards.config.loader": ("load", "loads", "read_stored"),
-    "rack.boards.config.resolved": ("Resolved", "resolve", "wire"),
+    "rack.boards.config.files": ("CONFIGS", "FAULTS", "list_names"),
+    "rack.boards.config.layout": ("list_replaced_cores",),
+    "rack.boards.config.loader": ("load", "load_text", "read_stored"),
+    "rack.boards.config.resolved": ("Resolved", "resolve", "resolve_layout"),
     "rack.boards.config.schema": ("RackConfig",),
-    "rack.boards.config.timing": ("budgets", "rack_timing"),
+    "rack.boards.config.timing": ("read_budgets", "build_rack_timing"),
 }
 
 # Hidden from type checkers, which would otherwise accept every misspelt name.
 if not TYPE_CHECKING:
-    __getattr__ = on_first_use(__name__, _PLACES)
+    __getattr__ = build_lazy_getattr(__name__, _PLACES)

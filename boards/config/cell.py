@@ -8,34 +8,34 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from rack.backplane.checked import pick
+from rack.backplane.checked import select_item
 from rack.boards.config.schema import RackConfig
 
 if TYPE_CHECKING:
     from rack.levels.robot.cell import Cell
 
 
-def cell_sizes(config: RackConfig) -> dict[str, int]:
+def compute_cell_sizes(config: RackConfig) -> dict[str, int]:
     """Return the sizes that messages use by name, such as the number of joints.
 
     Empty for a rack without an arm. Raises `RobotError` if arm and scene do not fit the model.
     """
     if config.robot is None:
         return {}
-    from rack.levels.robot.cell import sizes
+    from rack.levels.robot.cell import compute_sizes
 
-    return sizes(built_cell(config))
+    return compute_sizes(build_rack_cell(config))
 
 
-def geom_name(config: RackConfig, geom: int) -> str:
+def find_geom_name(config: RackConfig, geom: int) -> str:
     """Return the name of a geom of the cell from its number, which comes from shared memory."""
     from rack.levels.robot import lookup
 
-    model = built_cell(config).model
-    return lookup.geom_name(model, pick(range(model.ngeom), geom, "geom"))
+    model = build_rack_cell(config).model
+    return lookup.find_geom_name(model, select_item(range(model.ngeom), geom, "geom"))
 
 
-def built_cell(config: RackConfig) -> Cell:
+def build_rack_cell(config: RackConfig) -> Cell:
     """Build the cell of a rack that has an arm. Raises `RobotError` if arm and scene do not fit."""
     from rack.levels.robot.cell import build_cell
 

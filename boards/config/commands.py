@@ -11,41 +11,41 @@ from pydantic import ValidationError
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.backplane.layout import Layout
-from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.operator_table import Request
-from rack.boards.config.cell import built_cell
-from rack.boards.config.mistakes import at_key, mistakes_of
+from rack.boards.config.cell import build_rack_cell
+from rack.boards.config.mistakes import convert_errors, format_place
 from rack.boards.config.published import Levels, PublishedLevel
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.boards.config.timing import first_tick
+from rack.boards.config.timing import compute_first_tick
 from rack.boards.errors import ConfigError, Mistake, Mistakes
 from rack.levels.algebra import norm
 from rack.levels.errors import LevelError, RobotError
 from rack.levels.operator import (
-    NAMED,
+    NAMED_OPERATIONS,
     Commands,
     Goal,
     Operation,
     OperatorCommand,
-    goal_names,
-    listed,
+    format_commands,
+    format_goals,
 )
 from rack.levels.tables import read_setting
 
 DOWN = (0.0, 0.0, -1.0)
 
 
-def takes(level: PublishedLevel) -> str:
+def describe_commands(level: PublishedLevel) -> str:
     """Return the commands of a level as text, with valid names: "hold, resume, table saw|slow"."""
     words = []
     for what, goals in level.commands.items():
         names = "|".join(level.wording.get(what, ()))
-        wording = (what.name.lower(), names, goal_names(goals))
+        wording = (what.name.lower(), names, format_goals(goals))
         words.append(" ".join(word for word in wording if word))
     return ", ".join(words)
 
 
-def asked(table: Mapping[str, Any]) -> CommandConfig:
+def parse_command(table: Mapping[str, Any]) -> CommandConfig:
     """Return the command that a `[[command]]` table describes.
 
     Raises:
@@ -54,10 +54,12 @@ def asked(table: Mapping[str, Any]) -> CommandConfig:
     try:
         return CommandConfig.model_validate(table)
     except ValidationError as error:
-        raise ConfigError(mistakes_of(error, CommandConfig, table)) from None
+        raise ConfigError(convert_errors(error, CommandConfig, table)) from None
 
 
-def request(command: CommandConfig, config: RackConfig, levels: Levels, layout: Layout) -> Request:
+def build_request(
+    command: CommandConfig, config: RackConfig, levels: Levels, layout: Layout
+) -> Request:
     """Check a live command and return its request for the operator table.
 
     Args:
@@ -69,21 +71,21 @@ def request(command: CommandConfig, config: RackConfig, levels: Levels, layout: 
     Raises:
         ConfigError: The command has mistakes. All of them are listed.
     """
-    if mistakes := command_mistakes([("", command)], config, levels):
+    if mistakes := find_command_mistakes([("", command)], config, levels):
         raise ConfigError(mistakes)
-    return _request(command, layout)
+    return _encode_request(command, layout)
 
 
-def requests(config: RackConfig, layout: Layout) -> tuple[Request, ...]:
+def build_requests(config: RackConfig, layout: Layout) -> tuple[Request, ...]:
     """Return the requests for the commands of a checked config."""
-    return tuple(_request(command, layout) for command in config.command)
+    return tuple(_encode_request(command, layout) for command in config.command)
 
 
-def _request(command: CommandConfig, layout: Layout) -> Request:
+def _encode_request(command: CommandConfig, layout: Layout) -> Request:
     name = f"{command.level}.operator"
-    spec = layout.mailbox(name)
-    message = OperatorCommand(message_dtype(spec.fields, spec.size))
-    message.what = command.said
+    spec = layout.find_mailbox(name)
+    message = OperatorCommand(build_message_dtype(spec.fields, spec.size))
+    message.what = command.operation
     message.goal = (command.goals or [Goal.NONE])[0]
     if command.joints is not None:
         message.count = len(command.joints)
@@ -94,10 +96,14 @@ def _request(command: CommandConfig, layout: Layout) -> Request:
     if command.quaternion is not None:
         message.quaternion[:] = np.array(command.quaternion) / norm(command.quaternion)
     message.name = command.name or ""
-    return Request(layout.index(name), bytes(message.raw), first_tick(command, layout.clock_ns))
+    return Request(
+        layout.find_mailbox_index(name),
+        bytes(message.raw),
+        compute_first_tick(command, layout.clock_ns),
+    )
 
 
-def command_mistakes(
+def find_command_mistakes(
     commands: Iterable[tuple[str, CommandConfig]],
     config: RackConfig,
     levels: Levels,
@@ -116,7 +122,7 @@ def command_mistakes(
         mistake
         for place, command in placed
         if command.level not in broken
-        for mistake in _mistakes(place, command, config, levels)
+        for mistake in _check_command(place, command, config, levels)
     ]
     if len(placed) > OPERATOR_ENTRIES:
         mistakes.append(
@@ -129,10 +135,10 @@ def command_mistakes(
     return mistakes
 
 
-def _mistakes(
+def _check_command(
     place: str, command: CommandConfig, config: RackConfig, published: Levels
 ) -> Mistakes:
-    at = partial(at_key, place)
+    at = partial(format_place, place)
     if command.tick is not None and command.at is not None:
         yield Mistake(at("at"), command.at, "tick is also given; give only one of tick, at")
     levels = {name: level for name, level in published.items() if level.commands}
@@ -142,17 +148,17 @@ def _mistakes(
         return
     level = levels[command.level]
     known = level.commands
-    if command.said not in known:
-        why = f"'{command.level}' does not take {command.what}; it takes: {listed(known)}"
+    if command.operation not in known:
+        why = f"'{command.level}' does not take {command.what}; it takes: {format_commands(known)}"
         yield Mistake(at("what"), command.what, why)
         return
-    yield from _goal(at, command, known)
-    if command.said is Operation.SET:
-        yield from _setting(place, command, level)
+    yield from _check_goal(at, command, known)
+    if command.operation is Operation.SET:
+        yield from _check_setting(place, command, level)
     else:
-        yield from _name(at("name"), command, level)
-    if command.joints is not None and Goal.JOINTS in known[command.said]:
-        yield from _joints(at("joints"), command.joints, config)
+        yield from _check_name(at("name"), command, level)
+    if command.joints is not None and Goal.JOINTS in known[command.operation]:
+        yield from _check_joints(at("joints"), command.joints, config)
     for key in ("quaternion", "direction"):
         if getattr(command, key) is not None and not any(getattr(command, key)):
             yield Mistake(
@@ -160,20 +166,24 @@ def _mistakes(
             )
 
 
-def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Mistakes:
+def _check_goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Mistakes:
     """Check that a command has exactly one goal, of a form that the level accepts."""
-    accepted = known[command.said]
+    accepted = known[command.operation]
     goals = command.goals
     what = f"{command.what} of '{command.level}'"
     if not accepted:
         for goal in goals:
-            yield Mistake(at(_key(goal)), None, f"{command.what} takes no goal; remove it")
+            yield Mistake(
+                at(_find_goal_key(goal)), None, f"{command.what} takes no goal; remove it"
+            )
     elif len(goals) != 1:
-        why = "missing" if not goals else f"several given: {goal_names(goals)}"
-        yield Mistake(at("goal"), None, f"{why}; {what} takes one of: {goal_names(accepted)}")
+        why = "missing" if not goals else f"several given: {format_goals(goals)}"
+        yield Mistake(at("goal"), None, f"{why}; {what} takes one of: {format_goals(accepted)}")
     elif goals[0] not in accepted:
         yield Mistake(
-            at(_key(goals[0])), None, f"not a goal for {what}; valid goals: {goal_names(accepted)}"
+            at(_find_goal_key(goals[0])),
+            None,
+            f"not a goal for {what}; valid goals: {format_goals(accepted)}",
         )
     elif command.position is None and goals[0] in (Goal.POSE, Goal.DIRECTION):
         yield Mistake(at("position"), None, "missing; tool position, m")
@@ -182,19 +192,19 @@ def _goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> 
         yield Mistake(at("direction"), list(command.direction), why)
 
 
-def _key(goal: Goal) -> str:
+def _find_goal_key(goal: Goal) -> str:
     """Return the key of a `[[command]]` table that gives a goal of this form."""
     keys = {Goal.POSE: "quaternion", Goal.DIRECTION: "position", Goal.OFF: "on"}
     return keys.get(goal, goal.name.lower())
 
 
-def _name(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
+def _check_name(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
     """Check that the name in a command is known to its level, or absent if it takes none."""
-    if command.said not in NAMED:
+    if command.operation not in NAMED_OPERATIONS:
         if command.name is not None:
             yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
         return
-    known = level.wording.get(command.said)
+    known = level.wording.get(command.operation)
     # The names are unknown if the level's table has mistakes, which are reported separately.
     if known is not None and command.name not in known:
         yield Mistake(
@@ -204,9 +214,9 @@ def _name(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes
         )
 
 
-def _setting(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
+def _check_setting(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
     """Check that a command sets a live parameter of its level to a valid value."""
-    name = at_key(place, "name")
+    name = format_place(place, "name")
     try:
         key, value = read_setting(command.name or "")
     except LevelError as error:
@@ -217,15 +227,15 @@ def _setting(place: str, command: CommandConfig, level: PublishedLevel) -> Mista
         why = f"it is read at the launch only; live parameters: {', '.join(level.live) or 'none'}"
         yield Mistake(f"{params}.{key}", value, why)
         return
-    table = level.table
+    table = level.params_model
     setting = {key: value}
     try:
         table.model_validate(setting)
     except ValidationError as error:
-        yield from mistakes_of(error, table, setting, params)
+        yield from convert_errors(error, table, setting, params)
 
 
-def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistakes:
+def _check_joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistakes:
     robot = config.robot
     if robot is None:
         yield Mistake(place, list(joints), "the rack has no arm")
@@ -238,7 +248,7 @@ def _joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistak
         yield Mistake(place, list(joints), why)
         return
     try:
-        ranges = built_cell(config).limits.position
+        ranges = build_rack_cell(config).limits.position
     except RobotError:
         # An arm that does not fit its model is reported by the rules for the robot.
         return

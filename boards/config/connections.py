@@ -25,14 +25,14 @@ from rack.boards.config.schema import (
     ExchangeConfig,
     RackConfig,
     Sources,
-    TaskPlace,
+    TaskEntry,
 )
 from rack.boards.errors import Mistake
-from rack.boards.exchange import EXCHANGE, exchange_message
+from rack.boards.exchange import EXCHANGE_PORT, build_exchange_message
 from rack.boards.host.adapter import Adapter
-from rack.boards.wiring import Source, mailboxes_of
+from rack.boards.wiring import Source, list_mailboxes
 from rack.levels.host_program import HostProgram
-from rack.levels.level import Executor, MadePorts, Output, Planner, Program
+from rack.levels.level import ConfiguredPorts, Executor, Output, Planner, Program
 from rack.levels.operator import OperatorCommand
 from rack.levels.ports import InputPort
 
@@ -55,7 +55,7 @@ class TaskPorts:
         is_whole: False if mistakes hide some of the ports that the config adds.
     """
 
-    place: TaskPlace
+    place: TaskEntry
     kind: LevelClass
     inputs: Mapping[str, InputPort[Any]]
     outputs: Mapping[str, Output[Any]]
@@ -80,7 +80,7 @@ class TaskPorts:
         return [
             (port, mailbox)
             for port, source in self.reads.items()
-            for mailbox in mailboxes_of(source)
+            for mailbox in list_mailboxes(source)
         ]
 
     @cached_property
@@ -88,14 +88,14 @@ class TaskPorts:
         """Mailboxes that the task writes, by port."""
         return {port: f"{self.place.board}.{port}" for port in self.outputs}
 
-    def rests_on(self, output: str) -> tuple[str, ...]:
+    def find_origin_mailboxes(self, output: str) -> tuple[str, ...]:
         """Return the mailboxes from which the information in an output comes."""
         source = self.outputs[output].rests_on
-        return () if source is None else mailboxes_of(self.reads.get(source.name, {}))
+        return () if source is None else list_mailboxes(self.reads.get(source.name, {}))
 
 
-def _connected(
-    config: RackConfig, place: TaskPlace, kind: LevelClass, types: Mapping[str, type[Message]]
+def _connect_ports(
+    config: RackConfig, place: TaskEntry, kind: LevelClass, types: Mapping[str, type[Message]]
 ) -> TaskPorts:
     """Connect the ports of a task or host board.
 
@@ -107,25 +107,25 @@ def _connected(
             types from other mailboxes.
     """
     mistakes: list[Mistake] = []
-    reads = dict(_connections(config, place, kind.inputs, mistakes))
+    reads = dict(_connect_inputs(config, place, kind.inputs, mistakes))
     exchange: Mapping[str, ExchangeConfig] = {}
-    added_ports = MadePorts()
+    added_ports = ConfiguredPorts()
     if issubclass(kind, Executor):
         board = config.board[place.board]
         exchange = board.exchange
-        added_ports = kind.made_ports(board.params, types)
+        added_ports = kind.build_ports(board.params, types)
     for port, entry in added_ports.inputs.items():
         entry.name = port
         reads[port] = entry.source
     outputs = {**kind.outputs, **added_ports.outputs}
     if exchange and added_ports.is_whole:
         # If the class has an output of this name, it stays, and a rule reports it.
-        outputs.setdefault(EXCHANGE, Output(exchange_message(reads)))
+        outputs.setdefault(EXCHANGE_PORT, Output(build_exchange_message(reads)))
     inputs = {**kind.inputs, **added_ports.inputs}
     return TaskPorts(place, kind, inputs, outputs, reads, exchange, mistakes, added_ports.is_whole)
 
 
-def _class(place: TaskPlace) -> LevelClass:
+def _find_class(place: TaskEntry) -> LevelClass:
     """Return the class of a task or host board. Raises `LookupError` if it is not usable."""
     if place.role == "executor":
         return find_class(place.target, Executor)
@@ -140,9 +140,9 @@ def _class(place: TaskPlace) -> LevelClass:
     return program
 
 
-def _connections(
+def _connect_inputs(
     config: RackConfig,
-    place: TaskPlace,
+    place: TaskEntry,
     inputs: Mapping[str, InputPort[Any]],
     mistakes: list[Mistake],
 ) -> Iterator[tuple[str, Source]]:
@@ -154,8 +154,8 @@ def _connections(
         inputs: Declared inputs of the task, by port.
         mistakes: List to which the mistakes of inputs that cannot be connected are added.
     """
-    table = config.table(place)
-    wired = config.rewired(place)
+    table = config.get_table(place)
+    wired = config.get_rewired_ports(place)
     neighbours = {"own": (place.board,), "above": getattr(table, "above", ()), "below": table.below}
     others = config.board.keys() - {place.board}
     for port, entry in inputs.items():
@@ -172,10 +172,10 @@ def _connections(
             why = f"{port_text} reads one mailbox, not {len(mailboxes)}"
             mistakes.append(Mistake(f"{place.table}.{key}", wired.get(port, boards), why))
         elif key not in ("above", "below") or others.issuperset(boards):
-            yield port, _by_board(mailboxes) if entry.many else mailboxes[0]
+            yield port, _group_by_board(mailboxes) if entry.many else mailboxes[0]
 
 
-def _by_board(mailboxes: Sources) -> Source:
+def _group_by_board(mailboxes: Sources) -> Source:
     """Return mailboxes by board. If a board writes several of them, these are by mailbox name."""
     boards = [box.partition(".")[0] for box in mailboxes]
     pairs = zip(boards, mailboxes, strict=True)
@@ -195,17 +195,17 @@ class Wiring:
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
         self.config = config
         self.broken = broken
-        kinds: dict[TaskPlace, LevelClass] = {}
-        self.missing: dict[TaskPlace, str] = {}
-        for place in (*config.tasks(), *config.hosts()):
+        kinds: dict[TaskEntry, LevelClass] = {}
+        self.missing: dict[TaskEntry, str] = {}
+        for place in (*config.list_tasks(), *config.list_hosts()):
             try:
-                kinds[place] = _class(place)
+                kinds[place] = _find_class(place)
             except LookupError as error:
                 self.missing[place] = str(error.args[0])
         types: dict[str, type[Message]] = {}
         while True:
             self.ports = {
-                place: _connected(config, place, kind, types) for place, kind in kinds.items()
+                place: _connect_ports(config, place, kind, types) for place, kind in kinds.items()
             }
             written = {
                 box: ports.outputs[port].message
@@ -252,19 +252,19 @@ class Wiring:
         return reading
 
     @cached_property
-    def operated(self) -> list[str]:
+    def operator_mailboxes(self) -> list[str]:
         """Mailboxes through which an operator commands levels."""
-        classes = executors(self.config).items()
-        return [f"{board}.operator" for board, kind in classes if takes_commands(kind)]
+        classes = find_executors(self.config).items()
+        return [f"{board}.operator" for board, kind in classes if has_operator_port(kind)]
 
     @cached_property
     def types(self) -> dict[str, MessageType]:
         """Message type of every mailbox."""
         written = {name: output.message.message_type for name, (_, output) in self.writers.items()}
-        return written | dict.fromkeys(self.operated, OperatorCommand.message_type)
+        return written | dict.fromkeys(self.operator_mailboxes, OperatorCommand.message_type)
 
     @property
-    def names(self) -> str:
+    def mailbox_names(self) -> str:
         """Names of all mailboxes, separated by commas, for messages."""
         return ", ".join(self.types)
 
@@ -274,7 +274,7 @@ class Wiring:
         return {mailbox for ports in self.hosts for mailbox in ports.writes.values()}
 
     @cached_property
-    def passed(self) -> dict[str, str]:
+    def passed_mailboxes(self) -> dict[str, str]:
         """Mailboxes that bus adapters write, each with the mailbox that it is copied from."""
         return {
             f"{ports.place.board}.{port}": source
@@ -286,7 +286,9 @@ class Wiring:
     @cached_property
     def to_host(self) -> set[str]:
         """Mailboxes that bus adapters write for host boards."""
-        return {mailbox for mailbox, box in self.passed.items() if box not in self.from_host}
+        return {
+            mailbox for mailbox, box in self.passed_mailboxes.items() if box not in self.from_host
+        }
 
     @property
     def of_host(self) -> set[str]:
@@ -299,16 +301,16 @@ class Wiring:
         periods: dict[str, int] = {}
         for name in self.config.board if "clock" not in self.broken else ():
             with suppress(ClockError):
-                periods[name] = self.config.every(name)
+                periods[name] = self.config.find_period(name)
         return periods
 
     @cached_property
-    def unknown(self) -> set[str]:
+    def unknown_boards(self) -> set[str]:
         """Boards whose mistakes hide their mailboxes. A reader of such a mailbox is not wrong."""
         boards = {place.board for place in self.missing}
         boards |= {ports.place.board for ports in self.ports.values() if not ports.is_whole}
         boards |= {place.removeprefix("board.").removeprefix("host.") for place in self.broken}
-        is_lan_unknown = "adapter" in self.broken or is_taken(self.config)
+        is_lan_unknown = "adapter" in self.broken or is_adapter_name_taken(self.config)
         return boards | {LAN} if is_lan_unknown else boards
 
     @property
@@ -329,9 +331,9 @@ class Wiring:
 
     def is_known(self, mailbox: str) -> bool:
         """Return True if a mailbox exists, or may exist because its board has mistakes."""
-        return mailbox in self.types or mailbox.partition(".")[0] in self.unknown
+        return mailbox in self.types or mailbox.partition(".")[0] in self.unknown_boards
 
-    def readers(self, mailbox: str) -> tuple[str, ...]:
+    def list_readers(self, mailbox: str) -> tuple[str, ...]:
         """Return the names of the tasks and host boards that read a mailbox."""
         return tuple(dict.fromkeys(ports.task for ports, _ in self.reading.get(mailbox, ())))
 
@@ -339,7 +341,7 @@ class Wiring:
         """Return True for the network adapter's board and for the mailboxes that it writes."""
         return self.config.adapter.lan is not None and name.partition(".")[0] == LAN
 
-    def protocol(self, mailbox: str) -> Protocol:
+    def find_protocol(self, mailbox: str) -> Protocol:
         """Return the protocol of a mailbox, which depends on the config and on its writer."""
         if mailbox in self.to_host:
             # Host boards always read the newest message at once.
@@ -349,14 +351,20 @@ class Wiring:
         ):
             return "queue"
         protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
-        if protocol == "interrupt" and (mailbox in self.operated or self.is_of_network(mailbox)):
+        if protocol == "interrupt" and (
+            mailbox in self.operator_mailboxes or self.is_of_network(mailbox)
+        ):
             # No board of this rack sends these messages, so none can be interrupted by it.
             return "time-slice"
         # With a lock the clock would wait for readers.
-        return "double-buffer" if protocol == "lock" and mailbox in self.operated else protocol
+        return (
+            "double-buffer"
+            if protocol == "lock" and mailbox in self.operator_mailboxes
+            else protocol
+        )
 
 
-def executors(config: RackConfig) -> dict[str, type[Executor]]:
+def find_executors(config: RackConfig) -> dict[str, type[Executor]]:
     """Return the executor class of each board. Classes that are missing are left out."""
     classes: dict[str, type[Executor]] = {}
     for name, board in config.board.items():
@@ -365,16 +373,16 @@ def executors(config: RackConfig) -> dict[str, type[Executor]]:
     return classes
 
 
-def takes_commands(executor: type[Executor]) -> bool:
+def has_operator_port(executor: type[Executor]) -> bool:
     """Return True if a level reads commands of an operator."""
     return any(port.source == OWN_OPERATOR for port in executor.inputs.values())
 
 
-def is_taken(config: RackConfig) -> bool:
+def is_adapter_name_taken(config: RackConfig) -> bool:
     """Return True if another board has the name of the network adapter's board."""
     # If tables of boards are broken, the adapter's board may be missing too.
     return (
         config.adapter.lan is not None
         and LAN in config.board
-        and config.board[LAN] != config.adapter.lan.board()
+        and config.board[LAN] != config.adapter.lan.build_board()
     )

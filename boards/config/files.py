@@ -11,7 +11,13 @@ from typing import Any
 
 from rack.backplane.bounded_toml import MAX_DEPTH
 from rack.backplane.regular_file import read_regular_file
-from rack.boards.config.toml import Tables, merge, override, parse, table_of
+from rack.boards.config.toml import (
+    Tables,
+    apply_settings,
+    find_table_name,
+    merge_tables,
+    parse_tables,
+)
 from rack.boards.errors import ConfigError, Mistake
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -45,7 +51,7 @@ class Assembled:
     is_whole: bool = True
 
 
-def assembled(
+def assemble(
     name_or_path: str | Path, overrides: Sequence[str], faults: str | Path | None
 ) -> Assembled:
     """Read a config's files and apply settings and a fault script. Mistakes are collected.
@@ -59,24 +65,24 @@ def assembled(
     mistakes: list[Mistake] = []
     tables: Tables = {}
     folder = CONFIGS
-    with gathering(mistakes):
-        path = _path(name_or_path, "config", CONFIGS)
+    with collect_mistakes(mistakes):
+        path = _locate_config(name_or_path, "config", CONFIGS)
         folder = path.parent
-        tables = _read(path, (), {}, mistakes)
+        tables = _read_config(path, (), {}, mistakes)
     is_whole = not mistakes
     if faults is not None:
-        with gathering(mistakes):
-            tables = with_faults(tables, faults, folder)
+        with collect_mistakes(mistakes):
+            tables = append_faults(tables, faults, folder)
     invalid: list[Mistake] = []
-    overridden = override(tables, overrides, invalid)
+    overridden = apply_settings(tables, overrides, invalid)
     # Without all files, settings cannot be judged: they may refer to tables of a missing file.
-    anchored = anchor(overridden if is_whole else tables, Path.cwd())
-    broken = frozenset(table_of(setting.value) for setting in invalid)
+    anchored = resolve_paths(overridden if is_whole else tables, Path.cwd())
+    broken = frozenset(find_table_name(setting.value) for setting in invalid)
     return Assembled(anchored, [*mistakes, *invalid], broken, is_whole)
 
 
 @contextmanager
-def gathering(mistakes: list[Mistake]) -> Iterator[None]:
+def collect_mistakes(mistakes: list[Mistake]) -> Iterator[None]:
     """Context in which a `ConfigError` ends the block and adds its mistakes to the list."""
     try:
         yield
@@ -84,15 +90,15 @@ def gathering(mistakes: list[Mistake]) -> Iterator[None]:
         mistakes += error.mistakes
 
 
-def named_classes(tables: Tables) -> tuple[str, ...]:
+def list_level_classes(tables: Tables) -> tuple[str, ...]:
     """Return the level classes that unvalidated tables name, as "package.module:Class"."""
-    boards = [board for board in _table(tables, "board").values() if isinstance(board, dict)]
+    boards = [board for board in _get_table(tables, "board").values() if isinstance(board, dict)]
     names = [board.get(role) for board in boards for role in ("executor", "planner")]
-    names += [LAN_ADAPTER] if "lan" in _table(tables, "adapter") else []
+    names += [LAN_ADAPTER] if "lan" in _get_table(tables, "adapter") else []
     return tuple(dict.fromkeys(name for name in names if isinstance(name, str)))
 
 
-def with_faults(tables: Tables, name_or_path: str | Path, folder: Path) -> Tables:
+def append_faults(tables: Tables, name_or_path: str | Path, folder: Path) -> Tables:
     """Return the tables of a config with the faults of a script appended.
 
     Args:
@@ -105,8 +111,8 @@ def with_faults(tables: Tables, name_or_path: str | Path, folder: Path) -> Table
         ConfigError: The script cannot be read or contains something else.
     """
     folders = [FAULTS] if folder == CONFIGS else [folder, FAULTS]
-    path = _path(name_or_path, "--faults", *folders)
-    script = _tables(path)
+    path = _locate_config(name_or_path, "--faults", *folders)
+    script = _read_tables(path)
     mistakes = [
         Mistake(
             f"{path.name}: {key}", None, "a fault script contains [[fault]] tables and nothing else"
@@ -122,7 +128,7 @@ def with_faults(tables: Tables, name_or_path: str | Path, folder: Path) -> Table
     return {**tables, "fault": [*faults, *script.get("fault", [])]}
 
 
-def names(folder: Path = CONFIGS) -> list[str]:
+def list_names(folder: Path = CONFIGS) -> list[str]:
     """Return the names of the configs in a folder. The default is the folder of bundled racks.
 
     The config `<name>` is the file `<name>.toml` or `<name>/<name>.toml`. Further files in that
@@ -133,13 +139,13 @@ def names(folder: Path = CONFIGS) -> list[str]:
         racks = [
             path.stem
             for path in main.parent.glob("*.toml")
-            if path == main or "name" in _tables(path)
+            if path == main or "name" in _read_tables(path)
         ]
         rack_names += [main.stem if rack == main.stem else f"{main.stem}/{rack}" for rack in racks]
     return sorted(rack_names)
 
 
-def file_at(path: Path) -> Path | None:
+def find_file(path: Path) -> Path | None:
     """Return the absolute path of an existing file, regular or not.
 
     Returns:
@@ -155,25 +161,27 @@ def file_at(path: Path) -> Path | None:
         return None
 
 
-def anchor(tables: Tables, folder: Path) -> Tables:
+def resolve_paths(tables: Tables, folder: Path) -> Tables:
     """Return tables with absolute paths, relative ones being resolved from `folder`.
 
     A file that does not exist there is looked up among the bundled files, in configs/.
     """
 
     def find(text: str) -> str:
-        return str(_find(text, folder) or folder / text)
+        return str(_find_referenced_file(text, folder) or folder / text)
 
-    tables = with_texts(tables, ("robot", "model"), find)
-    tables = with_texts(tables, ("python_path",), lambda text: str((folder / text).resolve()))
-    tables = with_texts(tables, ("adapter", ANY, "certificates"), lambda text: str(folder / text))
+    tables = change_texts(tables, ("robot", "model"), find)
+    tables = change_texts(tables, ("python_path",), lambda text: str((folder / text).resolve()))
+    tables = change_texts(tables, ("adapter", ANY, "certificates"), lambda text: str(folder / text))
     racks = ("adapter", ANY, "launch")
-    tables = with_texts(tables, racks, lambda text: str(_find(text, folder) or text))
-    anchored: Tables = with_texts(tables, STATE_TABLES, find)
+    tables = change_texts(
+        tables, racks, lambda text: str(_find_referenced_file(text, folder) or text)
+    )
+    anchored: Tables = change_texts(tables, STATE_TABLES, find)
     return anchored
 
 
-def with_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) -> Any:
+def change_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) -> Any:
     """Return tables with some texts changed.
 
     Args:
@@ -185,39 +193,39 @@ def with_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) ->
     if keys and isinstance(value, dict):
         key, *rest = keys
         return {
-            name: with_texts(item, rest, change) if key in (name, ANY) else item
+            name: change_texts(item, rest, change) if key in (name, ANY) else item
             for name, item in value.items()
         }
     if not keys and isinstance(value, list):
-        return [with_texts(item, (), change) for item in value]
+        return [change_texts(item, (), change) for item in value]
     return change(value) if not keys and isinstance(value, str) else value
 
 
-def _table(tables: Tables, key: str) -> Tables:
+def _get_table(tables: Tables, key: str) -> Tables:
     """Return the table of a key. Empty if the key is missing or is not a table."""
     table = tables.get(key)
     return table if isinstance(table, dict) else {}
 
 
-def portable(model: Path) -> str:
+def shorten_path(model: Path) -> str:
     """Return a path as it is stored in a config. Paths of bundled files become relative."""
     return model.relative_to(CONFIGS).as_posix() if model.is_relative_to(CONFIGS) else str(model)
 
 
-def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
+def _locate_config(name_or_path: str | Path, place: str, *folders: Path) -> Path:
     """Return the file of a config or script. Raises `ConfigError` at `place` if it is not found."""
     text = str(name_or_path)
     is_path = isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml")
-    if is_path and (file := file_at(Path(text))):
+    if is_path and (file := find_file(Path(text))):
         return file
     # Look the text up among the names only if it is no file, because that reads every config.
     if is_path:
-        known = [folder for folder in folders if text in names(folder)]
+        known = [folder for folder in folders if text in list_names(folder)]
     else:
         known = [*folders, Path.cwd()]
-    named = next((file for folder in known if (file := _named(text, folder))), None)
+    named = next((file for folder in known if (file := _find_named_config(text, folder))), None)
     if named is None:
-        known_names = names(folders[-1])
+        known_names = list_names(folders[-1])
         near = get_close_matches(text, known_names, 1)
         valid = f"valid are a path or one of the names {', '.join(known_names)}"
         why = f"did you mean '{near[0]}'?" if near else valid
@@ -225,7 +233,7 @@ def _path(name_or_path: str | Path, place: str, *folders: Path) -> Path:
     return named
 
 
-def _read(
+def _read_config(
     path: Path, chain: tuple[Path, ...], known: dict[Path, Tables], mistakes: list[Mistake]
 ) -> Tables:
     """Read a file and merge its tables into the tables of the files that it extends.
@@ -237,12 +245,12 @@ def _read(
         mistakes: List to which every mistake is added.
     """
     if path not in known:
-        with gathering(mistakes):
-            known[path] = _merged(path, chain, known, mistakes)
+        with collect_mistakes(mistakes):
+            known[path] = _read_merged(path, chain, known, mistakes)
     return known.setdefault(path, {})
 
 
-def _merged(
+def _read_merged(
     path: Path, chain: tuple[Path, ...], known: dict[Path, Tables], mistakes: list[Mistake]
 ) -> Tables:
     if path in chain:
@@ -252,38 +260,42 @@ def _merged(
         why = f"the chain of extended files is longer than {MAX_DEPTH} files"
         raise ConfigError([Mistake(f"{path.name}: extends", None, why)])
     # A file without a format has format 1, even if it extends files of a newer format.
-    top = {"format": 1, **anchor(_tables(path), path.parent)}
+    top = {"format": 1, **resolve_paths(_read_tables(path), path.parent)}
     merged: Tables = {}
-    for base in _bases(top.pop("extends", []), path, mistakes):
-        merged = _extended(merged, _read(base, (*chain, path), known, mistakes))
-    return _extended(merged, top)
+    for base in _list_bases(top.pop("extends", []), path, mistakes):
+        merged = _merge_extension(merged, _read_config(base, (*chain, path), known, mistakes))
+    return _merge_extension(merged, top)
 
 
-def _extended(base: Tables, top: Tables) -> Tables:
+def _merge_extension(base: Tables, top: Tables) -> Tables:
     """Return `base` updated with `top`. A `[robot]` that names a model replaces the whole arm."""
-    if "model" in _table(top, "robot"):
+    if "model" in _get_table(top, "robot"):
         base = {key: value for key, value in base.items() if key != "robot"}
-    return merge(base, top)
+    return merge_tables(base, top)
 
 
-def _tables(path: Path) -> Tables:
+def _read_tables(path: Path) -> Tables:
     try:
         text = read_regular_file(path, MAX_FILE_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", error)
         raise ConfigError([Mistake(str(path), None, f"cannot be read: {why}")]) from None
-    return parse(text, path.name)
+    return parse_tables(text, path.name)
 
 
-def _bases(extends: Any, path: Path, mistakes: list[Mistake]) -> list[Path]:
+def _list_bases(extends: Any, path: Path, mistakes: list[Mistake]) -> list[Path]:
     place = f"{path.name}: extends"
     if not isinstance(extends, list) or not all(isinstance(item, str) for item in extends):
         raise ConfigError([Mistake(place, extends, "must be a list of config names or paths")])
     bases = []
     for item in extends:
-        base = _find(item, path.parent) or _find(f"{item}.toml", path.parent) or _named(item)
+        base = (
+            _find_referenced_file(item, path.parent)
+            or _find_referenced_file(f"{item}.toml", path.parent)
+            or _find_named_config(item)
+        )
         if base is None:
-            known = ", ".join(names())
+            known = ", ".join(list_names())
             why = f"no such file next to {path.name} or among the bundled configs: {known}"
             mistakes.append(Mistake(place, item, why))
         else:
@@ -291,11 +303,11 @@ def _bases(extends: Any, path: Path, mistakes: list[Mistake]) -> list[Path]:
     return bases
 
 
-def _named(name: str, folder: Path = CONFIGS) -> Path | None:
+def _find_named_config(name: str, folder: Path = CONFIGS) -> Path | None:
     """Return the file of a config by its name in a folder. None if it does not exist."""
-    return file_at(folder / f"{name}.toml") or file_at(folder / name / f"{name}.toml")
+    return find_file(folder / f"{name}.toml") or find_file(folder / name / f"{name}.toml")
 
 
-def _find(reference: str, folder: Path) -> Path | None:
+def _find_referenced_file(reference: str, folder: Path) -> Path | None:
     """Return the file that a config in `folder` refers to, from there or from configs/."""
-    return file_at(folder / reference) or file_at(CONFIGS / reference)
+    return find_file(folder / reference) or find_file(CONFIGS / reference)

@@ -9,15 +9,15 @@ from zlib import crc32
 from rack.backplane.address_map import CLOCK, FAULT_ENTRIES
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout, Role
-from rack.backplane.mailbox.queue import is_position
-from rack.boards.config.mistakes import at_key
+from rack.backplane.mailbox.queue import is_position_mailbox
+from rack.boards.config.mistakes import format_place
 from rack.boards.config.published import Levels
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.timing import first_tick
+from rack.boards.config.timing import compute_first_tick
 from rack.boards.errors import ConfigError, Mistake, Mistakes
 from rack.boards.faults.bounds import cycle_ticks
 from rack.boards.faults.clock_board import PHASES
-from rack.boards.faults.config import FaultConfig, condition
+from rack.boards.faults.config import FaultConfig, parse_condition
 from rack.boards.faults.kind import KINDS, Kind, Parameter
 from rack.levels.tables import RobotConfig
 
@@ -25,7 +25,7 @@ SEEDS = 2**31
 """Number of possible seeds of a fault."""
 
 
-def fault_mistakes(
+def find_fault_mistakes(
     faults: Iterable[tuple[str, FaultConfig]],
     config: RackConfig,
     levels: Levels,
@@ -42,9 +42,9 @@ def fault_mistakes(
         unspecified: Boards with known mistakes. What depends on them is not checked.
     """
     rules = [
-        FaultRules(place, fault, config, levels, layout, unspecified) for place, fault in faults
+        FaultCheck(place, fault, config, levels, layout, unspecified) for place, fault in faults
     ]
-    mistakes = [mistake for rule in rules for mistake in rule.mistakes()]
+    mistakes = [mistake for rule in rules for mistake in rule.find_mistakes()]
     if len(rules) > FAULT_ENTRIES:
         mistakes.append(
             Mistake("fault", len(rules), f"too many faults; a run can have at most {FAULT_ENTRIES}")
@@ -53,7 +53,7 @@ def fault_mistakes(
 
 
 @dataclass(frozen=True)
-class FaultRules:
+class FaultCheck:
     """Checks of one fault. The attributes are the arguments of `find_fault_mistakes`."""
 
     place: str
@@ -63,94 +63,98 @@ class FaultRules:
     layout: Layout | None
     unspecified: Collection[str]
 
-    def mistakes(self) -> Mistakes:
+    def find_mistakes(self) -> Mistakes:
         """Yield every mistake in the fault."""
         # The beginning and the end must each be given in only one way.
         for keys in (("tick", "at", "when"), ("for", "cycles")):
-            given_keys = [key for key in keys if self._value(key) is not None]
+            given_keys = [key for key in keys if self._get_value(key) is not None]
             for key in given_keys[1:]:
-                yield self._mistake(
+                yield self._build_mistake(
                     key, f"{given_keys[0]} is also given; give only one of {', '.join(keys)}"
                 )
         fault = self.fault
-        places = (*self.config.tasks(), *self.config.hosts())
+        places = (*self.config.list_tasks(), *self.config.list_hosts())
         tasks: dict[str, Role] = {place.name: place.role for place in places}
         kind = KINDS.names.get(fault.kind)
         if kind is None:
-            yield self._mistake("kind", f"no such kind; kinds: {', '.join(KINDS.names)}")
+            yield self._build_mistake("kind", f"no such kind; kinds: {', '.join(KINDS.names)}")
         else:
-            yield from self._of_kind(kind)
+            yield from self._check_kind(kind)
         if fault.board != CLOCK and fault.board not in tasks:
             if fault.board.partition(".")[0] not in self.unspecified:
-                yield self._mistake("board", f"no such task; tasks: {', '.join([*tasks, CLOCK])}")
+                yield self._build_mistake(
+                    "board", f"no such task; tasks: {', '.join([*tasks, CLOCK])}"
+                )
         elif kind is not None:
-            yield from self._target(kind, tasks)
-        if fault.when is not None and (layout := self._layout_of(fault.when)) is not None:
+            yield from self._check_target(kind, tasks)
+        if fault.when is not None and (layout := self._find_layout(fault.when)) is not None:
             try:
-                condition(fault.when, layout)
+                parse_condition(fault.when, layout)
             except LookupError as error:
-                yield self._mistake("when", str(error.args[0]))
+                yield self._build_mistake("when", str(error.args[0]))
 
-    def _of_kind(self, kind: Kind) -> Mistakes:
+    def _check_kind(self, kind: Kind) -> Mistakes:
         if kind.realtime and self.config.is_lockstep:
             why = (
                 f"{kind.name} needs real time: in lockstep time waits for every task; run without"
                 " --lockstep"
             )
-            yield self._mistake("kind", why)
+            yield self._build_mistake("kind", why)
         if kind.once:
-            yield from self._without(
+            yield from self._forbid_keys(
                 ("for", "cycles"), f"{kind.name} strikes once and has no duration; remove it"
             )
         if kind.where == "start":
-            yield from self._without(
+            yield from self._forbid_keys(
                 ("tick", "at", "when"), f"{kind.name} strikes as the board starts; remove it"
             )
         if self.fault.phase and not kind.within_tick:
-            takers = _listed(other.name for other in KINDS if other.within_tick)
-            yield self._mistake(
+            takers = _format_names(other.name for other in KINDS if other.within_tick)
+            yield self._build_mistake(
                 "phase", f"{kind.name} cannot strike within a tick; kinds that can: {takers}"
             )
         if self.fault.mailbox is not None and not kind.takes_mailbox:
-            takers = _listed(other.name for other in KINDS if other.takes_mailbox)
-            yield self._mistake(
+            takers = _format_names(other.name for other in KINDS if other.takes_mailbox)
+            yield self._build_mistake(
                 "mailbox", f"{kind.name} does not affect mailboxes; kinds that do: {takers}"
             )
-        yield from self._parameters(kind)
+        yield from self._check_parameters(kind)
 
-    def _parameters(self, kind: Kind) -> Mistakes:
+    def _check_parameters(self, kind: Kind) -> Mistakes:
         known = {parameter.name: parameter for parameter in kind.parameters}
         for name, value in self.fault.parameters.items():
-            why = f"{kind.name} has no such parameter; parameters: {_listed(known)}"
+            why = f"{kind.name} has no such parameter; parameters: {_format_names(known)}"
             if name in known:
-                why = _range(known[name], value, self.config.robot)
+                why = _explain_value(known[name], value, self.config.robot)
             if why:
                 plain = int(value) if value.is_integer() else value
-                yield Mistake(at_key(self.place, name), plain, why)
+                yield Mistake(format_place(self.place, name), plain, why)
         for parameter in kind.parameters:
             if parameter.default is None and parameter.name not in self.fault.parameters:
-                yield Mistake(at_key(self.place, parameter.name), None, f"missing; {parameter}")
+                yield Mistake(
+                    format_place(self.place, parameter.name), None, f"missing; {parameter}"
+                )
 
-    def _target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
-        if why := self._why_not_board(kind, tasks):
-            yield self._mistake("board", why)
-        elif why := self._why_not_mailbox(kind):
-            yield self._mistake("mailbox", why)
+    def _check_target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
+        if why := self._explain_board(kind, tasks):
+            yield self._build_mistake("board", why)
+        elif why := self._explain_mailbox(kind):
+            yield self._build_mistake("mailbox", why)
 
-    def _why_not_board(self, kind: Kind, tasks: Mapping[str, Role]) -> str:
+    def _explain_board(self, kind: Kind, tasks: Mapping[str, Role]) -> str:
         """Return why a fault of this kind cannot strike the task. Empty if it can."""
         board = self.fault.board
         if board in self.config.host and self.config.host[board].external:
             return "the rack does not start this external board, so it has no process to strike"
         if board == CLOCK:
-            kinds = _listed(other.name for other in KINDS if "clock" in other.tasks)
+            kinds = _format_names(other.name for other in KINDS if "clock" in other.tasks)
             why = f"{kind.name} cannot strike the clock; kinds that can: {kinds}"
             return "" if "clock" in kind.tasks else why
         if kind.tasks == ("clock",):
             return f'{kind.name} strikes only the clock; must be "{CLOCK}"'
         if tasks[board] not in kind.tasks:
             role = kind.tasks[0]
-            fitting = _listed(name for name, other in tasks.items() if other == role)
+            fitting = _format_names(name for name, other in tasks.items() if other == role)
             return f"{kind.name} strikes only {role}s; {role}s: {fitting}"
         if kind.where == "arm":
             able = [
@@ -160,30 +164,33 @@ class FaultRules:
                 if name not in self.levels or kind.name in self.levels[name].struck_by
             ]
             if board not in able:
-                return f"{kind.name} cannot strike this board; boards that it can: {_listed(able)}"
+                return (
+                    f"{kind.name} cannot strike this board; boards that it can: "
+                    f"{_format_names(able)}"
+                )
         return ""
 
-    def _layout_of(self, place: str) -> Layout | None:
+    def _find_layout(self, place: str) -> Layout | None:
         """Return the layout. None if there is none, or if it lacks the board of this place."""
         is_known = place.partition(".")[0].strip() not in self.unspecified
         return self.layout if is_known else None
 
-    def _why_not_mailbox(self, kind: Kind) -> str:
+    def _explain_mailbox(self, kind: Kind) -> str:
         """Return why a fault of this kind cannot strike the task's mailboxes. Empty if it can."""
         board = self.fault.board
         mailbox = self.fault.mailbox
-        layout = self._layout_of(board)
+        layout = self._find_layout(board)
         if layout is None or board == CLOCK or not kind.takes_mailbox:
             return ""
         # The reader of a queue writes its position without a port, so only bus faults reach it.
         written = {
             m.name: m
             for m in layout.mailboxes
-            if m.writer == board and (kind.where == "bus" or not is_position(m))
+            if m.writer == board and (kind.where == "bus" or not is_position_mailbox(m))
         }
         struck = [m for m in written.values() if mailbox in (None, m.name)]
         if mailbox is not None and not struck:
-            return f"'{board}' does not write it; it writes: {_listed(written)}"
+            return f"'{board}' does not write it; it writes: {_format_names(written)}"
         if kind.not_queued and struck and all(m.protocol == "queue" for m in struck):
             why = f"'{struck[0].name}' is a queue, which {kind.name} does not strike"
             return f"{why}: {kind.not_queued}"
@@ -194,23 +201,23 @@ class FaultRules:
         locked = [m.name for m in written.values() if m.protocol == "lock"]
         if kind.where == "lock" and (not locked or mailbox not in (None, *locked)):
             why = f"{kind.name} needs protocol lock; mailboxes of '{board}' that use it"
-            return f"{why}: {_listed(locked)}"
+            return f"{why}: {_format_names(locked)}"
         return ""
 
-    def _without(self, keys: Iterable[str], why: str) -> Mistakes:
+    def _forbid_keys(self, keys: Iterable[str], why: str) -> Mistakes:
         """Yield a mistake for each of these keys that is given."""
         for key in keys:
-            if self._value(key) is not None:
-                yield self._mistake(key, why)
+            if self._get_value(key) is not None:
+                yield self._build_mistake(key, why)
 
-    def _value(self, key: str) -> object:
+    def _get_value(self, key: str) -> object:
         return self.fault.lasts if key == "for" else getattr(self.fault, key)
 
-    def _mistake(self, key: str, why: str) -> Mistake:
-        return Mistake(at_key(self.place, key), self._value(key), why)
+    def _build_mistake(self, key: str, why: str) -> Mistake:
+        return Mistake(format_place(self.place, key), self._get_value(key), why)
 
 
-def _range(parameter: Parameter, value: float, robot: RobotConfig | None) -> str:
+def _explain_value(parameter: Parameter, value: float, robot: RobotConfig | None) -> str:
     """Return why a value of the parameter is not valid. Empty if it is."""
     most = parameter.most
     if parameter.name == "joint" and robot is not None:
@@ -221,22 +228,26 @@ def _range(parameter: Parameter, value: float, robot: RobotConfig | None) -> str
     return ""
 
 
-def _listed(names: Iterable[str]) -> str:
+def _format_names(names: Iterable[str]) -> str:
     """Return names separated by commas, or "none"."""
     return ", ".join(names) or "none"
 
 
-def places(config: RackConfig) -> list[tuple[str, FaultConfig]]:
+def list_faults(config: RackConfig) -> list[tuple[str, FaultConfig]]:
     """Return each fault of a config with its place, as in "fault[0]"."""
     return [(f"fault[{at}]", fault) for at, fault in enumerate(config.fault)]
 
 
-def injections(config: RackConfig, layout: Layout) -> tuple[Injection, ...]:
+def build_injections(config: RackConfig, layout: Layout) -> tuple[Injection, ...]:
     """Return the fault table's entries for the faults of a checked config."""
-    return tuple(_injection(fault, config, layout, place) for place, fault in places(config))
+    return tuple(
+        _build_injection(fault, config, layout, place) for place, fault in list_faults(config)
+    )
 
 
-def injection(fault: FaultConfig, config: RackConfig, levels: Levels, layout: Layout) -> Injection:
+def build_live_injection(
+    fault: FaultConfig, config: RackConfig, levels: Levels, layout: Layout
+) -> Injection:
     """Check a fault that is injected live and return its entry for the fault table.
 
     Args:
@@ -248,12 +259,14 @@ def injection(fault: FaultConfig, config: RackConfig, levels: Levels, layout: La
     Raises:
         ConfigError: The fault has mistakes. All of them are listed.
     """
-    if mistakes := fault_mistakes([("", fault)], config, levels, layout):
+    if mistakes := find_fault_mistakes([("", fault)], config, levels, layout):
         raise ConfigError(mistakes)
-    return _injection(fault, config, layout, "")
+    return _build_injection(fault, config, layout, "")
 
 
-def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: str) -> Injection:
+def _build_injection(
+    fault: FaultConfig, config: RackConfig, layout: Layout, place: str
+) -> Injection:
     kind = KINDS[fault.kind]
     names = [process.name for process in layout.processes]
     task = -1 if fault.board == CLOCK else names.index(fault.board)
@@ -261,7 +274,7 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: st
     if seed is None:
         # Two faults of one config must draw different random numbers.
         seed = crc32(f"{config.seed} {place}".encode()) % SEEDS
-    when = None if fault.when is None else condition(fault.when, layout)
+    when = None if fault.when is None else parse_condition(fault.when, layout)
     # Zero ticks mean until the end of the run, or that the fault strikes once.
     ticks = 0
     if fault.cycles is not None:
@@ -271,8 +284,8 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: st
     return Injection(
         kind=kind.number,
         task=task,
-        mailbox=_mailbox(fault, kind, layout),
-        tick=first_tick(fault, layout.clock_ns),
+        mailbox=_find_mailbox(fault, kind, layout),
+        tick=compute_first_tick(fault, layout.clock_ns),
         ticks=ticks,
         phase=int(fault.phase * PHASES),
         seed=seed,
@@ -283,10 +296,10 @@ def _injection(fault: FaultConfig, config: RackConfig, layout: Layout, place: st
     )
 
 
-def _mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
+def _find_mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
     """Return the index of the mailbox to strike. -1 if it is every one the task writes, or none."""
     if fault.mailbox is not None:
-        return layout.index(fault.mailbox)
+        return layout.find_mailbox_index(fault.mailbox)
     # A bus fault forges one message in one mailbox, by default the first that has a reader.
     candidates = (
         at

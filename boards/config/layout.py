@@ -9,24 +9,24 @@ from typing import Any
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import (
-    SPARE,
+    SPARE_SLOTS,
     ExchangeSpec,
     FieldSpec,
     InterruptSpec,
     Layout,
     MailboxSpec,
     TaskSpec,
-    depth_for,
+    compute_depth,
 )
-from rack.backplane.mailbox.queue import QueueTaken, taken_name
+from rack.backplane.mailbox.queue import QueueTaken, get_position_mailbox
 from rack.backplane.message_type import MessageType
 from rack.boards.config.connections import TaskPorts, Wiring
 from rack.boards.config.protocols import UNREAD
-from rack.boards.config.schema import RackConfig, TaskPlace
+from rack.boards.config.schema import RackConfig, TaskEntry
 
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox. Few are needed, because commands are rare."""
-KEPT_S = 2.0
+RETAINED_S = 2.0
 """Simulated time that mailboxes and trace rings retain.
 
 Real-time boards may starve a recorder for 1 s, in which it must lose nothing.
@@ -42,7 +42,7 @@ NS_PER_US = 1e3
 NS_PER_MS = 1e6
 
 
-def obtained_core(core: int) -> int:
+def find_core(core: int) -> int:
     """Return the core on which a task runs that requests `core`.
 
     A core that the machine lacks is replaced by one of the available cores, in turn.
@@ -51,21 +51,21 @@ def obtained_core(core: int) -> int:
     return core if core in available else available[core % len(available)]
 
 
-def shared_out(config: RackConfig) -> list[str]:
+def list_replaced_cores(config: RackConfig) -> list[str]:
     """Return a note for every requested core that is not available and is replaced."""
     requested: dict[int, list[str]] = {config.clock.core: [CLOCK]}
-    for place in config.tasks():
+    for place in config.list_tasks():
         requested.setdefault(place.core, []).append(place.name)
     available = ", ".join(map(str, sorted(os.sched_getaffinity(0))))
     return [
-        f"core {core} is not available (available: {available}): core {obtained_core(core)} runs"
+        f"core {core} is not available (available: {available}): core {find_core(core)} runs"
         f" {', '.join(tasks)}"
         for core, tasks in sorted(requested.items())
-        if obtained_core(core) != core
+        if find_core(core) != core
     ]
 
 
-def exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
+def build_exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
     """Return when an executor reads the ports of its `exchange` table, by port, in ticks."""
     board = ports.place.board
     every = wiring.every[board]
@@ -78,7 +78,7 @@ def exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
     }
 
 
-class LayoutMaker:
+class LayoutBuilder:
     """Computes the layout of a wiring that has no mistakes.
 
     Args:
@@ -90,30 +90,30 @@ class LayoutMaker:
         self._wiring = wiring
         self._config = wiring.config
         self._sizes = sizes
-        self._kept = round(KEPT_S * 1e9 / wiring.config.clock_ns)
-        self._tasks = {ports.task: self._task(ports.place) for ports in wiring.tasks}
-        self._hosts = {ports.task: self._host(ports.place) for ports in wiring.hosts}
+        self._kept = round(RETAINED_S * 1e9 / wiring.config.clock_ns)
+        self._tasks = {ports.task: self._build_task(ports.place) for ports in wiring.tasks}
+        self._hosts = {ports.task: self._build_host(ports.place) for ports in wiring.hosts}
 
-    def layout(self) -> Layout:
+    def build_layout(self) -> Layout:
         """Compute the layout."""
-        mailboxes = [box for name in self._wiring.writers for box in self._written(name)]
+        mailboxes = [box for name in self._wiring.writers for box in self._build_written(name)]
         # The clock writes the operator's commands to the levels.
         mailboxes += [
-            self._mailbox(name, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
-            for name in self._wiring.operated
+            self._build_mailbox(name, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
+            for name in self._wiring.operator_mailboxes
         ]
         tasks = tuple(self._tasks.values())
         hosts = tuple(self._hosts.values())
         return Layout(self._config.name, self._config.clock_ns, tasks, tuple(mailboxes), hosts)
 
-    def _written(self, name: str) -> Iterator[MailboxSpec]:
+    def _build_written(self, name: str) -> Iterator[MailboxSpec]:
         """Yield a mailbox and, for a queue, the mailbox with the position of its reader."""
         ports, output = self._wiring.writers[name]
         capacity = self._config.protocol.depth.get(name, UNREAD)
         if name in self._wiring.from_host:
             # The ring of a host board is a queue that does not depend on ticks.
-            depth = depth_for(capacity + SPARE, 1)
-            yield self._mailbox(
+            depth = compute_depth(capacity + SPARE_SLOTS, 1)
+            yield self._build_mailbox(
                 name, writer=ports.task, every=1, delay=0, depth=depth, capacity=capacity
             )
             return
@@ -122,31 +122,31 @@ class LayoutMaker:
         delay = writer.slice
         # A message that is visible at the start of a reader's slice must last until its end.
         tasks_and_hosts = self._tasks | self._hosts
-        readers = [tasks_and_hosts[reader] for reader in self._wiring.readers(name)]
+        readers = [tasks_and_hosts[reader] for reader in self._wiring.list_readers(name)]
         slowest = max((reader.slice for reader in readers), default=0)
-        box = self._mailbox(
+        box = self._build_mailbox(
             name,
             writer=writer.name,
             every=every,
             delay=delay,
-            depth=depth_for(max(slowest + delay, self._kept), every),
+            depth=compute_depth(max(slowest + delay, self._kept), every),
             rests_on=tuple(
                 box
-                for box in ports.rests_on(name.partition(".")[2])
-                if self._wiring.protocol(box) != "queue"
+                for box in ports.find_origin_mailboxes(name.partition(".")[2])
+                if self._wiring.find_protocol(box) != "queue"
             ),
             phase=writer.phase,
             max_age=round(output.max_age_s * 1e9 / self._config.clock_ns),
         )
         if box.protocol == "interrupt":
-            yield self._with_interrupts(box, writer, readers)
+            yield self._add_interrupts(box, writer, readers)
         # A queue has no reader here if its reader's board has mistakes.
         elif box.protocol == "queue" and readers:
-            yield from self._queue(box, capacity, readers[0], writer)
+            yield from self._build_queue(box, capacity, readers[0], writer)
         else:
             yield box
 
-    def _queue(
+    def _build_queue(
         self, box: MailboxSpec, capacity: int, reader: TaskSpec, writer: TaskSpec
     ) -> Iterator[MailboxSpec]:
         """Yield a queue and the mailbox in which its reader reports its position to the writer.
@@ -163,21 +163,21 @@ class LayoutMaker:
         # more messages than the capacity.
         most = capacity * (1 + self._kept // (box.delay + delay))
         # A deep queue retains fewer messages, to limit its memory.
-        slots = depth_for(min(most, 2 * capacity + SUSTAINED * self._kept // box.every), 1)
+        slots = compute_depth(min(most, 2 * capacity + SUSTAINED * self._kept // box.every), 1)
         yield replace(box, capacity=capacity, depth=slots)
-        yield self._mailbox(
-            taken_name(box.name),
+        yield self._build_mailbox(
+            get_position_mailbox(box.name),
             QueueTaken.message_type,
             readers=(writer.name,),
             protocol="time-slice",
             writer=reader.name,
             every=read.every,
             delay=delay,
-            depth=depth_for(max(writer.slice + delay, self._kept), read.every),
+            depth=compute_depth(max(writer.slice + delay, self._kept), read.every),
             phase=(read.phase + delay) % read.every,
         )
 
-    def _with_interrupts(
+    def _add_interrupts(
         self, box: MailboxSpec, writer: TaskSpec, readers: Sequence[TaskSpec]
     ) -> MailboxSpec:
         """Return a mailbox of protocol interrupt with the costs and times of its messages.
@@ -213,10 +213,10 @@ class LayoutMaker:
         # A message must still be in its slot when the last pending interrupt is served.
         waits = -(-(table.depth + 1) * service_ns // clock_ns)
         slowest = max((reader.slice for reader in readers), default=0)
-        depth = depth_for(max(slowest + delay + waits, self._kept), box.every)
+        depth = compute_depth(max(slowest + delay + waits, self._kept), box.every)
         return replace(box, delay=delay, depth=depth, interrupt=interrupt)
 
-    def _task(self, place: TaskPlace) -> TaskSpec:
+    def _build_task(self, place: TaskEntry) -> TaskSpec:
         board = self._config.board[place.board]
         every = self._wiring.every[place.board]
         wake = board.wake or self._config.clock.wake
@@ -226,17 +226,17 @@ class LayoutMaker:
             board=place.board,
             role=place.role,
             slot=place.slot,
-            core=obtained_core(place.core),
+            core=find_core(place.core),
             priority=place.priority,
             every=every,
             within_cycles=board.within_cycles if is_planner else 1,
-            depth=depth_for(self._kept, every),
+            depth=compute_depth(self._kept, every),
             # The planner of a polling executor must not poll too.
             wake="timer" if is_planner and wake == "poll" else wake,
             phase=board.phase,
         )
 
-    def _host(self, place: TaskPlace) -> TaskSpec:
+    def _build_host(self, place: TaskEntry) -> TaskSpec:
         """Return the record of a host board, which has no rate and no trace."""
         return TaskSpec(
             name=place.name,
@@ -251,7 +251,9 @@ class LayoutMaker:
             is_external=self._config.host[place.board].external,
         )
 
-    def _mailbox(self, name: str, kind: MessageType | None = None, **fields: Any) -> MailboxSpec:
+    def _build_mailbox(
+        self, name: str, kind: MessageType | None = None, **fields: Any
+    ) -> MailboxSpec:
         """Return the record of a mailbox.
 
         Args:
@@ -263,28 +265,28 @@ class LayoutMaker:
         kind = kind or wiring.types[name]
         reading = wiring.reading.get(name, ())
         derived = {
-            "readers": wiring.readers(name),
-            "protocol": wiring.protocol(name),
+            "readers": wiring.list_readers(name),
+            "protocol": wiring.find_protocol(name),
             "exchanges": tuple(
-                exchanges(wiring, p)[port] for p, port in reading if port in p.exchange
+                build_exchanges(wiring, p)[port] for p, port in reading if port in p.exchange
             ),
         }
         return MailboxSpec(
             name=name,
             message=kind.name,
             version=kind.version,
-            size=kind.dtype(self._sizes).itemsize,
-            fields=field_specs(kind, self._sizes),
+            size=kind.build_dtype(self._sizes).itemsize,
+            fields=build_field_specs(kind, self._sizes),
             **{**derived, **fields},
         )
 
 
-def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:
+def build_field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:
     """Return the fields of a message type as plain data, with offsets, shapes and numpy types.
 
     Tools that attach to a rack read messages by these records, without the message classes.
     """
-    offsets: Mapping[str, Any] = kind.dtype(sizes).fields or {}
+    offsets: Mapping[str, Any] = kind.build_dtype(sizes).fields or {}
     specs = []
     for field in kind.fields:
         dtype, offset = offsets[field.name][:2]
@@ -300,7 +302,7 @@ def field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec,
                 offset=offset,
                 unit=field.unit if isinstance(field.unit, str) else field.unit.__name__,
                 meaning=field.meaning,
-                fields=() if group is None else field_specs(group, sizes),
+                fields=() if group is None else build_field_specs(group, sizes),
                 values=tuple((number.name.lower(), int(number)) for number in names),
                 length=field.length,
             )

@@ -14,11 +14,11 @@ from typing import TypeVar
 from pydantic import ValidationError
 
 from rack.boards.classes import extend_path
-from rack.boards.config.files import CONFIGS, Assembled, anchor, assembled
-from rack.boards.config.mistakes import mistakes_of
+from rack.boards.config.files import CONFIGS, Assembled, assemble, resolve_paths
+from rack.boards.config.mistakes import convert_errors
 from rack.boards.config.resolved import Examination
 from rack.boards.config.schema import LAST_SLOT, CommandConfig, RackConfig
-from rack.boards.config.toml import Tables, parse, table_of, without
+from rack.boards.config.toml import Tables, find_table_name, parse_tables, remove_tables
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.levels.errors import RobotError
@@ -43,15 +43,15 @@ def load(
     Raises:
         ConfigError: A file, a setting or a table is wrong. All mistakes are listed.
     """
-    return validated(assembled(name_or_path, overrides, faults))
+    return validate(assemble(name_or_path, overrides, faults))
 
 
-def loads(text: str) -> RackConfig:
+def load_text(text: str) -> RackConfig:
     """Load a config from TOML text, as `RackConfig.to_toml_text` writes it.
 
     Like `load`, this extends the import path and raises `ConfigError` with every mistake.
     """
-    return validated(Assembled(anchor(parse(text), CONFIGS)))
+    return validate(Assembled(resolve_paths(parse_tables(text), CONFIGS)))
 
 
 def read_stored(text: str) -> RackConfig:
@@ -62,14 +62,14 @@ def read_stored(text: str) -> RackConfig:
     Raises:
         ConfigError: A table is wrong. All mistakes are listed.
     """
-    tables = anchor(parse(text), CONFIGS)
+    tables = resolve_paths(parse_tables(text), CONFIGS)
     try:
-        return _with_derived(RackConfig.model_validate(tables))
+        return _complete_robot(RackConfig.model_validate(tables))
     except ValidationError as error:
-        raise ConfigError(mistakes_of(error, RackConfig, tables)) from None
+        raise ConfigError(convert_errors(error, RackConfig, tables)) from None
 
 
-def validated(assembly: Assembled) -> RackConfig:
+def validate(assembly: Assembled) -> RackConfig:
     """Validate the tables of a config, and add the folders of its levels to the import path.
 
     Raises:
@@ -82,33 +82,33 @@ def validated(assembly: Assembled) -> RackConfig:
     try:
         config = RackConfig.model_validate(tables)
     except ValidationError as error:
-        broken |= _broken(error)
+        broken |= _find_broken_tables(error)
         mistakes += [
             mistake
-            for mistake in mistakes_of(error, RackConfig, tables)
+            for mistake in convert_errors(error, RackConfig, tables)
             # A missing key may be in a file or setting that could not be read.
             if not mistake.why.startswith("missing")
-            or (assembly.is_whole and table_of(mistake.place) not in assembly.broken)
+            or (assembly.is_whole and find_table_name(mistake.place) not in assembly.broken)
         ]
     if not assembly.is_whole:
         raise ConfigError(mistakes)
     if broken:
-        config = _intact(tables, broken)
+        config = _build_valid_part(tables, broken)
     extend_path(config.python_path)
     try:
-        config = _with_derived(config)
+        config = _complete_robot(config)
     except ConfigError as error:
         broken |= {"robot"}
         mistakes += error.mistakes
-        config = _intact(tables, broken)
+        config = _build_valid_part(tables, broken)
     if not mistakes:
         return config
-    faults = _readable(tables, "fault", FaultConfig)
-    commands = _readable(tables, "command", CommandConfig)
+    faults = _iterate_valid_tables(tables, "fault", FaultConfig)
+    commands = _iterate_valid_tables(tables, "command", CommandConfig)
     raise ConfigError([*mistakes, *Examination(config, faults, commands, broken).mistakes])
 
 
-def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
+def _iterate_valid_tables(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
     """Yield place and record of each valid table of a list. Invalid ones are already reported."""
     entries = tables.get(key)
     if not isinstance(entries, list):
@@ -118,7 +118,7 @@ def _readable(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]
             yield f"{key}[{at}]", kind.model_validate(entry)
 
 
-def _broken(error: ValidationError) -> frozenset[str]:
+def _find_broken_tables(error: ValidationError) -> frozenset[str]:
     """Return the tables with mistakes, as "robot", "board.servo" or "host.program"."""
     places = [[str(key) for key in entry["loc"]] for entry in error.errors()]
     return frozenset(
@@ -126,9 +126,11 @@ def _broken(error: ValidationError) -> frozenset[str]:
     )
 
 
-def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
+def _build_valid_part(tables: Tables, broken: frozenset[str]) -> RackConfig:
     """Return a config that consists of the tables without mistakes."""
-    valid = without({key: tables[key] for key in RackConfig.model_fields if key in tables}, broken)
+    valid = remove_tables(
+        {key: tables[key] for key in RackConfig.model_fields if key in tables}, broken
+    )
     # Placeholders for required tables: nothing that depends on a broken table is checked.
     required = {"name": "unnamed", "clock": {"period_ms": 1}}
     board = {"unnamed": {"slot": LAST_SLOT, "every": 1, "executor": "unnamed:Unnamed"}}
@@ -136,7 +138,7 @@ def _intact(tables: Tables, broken: frozenset[str]) -> RackConfig:
     return config if valid["board"] else config.model_copy(update={"board": {}})
 
 
-def _with_derived(config: RackConfig) -> RackConfig:
+def _complete_robot(config: RackConfig) -> RackConfig:
     """Return the config with joints, tool and home of the arm taken from its model if not given.
 
     Raises:
@@ -145,9 +147,9 @@ def _with_derived(config: RackConfig) -> RackConfig:
     robot = config.robot
     if robot is None or (robot.joints and robot.tool and robot.home):
         return config
-    from rack.levels.robot.lookup import derived
+    from rack.levels.robot.lookup import derive_robot
 
     try:
-        return config.model_copy(update={"robot": derived(robot)})
+        return config.model_copy(update={"robot": derive_robot(robot)})
     except RobotError as error:
         raise ConfigError([Mistake("robot", None, str(error))]) from None

@@ -15,7 +15,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from rack.boards.errors import Mistake
-from rack.levels.tables import keys_of
+from rack.levels.tables import describe_keys
 
 HINTS = {
     "robot": (
@@ -25,7 +25,7 @@ HINTS = {
 """Hints by table, for an error about a missing key."""
 
 
-def mistakes_of(
+def convert_errors(
     error: ValidationError, model: type[BaseModel], tables: Any, place: str = ""
 ) -> list[Mistake]:
     """Convert a validation error of pydantic into mistakes.
@@ -36,7 +36,9 @@ def mistakes_of(
         tables: The tables.
         place: Place of the tables in the config. Empty for the whole config.
     """
-    reports = [_mistake(entry, model, tables, place) for entry in error.errors(include_url=False)]
+    reports = [
+        _convert_error(entry, model, tables, place) for entry in error.errors(include_url=False)
+    ]
     # pydantic reports a value of a union once for each member type. Keep the first report for each
     # place, and drop a report about a container if there is one about a value inside it.
     first = {mistake.place: mistake for mistake in reversed(reports)}
@@ -48,8 +50,8 @@ def mistakes_of(
     return [first[place] for place in reversed(first) if place not in within]
 
 
-def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: str) -> Mistake:
-    keys = _keys(entry["loc"], tables, entry["type"] == "missing")
+def _convert_error(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: str) -> Mistake:
+    keys = _drop_variant_names(entry["loc"], tables, entry["type"] == "missing")
     where = (
         place + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
     ).lstrip(".")
@@ -60,7 +62,7 @@ def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: st
         why = f"valid values: {valid}" if valid else "missing; it selects the kind of table"
         # pydantic puts the name of the key in quotes.
         return Mistake(f"{where}.{context['discriminator'][1:-1]}", context.get("tag"), why)
-    known, field = _declared(model, keys, tables)
+    known, field = _find_declaration(model, keys, tables)
     meaning = f"; {field.description}" if field is not None and field.description else ""
     if entry["type"] == "missing":
         return Mistake(where, None, f"missing{meaning}{HINTS.get(str(keys[0]), '')}")
@@ -79,7 +81,9 @@ def _mistake(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: st
     return Mistake(where, entry["input"], f"{text}{meaning}")
 
 
-def _keys(loc: tuple[int | str, ...], table: Any, is_missing: bool) -> list[int | str]:
+def _drop_variant_names(
+    loc: tuple[int | str, ...], table: Any, is_missing: bool
+) -> list[int | str]:
     """Return the keys of a location, without the names of union members that pydantic inserts."""
     keys: list[int | str] = []
     for key in loc:
@@ -90,7 +94,7 @@ def _keys(loc: tuple[int | str, ...], table: Any, is_missing: bool) -> list[int 
     return [*keys, loc[-1]] if is_missing else keys
 
 
-def _declared(
+def _find_declaration(
     model: type[BaseModel], keys: list[int | str], table: Any
 ) -> tuple[list[str], FieldInfo | None]:
     """Return the valid keys of the table that contains the last of `keys`, and that key's field."""
@@ -99,7 +103,7 @@ def _declared(
     field = None
     is_name = False
     for key in keys:
-        models = [kind for kind in models if _fits(kind, table)] or models
+        models = [kind for kind in models if _may_be_of_kind(kind, table)] or models
         try:
             table = table[key]
         except (LookupError, TypeError):
@@ -111,14 +115,14 @@ def _declared(
             # The user's name of a table, as "servo" in [board.servo].
             is_name = False
             continue
-        known = {name: f for kind in models for name, f in keys_of(kind).items()}
+        known = {name: f for kind in models for name, f in describe_keys(kind).items()}
         field = known.get(key)
-        models = list(_models(field.annotation)) if field is not None else []
+        models = list(_list_models(field.annotation)) if field is not None else []
         is_name = field is not None and get_origin(field.annotation) is dict
     return list(known), field
 
 
-def _fits(kind: type[BaseModel], table: Any) -> bool:
+def _may_be_of_kind(kind: type[BaseModel], table: Any) -> bool:
     """Return True if a table may be of a kind, judged by keys with fixed values (do = "goto")."""
     fixed = {
         key: get_args(f.annotation)
@@ -130,25 +134,25 @@ def _fits(kind: type[BaseModel], table: Any) -> bool:
     )
 
 
-def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+def _list_models(annotation: Any) -> Iterator[type[BaseModel]]:
     """Yield the models that occur in a type such as `tuple[Transfer | Goto, ...]`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):
-        yield from _models(part)
+        yield from _list_models(part)
 
 
-def repeated(place: str, names: Iterable[str]) -> Iterator[Mistake]:
+def report_repeated_names(place: str, names: Iterable[str]) -> Iterator[Mistake]:
     """Yield a mistake for every name that is listed more than once."""
-    for name, count in repeats(names):
+    for name, count in count_repeated_names(names):
         yield Mistake(place, name, f"listed {count} times")
 
 
-def repeats(names: Iterable[str]) -> Iterator[tuple[str, int]]:
+def count_repeated_names(names: Iterable[str]) -> Iterator[tuple[str, int]]:
     """Yield each name that occurs more than once, with the number of its occurrences."""
     return ((name, count) for name, count in Counter(names).items() if count > 1)
 
 
-def at_key(place: str, key: str) -> str:
+def format_place(place: str, key: str) -> str:
     """Return the place of a key in the table at `place`, which is empty outside a config."""
     return f"{place}.{key}" if place else key

@@ -19,14 +19,14 @@ from pydantic.fields import FieldInfo
 from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
 from rack.backplane.segment import Segment
-from rack.boards.config.connections import executors, takes_commands
+from rack.boards.config.connections import find_executors, has_operator_port
 from rack.boards.config.schema import RackConfig
 from rack.boards.faults.kind import KINDS, Kind
 from rack.boards.faults.kinds import BUILT_IN
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor
-from rack.levels.operator import NAMED, Goal, Operation
-from rack.levels.tables import Table, keys_of, live_keys, read_params
+from rack.levels.operator import NAMED_OPERATIONS, Goal, Operation
+from rack.levels.tables import Table, describe_keys, list_live_keys, read_params
 
 TYPES: Mapping[str, type] = {kind.__name__: kind for kind in (bool, int, float, str)}
 """Parameter types, by name, whose values can be checked without the level's class."""
@@ -83,7 +83,7 @@ class PublishedLevel:
     findings: tuple[PublishedFinding, ...] = ()
 
     @property
-    def table(self) -> type[Table]:
+    def params_model(self) -> type[Table]:
         """Model that checks values of the live parameters and accepts any other parameter."""
         fields: dict[str, Any] = dict.fromkeys(self.keys, (Any, None))
         for key, param in self.live.items():
@@ -104,7 +104,7 @@ class PublishedRack:
     levels: Levels = field(default_factory=dict)
     kinds: tuple[Kind, ...] = ()
 
-    def text(self) -> str:
+    def to_json(self) -> str:
         """Return the record as JSON, without the parts of fault kinds that are code."""
         return encode_json(ADAPTER.dump_python(self, exclude=CODE))
 
@@ -116,11 +116,11 @@ class PublishedRack:
             ValueError: The text is not such a record.
         """
         published = ADAPTER.validate_json(text)
-        KINDS.adopt(published.kinds)
+        KINDS.add_missing(published.kinds)
         return published
 
     @classmethod
-    def of_rack(cls, segment: Segment) -> PublishedRack:
+    def read_from_segment(cls, segment: Segment) -> PublishedRack:
         """Read the record that a rack has published. Raises `SegmentError` if it is not valid."""
         try:
             return cls.read(segment.published)
@@ -143,32 +143,34 @@ CODE: Any = {
 """Fields that are not published because they contain functions or classes."""
 
 
-def publish(config: RackConfig) -> PublishedRack:
+def gather_facts(config: RackConfig) -> PublishedRack:
     """Gather the facts about the levels of a rack. This imports their classes."""
-    levels = {name: _level(config, name, kind) for name, kind in executors(config).items()}
+    levels = {
+        name: _describe_level(config, name, kind) for name, kind in find_executors(config).items()
+    }
     return PublishedRack(levels, tuple(kind for kind in KINDS if kind.name not in BUILT_IN))
 
 
-def _level(config: RackConfig, board: str, kind: type[Executor]) -> PublishedLevel:
-    commands = kind.commands if takes_commands(kind) else {}
+def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> PublishedLevel:
+    commands = kind.commands if has_operator_port(kind) else {}
     params = config.board[board].params
     live: dict[str, PublishedParam] = {}
-    if kind.params is not None and (keys := live_keys(kind.params)):
-        declared = keys_of(kind.params)
+    if kind.params is not None and (keys := list_live_keys(kind.params)):
+        declared = describe_keys(kind.params)
         launched = None
         # Parameters with mistakes have no values. The mistakes are reported by the rules.
         with suppress(LevelError):
             launched = read_params(kind.params, params)
-        live = {key: _param(declared[key], getattr(launched, key, "")) for key in keys}
+        live = {key: _describe_param(declared[key], getattr(launched, key, "")) for key in keys}
     wording = {Operation.SET: tuple(live)}
-    for what in commands.keys() & {*NAMED} - {Operation.SET}:
+    for what in commands.keys() & {*NAMED_OPERATIONS} - {Operation.SET}:
         # A state table may be invalid while it is being edited.
         with suppress(LevelError):
-            wording[what] = tuple(kind.wording(what, params, config.scene))
+            wording[what] = tuple(kind.list_operation_names(what, params, config.scene))
     return PublishedLevel(
         commands={what: tuple(goals) for what, goals in commands.items()},
         wording=wording,
-        names=tuple(kind.names(params)),
+        names=tuple(kind.list_names(params)),
         keys=() if kind.params is None else tuple(kind.params.model_fields),
         live=live,
         struck_by=tuple(k.name for k in KINDS if isinstance(k.step, kind.faults)),
@@ -179,7 +181,7 @@ def _level(config: RackConfig, board: str, kind: type[Executor]) -> PublishedLev
     )
 
 
-def _param(declared: FieldInfo, launched: object) -> PublishedParam:
+def _describe_param(declared: FieldInfo, launched: object) -> PublishedParam:
     constraints: dict[Constraint, float | bool] = {}
     for bound in declared.metadata:
         for key in get_args(Constraint):

@@ -6,11 +6,11 @@ from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from rack.boards.faults.config import as_seconds
+from rack.boards.faults.config import parse_seconds
 from rack.levels.tables import Table
 
-Span = Annotated[float, BeforeValidator(as_seconds), Field(ge=0, le=1e6, allow_inf_nan=False)]
-Stretch = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False), BeforeValidator(as_seconds)]
+Span = Annotated[float, BeforeValidator(parse_seconds), Field(ge=0, le=1e6, allow_inf_nan=False)]
+Stretch = Annotated[float, Field(ge=1, le=1e6, allow_inf_nan=False), BeforeValidator(parse_seconds)]
 
 
 class RecordConfig(Table):
@@ -29,7 +29,7 @@ class RecordConfig(Table):
     """time kept after each such event [s]; also as in "5 s" """
 
     @model_validator(mode="after")
-    def _remembers(self) -> Self:
+    def _check_windows(self) -> Self:
         """Require that rows are kept until they may be needed: faults can be detected late."""
         if self.keep is not None and self.keep < self.before + self.after:
             raise ValueError(

@@ -14,14 +14,14 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core.core_schema import ModelSchema
 
-from rack.boards.config.connections import Wiring, executors
+from rack.boards.config.connections import Wiring, find_executors
 from rack.boards.config.files import EXTENDS
-from rack.boards.config.rules.mailboxes import exchange, ports
+from rack.boards.config.rules.mailboxes import check_exchange, check_ports
 from rack.boards.config.schema import LAN, RackConfig
-from rack.boards.errors import ConfigError, shown
+from rack.boards.errors import ConfigError, format_value
 from rack.boards.faults.kind import KINDS
 from rack.levels.ports import FindingKind
-from rack.levels.tables import keys_of
+from rack.levels.tables import describe_keys
 
 REQUIRED = "required"
 NAME = ".<name>"
@@ -76,33 +76,33 @@ class DescribedSchema(GenerateJsonSchema):
     def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
         """Return the JSON schema of one table."""
         json_schema = super().model_schema(schema)
-        for key, field in keys_of(schema["cls"]).items():
+        for key, field in describe_keys(schema["cls"]).items():
             json_schema["properties"][key]["description"] = field.description or ""
         return json_schema
 
 
-def key_tables(config: RackConfig) -> list[KeyTable]:
+def list_key_tables(config: RackConfig) -> list[KeyTable]:
     """Return every table that a config with these boards may contain.
 
     Raises:
         ConfigError: A class that the config names does not exist.
     """
     wiring = Wiring(config)
-    if mistakes := [*ports(wiring), *exchange(wiring)]:
+    if mistakes := [*check_ports(wiring), *check_exchange(wiring)]:
         raise ConfigError(mistakes)
-    top, *tables = _tables(RackConfig, "")
+    top, *tables = _list_model_tables(RackConfig, "")
     extends = Key("extends", "list of strings", "", "", "", EXTENDS)
     top = KeyTable("rack", "(top of the file)", top.meaning, (extends, *top.keys))
-    tables = [top, *tables, *_fault_kinds()]
+    tables = [top, *tables, *_list_fault_tables()]
     for program in wiring.programs:
-        tables += _tables(program, "task")
+        tables += _list_model_tables(program, "task")
     for board, params in wiring.params:
         # The parameters of the network adapter are written in `[adapter.lan]`.
         if config.adapter.lan is None or board != f"board.{LAN}":
-            tables += _tables(params, f"{board}.params")
+            tables += _list_model_tables(params, f"{board}.params")
     tables += [
-        _findings(board, kind.finding_kinds)
-        for board, kind in executors(config).items()
+        _build_findings_table(board, kind.finding_kinds)
+        for board, kind in find_executors(config).items()
         if kind.finding_kinds
     ]
     return tables
@@ -114,7 +114,7 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
     Raises:
         LookupError: No table has such a name. The message lists the tables.
     """
-    known = {table.name: table for table in key_tables(config)}
+    known = {table.name: table for table in list_key_tables(config)}
     parts = name.strip("[]").split(".")
     tables = [".".join(parts)]
     if (
@@ -135,55 +135,63 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
     )
 
 
-def _tables(model: type[BaseModel], path: str) -> Iterator[KeyTable]:
+def _list_model_tables(model: type[BaseModel], path: str) -> Iterator[KeyTable]:
     schema = model.model_json_schema(schema_generator=DescribedSchema)
-    return _walk(schema, schema.get("$defs", {}), path, path, f"[{path}]")
+    return _walk_schema(schema, schema.get("$defs", {}), path, path, f"[{path}]")
 
 
-def _walk(schema: Schema, known: Schema, name: str, path: str, heading: str) -> Iterator[KeyTable]:
+def _walk_schema(
+    schema: Schema, known: Schema, name: str, path: str, heading: str
+) -> Iterator[KeyTable]:
     """Yield the table that a schema describes, followed by the tables inside it."""
     keys = []
     inner: list[KeyTable] = []
     for key, entry in schema.get("properties", {}).items():
         below = f"{path}.{key}".lstrip(".")
-        tables = [*_inner(entry, known, f"{name}.{key}".lstrip("."), below, f"[{below}]")]
+        tables = [
+            *_list_inner_tables(entry, known, f"{name}.{key}".lstrip("."), below, f"[{below}]")
+        ]
         inner += tables
         if not tables:
-            keys.append(_key(key, entry, key in schema.get("required", ())))
+            keys.append(_describe_key(key, entry, key in schema.get("required", ())))
     if keys:
-        yield KeyTable(name, heading, _summary(schema.get("description", "")), tuple(keys))
+        yield KeyTable(
+            name, heading, _summarise_docstring(schema.get("description", "")), tuple(keys)
+        )
     yield from inner
 
 
-def _inner(entry: Schema, known: Schema, name: str, path: str, heading: str) -> Iterator[KeyTable]:
+def _list_inner_tables(
+    entry: Schema, known: Schema, name: str, path: str, heading: str
+) -> Iterator[KeyTable]:
     """Yield the tables that a value of this schema may be, or may contain."""
     if "$ref" in entry:
-        yield from _walk(known[entry["$ref"].rpartition("/")[2]], known, name, path, heading)
+        yield from _walk_schema(known[entry["$ref"].rpartition("/")[2]], known, name, path, heading)
     for option in entry.get("anyOf", ()):
-        yield from _inner(option, known, name, path, heading)
+        yield from _list_inner_tables(option, known, name, path, heading)
     kinds = entry.get("discriminator", {"mapping": {}})
     for value, ref in kinds["mapping"].items():
         chosen = f'{heading} with {kinds["propertyName"]} = "{value}"'
-        yield from _inner({"$ref": ref}, known, f"{name}.{value}", path, chosen)
+        yield from _list_inner_tables({"$ref": ref}, known, f"{name}.{value}", path, chosen)
     if isinstance(entry.get("items"), dict):
-        yield from _inner(entry["items"], known, name, path, f"[[{path}]]")
-    for value_schema in _named(entry):
-        yield from _inner(value_schema, known, name, f"{path}{NAME}", f"[{path}{NAME}]")
+        yield from _list_inner_tables(entry["items"], known, name, path, f"[[{path}]]")
+    for value_schema in _list_value_schemas(entry):
+        yield from _list_inner_tables(value_schema, known, name, f"{path}{NAME}", f"[{path}{NAME}]")
 
 
-def _named(entry: Schema) -> Iterator[Schema]:
+def _list_value_schemas(entry: Schema) -> Iterator[Schema]:
     """Yield the schemas of the values in a table whose keys are chosen by the user."""
     values = (entry.get("additionalProperties"), *entry.get("patternProperties", {}).values())
     yield from (value for value in values if isinstance(value, dict))
 
 
-def _key(name: str, entry: Schema, is_required: bool) -> Key:
+def _describe_key(name: str, entry: Schema, is_required: bool) -> Key:
     # A description declares the unit in brackets, as in "tick period [ms]; a whole number of ns".
     before, _, rest = entry.get("description", "").partition(" [")
     unit, _, after = rest.partition("]")
     default = entry.get("default")
-    default_text = "" if default in (None, [], {}) else shown(default)
-    kind, permitted = _values(entry)
+    default_text = "" if default in (None, [], {}) else format_value(default)
+    kind, permitted = _describe_values(entry)
     return Key(
         name=name,
         type=kind,
@@ -194,7 +202,7 @@ def _key(name: str, entry: Schema, is_required: bool) -> Key:
     )
 
 
-def _values(entry: Schema) -> tuple[str, list[str]]:
+def _describe_values(entry: Schema) -> tuple[str, list[str]]:
     """Return the type of a value and, for each alternative type with limits, its valid values.
 
     For a list or table of equal items, the limits are those on each item.
@@ -205,12 +213,12 @@ def _values(entry: Schema) -> tuple[str, list[str]]:
         kind = "path" if option.get("format") == "path" else option.get("type", "any")
         kind = {"array": "list", "object": "table"}.get(kind, kind)
         listed = option.get("prefixItems", ())
-        places = (option.get("items"), *listed, *_named(option))
+        places = (option.get("items"), *listed, *_list_value_schemas(option))
         item = next((place for place in places if isinstance(place, dict)), None)
         if item is None:
-            permitted = _limits(option)
+            permitted = _format_limits(option)
         else:
-            item_type, inner = _values(item)
+            item_type, inner = _describe_values(item)
             first, _, rest = item_type.partition(" ")
             count = f"{len(listed)} " if listed else ""
             kind = f"{kind} of {count}{first}s {rest}".rstrip()
@@ -223,32 +231,35 @@ def _values(entry: Schema) -> tuple[str, list[str]]:
     return " or ".join(kinds), limits
 
 
-def _limits(entry: Schema) -> str:
+def _format_limits(entry: Schema) -> str:
     """Return the valid values of a number, text or truth value as text. Empty without limits."""
     if values := entry.get("enum", [entry["const"]] if "const" in entry else []):
-        return ", ".join(map(shown, values))
+        return ", ".join(map(format_value, values))
     if {"minimum", "maximum"} <= entry.keys():
-        return f"{_number(entry['minimum'])} to {_number(entry['maximum'])}"
+        return f"{_format_number(entry['minimum'])} to {_format_number(entry['maximum'])}"
     bounds = [
-        next((f"{word} {_number(entry[key])}" for key, word in kinds.items() if key in entry), "")
+        next(
+            (f"{word} {_format_number(entry[key])}" for key, word in kinds.items() if key in entry),
+            "",
+        )
         for kinds in (LEAST, MOST)
     ]
     return ", ".join(filter(None, bounds))
 
 
-def _number(value: float) -> str:
+def _format_number(value: float) -> str:
     text = f"{value:g}"
     return text if float(text) == value else str(value)
 
 
-def _summary(docstring: str) -> str:
+def _summarise_docstring(docstring: str) -> str:
     """Return the first sentence of a table's docstring, without its heading."""
     text = " ".join(docstring.partition("\n\n")[0].split())
     text = text.rpartition("]`: ")[2].partition(". ")[0].rstrip(".")
     return text[:1].lower() + text[1:]
 
 
-def _findings(board: str, kinds: Mapping[str, FindingKind]) -> KeyTable:
+def _build_findings_table(board: str, kinds: Mapping[str, FindingKind]) -> KeyTable:
     """Return the events that a level declares, in the form of a table of keys."""
     keys = tuple(
         Key(kind.name, "number", kind.unit.removeprefix("1"), "", "", kind.doc)
@@ -259,7 +270,7 @@ def _findings(board: str, kinds: Mapping[str, FindingKind]) -> KeyTable:
     )
 
 
-def _fault_kinds() -> Iterator[KeyTable]:
+def _list_fault_tables() -> Iterator[KeyTable]:
     """Yield a table for each fault kind that has parameters, without the keys of all faults."""
     for kind in KINDS:
         keys = [
@@ -267,8 +278,8 @@ def _fault_kinds() -> Iterator[KeyTable]:
                 name=param.name,
                 type="integer" if param.is_whole else "number",
                 unit="" if param.unit == "1" else param.unit,
-                permitted=f"{_number(param.least)} to {_number(param.most)}",
-                default=REQUIRED if param.default is None else _number(param.default),
+                permitted=f"{_format_number(param.least)} to {_format_number(param.most)}",
+                default=REQUIRED if param.default is None else _format_number(param.default),
                 meaning=param.meaning,
             )
             for param in kind.parameters

@@ -14,27 +14,27 @@ from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
 from rack.backplane.operator_table import Request
 from rack.backplane.words import Demand
-from rack.boards.config.cell import cell_sizes
-from rack.boards.config.commands import command_mistakes, requests
+from rack.boards.config.cell import compute_cell_sizes
+from rack.boards.config.commands import build_requests, find_command_mistakes
 from rack.boards.config.connections import TaskPorts, Wiring
-from rack.boards.config.injections import fault_mistakes, injections, places
-from rack.boards.config.layout import KEPT_S, LayoutMaker, exchanges, obtained_core
-from rack.boards.config.published import PublishedRack, publish
-from rack.boards.config.rules import broken_rules, network_rules
-from rack.boards.config.rules.levels import memory, neighbours, sizes
+from rack.boards.config.injections import build_injections, find_fault_mistakes, list_faults
+from rack.boards.config.layout import RETAINED_S, LayoutBuilder, build_exchanges, find_core
+from rack.boards.config.published import PublishedRack, gather_facts
+from rack.boards.config.rules import apply_rules, load_network_rules
+from rack.boards.config.rules.levels import check_memory, check_neighbours, check_sizes
 from rack.boards.config.schema import LAN, CommandConfig, RackConfig
-from rack.boards.config.timing import is_critical, reservation
-from rack.boards.config.toml import table_of, without
+from rack.boards.config.timing import compute_reservation, is_critical
+from rack.boards.config.toml import find_table_name, remove_tables
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import (
     BusTimes,
     ClockWiring,
-    Entries,
+    ExchangedEntries,
     HostWiring,
     TaskWiring,
-    mailboxes_of,
+    list_mailboxes,
 )
 from rack.levels.level import LevelContext, Pace
 from rack.levels.tables import GoalConfig, RobotConfig
@@ -46,7 +46,7 @@ SILENT_S = 30.0
 
 At least 8 cycles of that level.
 """
-AHEAD_S = KEPT_S / 2
+AHEAD_S = RETAINED_S / 2
 """Simulated time by which lockstep may run ahead of a recorder: half of what the rings retain."""
 LAYOUT_NEEDS = {"clock", "protocol", "robot", "scene", "task"}
 """Tables that a layout depends on. If one has mistakes, no layout is computed."""
@@ -59,23 +59,23 @@ def resolve(config: RackConfig) -> Resolved:
         ConfigError: The config has mistakes. All of them are listed, including mistakes in the
             certificate files of this machine.
     """
-    network = network_rules(config)
+    network = load_network_rules(config)
     further = () if network is None else network.check_credentials(config)
-    return _examined(config, further).resolved()
+    return _examine(config, further).build_resolved_rack()
 
 
-def wire(config: RackConfig) -> Layout:
+def resolve_layout(config: RackConfig) -> Layout:
     """Return the layout of a config, without a check of files that only its own machine has.
 
     Raises:
         ConfigError: The config has mistakes. All of them are listed.
     """
-    return _examined(config).resolved().layout
+    return _examine(config).build_resolved_rack().layout
 
 
-def classes(config: RackConfig) -> tuple[str, ...]:
+def list_class_names(config: RackConfig) -> tuple[str, ...]:
     """Return the class names of all levels, which the crate preloads during the config check."""
-    return tuple(dict.fromkeys(place.target for place in config.tasks()))
+    return tuple(dict.fromkeys(place.target for place in config.list_tasks()))
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Resolved:
     published: PublishedRack
     goals: Mapping[int, GoalConfig]
 
-    def for_run(self, repeats: str, entries: Mapping[str, Entries] | None) -> Resolved:
+    def for_run(self, repeats: str, entries: Mapping[str, ExchangedEntries] | None) -> Resolved:
         """Return a copy for one run.
 
         Args:
@@ -126,7 +126,7 @@ class Resolved:
         """Whether adapters repeat the messages that entered a recorded run from outside."""
         return any(task.entries is not None for task in self.tasks)
 
-    def clock(self, seconds: float | None) -> ClockWiring:
+    def build_clock_wiring(self, seconds: float | None) -> ClockWiring:
         """Return the wiring of the clock's board.
 
         Args:
@@ -135,12 +135,12 @@ class Resolved:
         config = self.config
         clock = config.clock
         ends_run = self.ends_run
-        silent = self._ticks(SILENT_S)
+        silent = self._to_ticks(SILENT_S)
         if ends_run is not None:
-            writer = self.layout.mailbox(ends_run).writer
-            silent = max(silent, 8 * self.layout.task(writer).every)
+            writer = self.layout.find_mailbox(ends_run).writer
+            silent = max(silent, 8 * self.layout.find_task(writer).every)
         executors = [task for task in self.layout.tasks if task.role == "executor"]
-        core = obtained_core(clock.core)
+        core = find_core(clock.core)
         # In lockstep the clock shares the core of the fastest board, because a context switch is
         # faster than waking up another core. A polling board never yields its core.
         if config.is_lockstep and (yielding := [t for t in executors if t.wake != "poll"]):
@@ -150,20 +150,20 @@ class Resolved:
         return ClockWiring(
             lockstep=config.is_lockstep,
             period_ns=config.tick_ns,
-            stop_tick=0 if seconds is None else max(1, self._ticks(seconds)),
+            stop_tick=0 if seconds is None else max(1, self._to_ticks(seconds)),
             ends_run=ends_run,
-            linger=self._ticks(LINGER_S),
+            linger=self._to_ticks(LINGER_S),
             silent=silent,
-            history=self._ticks(AHEAD_S),
+            history=self._to_ticks(AHEAD_S),
             core=core,
             priority=clock.priority,
             keeps_awake=not config.is_lockstep and clock.idle_cores == "awake",
-            reservation=reservation(config, config.timing.clock_ms, 1),
-            restart_ticks=max(1, self._ticks(config.supervision.lockstep_restart_s)),
+            reservation=compute_reservation(config, config.timing.clock_ms, 1),
+            restart_ticks=max(1, self._to_ticks(config.supervision.lockstep_restart_s)),
             on_loss={task.name: demands[config.board[task.board].on_loss] for task in executors},
         )
 
-    def _ticks(self, seconds: float) -> int:
+    def _to_ticks(self, seconds: float) -> int:
         return round(seconds * 1e9 / self.config.clock_ns)
 
     @property
@@ -180,10 +180,10 @@ class Resolved:
         return max(min(priorities, default=0) - 1, 0)
 
 
-def _examined(config: RackConfig, further: Iterable[Mistake] = ()) -> Examination:
+def _examine(config: RackConfig, further: Iterable[Mistake] = ()) -> Examination:
     """Check a config. Raises `ConfigError` with its mistakes and the `further` ones, if any."""
     commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
-    examination = Examination(config, places(config), commands)
+    examination = Examination(config, list_faults(config), commands)
     if mistakes := [*examination.mistakes, *further]:
         raise ConfigError(mistakes)
     return examination
@@ -214,50 +214,53 @@ class Examination:
         self._wiring = Wiring(config, broken)
         self._sizes: dict[str, int] = {}
         self._layout: Layout | None = None
-        self.mistakes = broken_rules(self._wiring)
+        self.mistakes = apply_rules(self._wiring)
         # The checks that need a layout use only the boards without mistakes.
-        wrong = broken.union(table_of(mistake.place) for mistake in self.mistakes)
-        wiring = self._wiring if not wrong else Wiring(_reduced(config, wrong), wrong)
+        wrong = broken.union(find_table_name(mistake.place) for mistake in self.mistakes)
+        wiring = self._wiring if not wrong else Wiring(_remove_broken_boards(config, wrong), wrong)
         if wiring.tasks and not wrong & LAYOUT_NEEDS:
-            self._sizes = cell_sizes(config)
-            self.mistakes += (unknown_sizes := [*sizes(wiring, self._sizes)])
+            self._sizes = compute_cell_sizes(config)
+            self.mistakes += (unknown_sizes := [*check_sizes(wiring, self._sizes)])
             if not unknown_sizes:
-                self._layout = LayoutMaker(wiring, self._sizes).layout()
-                self._contexts = self._contexts_of_boards(wiring)
-                self.mistakes += memory(self._layout)
-                self.mistakes += neighbours(wiring, self._contexts)
-        self._published = publish(config)
+                self._layout = LayoutBuilder(wiring, self._sizes).build_layout()
+                self._contexts = self._build_board_contexts(wiring)
+                self.mistakes += check_memory(self._layout)
+                self.mistakes += check_neighbours(wiring, self._contexts)
+        self._published = gather_facts(config)
         levels = self._published.levels
-        self.mistakes += fault_mistakes(faults, config, levels, self._layout, wiring.unknown)
+        self.mistakes += find_fault_mistakes(
+            faults, config, levels, self._layout, wiring.unknown_boards
+        )
         broken_boards = self._wiring.broken_boards
-        self.mistakes += command_mistakes(commands, config, levels, broken_boards)
-        if (network := network_rules(config)) is not None:
+        self.mistakes += find_command_mistakes(commands, config, levels, broken_boards)
+        if (network := load_network_rules(config)) is not None:
             self.mistakes = [network.move_to_adapter(mistake, config) for mistake in self.mistakes]
 
-    def resolved(self) -> Resolved:
+    def build_resolved_rack(self) -> Resolved:
         """Return everything derived from the config, which must have no mistakes."""
         config = self._config
         layout = self._layout
         assert layout is not None, "no mistakes"
-        faults = injections(config, layout)
+        faults = build_injections(config, layout)
         failing = {
             layout.tasks[fault.task].name for fault in faults if KINDS[fault.kind].where == "start"
         }
         tasks = tuple(
-            self._task(layout, ports, ports.task in failing) for ports in self._wiring.tasks
+            self._build_task_wiring(layout, ports, ports.task in failing)
+            for ports in self._wiring.tasks
         )
-        hosts = tuple(self._host(ports) for ports in self._wiring.hosts)
+        hosts = tuple(self._build_host_wiring(ports) for ports in self._wiring.hosts)
         # A goal in the config replaces the program's goal for the same object.
         rows = config.scene.objects.index
         programs = [program.model_validate(config.task) for program in self._wiring.programs]
-        goals = [goal for program in programs for goal in program.goals()]
+        goals = [goal for program in programs for goal in program.list_goals()]
         goal_by_row = {rows(goal.object): goal for goal in (*goals, *config.scene.goal)}
-        commands = requests(config, layout)
+        commands = build_requests(config, layout)
         return Resolved(
             config, layout, tasks, hosts, faults, commands, self._published, goal_by_row
         )
 
-    def _host(self, ports: TaskPorts) -> HostWiring:
+    def _build_host_wiring(self, ports: TaskPorts) -> HostWiring:
         config = self._config
         name = ports.place.board
         return HostWiring(
@@ -265,14 +268,16 @@ class Examination:
             target=ports.place.target,
             inputs=dict(ports.sources),
             outputs=dict(ports.writes),
-            context=self._context(name, config.host[name].params, every=1, within_cycles=1),
+            context=self._build_context(name, config.host[name].params, every=1, within_cycles=1),
             is_external=config.host[name].external,
             computing=round(config.host[name].computing_ms * 1e6 / config.clock_ns),
         )
 
-    def _task(self, layout: Layout, ports: TaskPorts, fails_self_test: bool) -> TaskWiring:
+    def _build_task_wiring(
+        self, layout: Layout, ports: TaskPorts, fails_self_test: bool
+    ) -> TaskWiring:
         board = self._config.board[ports.place.board]
-        spec = layout.task(ports.task)
+        spec = layout.find_task(ports.task)
         is_executor = spec.role == "executor"
         # A bus adapter exchanges the mailboxes of the host side itself.
         of_host = self._wiring.of_host
@@ -284,7 +289,7 @@ class Examination:
             inputs={
                 port: source
                 for port, source in ports.reads.items()
-                if not from_host.intersection(mailboxes_of(source))
+                if not from_host.intersection(list_mailboxes(source))
             },
             outputs={port: box for port, box in ports.writes.items() if box not in of_host},
             context=self._contexts[spec.board],
@@ -293,9 +298,9 @@ class Examination:
             guards_clock=is_executor and spec.every == min(self._wiring.every.values()),
             fails_self_test=fails_self_test,
             entries=None,
-            exchange=exchanges(self._wiring, ports),
+            exchange=build_exchanges(self._wiring, ports),
             # Planners run below all reservations.
-            reservation=reservation(
+            reservation=compute_reservation(
                 self._config, board.busy_ms if is_executor else 0.0, spec.every
             ),
             transfer=BusTimes(
@@ -303,12 +308,12 @@ class Examination:
             ),
         )
 
-    def _contexts_of_boards(self, wiring: Wiring) -> dict[str, LevelContext]:
+    def _build_board_contexts(self, wiring: Wiring) -> dict[str, LevelContext]:
         every = wiring.every
         boards = wiring.config.board
         paces = {name: Pace(every[name], board.within_cycles) for name, board in boards.items()}
         return {
-            name: self._context(
+            name: self._build_context(
                 name,
                 board.params,
                 every=every[name],
@@ -322,7 +327,7 @@ class Examination:
             if boards.keys() >= {*board.above, *board.below}
         }
 
-    def _context(self, name: str, params: Mapping[str, Any], **times: Any) -> LevelContext:
+    def _build_context(self, name: str, params: Mapping[str, Any], **times: Any) -> LevelContext:
         config = self._config
         return LevelContext(
             board=name,
@@ -339,9 +344,9 @@ class Examination:
         )
 
 
-def _reduced(config: RackConfig, broken: frozenset[str]) -> RackConfig:
+def _remove_broken_boards(config: RackConfig, broken: frozenset[str]) -> RackConfig:
     """Return a config without the boards and host boards that have mistakes."""
-    tables = without({"board": config.board, "host": config.host}, broken)
+    tables = remove_tables({"board": config.board, "host": config.host}, broken)
     if "adapter" in broken:
         tables["board"].pop(LAN, None)
     return config.model_copy(update=tables)

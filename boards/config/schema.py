@@ -13,16 +13,16 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
-from rack.backplane.clock.system_clock import ticks_of
+from rack.backplane.clock.system_clock import compute_period_ticks
 from rack.backplane.layout import Role, TaskSpec, Wake
 from rack.backplane.rack_name import RACK_NAME
-from rack.boards.config.files import LAN_ADAPTER, STATE_TABLES, portable, with_texts
+from rack.boards.config.files import LAN_ADAPTER, STATE_TABLES, change_texts, shorten_path
 from rack.boards.config.protocols import MailboxName, ProtocolConfig
 from rack.boards.config.record import RecordConfig
 from rack.boards.config.toml import to_toml
 from rack.boards.faults.config import FaultConfig
 from rack.boards.lan.config import LanTable
-from rack.levels.operator import NAME_BYTES, Goal, Operation
+from rack.levels.operator import MAX_NAME_BYTES, Goal, Operation
 from rack.levels.tables import (
     Finite,
     Moment,
@@ -47,7 +47,7 @@ Mode = Literal["realtime", "lockstep"]
 OnLoss = Literal["hold", "stop", "brake"]
 
 
-def _listed(value: Any) -> Any:
+def _to_tuple(value: Any) -> Any:
     """Return a single name or a list of names as a tuple."""
     if isinstance(value, str):
         return (value,)
@@ -56,8 +56,8 @@ def _listed(value: Any) -> Any:
 
 RackName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]
 ClassName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$")]
-Neighbours = Annotated[tuple[str, ...], BeforeValidator(_listed)]
-Sources = Annotated[tuple[MailboxName, ...], BeforeValidator(_listed)]
+Neighbours = Annotated[tuple[str, ...], BeforeValidator(_to_tuple)]
+Sources = Annotated[tuple[MailboxName, ...], BeforeValidator(_to_tuple)]
 Slot = Annotated[int, Field(ge=CLOCK_SLOT + 1, le=LAST_SLOT)]
 Core = Annotated[int, Field(ge=0, le=1023)]
 Priority = Annotated[int, Field(ge=0, le=99)]
@@ -67,7 +67,7 @@ SHORTEST_MS = 0.01
 """Shortest tick, in real time and in simulated time."""
 FORMAT = 2
 """Newest format of configs, used since rack 0.2."""
-CHANGED = (
+FORMAT_NOTE = (
     'config format 1, from before rack 0.2: since then clock.idle_cores is "sleep" unless it is'
     " given, and classes of levels have moved (old names still work); write format = 2 when"
     " that suits you"
@@ -190,7 +190,7 @@ class SupervisionConfig(Table):
     to whole cycles; cycles due during an injected fault or the recovery from it do not count; 1: no
     limit"""
 
-    def restart_s(self, lockstep: bool) -> float:
+    def find_restart_time(self, lockstep: bool) -> float:
         """Return the longest simulated time that a restart may take, s."""
         return self.lockstep_restart_s if lockstep else max(RESTART_S, self.lockstep_restart_s)
 
@@ -279,7 +279,7 @@ class LanConfig(PlacedConfig, LanTable):
     rate_hz: Positive = Field(50.0, ge=1e-6)
     """rate of the board [Hz]; must divide the clock rate"""
 
-    def board(self) -> BoardConfig:
+    def build_board(self) -> BoardConfig:
         """Return the table of the board that this table adds to the rack."""
         placement = {key: value for key, value in self if key not in LanTable.model_fields}
         params = self.model_dump(
@@ -359,14 +359,14 @@ class CommandConfig(Table):
     """goal: direction of the tool's z axis, with any rotation about it; default: down"""
     home: bool = False
     """goal: the arm's start position"""
-    name: Annotated[str, StringConstraints(max_length=NAME_BYTES)] | None = None
+    name: Annotated[str, StringConstraints(max_length=MAX_NAME_BYTES)] | None = None
     """name of a control modification or of a state table; command to carry out, as in pick block1;
     parameter to set, as in bandwidth=80"""
     on: bool | None = None
     """whether to add (true) or to remove (false) the control modification"""
 
     @property
-    def said(self) -> Operation:
+    def operation(self) -> Operation:
         """Operation that is commanded."""
         return Operation[self.what.upper()]
 
@@ -380,7 +380,7 @@ class CommandConfig(Table):
         return goals if self.on is None else [*goals, Goal.ON if self.on else Goal.OFF]
 
 
-class TaskPlace(NamedTuple):
+class TaskEntry(NamedTuple):
     """Entry of the config for a task or a host board.
 
     Attributes:
@@ -459,16 +459,16 @@ class RackConfig(Table):
     """operator commands, each at a tick"""
 
     @model_validator(mode="after")
-    def _with_adapters(self) -> Self:
+    def _add_adapter_boards(self) -> Self:
         """Add the board of the network adapter."""
         if self.adapter.lan is not None and LAN not in self.board:
-            self.board[LAN] = self.adapter.lan.board()
+            self.board[LAN] = self.adapter.lan.build_board()
         return self
 
     @property
-    def changed(self) -> list[str]:
+    def format_notes(self) -> list[str]:
         """Note on the changes since the format of this config. Empty for the newest format."""
-        return [CHANGED] if self.format < FORMAT else []
+        return [FORMAT_NOTE] if self.format < FORMAT else []
 
     @property
     def is_lockstep(self) -> bool:
@@ -490,7 +490,7 @@ class RackConfig(Table):
         """Names of the arm's joints. Empty without an arm."""
         return () if self.robot is None else self.robot.joints
 
-    def every(self, board: str) -> int:
+    def find_period(self, board: str) -> int:
         """Return the period of a board's executor, ticks.
 
         Raises:
@@ -499,9 +499,9 @@ class RackConfig(Table):
         config = self.board[board]
         if config.every is not None:
             return config.every
-        return ticks_of(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
+        return compute_period_ticks(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
 
-    def links(self) -> Iterator[tuple[str, str]]:
+    def list_links(self) -> Iterator[tuple[str, str]]:
         """Yield each pair of neighbours as upper and lower board. One of them names the other."""
         listed = [(name, lower) for name, board in self.board.items() for lower in board.below]
         listed += [(upper, name) for name, board in self.board.items() for upper in board.above]
@@ -511,21 +511,21 @@ class RackConfig(Table):
             if {*link} <= self.board.keys() and link[0] != link[1]
         )
 
-    def all_below(self, board: str) -> set[str]:
+    def find_boards_below(self, board: str) -> set[str]:
         """Return all boards below a board, at any distance."""
-        direct = {lower for upper, lower in self.links() if upper == board}
-        return direct.union(*(self.all_below(lower) for lower in direct))
+        direct = {lower for upper, lower in self.list_links() if upper == board}
+        return direct.union(*(self.find_boards_below(lower) for lower in direct))
 
-    def tasks(self) -> Iterator[TaskPlace]:
+    def list_tasks(self) -> Iterator[TaskEntry]:
         """Yield the tasks of all boards: of each board the executor, then the planner."""
         for name, board in self.board.items():
-            yield TaskPlace(
+            yield TaskEntry(
                 name, name, "executor", board.executor, board.slot, board.core, board.priority
             )
             if board.planner is not None:
                 slot = board.slot if board.planner_slot is None else board.planner_slot
                 core = board.core if board.planner_core is None else board.planner_core
-                yield TaskPlace(
+                yield TaskEntry(
                     f"{name}.planner",
                     name,
                     "planner",
@@ -535,22 +535,22 @@ class RackConfig(Table):
                     board.planner_priority,
                 )
 
-    def hosts(self) -> Iterator[TaskPlace]:
+    def list_hosts(self) -> Iterator[TaskEntry]:
         """Yield the host boards. They have no slot and run on any core."""
         for name, host in self.host.items():
-            yield TaskPlace(name, name, "host", host.program, OUTSIDE, ANY_CORE, 0)
+            yield TaskEntry(name, name, "host", host.program, OUTSIDE, ANY_CORE, 0)
 
-    def table(self, of: TaskPlace | TaskSpec) -> BoardConfig | HostConfig:
+    def get_table(self, of: TaskEntry | TaskSpec) -> BoardConfig | HostConfig:
         """Return the table of a task's board, or of a host board."""
         return self.host[of.board] if of.role == "host" else self.board[of.board]
 
-    def rewired(self, place: TaskPlace) -> Mapping[str, Sources]:
+    def get_rewired_ports(self, place: TaskEntry) -> Mapping[str, Sources]:
         """Return the mailboxes to which the config connects ports of a task, by port."""
-        sources: Mapping[str, Sources] = getattr(self.table(place), place.reads_key)
+        sources: Mapping[str, Sources] = getattr(self.get_table(place), place.reads_key)
         return sources
 
     @property
-    def outside(self) -> str:
+    def outside_state(self) -> str:
         """State outside the rack that snapshots cannot contain, as text. Empty if there is none.
 
         Such a rack repeats a run only if the recorded messages from outside enter it again.
@@ -560,14 +560,14 @@ class RackConfig(Table):
         states += [f"'{LAN}': what comes from the network"] if self.adapter.lan is not None else []
         return "; ".join(states)
 
-    def text(self) -> str:
+    def to_toml_text(self) -> str:
         """Return the config as TOML text that loads to the same config without further files."""
         # JSON mode cannot represent infinity and NaN, which parameters of levels may contain.
         tables = self.model_dump(exclude_none=True, by_alias=True)
         tables["python_path"] = [str(folder) for folder in self.python_path]
         if self.robot is not None:
-            tables["robot"]["model"] = portable(self.robot.model)
+            tables["robot"]["model"] = shorten_path(self.robot.model)
         if self.adapter.lan is not None:
             tables["board"].pop(LAN, None)
-        tables = with_texts(tables, STATE_TABLES, lambda file: portable(Path(file)))
+        tables = change_texts(tables, STATE_TABLES, lambda file: shorten_path(Path(file)))
         return to_toml(tables)

@@ -8,7 +8,7 @@ from dataclasses import asdict, fields, replace
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.mailbox.inbox import InterruptSource
-from rack.backplane.mailbox.interrupt import how_sent
+from rack.backplane.mailbox.interrupt import get_interrupt_spec
 from rack.backplane.process import Reservation
 from rack.boards.config.schema import (
     BudgetConfig,
@@ -23,7 +23,7 @@ from rack.boards.timing.rack import CyclicSchedule, RackTiming
 from rack.boards.timing.tasks import Budget, Part, TimedTask, Unit
 
 NS_PER_MS = 1e6
-RESERVED = 2
+RESERVED_BUDGETS = 2
 """Factor between a board's budget and the processor time that it reserves per cycle.
 
 A budget is a 99th percentile, and the kernel suspends a task that exceeds its reservation until its
@@ -35,7 +35,7 @@ PLANNER_BUDGET = ("exchange_ms", "plan_ms", "update_ms", "plan_within_ms")
 """Keys of a budget that only a board with a planner may have."""
 
 
-def rack_timing(
+def build_rack_timing(
     config: RackConfig, layout: Layout, measured: Mapping[str, Budget] | None = None
 ) -> RackTiming:
     """Build the timing model's record of a rack.
@@ -45,12 +45,12 @@ def rack_timing(
         layout: Its layout.
         measured: Budgets by board. None for the budgets in the config.
     """
-    measured = budgets(config) if measured is None else measured
+    measured = read_budgets(config) if measured is None else measured
     goal_ms = config.timing.response_ms
     clock_cost_ns = round(config.timing.clock_ms * NS_PER_MS)
     parts = (Part(Unit.PROCESS, clock_cost_ns),) if clock_cost_ns else ()
     goal_ns = None if goal_ms is None else goal_ms * NS_PER_MS
-    schedule = None if config.schedule is None else frames(config.schedule, config.clock_ns)
+    schedule = None if config.schedule is None else compute_frames(config.schedule, config.clock_ns)
     return RackTiming(
         is_lockstep=config.is_lockstep,
         speed=config.clock.speed,
@@ -58,36 +58,39 @@ def rack_timing(
         clock=TimedTask(
             CLOCK, CLOCK, "clock", config.clock.core, config.clock.priority, config.tick_ns, parts
         ),
-        boards={name: _board(config, layout, name, measured.get(name)) for name in config.board},
+        boards={
+            name: _build_board_timing(config, layout, name, measured.get(name))
+            for name in config.board
+        },
         context_switch_ns=round(config.timing.context_switch_ms * NS_PER_MS),
         small_share=config.timing.small_share,
         response_goal_ns=goal_ns,
-        inboxes=inboxes(layout),
+        inboxes=build_inboxes(layout),
         schedule=schedule,
     )
 
 
-def frames(table: ScheduleConfig, clock_ns: int) -> CyclicSchedule:
+def compute_frames(table: ScheduleConfig, clock_ns: int) -> CyclicSchedule:
     """Return the frames of a static schedule, rounded to ticks."""
     return CyclicSchedule(*(round(ms * 1e6 / clock_ns) for ms in (table.minor_ms, table.major_ms)))
 
 
-def inboxes(layout: Layout) -> dict[str, InboxTiming]:
+def build_inboxes(layout: Layout) -> dict[str, InboxTiming]:
     """Return the inbox of each board that messages interrupt, by the task that serves it."""
     timings = {}
     for slot in dict.fromkeys(task.slot for task in layout.tasks):
-        if boxes := layout.interrupting(slot):
-            name = layout.handler(slot)
+        if boxes := layout.list_interrupting_mailboxes(slot):
+            name = layout.find_interrupt_task(slot)
             names = tuple(box.name for box in boxes)
             sources = tuple(
-                InterruptSource(box.every * layout.clock_ns, how_sent(box).service_ns)
+                InterruptSource(box.every * layout.clock_ns, get_interrupt_spec(box).service_ns)
                 for box in boxes
             )
-            timings[name] = InboxTiming(name, names, sources, how_sent(boxes[0]).depth)
+            timings[name] = InboxTiming(name, names, sources, get_interrupt_spec(boxes[0]).depth)
     return timings
 
 
-def without_interrupts(timing: RackTiming, measured: Mapping[str, Budget]) -> dict[str, Budget]:
+def subtract_interrupts(timing: RackTiming, measured: Mapping[str, Budget]) -> dict[str, Budget]:
     """Return budgets measured in a run without the time that interrupts took.
 
     In lockstep interrupts take no time.
@@ -97,24 +100,26 @@ def without_interrupts(timing: RackTiming, measured: Mapping[str, Budget]) -> di
     return {
         name: replace(
             budget,
-            read_ns=max(0, budget.read_ns - timing.interrupted_ns(name)),
-            plan_ns=max(0, budget.plan_ns - timing.interrupted_ns(f"{name}.planner")),
+            read_ns=max(0, budget.read_ns - timing.compute_interrupted_ns(name)),
+            plan_ns=max(0, budget.plan_ns - timing.compute_interrupted_ns(f"{name}.planner")),
         )
         for name, budget in measured.items()
     }
 
 
-def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None) -> BoardTiming:
+def _build_board_timing(
+    config: RackConfig, layout: Layout, name: str, budget: Budget | None
+) -> BoardTiming:
     board = config.board[name]
     within_ms = None if board.budget is None else board.budget.plan_within_ms
     within_ns = None if within_ms is None else round(within_ms * NS_PER_MS)
     planner_core = board.core if board.planner_core is None else board.planner_core
     return BoardTiming(
         name=name,
-        above=tuple(upper for upper, lower in config.links() if lower == name),
-        below=tuple(lower for upper, lower in config.links() if upper == name),
+        above=tuple(upper for upper, lower in config.list_links() if lower == name),
+        below=tuple(lower for upper, lower in config.list_links() if upper == name),
         coupling=board.coupling,
-        every=layout.task(name).every,
+        every=layout.find_task(name).every,
         within_cycles=board.within_cycles,
         core=board.core,
         priority=board.priority,
@@ -126,11 +131,11 @@ def _board(config: RackConfig, layout: Layout, name: str, budget: Budget | None)
         plan_within_ns=within_ns,
         queues=tuple(box.name for box in layout.mailboxes if box.capacity and name in box.readers),
         phase=board.phase,
-        reads=_reads(layout, name),
+        reads=_find_read_ticks(layout, name),
     )
 
 
-def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
+def _find_read_ticks(layout: Layout, board: str) -> dict[str, TickGrid]:
     """Return the ticks at which an executor reads messages, by their writer.
 
     Writers whose messages it reads in every cycle are left out. If there are several ports, the one
@@ -144,7 +149,7 @@ def _reads(layout: Layout, board: str) -> dict[str, TickGrid]:
     return grids
 
 
-def reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
+def compute_reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
     """Return the processor time that a task reserves under earliest deadline first.
 
     Args:
@@ -158,10 +163,10 @@ def reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation |
     if config.clock.scheduler == "fixed-priority" or config.is_lockstep or not busy_ms:
         return None
     period_ns = every * config.tick_ns
-    return Reservation(min(round(RESERVED * busy_ms * NS_PER_MS), period_ns), period_ns)
+    return Reservation(min(round(RESERVED_BUDGETS * busy_ms * NS_PER_MS), period_ns), period_ns)
 
 
-def first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:
+def compute_first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:
     """Return the tick from which a command or a fault is due. -1 means at once."""
     if entry.at is not None:
         return round(entry.at * 1e9 / clock_ns)
@@ -180,11 +185,11 @@ def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
     """
     return (
         config.board[board].coupling == "tight"
-        and layout.mailbox(f"{board}.plan").protocol == "lock"
+        and layout.find_mailbox(f"{board}.plan").protocol == "lock"
     )
 
 
-def budgets(config: RackConfig) -> dict[str, Budget]:
+def read_budgets(config: RackConfig) -> dict[str, Budget]:
     """Return the budgets in a config, by board. Boards without one are left out."""
     return {
         name: Budget(
@@ -195,7 +200,7 @@ def budgets(config: RackConfig) -> dict[str, Budget]:
     }
 
 
-def with_budgets(config: RackConfig, measured: Mapping[str, Budget]) -> RackConfig:
+def replace_budgets(config: RackConfig, measured: Mapping[str, Budget]) -> RackConfig:
     """Return a config with exactly these budgets, by board. Each `plan_within_ms` is kept."""
     boards = {}
     for name, board in config.board.items():

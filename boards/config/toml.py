@@ -11,7 +11,7 @@ from typing import Any
 import tomli_w
 
 from rack.backplane.bounded_toml import INTEGER_BITS, MAX_DEPTH, TOO_DEEP, TOO_LONG, load_toml
-from rack.boards.errors import ConfigError, Mistake, shown
+from rack.boards.errors import ConfigError, Mistake, format_value
 
 SETTING = re.compile(r"""((?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[^"'=\n])+)=([^\0]*)""")
 """A setting "key.sub=value". Its key is in TOML, as in `protocol.mailbox."level.plan"=lock`."""
@@ -21,7 +21,7 @@ FREE_FORM = ("params", "task")
 Tables = dict[str, Any]
 
 
-def parse(text: str, place: str = "config") -> Tables:
+def parse_tables(text: str, place: str = "config") -> Tables:
     """Parse TOML text.
 
     Raises:
@@ -34,22 +34,24 @@ def parse(text: str, place: str = "config") -> Tables:
         raise ConfigError([Mistake(place, None, f"not TOML: {error}")]) from None
     except ValueError as error:
         raise ConfigError([Mistake(place, None, str(error))]) from None
-    checks = (_out_of_bounds(f"{place}: {key}", value, 1) for key, value in tables.items())
+    checks = (
+        _find_values_out_of_bounds(f"{place}: {key}", value, 1) for key, value in tables.items()
+    )
     if mistakes := list(chain.from_iterable(checks)):
         raise ConfigError(mistakes)
     return tables
 
 
-def _out_of_bounds(where: str, value: Any, depth: int) -> Iterator[Mistake]:
+def _find_values_out_of_bounds(where: str, value: Any, depth: int) -> Iterator[Mistake]:
     """Yield mistakes for values that TOML permits and configs do not, such as dates and NUL."""
     if isinstance(value, dict | list) and depth >= MAX_DEPTH:
         yield Mistake(where, None, TOO_DEEP)
     elif isinstance(value, dict):
         for key, item in value.items():
-            yield from _out_of_bounds(f"{where}.{key}", item, depth + 1)
+            yield from _find_values_out_of_bounds(f"{where}.{key}", item, depth + 1)
     elif isinstance(value, list):
         for at, item in enumerate(value):
-            yield from _out_of_bounds(f"{where}[{at}]", item, depth + 1)
+            yield from _find_values_out_of_bounds(f"{where}[{at}]", item, depth + 1)
     elif isinstance(value, int) and value.bit_length() >= INTEGER_BITS:
         yield Mistake(where, value, TOO_LONG)
     elif isinstance(value, str) and "\0" in value:
@@ -61,30 +63,33 @@ def _out_of_bounds(where: str, value: Any, depth: int) -> Iterator[Mistake]:
 
 def to_toml(tables: Mapping[str, Any]) -> str:
     """Return tables as TOML text. Empty tables and lists are left out."""
-    return tomli_w.dumps(_without_empty(tables))
+    return tomli_w.dumps(_drop_empty_values(tables))
 
 
-def _without_empty(table: Mapping[str, Any]) -> Tables:
+def _drop_empty_values(table: Mapping[str, Any]) -> Tables:
     filled = {key: value for key, value in table.items() if value not in ({}, [], ())}
-    return {key: value if key in FREE_FORM else _lean(value) for key, value in filled.items()}
+    return {
+        key: value if key in FREE_FORM else _drop_empty_items(value)
+        for key, value in filled.items()
+    }
 
 
-def _lean(value: Any) -> Any:
+def _drop_empty_items(value: Any) -> Any:
     if isinstance(value, list | tuple):
-        return [_lean(item) for item in value]
-    return _without_empty(value) if isinstance(value, Mapping) else value
+        return [_drop_empty_items(item) for item in value]
+    return _drop_empty_values(value) if isinstance(value, Mapping) else value
 
 
-def merge(base: Tables, top: Tables) -> Tables:
+def merge_tables(base: Tables, top: Tables) -> Tables:
     """Return `base` updated with `top`. Tables within them are merged key by key."""
     merged = dict(base)
     for key, value in top.items():
         is_table = isinstance(value, dict) and isinstance(base.get(key), dict)
-        merged[key] = merge(base[key], value) if is_table else value
+        merged[key] = merge_tables(base[key], value) if is_table else value
     return merged
 
 
-def override(tables: Tables, settings: Sequence[str], mistakes: list[Mistake]) -> Tables:
+def apply_settings(tables: Tables, settings: Sequence[str], mistakes: list[Mistake]) -> Tables:
     """Return tables with settings `key.sub=value` applied in order.
 
     Values are TOML. Text that is not TOML is taken as a string. A number in a key is an index into
@@ -97,8 +102,8 @@ def override(tables: Tables, settings: Sequence[str], mistakes: list[Mistake]) -
     """
     for setting in settings:
         try:
-            keys, text = _parts(setting)
-            tables = _put(tables, keys, _value(text))
+            keys, text = _split_setting(setting)
+            tables = _set_value(tables, keys, _parse_value(text))
         except LookupError as error:
             mistakes.append(Mistake("--set", setting, str(error.args[0])))
         except ConfigError as error:
@@ -106,7 +111,7 @@ def override(tables: Tables, settings: Sequence[str], mistakes: list[Mistake]) -
     return tables
 
 
-def _parts(setting: str) -> tuple[list[str], str]:
+def _split_setting(setting: str) -> tuple[list[str], str]:
     """Split a setting into keys and value text. Raises `LookupError` if it is not one."""
     match = SETTING.fullmatch(setting)
     keys: list[str] = []
@@ -124,7 +129,7 @@ def _parts(setting: str) -> tuple[list[str], str]:
     return keys, match[2]
 
 
-def _value(text: str) -> Any:
+def _parse_value(text: str) -> Any:
     try:
         load_toml(f"value = {text}")
     except tomllib.TOMLDecodeError:
@@ -132,33 +137,39 @@ def _value(text: str) -> Any:
     except ValueError:
         # The text is TOML, but its value is out of bounds: `parse` reports why.
         pass
-    return parse(f"value = {text}")["value"]
+    return parse_tables(f"value = {text}")["value"]
 
 
-def _put(node: Any, keys: list[str], value: Any) -> Any:
+def _set_value(node: Any, keys: list[str], value: Any) -> Any:
     """Return a copy of `node` with `value` set at `keys`. Raises `LookupError` for a wrong path."""
     if not keys:
-        return merge(node, value) if isinstance(node, dict) and isinstance(value, dict) else value
+        return (
+            merge_tables(node, value)
+            if isinstance(node, dict) and isinstance(value, dict)
+            else value
+        )
     key, *rest = keys
     if isinstance(node, list):
         if key not in map(str, range(len(node))):
-            raise LookupError(f"{shown(key)} is not an index of a list of {len(node)}")
+            raise LookupError(f"{format_value(key)} is not an index of a list of {len(node)}")
         items = list(node)
-        items[int(key)] = _put(items[int(key)], rest, value)
+        items[int(key)] = _set_value(items[int(key)], rest, value)
         return items
     if not isinstance(node, dict):
-        raise LookupError(f"{shown(key)} cannot be set in {shown(node)}, which is not a table")
+        raise LookupError(
+            f"{format_value(key)} cannot be set in {format_value(node)}, which is not a table"
+        )
     empty: Tables | None = {} if rest else None
-    return {**node, key: _put(node.get(key, empty), rest, value)}
+    return {**node, key: _set_value(node.get(key, empty), rest, value)}
 
 
-def table_of(place: str) -> str:
+def find_table_name(place: str) -> str:
     """Return the table that contains a place: "board.servo" for "board.servo.rate_hz = 3"."""
     kind, *name = re.split(r"[.\[=]", place.replace("mailbox ", "board."))[:2]
     return f"{kind}.{name[0]}" if name and kind in ("board", "host") else kind
 
 
-def without(tables: Tables, broken: frozenset[str]) -> Tables:
+def remove_tables(tables: Tables, broken: frozenset[str]) -> Tables:
     """Return tables without the `broken` ones, which are named as in "robot" or "board.servo"."""
     remaining = {key: value for key, value in tables.items() if key not in broken}
     for key in ("board", "host"):

@@ -10,21 +10,21 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.checked import as_named, as_whole, pick
+from rack.backplane.checked import select_item, to_enum, to_integer
 from rack.backplane.fault_table import FaultTable
-from rack.backplane.message import printable
+from rack.backplane.message import escape_text
 from rack.backplane.operator_table import OperatorTable
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import MISSES, PEER, Alarm, alarm_ring
+from rack.backplane.watch.alarms import MISSES, PEER, Alarm, open_alarm_ring
 from rack.backplane.words import Demand
-from rack.boards.config.cell import geom_name
+from rack.boards.config.cell import find_geom_name
 from rack.boards.config.loader import read_stored
 from rack.boards.config.published import Levels, PublishedRack
 from rack.boards.events import DEMANDED, NO_TORQUE, Event, EventKind
-from rack.boards.faults.bounds import counting
-from rack.boards.faults.describe import board_of, joint_name, subject_of
-from rack.boards.faults.describe import describe as describe_fault
-from rack.boards.operator import describe, level_of, message_of
+from rack.boards.faults.bounds import format_count
+from rack.boards.faults.describe import describe_fault as describe_fault
+from rack.boards.faults.describe import find_board, find_subject, format_joint
+from rack.boards.operator import copy_request_message, describe_command, find_level
 from rack.levels.errors import LevelError
 from rack.levels.messages import Error
 from rack.levels.operator import Operation, OperatorCommand
@@ -58,7 +58,7 @@ DEMANDED_BY: Mapping[str, str] = {
 }
 """Reasons why the arm must stop or brake, other than the loss of a board."""
 
-KIND_OF: Mapping[Alarm, EventKind] = {
+EVENT_KINDS: Mapping[Alarm, EventKind] = {
     Alarm.FAULT_BEGINS: "fault",
     Alarm.FAULT_ENDS: "fault",
     Alarm.REJOINED: "recovery",
@@ -161,7 +161,7 @@ class RungAlarm(NamedTuple):
     event: Event
 
 
-class AlarmWatch:
+class AlarmReader:
     """Reader of all alarm rings of a rack.
 
     Attributes:
@@ -171,30 +171,32 @@ class AlarmWatch:
     def __init__(self, segment: Segment) -> None:
         config = read_stored(segment.config)
         self._rings = {
-            name: alarm_ring(segment, name)
+            name: open_alarm_ring(segment, name)
             for name in (CLOCK, *(t.name for t in segment.layout.tasks))
         }
         # The cell is built only when the first collision is reported.
-        geom = str if config.robot is None else partial(geom_name, config)
-        levels = PublishedRack.of_rack(segment).levels
-        self._events = AlarmEvents(segment, config.joints, geom, levels)
+        geom = str if config.robot is None else partial(find_geom_name, config)
+        levels = PublishedRack.read_from_segment(segment).levels
+        self._events = AlarmConverter(segment, config.joints, geom, levels)
         self.lost = 0
 
-    def drain(self) -> list[RungAlarm]:
+    def read_alarms(self) -> list[RungAlarm]:
         """Return the alarms since the last call, in the order of ticks and times."""
         alarms: list[RungAlarm] = []
         for owner, ring in self._rings.items():
-            if not ring.waiting:
+            if not ring.waiting_count:
                 continue
-            rows, lost = ring.drain()
+            rows, lost = ring.read_new_rows()
             self.lost += lost
             for row in rows:
-                alarm = as_named(Alarm, row["code"])
-                alarms.append(RungAlarm(alarm, int(row["subject"]), self._events.of(row, owner)))
+                alarm = to_enum(Alarm, row["code"])
+                alarms.append(
+                    RungAlarm(alarm, int(row["subject"]), self._events.build_event(row, owner))
+                )
         return sorted(alarms, key=lambda rung: (rung.event.tick, rung.event.time_ns))
 
 
-class AlarmEvents:
+class AlarmConverter:
     """Converter of a rack's alarms to events.
 
     Args:
@@ -220,7 +222,7 @@ class AlarmEvents:
         # Values of live parameters that were set since the launch, by board and key.
         self._live: dict[tuple[str, str], object] = {}
 
-    def of(self, row: np.void, owner: str) -> Event:
+    def build_event(self, row: np.void, owner: str) -> Event:
         """Convert an alarm to an event.
 
         The board of the event is the one that raised the alarm. For a fault, restart or command it
@@ -233,57 +235,57 @@ class AlarmEvents:
         Raises:
             DamageError: The record refers to something that does not exist.
         """
-        alarm = as_named(Alarm, row["code"])
+        alarm = to_enum(Alarm, row["code"])
         about, text = next((kind, texts[alarm]) for kind, texts in TEXTS.items() if alarm in texts)
         number = int(row["subject"])
         value = float(row["value"])
         since = int(row["since"])
-        kind = KIND_OF.get(alarm, "detection")
+        kind = EVENT_KINDS.get(alarm, "detection")
         code = alarm.name.lower()
         fault = -1
         words: dict[str, object] = {}
         if about == "fault":
             fault = number
-            entry = pick(self._faults.entries, number, "fault")
-            subject = subject_of(entry, self._layout, self._joints)
-            board = board_of(entry, self._layout)
+            entry = select_item(self._faults.entries, number, "fault")
+            subject = find_subject(entry, self._layout, self._joints)
+            board = find_board(entry, self._layout)
             code = "begins" if alarm == Alarm.FAULT_BEGINS else "ends"
             words["what"] = describe_fault(entry, self._layout, self._joints, with_board=False)
-            words["lasts"] = f", for {self._span(entry.ticks)}" if entry.ticks else ""
-            words["times"] = counting(entry.count, "time")
+            words["lasts"] = f", for {self._format_span(entry.ticks)}" if entry.ticks else ""
+            words["times"] = format_count(entry.count, "time")
         elif about == "command":
-            request = pick(self._operator.entries, number, "command")
-            subject = board = level_of(request, self._layout)
-            message = message_of(request, self._layout)
-            words["what"] = describe(message)
+            request = select_item(self._operator.entries, number, "command")
+            subject = board = find_level(request, self._layout)
+            message = copy_request_message(request, self._layout)
+            words["what"] = describe_command(message)
             if alarm == Alarm.COMMANDED:
                 since = -1
-                code = as_named(Operation, message.what).name.lower()
+                code = to_enum(Operation, message.what).name.lower()
                 is_set = message.what == Operation.SET
-                words["before"] = self._before(board, message) if is_set else ""
+                words["before"] = self._format_previous_value(board, message) if is_set else ""
         elif about == "demand":
-            demand = as_named(Demand, value)
-            subject = ANOTHER_RACK if number == PEER else self._task(number, EMERGENCY_STOP)
+            demand = to_enum(Demand, value)
+            subject = ANOTHER_RACK if number == PEER else self._name_task(number, EMERGENCY_STOP)
             board = owner
             kind = "reaction" if demand else "recovery"
             why = DEMANDED_BY.get(subject, f"'{subject}' is lost")
             words["what"] = DEMANDS[demand].format(why=why)
         elif about == "finding":
             declared = self._levels[owner].findings if owner in self._levels else ()
-            finding = pick(declared, number, "finding")
+            finding = select_item(declared, number, "finding")
             code = finding.name
             subject = board = owner
             measured = f"{value:.6g} {finding.unit}".removesuffix(" 1")
             detail = bytes(row["text"]).decode("utf-8", "replace") or finding.meaning
-            words["what"] = printable(f"{code}: {measured}, {detail}")
+            words["what"] = escape_text(f"{code}: {measured}, {detail}")
         else:
-            subject = self._subject(about, number, owner)
+            subject = self._name_subject(about, number, owner)
             board = subject if alarm == Alarm.REJOINED else owner
             if about == "mailbox":
                 words["writer"] = self._layout.mailboxes[number].writer
             elif about == "geom":
-                words["writer"] = self._geom(as_whole(value))
-        span = self._span(value)
+                words["writer"] = self._geom(to_integer(value))
+        span = self._format_span(value)
         text = text.format(
             **words,
             subject=subject,
@@ -292,9 +294,9 @@ class AlarmEvents:
             span=span,
             lasted=f" for {span}" if value else "",
             late_ms=value * 1e-6,
-            releases=counting(value, "release"),
-            messages=counting(value, "message"),
-            ticks=counting(value, "tick"),
+            releases=format_count(value, "release"),
+            messages=format_count(value, "message"),
+            ticks=format_count(value, "tick"),
         )
         tick = found_at = int(row["tick"])
         if alarm == Alarm.BRAKES_CLOSED and since < found_at:
@@ -314,28 +316,28 @@ class AlarmEvents:
             since=since,
         )
 
-    def _subject(self, about: About, number: int, owner: str) -> str:
+    def _name_subject(self, about: About, number: int, owner: str) -> str:
         """Return the name of the subject of an alarm. Raises `DamageError` if it does not exist."""
         match about:
             case "task":
-                return self._task(number, CLOCK)
+                return self._name_task(number, CLOCK)
             case "mailbox":
-                return pick(self._layout.mailboxes, number, "mailbox").name
+                return select_item(self._layout.mailboxes, number, "mailbox").name
             case "joint":
-                return joint_name(number, self._joints)
+                return format_joint(number, self._joints)
             case "geom":
                 return self._geom(number)
             case "name":
                 names = self._levels[owner].names if owner in self._levels else ()
-                return pick(names, number, "name")
+                return select_item(names, number, "name")
             case "brakes" if number > 0:
-                return as_named(Error, number).name.lower()
+                return to_enum(Error, number).name.lower()
             case "brakes":
-                return pick(ENGAGED_BY, -number, "reason to brake")
+                return select_item(ENGAGED_BY, -number, "reason to brake")
             case _:
                 return ""
 
-    def _before(self, board: str, command: OperatorCommand) -> str:
+    def _format_previous_value(self, board: str, command: OperatorCommand) -> str:
         """Return the value of a parameter before a command that sets it, as a clause."""
         try:
             key, value = read_setting(command.name)
@@ -347,9 +349,9 @@ class AlarmEvents:
         self._live[board, key] = value
         return f", before {before}"
 
-    def _task(self, number: int, other: str) -> str:
+    def _name_task(self, number: int, other: str) -> str:
         """Return the name of a task by its number, or `other` for a negative number."""
-        return pick(self._layout.processes, number, "task").name if number >= 0 else other
+        return select_item(self._layout.processes, number, "task").name if number >= 0 else other
 
-    def _span(self, ticks: float) -> str:
-        return f"{counting(ticks, 'tick')} ({ticks * self._layout.clock_ns * 1e-6:g} ms)"
+    def _format_span(self, ticks: float) -> str:
+        return f"{format_count(ticks, 'tick')} ({ticks * self._layout.clock_ns * 1e-6:g} ms)"

@@ -9,11 +9,17 @@ from contextlib import closing, suppress
 from rack.backplane.address_map import HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import RackInUseError, SegmentError
-from rack.backplane.segment import Segment, racks, shm_path, stranger, unlink
+from rack.backplane.segment import (
+    Segment,
+    find_foreign_kind,
+    get_shm_path,
+    list_racks,
+    unlink_segment,
+)
 from rack.backplane.words import Head
 
 
-def remove_dead(rack: str) -> bool:
+def remove_dead_rack(rack: str) -> bool:
     """Remove the segment of a rack that is not running.
 
     Returns:
@@ -23,18 +29,18 @@ def remove_dead(rack: str) -> bool:
         RackInUseError: The launcher of the rack is alive.
         SegmentError: The segment belongs to another user or is not a file.
     """
-    if rack not in racks():
+    if rack not in list_racks():
         return False
     with suppress(FileNotFoundError):
         # A file too short for a head is not in use: a launch gives a segment its name only when it
         # is complete.
-        if stranger(rack) is None and shm_path(rack).stat().st_size < HEAD_SIZE:
-            unlink(rack)
+        if find_foreign_kind(rack) is None and get_shm_path(rack).stat().st_size < HEAD_SIZE:
+            unlink_segment(rack)
             return True
     try:
         segment = Segment.open(rack)
     except SegmentError:
-        if rack in racks():
+        if rack in list_racks():
             raise
         # Another program has just removed it.
         return False
@@ -47,30 +53,30 @@ def remove_dead(rack: str) -> bool:
         # If two programs find the same dead rack, only one may remove it. Otherwise the slower
         # program would remove a rack that the faster one has launched under the same name.
         with closing(ByteLock(segment.fd, 8 * Head.MAGIC)) as removal:
-            if not removal.take() or not segment.has_its_name:
+            if not removal.take() or not segment.is_named:
                 return False
-            unlink(rack)
+            unlink_segment(rack)
             return True
 
 
-def remove_own(rack: str | None = None, killed: Collection[int] = ()) -> None:
+def remove_own_racks(rack: str | None = None, killed: Collection[int] = ()) -> None:
     """Remove racks that this process has launched, whatever their state.
 
     Args:
         rack: Name of a rack. None for all of them.
         killed: Processes that this one has killed. The racks that they launched are removed too.
     """
-    for name in racks() if rack is None else [rack]:
+    for name in list_racks() if rack is None else [rack]:
         with suppress(SegmentError):
             segment = Segment.open(name)
             if segment.launcher in killed or (
                 segment.launcher_is_alive and segment.launcher == os.getpid()
             ):
-                unlink(name)
+                unlink_segment(name)
             segment.close()
 
 
-def clean() -> tuple[list[str], list[str], list[str]]:
+def remove_dead_racks() -> tuple[list[str], list[str], list[str]]:
     """Remove every rack that is not running.
 
     Returns:
@@ -79,9 +85,9 @@ def clean() -> tuple[list[str], list[str], list[str]]:
     removed = []
     in_use = []
     foreign = []
-    for rack in racks():
+    for rack in list_racks():
         try:
-            if remove_dead(rack):
+            if remove_dead_rack(rack):
                 removed.append(rack)
         except RackInUseError:
             in_use.append(rack)

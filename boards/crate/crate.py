@@ -22,15 +22,21 @@ from importlib import import_module
 from multiprocessing.connection import Connection, wait
 from socket import socket
 
-from rack.backplane.copies import fill_memory
+from rack.backplane.copies import restore_memory
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import note_used_files
-from rack.backplane.process import adopt_orphans, children_of, readable, refusal, set_priority
+from rack.backplane.process import (
+    adopt_orphans,
+    describe_refusal,
+    list_children,
+    set_priority,
+    wait_readable,
+)
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import done_semaphore
+from rack.backplane.semaphores import get_done_semaphore
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards.classes import find_class
-from rack.boards.crate.line import received
+from rack.boards.crate.line import receive_or_none
 from rack.boards.crate.output import HostOutput
 from rack.boards.crate.requests import (
     Compiling,
@@ -51,9 +57,9 @@ from rack.boards.crate.requests import (
     Shown,
 )
 from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy
-from rack.boards.errors import LONGEST_REASON, one_line
+from rack.boards.errors import MAX_REASON_LENGTH, to_one_line
 from rack.boards.faults.tasks import act_on_core
-from rack.boards.run.board import enter, run_clock_board, run_task_board
+from rack.boards.run.board import run_board, run_clock_board, run_task_board
 from rack.boards.run.compiled_mailbox import load_machine_code
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 from rack.levels import compiled
@@ -66,7 +72,7 @@ HOST_BOARD = "rack.boards.host.board"
 """Module that runs host programs. It is imported only in the processes of host boards."""
 HOST_PROCESSES = 4
 """Processes that are not in the layout: Rack, crate, clock, recorder."""
-REST_S = 0.01
+OUTPUT_PAUSE_S = 0.01
 """Time between two reads of a host board's output, so that endless output delays nothing else."""
 ORPHANS_S = 1.0
 """Longest wait for the end of processes that a host board has started."""
@@ -110,32 +116,32 @@ class Crate:
             printing = [output for output in self._outputs.values() if output not in self._resting]
             readers = [output.reader for output in printing]
             ready = self._reap_ended(
-                REST_S if self._resting else None, self._line, self._launcher, *readers
+                OUTPUT_PAUSE_S if self._resting else None, self._line, self._launcher, *readers
             )
             if not ready:
                 self._resting.clear()
             for output in printing:
                 if output.reader in ready:
-                    output.pass_on()
+                    output.copy_output()
                     self._resting.append(output)
             is_gone = self._launcher in ready
             if is_gone or self._line in ready:
-                request = None if is_gone else received(self._line)
+                request = None if is_gone else receive_or_none(self._line)
                 if request is None:
-                    self._leave()
+                    self._leave_rack()
                     had_any = len(self._shelf) > 0
-                    self._shelf.clear()
+                    self._shelf.drop_all()
                     self._reap_copies(are_all=had_any)
                     return
-                self._serve(request)
+                self._serve_request(request)
 
-    def _serve(self, request: object) -> None:
+    def _serve_request(self, request: object) -> None:
         """Carry out one request of the Rack."""
         match request:
             case Preload() as preload:
-                self._preload(preload)
+                self._preload_levels(preload)
             case Open() as opening:
-                self._open(opening)
+                self._open_rack(opening)
             case PowerOn(name, TaskWiring() | ClockWiring() as wiring):
                 self._power_on(name, wiring)
             case PowerOn(name, HostWiring() as host):
@@ -144,67 +150,69 @@ class Crate:
                     self._outputs[name] = HostOutput(name)
                 lines = self._attention, self._outputs[name].writer
                 # Import the module in the forked process, so that the crate stays small.
-                self._fork(
+                self._fork_board(
                     name,
                     lambda segment: import_module(HOST_BOARD).run_host_board(segment, host, *lines),
                 )
             case PowerOn(name, HogWiring(entry)):
-                self._fork(name, lambda segment: act_on_core(segment, entry))
+                self._fork_board(name, lambda segment: act_on_core(segment, entry))
             case PowerOff(name):
-                self._kill(name)
+                self._kill_boards(name)
             case Leave():
-                self._leave()
+                self._leave_rack()
                 # If the Rack is gone, `run` notices it next.
                 with suppress(OSError):
                     self._line.send(Left())
             case Show(tick, name):
-                snapshot = self._shelf.nearest(tick)
-                text = "" if snapshot is None or not name else snapshot.copies[name].show()
+                snapshot = self._shelf.find_nearest(tick)
+                text = (
+                    "" if snapshot is None or not name else snapshot.copies[name].read_attributes()
+                )
                 self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
 
-    def _open(self, opening: Open) -> None:
+    def _open_rack(self, opening: Open) -> None:
         """Attach to a segment, and fill it if the rack continues from a snapshot."""
         self._opened = segment = Segment.attach(opening.rack)
         note_used_files()
         set_priority(opening.priority)
-        snapshot = None if opening.before is None else self._shelf.nearest(opening.before)
+        snapshot = None if opening.before is None else self._shelf.find_nearest(opening.before)
         if snapshot is not None:
-            fill_memory(segment, snapshot.memory, snapshot.tick)
+            restore_memory(segment, snapshot.memory, snapshot.tick)
             self._to_go_on = {**snapshot.copies}
-            self._state_snapshots()
+            self._publish_snapshots()
         self._line.send(Opened(-1 if snapshot is None else snapshot.tick))
 
     def _power_on(self, name: str, wiring: TaskWiring | ClockWiring) -> None:
         """Fork a task or the clock, or let its copy in the snapshot continue."""
         self._wirings[name] = wiring
         copy = self._to_go_on.pop(name, None)
-        if copy is not None and copy.can_be(wiring):
+        if copy is not None and copy.can_continue_as(wiring):
             try:
-                self._watch(name, copy.go_on(wiring, self._segment.rack))
+                self._watch_process(name, copy.continue_as(wiring, self._segment.rack))
             except OSError:
-                self._fail_to_fork(name, "its copy in the snapshot is gone")
+                self._report_fork_failure(name, "its copy in the snapshot is gone")
             return
         lines = self._attention, self._shelf.boards_line
         if isinstance(wiring, TaskWiring):
-            self._fork(name, lambda segment: run_task_board(segment, wiring, *lines))
+            self._fork_board(name, lambda segment: run_task_board(segment, wiring, *lines))
             return
         if copy is not None:
             # As after the loss of a clock, the new clock continues the run.
             self._segment.words[System.STATE] = Run.RUNNING
-        self._fork(name, lambda segment: run_clock_board(segment, wiring, *lines))
+        self._fork_board(name, lambda segment: run_clock_board(segment, wiring, *lines))
 
     def _take_note(self) -> None:
         """Receive a note of a board about its copy."""
-        self._shelf.take_note(self._wirings)
-        self._state_snapshots()
+        self._shelf.receive_note(self._wirings)
+        self._publish_snapshots()
 
-    def _state_snapshots(self) -> None:
+    def _publish_snapshots(self) -> None:
         """Write the number and size of the snapshots to the backplane."""
         words = self._segment.words
         words[System.SNAPSHOTS] = len(self._shelf)
         words[System.SNAPSHOT_BYTES] = self._shelf.private_bytes
 
-    def _preload(self, request: Preload) -> None:
+    def _preload_levels(self, request: Preload) -> None:
         """Import and preload what the boards share. The Rack reports mistakes of the config."""
         sys.path[:] = request.path
         compiled.on_compile = lambda function: self._line.send(Compiling(function))
@@ -221,7 +229,7 @@ class Crate:
                     if issubclass(kind, Executor | Planner):
                         kind.preload()
                 except Exception as error:
-                    reason = one_line(f"{type(error).__name__}: {error}", LONGEST_REASON)
+                    reason = to_one_line(f"{type(error).__name__}: {error}", MAX_REASON_LENGTH)
                     self._line.send(PreloadFailed(reference, reason))
                     return
                 self._preloaded.add(reference)
@@ -235,14 +243,14 @@ class Crate:
         gc.freeze()
         gc.enable()
 
-    def _fork(self, name: str, board: Callable[[Segment], int]) -> None:
+    def _fork_board(self, name: str, board: Callable[[Segment], int]) -> None:
         """Fork a process that runs `board` and exits with the status that it returns."""
         crate = os.getpid()
         try:
             pid = os.fork()
         except OSError as error:
             needed = f"the rack needs {len(self._segment.layout.processes) + HOST_PROCESSES}"
-            self._fail_to_fork(name, f"{refusal(error)}; {needed}")
+            self._report_fork_failure(name, f"{describe_refusal(error)}; {needed}")
             return
         if pid == 0:
             self._line.close()
@@ -250,18 +258,18 @@ class Crate:
             # The child must exit here, so that the code of the crate does not run twice.
             status = os.EX_SOFTWARE
             try:
-                status = enter(crate, name, self._segment, board)
+                status = run_board(crate, name, self._segment, board)
             finally:
                 os._exit(status)
-        self._watch(name, pid)
+        self._watch_process(name, pid)
 
-    def _fail_to_fork(self, name: str, why: str) -> None:
+    def _report_fork_failure(self, name: str, why: str) -> None:
         """Report a board that could not be forked as ended before it began."""
         end = Ended(name, 0, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
         with suppress(OSError):
             self._line.send(ForkFailed(end, f"board '{name}' cannot be forked: {why}"))
 
-    def _watch(self, name: str, pid: int) -> None:
+    def _watch_process(self, name: str, pid: int) -> None:
         """Watch a new process of a board and report it to the Rack."""
         pidfd = os.pidfd_open(pid)
         self._boards[pidfd] = name, pid
@@ -269,7 +277,7 @@ class Crate:
         with suppress(OSError):
             self._line.send(Forked(name, pid))
 
-    def _end_orphans(self) -> None:
+    def _kill_orphans(self) -> None:
         """Kill the processes that an ended host board has started, in whatever session.
 
         Its end has made them children of the crate.
@@ -277,7 +285,7 @@ class Crate:
         deadline = time.monotonic() + ORPHANS_S
         while time.monotonic() < deadline:
             boards = {pid for _, pid in self._boards.values()}
-            orphans = children_of(os.getpid()) - boards - self._shelf.pids
+            orphans = list_children(os.getpid()) - boards - self._shelf.pids
             if not orphans:
                 return
             for pid in orphans:
@@ -293,7 +301,7 @@ class Crate:
         words = self._segment.words
         tick = words[System.TICK]
         if name in self._segment.map.blocks and words[System.STATE] != Run.STOPPED:
-            block = self._segment.block(name)
+            block = self._segment.get_block(name)
             # In lockstep the board may have finished part of a batch of cycles.
             tick = max(tick, min(block[Block.DONE] + 1, block[Block.RELEASED]))
             if self._is_host(name) and block[Block.STATE] == TaskState.ENDED:
@@ -306,22 +314,24 @@ class Crate:
                 block[Block.STATE] = TaskState.ABSENT
             block[Block.LOST] = block[Block.LOST] or tick + 1
             if not self._is_host(name):
-                UtilityLines(self._segment).assert_sysfail(self._segment.layout.task(name).slot)
+                UtilityLines(self._segment).assert_sysfail(
+                    self._segment.layout.find_task(name).slot
+                )
             words[System.LOSSES] += 1
             # In lockstep the clock waits for the task's semaphore.
-            done_semaphore(self._segment, name).release()
+            get_done_semaphore(self._segment, name).release()
         return tick
 
     def _is_host(self, name: str) -> bool:
         return any(host.name == name for host in self._segment.layout.hosts)
 
-    def _kill(self, board: str | None = None) -> None:
+    def _kill_boards(self, board: str | None = None) -> None:
         """Kill a board, or all of them."""
         for pidfd, (name, _) in self._boards.items():
             if board in (None, name):
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
 
-    def _leave(self) -> None:
+    def _leave_rack(self) -> None:
         """Leave the present rack: let its boards end, and kill boards that take too long."""
         deadline = time.monotonic() + LEAVE_S
         for pidfd, (name, _) in self._boards.items():
@@ -330,11 +340,11 @@ class Crate:
                 signal.pidfd_send_signal(pidfd, signal.SIGTERM)
         while self._boards and (left := deadline - time.monotonic()) > 0:
             self._reap_ended(left)
-        self._kill()
+        self._kill_boards()
         while self._boards:
             self._reap_ended(None)
         # Receive the notes that boards wrote about their copies before they ended.
-        while readable(self._shelf.line.fileno(), 0):
+        while wait_readable(self._shelf.line.fileno(), 0):
             self._take_note()
         self._reap_copies()
         for output in self._outputs.values():
@@ -371,8 +381,8 @@ class Crate:
             os.close(pidfd)
             _, status = os.waitpid(pid, 0)
             if self._is_host(name):
-                self._end_orphans()
-                self._outputs[name].pass_on(is_over=True)
+                self._kill_orphans()
+                self._outputs[name].copy_output(is_over=True)
             with suppress(OSError):
                 self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
         if self._shelf.line in ready:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.process import GONE, STOPPED, WAITING, state_of
+from rack.backplane.process import ENDED_STATES, STOPPED_STATES, WAITING_STATES, read_state
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
@@ -26,7 +26,7 @@ class Heartbeat:
     def __init__(self, segment: Segment) -> None:
         self._words = segment.words
         watched = segment.layout.tasks if self._words[System.LOCKSTEP] else ()
-        self._blocks = {task.name: segment.block(task.name) for task in watched}
+        self._blocks = {task.name: segment.get_block(task.name) for task in watched}
         bound_s = max(LEAST_S, HEARTBEATS_MISSED * self._words[System.PERIOD_NS] * 1e-9)
         self._bounds = {
             **dict.fromkeys(self._blocks, LOCKSTEP_S),
@@ -36,7 +36,7 @@ class Heartbeat:
         self._reported: set[str] = set()
         self._waited_at = -1
 
-    def hanging(self) -> list[str]:
+    def find_hanging(self) -> list[str]:
         """Return the tasks found hanging since the last call. The system clock is "clock"."""
         if self._words[System.STATE] != Run.RUNNING:
             return []
@@ -70,10 +70,10 @@ class Heartbeat:
 
     def _clock_is_stuck(self) -> bool:
         """Return True if a silent clock is stopped, dead or waiting, and not merely starved."""
-        state = state_of(self._words[System.CLOCK_PID])
+        state = read_state(self._words[System.CLOCK_PID])
         tick = self._seen[CLOCK][0]
         # A waiting clock must be seen twice: after a pause of the whole machine it is woken soon.
-        waits = state in WAITING
-        is_stuck = state in STOPPED + GONE or (waits and self._waited_at == tick)
+        waits = state in WAITING_STATES
+        is_stuck = state in STOPPED_STATES + ENDED_STATES or (waits and self._waited_at == tick)
         self._waited_at = tick if waits else -1
         return is_stuck

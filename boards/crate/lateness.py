@@ -13,8 +13,8 @@ from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.segment import Segment
 from rack.boards.config.schema import RackConfig
-from rack.boards.faults.describe import board_of, describe
-from rack.boards.faults.kind import kind_of
+from rack.boards.faults.describe import describe_fault, find_board
+from rack.boards.faults.kind import find_kind
 
 
 def judge_lost_cycles(
@@ -39,14 +39,16 @@ def judge_lost_cycles(
     excused = []
     layout = segment.layout
     fraction = config.supervision.max_missed_fraction
-    restart_s = config.supervision.restart_s(config.clock.mode == "lockstep")
-    table = FaultTable(segment).staged((Stage.ACTIVE, Stage.OVER))
+    restart_s = config.supervision.find_restart_time(config.clock.mode == "lockstep")
+    table = FaultTable(segment).list_entries((Stage.ACTIVE, Stage.OVER))
     faults = [fault for fault in table if fault.struck_tick >= 0]
     for task in layout.tasks:
         counts = segment.count_cycles(task, end)
         disturbed = []
         for fault in faults:
-            recovery = kind_of(fault).recovery_ticks(board_of(fault, layout), layout, restart_s)
+            recovery = find_kind(fault).compute_recovery_ticks(
+                find_board(fault, layout), layout, restart_s
+            )
             # The cycle in progress when the fault strikes may also be lost.
             first = max(0, fault.struck_tick - task.slice + 1)
             disturbed.append((first, min(end, fault.until + recovery)))
@@ -55,12 +57,12 @@ def judge_lost_cycles(
         judged = counts.due - excusable
         text = f"level '{task.name}' {counts}"
         if excusable:
-            named = ", ".join(describe(fault, layout, config.joints) for fault in faults)
+            named = ", ".join(describe_fault(fault, layout, config.joints) for fault in faults)
             text += f", {excusable} of which were due during faults and recoveries: {named}"
-        if rest > _permit(judged, fraction, counts.plan):
+        if rest > _count_permitted(judged, fraction, counts.plan):
             share = f"{100 * rest / judged:.3g} %; at most {100 * fraction:.3g} % permitted"
             late.append(f"{text} ({share})")
-        elif counts.lost > _permit(counts.due, fraction, counts.plan):
+        elif counts.lost > _count_permitted(counts.due, fraction, counts.plan):
             excused.append(text)
     return late, excused
 
@@ -73,11 +75,11 @@ def _count_releases(task: TaskSpec, spans: Iterable[tuple[int, int]]) -> int:
         first = max(first, reached)
         if first < end:
             reached = end
-            count += (task.grid.since(end) - task.grid.since(first)) // task.every
+            count += (task.grid.find_tick(end) - task.grid.find_tick(first)) // task.every
     return count
 
 
-def _permit(due: int, fraction: float, plan: int) -> int:
+def _count_permitted(due: int, fraction: float, plan: int) -> int:
     """Return how many of the due cycles may be lost.
 
     The fraction is rounded up, so that one late cycle or plan does not fail a short run. Not all

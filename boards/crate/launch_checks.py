@@ -6,12 +6,12 @@ import os
 from collections.abc import Iterator
 from resource import RLIMIT_MEMLOCK, RLIMIT_NOFILE, getrlimit
 
-from rack.backplane.process import DEADLINE, cores_kept_awake, mapped_and_locked
+from rack.backplane.process import DEADLINE, keep_cores_awake, read_memory_sizes
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
-from rack.boards.config.layout import shared_out
+from rack.boards.config.layout import list_replaced_cores
 from rack.boards.config.resolved import Resolved
-from rack.boards.config.rules import network_rules
+from rack.boards.config.rules import load_network_rules
 from rack.boards.errors import LaunchError
 
 _PERMIT = (
@@ -43,8 +43,8 @@ def check_realtime(plan: Resolved, segment: Segment) -> None:
 def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
     """Yield what a launch reports: replaced cores, refused priorities and other limits."""
     config = plan.config
-    yield from (*config.changed, *shared_out(config))
-    if (network := network_rules(config)) is not None:
+    yield from (*config.format_notes, *list_replaced_cores(config))
+    if (network := load_network_rules(config)) is not None:
         yield from network.list_network_notes(config)
     if config.is_lockstep:
         yield from (
@@ -59,7 +59,7 @@ def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
     yield from _list_reservations(plan, segment)
     unlocked = {}
     for task in plan.layout.tasks:
-        mapped, locked = mapped_and_locked(segment.block(task.name)[Block.PID])
+        mapped, locked = read_memory_sizes(segment.get_block(task.name)[Block.PID])
         if not locked:
             unlocked[task.name] = mapped
     if unlocked:
@@ -70,7 +70,7 @@ def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
             f" {_PERMIT.format('memlock unlimited', 'l', 'CAP_IPC_LOCK')}"
         )
     if config.clock.idle_cores == "awake":
-        with cores_kept_awake() as refusal:
+        with keep_cores_awake() as refusal:
             yield f'clock.idle_cores = "awake": {refusal or "idle cores are held awake"}'
 
 
@@ -79,7 +79,7 @@ def _find_refusal(plan: Resolved, segment: Segment) -> str:
     refused = [
         task.name
         for task in plan.layout.tasks
-        if task.priority and not segment.block(task.name)[Block.PRIORITY]
+        if task.priority and not segment.get_block(task.name)[Block.PRIORITY]
     ]
     if not refused or plan.config.is_lockstep:
         return ""
@@ -89,7 +89,9 @@ def _find_refusal(plan: Resolved, segment: Segment) -> str:
 def _list_reservations(plan: Resolved, segment: Segment) -> Iterator[str]:
     """Yield which tasks have a reservation, on which cores, and which were refused one."""
     blocks = {
-        task.task: segment.block(task.task) for task in plan.tasks if task.reservation is not None
+        task.task: segment.get_block(task.task)
+        for task in plan.tasks
+        if task.reservation is not None
     }
     reserved = {name for name, block in blocks.items() if block[Block.PRIORITY] == DEADLINE}
     pinned = {name for name in reserved if len(os.sched_getaffinity(blocks[name][Block.PID])) == 1}

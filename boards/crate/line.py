@@ -17,11 +17,11 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import Self
 
-from rack.boards.crate.output import lines_of
+from rack.boards.crate.output import split_lines
 from rack.boards.crate.requests import Leave, Left, Show, Shown
 from rack.boards.errors import LaunchError
 
-SINGLE_THREADED = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Settings that keep numerical libraries single-threaded.
 
 The crate must have no threads when it forks, and a board has only one core.
@@ -75,7 +75,7 @@ class CrateLine:
             stdin=subprocess.DEVNULL,
             stdout=self._printed,
             stderr=self._printed,
-            env=environment(),
+            env=build_environment(),
         )
         crate_end.close()
         self._is_closed = False
@@ -91,28 +91,28 @@ class CrateLine:
         """Process id of the crate."""
         return self._process.pid
 
-    def printed(self) -> list[str]:
+    def read_output(self) -> list[str]:
         """Return the lines that boards have printed since the last call."""
         data = os.pread(self._printed, 1 << 20, self._read_to)
-        lines = lines_of(data)
+        lines = split_lines(data)
         self._read_to += sum(map(len, lines))
         return [text for line in lines for text in line.decode(errors="replace").splitlines()]
 
-    def send(self, request: object) -> None:
+    def send_request(self, request: object) -> None:
         """Send a request to the crate. If it is gone, raises `LaunchError` with its output."""
         try:
             self.line.send(request)
         except OSError:
-            raise LaunchError("\n".join(self.printed()) or "the crate has ended") from None
+            raise LaunchError("\n".join(self.read_output()) or "the crate has ended") from None
 
-    def ask(self, request: object) -> None:
+    def try_request(self, request: object) -> None:
         """Send a request to the crate, or nothing if it is gone: `receive` will notice that."""
         with suppress(LaunchError):
-            self.send(request)
+            self.send_request(request)
 
-    def receive(self) -> object:
+    def receive_message(self) -> object:
         """Wait for the crate's next message and return it. None if the crate is gone."""
-        return received(self.line)
+        return receive_or_none(self.line)
 
     def close(self, timeout_s: float) -> None:
         """Close the line, so that the crate ends its boards and itself.
@@ -147,7 +147,7 @@ class WarmCrate(CrateLine):
         self.is_last = False
 
     def __exit__(self, *error: object) -> None:
-        self.end()
+        self.end_crate()
 
     @property
     def is_over(self) -> bool:
@@ -161,19 +161,19 @@ class WarmCrate(CrateLine):
         if self.is_last:
             super().close(timeout_s)
             return
-        self.ask(Leave())
+        self.try_request(Leave())
         deadline = time.monotonic() + LEAVE_S
         answer: object = self
         while answer is not None and self.line.poll(max(0.0, deadline - time.monotonic())):
-            answer = self.receive()
+            answer = self.receive_message()
             if isinstance(answer, Left):
-                self.printed()
+                self.read_output()
                 with suppress(BlockingIOError):
                     os.eventfd_read(self.attention)
                 return
-        self.end()
+        self.end_crate()
 
-    def show(self, tick: int, task: str) -> Shown:
+    def read_attributes(self, tick: int, task: str) -> Shown:
         """Read the attributes of a level from a snapshot.
 
         Args:
@@ -183,30 +183,30 @@ class WarmCrate(CrateLine):
         Returns:
             The tick of the snapshot, or -1 without one, and the attributes as JSON.
         """
-        self.ask(Show(tick, task))
+        self.try_request(Show(tick, task))
         answer: object = self
         while answer is not None and not isinstance(answer, Shown):
-            answer = self.receive()
+            answer = self.receive_message()
         return answer or Shown(-1, "")
 
-    def end(self) -> None:
+    def end_crate(self) -> None:
         """End the crate and its snapshots."""
         super().close(END_S)
 
 
-def environment() -> dict[str, str]:
+def build_environment() -> dict[str, str]:
     """Return the environment of the crate: this process's, with settings for repeatable runs."""
     tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
     return {
         **os.environ,
-        **SINGLE_THREADED,
+        **ONE_THREAD,
         **NO_WINDOWS,
         TUNABLES: tunables,
         "PYTHONPATH": os.pathsep.join(sys.path),
     }
 
 
-def received(line: Connection) -> object:
+def receive_or_none(line: Connection) -> object:
     """Wait for the next message on a line and return it. None if the other end is gone."""
     try:
         return line.recv()

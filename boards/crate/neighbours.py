@@ -16,9 +16,9 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.bounded_toml import load_toml
 from rack.backplane.errors import SegmentError
 from rack.backplane.process import SCHED_DEADLINE
-from rack.backplane.segment import Segment, racks
+from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import Block, Run, System
-from rack.boards.config.layout import obtained_core
+from rack.boards.config.layout import find_core
 from rack.boards.config.schema import RackConfig
 
 
@@ -44,26 +44,26 @@ class Holder:
         )
 
 
-def holders(ignored: str) -> dict[int, Holder]:
+def find_holders(ignored: str) -> dict[int, Holder]:
     """Return the rack that occupies each core. The rack named `ignored` does not count."""
     occupied: dict[int, Holder] = {}
-    for name in racks():
+    for name in list_racks():
         if name == ignored:
             continue
         try:
             segment = Segment.attach(name)
         except SegmentError:
             # A rack of another user or version cannot be read, but its processes show its cores.
-            occupied = {**_seen(name), **occupied}
+            occupied = {**_find_cores_of_processes(name), **occupied}
             continue
         if segment.launcher_is_alive and not segment.words[System.LOCKSTEP]:
-            for core, tasks in _held(segment).items():
+            for core, tasks in _find_cores_of_rack(segment).items():
                 occupied.setdefault(core, Holder(name, segment.launcher_text, tuple(tasks)))
         segment.close()
     return occupied
 
 
-def _seen(rack: str) -> dict[int, Holder]:
+def _find_cores_of_processes(rack: str) -> dict[int, Holder]:
     """Find the cores that a rack occupies from the names and priorities of processes."""
     occupied: dict[int, Holder] = {}
     for folder in Path("/proc").glob("[0-9]*"):
@@ -82,23 +82,23 @@ def _seen(rack: str) -> dict[int, Holder]:
     return occupied
 
 
-def _held(segment: Segment) -> dict[int, list[str]]:
+def _find_cores_of_rack(segment: Segment) -> dict[int, list[str]]:
     """Return the real-time tasks of a running rack by core, from its segment."""
     if segment.words[System.STATE] == Run.STOPPED:
         return {}
     occupied: dict[int, list[str]] = {}
     for task in segment.layout.tasks:
-        if segment.block(task.name)[Block.PRIORITY]:
+        if segment.get_block(task.name)[Block.PRIORITY]:
             occupied.setdefault(task.core, []).append(task.name)
     # The config is not validated: another version of this program may have created the segment.
     clock = load_toml(segment.config).get("clock", {})
     # If the boards were refused their priority, so was the clock.
     if occupied and clock.get("priority"):
-        occupied.setdefault(obtained_core(clock["core"]), []).append(CLOCK)
+        occupied.setdefault(find_core(clock["core"]), []).append(CLOCK)
     return occupied
 
 
-def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
+def move_boards(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
     """Move boards from occupied cores to a free one, unless the config gives their core.
 
     Args:
@@ -114,28 +114,25 @@ def placed(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, 
     moved = {
         name: board
         for name, board in config.board.items()
-        if board.priority
-        and "core" not in board.model_fields_set
-        and obtained_core(board.core) in held
+        if board.priority and "core" not in board.model_fields_set and find_core(board.core) in held
     }
     boards = {name: board.model_copy(update={"core": free[0]}) for name, board in moved.items()}
     notes = [
-        f"{name} on core {free[0]}: {held[obtained_core(board.core)]}"
-        for name, board in moved.items()
+        f"{name} on core {free[0]}: {held[find_core(board.core)]}" for name, board in moved.items()
     ]
     return config.model_copy(update={"board": {**config.board, **boards}}), notes
 
 
-def conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
+def find_conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
     """Return a line for each core that real-time tasks of this config share with another rack."""
     tasks = [
         (CLOCK, config.clock.core, config.clock.priority),
-        *((t.name, t.core, t.priority) for t in config.tasks()),
+        *((t.name, t.core, t.priority) for t in config.list_tasks()),
     ]
     requested: dict[int, list[str]] = {}
     for task, core, priority in tasks:
         if priority:
-            requested.setdefault(obtained_core(core), []).append(task)
+            requested.setdefault(find_core(core), []).append(task)
     both = sorted(requested.keys() & held.keys()) if config.clock.mode == "realtime" else []
     return [
         f"core {core}, requested by {', '.join(requested[core])}: {held[core]}" for core in both

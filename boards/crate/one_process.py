@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.message import AnyMessage, Message
 from rack.boards.classes import find_class
 from rack.boards.config import RackConfig, load, resolve
@@ -57,8 +57,8 @@ class OneProcess:
             raise LaunchError(f"{names}: a host board, which needs a separate process")
         self.tick = 0
         self._clock_ns = plan.layout.clock_ns
-        self._posts = {spec.name: Post(spec) for spec in plan.layout.mailboxes}
-        self._tasks = [LoneTask(plan.layout, wiring, self._posts) for wiring in plan.tasks]
+        self._posts = {spec.name: PrivateMailbox(spec) for spec in plan.layout.mailboxes}
+        self._tasks = [PrivateTask(plan.layout, wiring, self._posts) for wiring in plan.tasks]
         self._cycles = [(*task.spec.grid, task.cycle) for task in self._tasks]
 
     @classmethod
@@ -112,7 +112,7 @@ class OneProcess:
         post = self._posts.get(mailbox)
         if post is None:
             raise LookupError(f"no mailbox '{mailbox}'; mailboxes: {', '.join(self._posts)}")
-        newest = post.newest(self.tick - 1)
+        newest = post.find_newest(self.tick - 1)
         if newest is None:
             raise LookupError(f"'{mailbox}' is empty at tick {self.tick - 1}")
         message = AnyMessage(post.dtype)
@@ -122,11 +122,11 @@ class OneProcess:
     @property
     def serials(self) -> Mapping[str, int]:
         """Serial of the newest visible message of each mailbox that has one."""
-        newest = {name: post.newest(self.tick - 1) for name, post in self._posts.items()}
+        newest = {name: post.find_newest(self.tick - 1) for name, post in self._posts.items()}
         return {name: entry[0] for name, entry in newest.items() if entry is not None}
 
 
-class Post:
+class PrivateMailbox:
     """Mailbox in private memory.
 
     Attributes:
@@ -140,7 +140,7 @@ class Post:
 
     def __init__(self, spec: MailboxSpec) -> None:
         self.spec = spec
-        self.dtype = message_dtype(spec.fields, spec.size)
+        self.dtype = build_message_dtype(spec.fields, spec.size)
         self.message = AnyMessage(self.dtype)
         self.serial = 0
         self.kept: deque[tuple[int, int, bytes]] = deque(maxlen=spec.delay // spec.every + 2)
@@ -156,7 +156,7 @@ class Post:
             self.serial += 1
             self.kept.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
 
-    def newest(self, tick: int) -> tuple[int, bytes] | None:
+    def find_newest(self, tick: int) -> tuple[int, bytes] | None:
         """Return serial and bytes of the newest message visible at `tick`. None without one."""
         for visible_at, serial, data in reversed(self.kept):
             if visible_at <= tick:
@@ -164,10 +164,10 @@ class Post:
         return None
 
 
-class PostReader:
+class PrivateReader:
     """Reader of a `Post`, which returns messages with verdicts as a board's reader does."""
 
-    def __init__(self, post: Post, kind: type[Message]) -> None:
+    def __init__(self, post: PrivateMailbox, kind: type[Message]) -> None:
         self._post = post
         self._serial = 0
         self._message = kind(post.dtype)
@@ -175,7 +175,7 @@ class PostReader:
 
     def read(self, tick: int) -> Reading[Message]:
         """Return the newest message visible at `tick` with its verdict."""
-        newest = self._post.newest(tick)
+        newest = self._post.find_newest(tick)
         if newest is None:
             return self._readings[Verdict.NONE]
         serial, data = newest
@@ -186,7 +186,7 @@ class PostReader:
         return self._readings[Verdict.NEW]
 
 
-class LoneTask:
+class PrivateTask:
     """An executor or planner with its ports connected to mailboxes in private memory.
 
     Args:
@@ -195,8 +195,10 @@ class LoneTask:
         posts: All mailboxes by name.
     """
 
-    def __init__(self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, Post]) -> None:
-        self.spec = layout.task(wiring.task)
+    def __init__(
+        self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, PrivateMailbox]
+    ) -> None:
+        self.spec = layout.find_task(wiring.task)
         kind: type[Executor] | type[Planner] = find_class(
             wiring.target,
             Executor if self.spec.role == "executor" else Planner,
@@ -208,45 +210,45 @@ class LoneTask:
         self._readers: list[tuple[dict[str, Any], str, Callable[[int], Reading[Message]]]] = []
         for port, source in wiring.inputs.items():
             message = level.inputs[port].message if port in level.inputs else AnyMessage
-            table = level.input_table(port)
+            table = level.find_input_table(port)
             if isinstance(source, str):
-                self._add(table, port, PostReader(posts[source], message))
+                self._add_reader(table, port, PrivateReader(posts[source], message))
                 continue
             table[port] = {}
             for board, mailbox in source.items():
-                self._add(table[port], board, PostReader(posts[mailbox], message))
+                self._add_reader(table[port], board, PrivateReader(posts[mailbox], message))
         self._posts = [posts[name] for name in wiring.outputs.values()]
         for port, name in wiring.outputs.items():
             message = level.outputs[port].message if port in level.outputs else AnyMessage
             level.place_output(port, message(posts[name].dtype, posts[name].message.raw))
         self._busy_until = 0
-        self.cycle = self._execute if isinstance(level, Executor) else self._plan
+        self.cycle = self._run_executor if isinstance(level, Executor) else self._run_planner
 
-    def _add(self, values: dict[str, Any], key: str, reader: PostReader) -> None:
+    def _add_reader(self, values: dict[str, Any], key: str, reader: PrivateReader) -> None:
         values[key] = reader.read(-1)
         self._readers.append((values, key, reader.read))
 
-    def _execute(self, tick: int) -> None:
-        self._read(tick)
+    def _run_executor(self, tick: int) -> None:
+        self._read_inputs(tick)
         assert isinstance(self.level, Executor), "a planner plans"
         self.level.process(tick)
         self.level.findings.clear()
-        self._write(tick)
+        self._write_outputs(tick)
 
-    def _plan(self, tick: int) -> None:
+    def _run_planner(self, tick: int) -> None:
         if tick < self._busy_until:
             return
-        self._read(tick)
+        self._read_inputs(tick)
         assert isinstance(self.level, Planner), "an executor executes"
         if self.level.wanted(tick):
             self._busy_until = tick + self.spec.slice
             self.level.plan(tick)
-            self._write(tick)
+            self._write_outputs(tick)
 
-    def _read(self, tick: int) -> None:
+    def _read_inputs(self, tick: int) -> None:
         for values, key, read in self._readers:
             values[key] = read(tick)
 
-    def _write(self, tick: int) -> None:
+    def _write_outputs(self, tick: int) -> None:
         for post in self._posts:
             post.write(tick, self.spec.every)

@@ -14,7 +14,7 @@ MOST_READ = 1 << 16
 _LINE = re.compile(rb"[^\n]{%d}\n?|[^\n]*\n" % LONGEST_LINE)
 
 
-def lines_of(data: bytes) -> list[bytes]:
+def split_lines(data: bytes) -> list[bytes]:
     """Split output into complete lines with their line ends. Long lines are cut.
 
     An incomplete line at the end is left out.
@@ -41,7 +41,7 @@ class HostOutput:
         os.close(self.reader)
         os.close(self.writer)
 
-    def pass_on(self, is_over: bool = False) -> None:
+    def copy_output(self, is_over: bool = False) -> None:
         """Copy new output. Each time that the number of dropped lines has doubled, print it.
 
         Args:
@@ -51,7 +51,7 @@ class HostOutput:
             self._rest += os.read(self.reader, MOST_READ)
         if is_over and self._rest[-1:] not in b"\n":
             self._rest += b"\n"
-        lines = lines_of(self._rest)
+        lines = split_lines(self._rest)
         self._rest = self._rest[sum(map(len, lines)) :]
         first_lines = lines[: max(0, MOST_LINES - self._lines)]
         self._lines += len(lines)

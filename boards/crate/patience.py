@@ -10,7 +10,7 @@ from rack.boards.crate.line import CrateLine
 from rack.boards.crate.requests import Compiling, Opened, PreloadFailed, Preloading
 from rack.boards.errors import LaunchError
 from rack.boards.events import Journal
-from rack.boards.lan.awaited import awaited
+from rack.boards.lan.awaited import find_waits
 
 COMPILE_S = 300.0
 """Time limit for compiling one function: thirty times the longest on an idle machine."""
@@ -18,7 +18,7 @@ PATIENCE_S = 2.0
 """Time after which a wait is reported. It is reported again each time that it has doubled."""
 
 
-class Patience:
+class ReportedWait:
     """A wait with a time limit. If it takes long, it is reported.
 
     Args:
@@ -42,15 +42,15 @@ class Patience:
         """Time until the next report is due or the time limit is reached, s."""
         return max(0.0, min(self._report_s, self._limit_s) - self._waited_s)
 
-    def renew(self, limit_s: float) -> None:
+    def restart_limit(self, limit_s: float) -> None:
         """Start another time limit now. The times of reports do not change."""
         self.limit_s = limit_s
         self._limit_s = self._waited_s + limit_s
 
-    def report(self, doing: str) -> None:
+    def report_if_due(self, doing: str) -> None:
         """Report the wait if a report is due. `doing` is a clause that says what is in progress."""
         if self._waited_s >= self._report_s:
-            self._journal.add("waiting", "", f"{doing}, {self._waited_s:.0f} s so far")
+            self._journal.add_event("waiting", "", f"{doing}, {self._waited_s:.0f} s so far")
             self._report_s *= 2.0
 
     @property
@@ -58,26 +58,26 @@ class Patience:
         return time.monotonic() - self._began
 
 
-class RackAwaited:
+class PeerWaitReporter:
     """Reports of adapters that wait for another rack in lockstep, which has no time limit."""
 
     def __init__(self, segment: Segment, journal: Journal) -> None:
         self._segment = segment
         self._journal = journal
-        self._patience: Patience | None = None
+        self._patience: ReportedWait | None = None
 
-    def look(self) -> None:
+    def report_if_due(self) -> None:
         """Report the racks that adapters wait for, if a report is due."""
-        waits = list(awaited(self._segment))
+        waits = list(find_waits(self._segment))
         if not waits:
             self._patience = None
             return
-        self._patience = self._patience or Patience(self._journal, math.inf)
+        self._patience = self._patience or ReportedWait(self._journal, math.inf)
         for board, why in waits:
-            self._patience.report(f"'{board}' {why}")
+            self._patience.report_if_due(f"'{board}' {why}")
 
 
-def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> int:
+def await_open_segment(crate: CrateLine, journal: Journal, limit_s: float) -> int:
     """Wait until the crate has preloaded the levels and opened the segment.
 
     Args:
@@ -91,25 +91,25 @@ def await_opened(crate: CrateLine, journal: Journal, limit_s: float) -> int:
     Raises:
         LaunchError: A class cannot be preloaded, or the time limit is exceeded.
     """
-    patience = Patience(journal, limit_s)
+    patience = ReportedWait(journal, limit_s)
     doing = "the crate is starting"
     while not patience.is_over:
         if not crate.line.poll(patience.left_s):
-            patience.report(doing)
+            patience.report_if_due(doing)
             continue
-        match crate.receive():
+        match crate.receive_message():
             case Opened(tick):
                 return tick
             case Preloading(kind):
-                patience = Patience(journal, limit_s)
+                patience = ReportedWait(journal, limit_s)
                 doing = f"preloading '{kind}'"
             case Compiling(function):
-                patience.renew(COMPILE_S)
+                patience.restart_limit(COMPILE_S)
                 doing = f"compiling '{function}', which is kept for later launches"
             case PreloadFailed(kind, why):
                 raise LaunchError(f"'{kind}' cannot be preloaded: {why}")
             case None:
-                raise LaunchError("\n".join(crate.printed()) or "the crate has ended")
+                raise LaunchError("\n".join(crate.read_output()) or "the crate has ended")
     raise LaunchError(
-        "\n".join(crate.printed()) or f"{doing}: not done within {patience.limit_s:g} s"
+        "\n".join(crate.read_output()) or f"{doing}: not done within {patience.limit_s:g} s"
     )

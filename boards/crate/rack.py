@@ -15,28 +15,28 @@ from rack.backplane.fault_table import FaultTable
 from rack.backplane.operator_table import OperatorTable, Request, RequestEntry
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
-from rack.boards.config.commands import asked, request
+from rack.boards.config.commands import build_request, parse_command
 from rack.boards.config.loader import load
-from rack.boards.config.resolved import Resolved, classes, resolve
+from rack.boards.config.resolved import Resolved, list_class_names, resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate import launch_checks
-from rack.boards.crate.clean import remove_dead, remove_own
+from rack.boards.crate.clean import remove_dead_rack, remove_own_racks
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.neighbours import conflicts, holders, placed
-from rack.boards.crate.patience import await_opened
+from rack.boards.crate.neighbours import find_conflicts, find_holders, move_boards
+from rack.boards.crate.patience import await_open_segment
 from rack.boards.crate.requests import CellConfig, HogWiring, Open, PowerOff, PowerOn, Preload
 from rack.boards.crate.supervisor import STOP_S, Supervisor
 from rack.boards.errors import ConfigError, Mistake, SnapshotError
-from rack.boards.events import CONTINUES, Event, Journal, Outcome
+from rack.boards.events import CONTINUATION_CODE, Event, Journal, Outcome
 from rack.boards.faults.kind import KINDS
-from rack.boards.wiring import Continuation, Entries, SnapshotPolicy
+from rack.boards.wiring import Continuation, ExchangedEntries, SnapshotPolicy
 
 LAUNCH_S = 60.0
 """Time limit for each step of the launch, such as preloading one class or starting all boards."""
 TO_SHARE = "stop that rack, choose other cores, or use --share"
-LEAVE_S = 2.0
+BOARDS_END_S = 2.0
 """Time that the boards have to end by themselves."""
-LOOK_S = 0.5
+WATCH_S = 0.5
 """Time between two checks of the boards if none of them reports anything."""
 
 
@@ -69,7 +69,7 @@ class Rack:
         on_event: Callable[[Event], None] | None = None,
         share: bool = True,
         crate: CrateLine | None = None,
-        entries: Mapping[str, Entries] | None = None,
+        entries: Mapping[str, ExchangedEntries] | None = None,
         snapshots: SnapshotPolicy | None = None,
         continues: Continuation | None = None,
         requests: Sequence[Request] = (),
@@ -142,29 +142,31 @@ class Rack:
 
     def _power_on(self) -> None:
         """Carry out the steps of a launch. After an error the caller must close the rack."""
-        occupied = holders(self.config.name)
-        self.config, moved = placed(self.config, occupied)
-        shared = conflicts(self.config, occupied)
+        occupied = find_holders(self.config.name)
+        self.config, moved = move_boards(self.config, occupied)
+        shared = find_conflicts(self.config, occupied)
         if shared and not self._share:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
         # Report occupied cores first, because the next steps take long on them.
         for note in shared:
-            self._journal.add("waiting", "", note)
+            self._journal.add_event("waiting", "", note)
         self._crate = crate = self._crate or CrateLine()
         # The crate imports levels while this process resolves the config, which saves 0.5 s on two
         # cores. If a level's module ends the crate, `resolve` reports which module that is.
-        crate.ask(Preload(classes(self.config), tuple(sys.path), cell_of(self.config)))
+        crate.try_request(
+            Preload(list_class_names(self.config), tuple(sys.path), build_cell_config(self.config))
+        )
         plan = resolve(self.config).for_run(self._repeats, self._entries)
         if self._snapshots is not None:
             # In a replay the wiring contains what came from outside.
-            why = "" if plan.is_replay else self.config.outside
+            why = "" if plan.is_replay else self.config.outside_state
             if self.config.clock.mode != "lockstep":
                 why = "they are taken in lockstep; add --lockstep"
             if why:
                 raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
         launch_checks.check_open_files(plan)
-        remove_dead(self.config.name)
-        segment = Segment.create(plan.layout, self.config.text(), plan.published.text())
+        remove_dead_rack(self.config.name)
+        segment = Segment.create(plan.layout, self.config.to_toml_text(), plan.published.to_json())
         self._journal.segment = segment
         self._launched = supervisor = Supervisor(segment, plan, crate, self._journal)
         words = segment.words
@@ -178,37 +180,40 @@ class Rack:
             words[System.SNAPSHOT_EVERY] = policy.every
             words[System.SNAPSHOT_AT] = 0 if policy.at is None else policy.at + 1
         before = None if self._continues is None else self._continues.tick
-        crate.send(Open(self.config.name, plan.crate_priority, before))
-        self._journal.add(
+        crate.send_request(Open(self.config.name, plan.crate_priority, before))
+        self._journal.add_event(
             "launch", "", f"{len(plan.tasks)} tasks, segment of {len(segment.bytes)} bytes"
         )
-        self.begins_at = await_opened(crate, self._journal, LAUNCH_S)
+        self.begins_at = await_open_segment(crate, self._journal, LAUNCH_S)
         if before is not None and self.begins_at < 0:
             raise SnapshotError(f"rack '{self.config.name}': no snapshot before tick {before}")
         for wiring in plan.tasks:
-            crate.send(PowerOn(wiring.task, wiring))
+            crate.send_request(PowerOn(wiring.task, wiring))
         supervisor.await_ready(LAUNCH_S)
         launch_checks.check_realtime(plan, segment)
-        self._inject(plan, crate)
+        self._fill_tables(plan, crate)
         for note in (*moved, *launch_checks.list_launch_notes(plan, segment)):
-            self._journal.add("ready", "", note)
+            self._journal.add_event("ready", "", note)
 
-    def _inject(self, plan: Resolved, crate: CrateLine) -> None:
+    def _fill_tables(self, plan: Resolved, crate: CrateLine) -> None:
         """Enter the config's faults and commands into their tables, and start hog processes."""
         table = FaultTable(self.segment)
         before = self._continues or Continuation(0)
         for injection in plan.faults[before.faults :]:
-            entry = table.add(injection)
+            entry = table.add_fault(injection)
             if KINDS[injection.kind].where == "core":
-                crate.send(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
+                crate.send_request(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
         desk = OperatorTable(self.segment)
         # A snapshot contains pending commands, and also leases of clients that no longer exist.
-        for lease in desk.leased():
-            desk.release(lease)
-        for request_entry in (*plan.commands[before.commands :], *desk.lacking(self._requests)):
-            desk.add(request_entry)
+        for lease in desk.list_leased():
+            desk.release_lease(lease)
+        for request_entry in (
+            *plan.commands[before.commands :],
+            *desk.find_missing(self._requests),
+        ):
+            desk.add_request(request_entry)
 
-    def follow(self, events: Iterable[Event]) -> None:
+    def take_over_events(self, events: Iterable[Event]) -> None:
         """Take over events of the continued run from before its snapshot.
 
         The outcome of this run counts them.
@@ -223,7 +228,7 @@ class Rack:
         """
         supervisor = self._supervisor
         plan = supervisor.plan
-        clock = plan.clock(seconds)
+        clock = plan.build_clock_wiring(seconds)
         if self._snapshots is not None or self._continues is not None:
             # Keep the last tick out of the clock's wiring: a run that continues from a snapshot may
             # end at another tick, and its wiring must be the same.
@@ -235,20 +240,22 @@ class Rack:
         else:
             # The latch is in the snapshot, and earlier alarms are events of the continued run.
             supervisor.is_armed = True
-            supervisor.alarms.drain()
+            supervisor.alarms.read_alarms()
             tick = self.begins_at
-            self._journal.add("launch", "", f"continues before tick {tick}", CONTINUES, tick=tick)
+            self._journal.add_event(
+                "launch", "", f"continues before tick {tick}", CONTINUATION_CODE, tick=tick
+            )
             for board, lost in self._continues.losses:
                 if lost < tick:
-                    supervisor.policy.admit(board, lost)
+                    supervisor.policy.admit_restart(board, lost)
         supervisor.recovery.start(clock, plan)
-        self._journal.add("start", CLOCK, self.config.clock.mode)
+        self._journal.add_event("start", CLOCK, self.config.clock.mode)
 
     def run(self, seconds: float | None = None) -> Outcome:
         """Run for `seconds` of simulated time, or until the task ends, and return the outcome."""
         self.start(seconds)
         while (outcome := self.outcome) is None:
-            self.watch(LOOK_S)
+            self.watch(WATCH_S)
         return outcome
 
     def run_in_background(self, seconds: float | None = None) -> None:
@@ -265,7 +272,7 @@ class Rack:
 
     def _supervise(self) -> None:
         try:
-            while self.watch(LOOK_S):
+            while self.watch(WATCH_S):
                 continue
         except BaseException as error:
             # The boards are no longer supervised. `wait` and `__exit__` raise the error.
@@ -316,10 +323,10 @@ class Rack:
             ConfigError: The command has mistakes. All of them are listed.
             OperatorTableError: Too many commands are pending.
         """
-        command = asked({"level": level, "what": what, "tick": tick, **goal})
+        command = parse_command({"level": level, "what": what, "tick": tick, **goal})
         plan = self._supervisor.plan
-        entry = request(command, self.config, plan.published.levels, plan.layout)
-        return OperatorTable(self.segment).add(entry)
+        entry = build_request(command, self.config, plan.published.levels, plan.layout)
+        return OperatorTable(self.segment).add_request(entry)
 
     def close(self) -> None:
         """End the rack. No process and no segment of it is left."""
@@ -328,22 +335,22 @@ class Rack:
             return
         if self._thread is not None and self.outcome is None:
             self.stop()
-            self._thread.join(STOP_S + LEAVE_S)
+            self._thread.join(STOP_S + BOARDS_END_S)
         self._crate = None
         leave_s = 0.0
         try:
             if (launched := self._launched) is not None:
                 launched.end_boards()
                 tasks = launched.plan.layout.tasks
-                is_any_lost = any(self.segment.block(task.name)[Block.LOST] for task in tasks)
+                is_any_lost = any(self.segment.get_block(task.name)[Block.LOST] for task in tasks)
                 if is_any_lost or launched.recovery.given_up:
-                    crate.ask(PowerOff())
+                    crate.try_request(PowerOff())
                 # Do not wait for a crate without boards, which may still be importing.
-                leave_s = LEAVE_S if launched.pids else 0.0
+                leave_s = BOARDS_END_S if launched.pids else 0.0
             crate.close(leave_s)
         finally:
             # Remove the segment by name: the launch may have been interrupted before it was stored.
-            remove_own(self.config.name)
+            remove_own_racks(self.config.name)
             if self._launched is not None:
                 self.segment.close()
 
@@ -353,6 +360,6 @@ class Rack:
         return self._launched
 
 
-def cell_of(config: RackConfig) -> CellConfig | None:
+def build_cell_config(config: RackConfig) -> CellConfig | None:
     """Return the tables that the crate needs to compile the cell. None without an arm."""
     return None if config.robot is None else CellConfig(config.robot, config.scene, config.clock_ns)

@@ -12,22 +12,22 @@ from collections.abc import Callable, Mapping
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout
-from rack.backplane.process import STOPPED, how_ended, state_of
+from rack.backplane.process import STOPPED_STATES, describe_end, read_state
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
 from rack.boards.config.resolved import Resolved
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.requests import Ended, PowerOff, PowerOn
-from rack.boards.errors import CANNOT_GO_ON
+from rack.boards.errors import UNRECOVERABLE_STATUS
 from rack.boards.events import Journal
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 
-UP = (TaskState.READY, TaskState.RUNNING)
+UP_STATES = (TaskState.READY, TaskState.RUNNING)
 """States of a board that has passed its self-test and has not ended."""
 
 
-class Supervision:
+class RestartPolicy:
     """Restart policy of a rack.
 
     It counts in ticks, so that equal losses in lockstep have equal outcomes.
@@ -40,13 +40,13 @@ class Supervision:
         # Names that each task depends on. The clock and host boards depend on nothing.
         self._needs: dict[str, set[str]] = defaultdict(set)
         for task in layout.tasks:
-            below = config.all_below(task.board)
+            below = config.find_boards_below(task.board)
             needed = {other.name for other in layout.tasks if other.board in below}
             self._needs[task.name] = {CLOCK, *needed} | (
                 {task.board} if task.role == "planner" else set()
             )
 
-    def admit(self, task: str, tick: int) -> str:
+    def admit_restart(self, task: str, tick: int) -> str:
         """Request a restart of a task that was lost at `tick`, and count it if it is permitted.
 
         Returns:
@@ -55,7 +55,7 @@ class Supervision:
         common = self._config.supervision
         most, within_s = common.restarts, common.within_s
         if task != CLOCK:
-            board = self._config.table(self._layout.task(task))
+            board = self._config.get_table(self._layout.find_task(task))
             most = most if board.restarts is None else board.restarts
             board_s = board.restarts_within_s
             within_s = within_s if board_s is None else board_s
@@ -66,7 +66,7 @@ class Supervision:
         self._restarts[task] = [*recent, tick]
         return f"restart {len(recent) + 1} of at most {most} in {within_s:g} s"
 
-    def in_order(self, tasks: list[str]) -> list[str]:
+    def sort_by_dependency(self, tasks: list[str]) -> list[str]:
         """Return the tasks in the order of restart.
 
         The clock comes first, lower levels come before higher ones, executors before planners.
@@ -101,7 +101,7 @@ class Recovery:
     """
 
     def __init__(
-        self, segment: Segment, supervision: Supervision, crate: CrateLine, journal: Journal
+        self, segment: Segment, supervision: RestartPolicy, crate: CrateLine, journal: Journal
     ) -> None:
         self.wirings: Mapping[str, TaskWiring | ClockWiring | HostWiring] = {}
         self.faults: list[str] = []
@@ -124,9 +124,9 @@ class Recovery:
         }
         for name, wiring in self.wirings.items():
             if not isinstance(wiring, TaskWiring):
-                self._crate.ask(PowerOn(name, wiring))
+                self._crate.try_request(PowerOn(name, wiring))
 
-    def lose(self, end: Ended, is_over: bool, record_printed: Callable[[], None]) -> None:
+    def record_loss(self, end: Ended, is_over: bool, record_printed: Callable[[], None]) -> None:
         """Record the end of a board, and restart it or give it up.
 
         Args:
@@ -138,20 +138,22 @@ class Recovery:
         is_host = isinstance(self.wirings.get(name), HostWiring)
         self._starting = [other for other in self._starting if other != name]
         self._stopped.discard(name)
-        if is_host and self._segment.block(name)[Block.STATE] == TaskState.ENDED:
-            self._journal.add("done", name, f"host board '{name}': its program is done", "done")
+        if is_host and self._segment.get_block(name)[Block.STATE] == TaskState.ENDED:
+            self._journal.add_event(
+                "done", name, f"host board '{name}': its program is done", "done"
+            )
             return
-        text = f"{'host ' * is_host}board '{name}' ended: {how_ended(end.status)}"
-        self._journal.add("died", name, text, "died", end.seen_ns, end.tick)
+        text = f"{'host ' * is_host}board '{name}' ended: {describe_end(end.status)}"
+        self._journal.add_event("died", name, text, "died", end.seen_ns, end.tick)
         if not self.wirings or (is_over and not is_host):
-            self._give_up(name, text)
+            self._record_giving_up(name, text)
             return
-        if end.status == CANNOT_GO_ON and not is_host:
+        if end.status == UNRECOVERABLE_STATUS and not is_host:
             record_printed()
-            text = self._reason(name) or text
-        elif restart := self._supervision.admit(name, end.tick):
+            text = self._find_printed_reason(name) or text
+        elif restart := self._supervision.admit_restart(name, end.tick):
             self._waiting.append(name)
-            self._journal.add("reaction", name, restart, "restart")
+            self._journal.add_event("reaction", name, restart, "restart")
             return
         else:
             text = f"{text}; no restarts left"
@@ -159,27 +161,27 @@ class Recovery:
             self.is_beyond_help = True
         else:
             # The clock reacts to this state by braking the arm and ending the run.
-            self._segment.block(name)[Block.STATE] = TaskState.GIVEN_UP
-        self._give_up(name, text, is_host)
+            self._segment.get_block(name)[Block.STATE] = TaskState.GIVEN_UP
+        self._record_giving_up(name, text, is_host)
 
-    def lose_crate(self) -> None:
+    def record_crate_loss(self) -> None:
         """Record the end of the crate, with which all boards have ended."""
         self.is_beyond_help = True
         text = "the crate ended, and all boards with it"
-        self._journal.add("died", "crate", text, "died")
-        self._give_up("crate", text)
+        self._journal.add_event("died", "crate", text, "died")
+        self._record_giving_up("crate", text)
 
     def report_hanging(self, board: str, why: str = "") -> None:
         """Record that a board hangs, followed by `why`."""
         text = f"'{board}' is not responding{why}"
-        self._journal.add("detection", "rack", text, "hang", subject=board)
+        self._journal.add_event("detection", "rack", text, "hang", subject=board)
 
-    def end_hanging(self, board: str) -> None:
+    def kill_hanging(self, board: str) -> None:
         """Kill a hanging board, so that it is lost, unless it is already being restarted."""
         if board not in (*self._waiting, *self._starting):
-            self._crate.ask(PowerOff(board))
+            self._crate.try_request(PowerOff(board))
 
-    def advance(self) -> None:
+    def restart_due_boards(self) -> None:
         """Power on boards whose dependencies are present, and kill stopped host boards.
 
         A host board that a signal has stopped is not detected in any other way.
@@ -187,27 +189,27 @@ class Recovery:
         self._starting = [
             name
             for name in self._starting
-            if name != CLOCK and self._segment.block(name)[Block.STATE] not in UP
+            if name != CLOCK and self._segment.get_block(name)[Block.STATE] not in UP_STATES
         ]
         absent = [*self._waiting, *self._starting]
-        for board in self._supervision.in_order(self._waiting):
+        for board in self._supervision.sort_by_dependency(self._waiting):
             if not self._supervision.must_wait(board, absent):
                 self._waiting.remove(board)
                 self._starting.append(board)
-                self._crate.ask(PowerOn(board, self.wirings[board]))
+                self._crate.try_request(PowerOn(board, self.wirings[board]))
         hosts = {name for name, wiring in self.wirings.items() if isinstance(wiring, HostWiring)}
         for name in hosts - self._stopped:
-            if state_of(self._segment.block(name)[Block.PID]) in STOPPED:
+            if read_state(self._segment.get_block(name)[Block.PID]) in STOPPED_STATES:
                 self._stopped.add(name)
                 self.report_hanging(name, ": stopped by a signal")
-                self._crate.ask(PowerOff(name))
+                self._crate.try_request(PowerOff(name))
 
-    def _reason(self, board: str) -> str:
+    def _find_printed_reason(self, board: str) -> str:
         """Return the last reason that a board has printed. Empty if it has printed none."""
         printed = (event.text for event in reversed(self._journal.events))
         return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
 
-    def _give_up(self, board: str, text: str, is_host: bool = False) -> None:
+    def _record_giving_up(self, board: str, text: str, is_host: bool = False) -> None:
         self.faults.append(text)
         self.given_up |= not is_host
-        self._journal.add("reaction", board, f"gave up on '{board}'", "given_up")
+        self._journal.add_event("reaction", board, f"gave up on '{board}'", "given_up")

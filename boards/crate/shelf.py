@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 
-from rack.boards.run.copying import GoOn, receive_note
+from rack.boards.run.copying import ContinueRequest, receive_note
 from rack.boards.wiring import ClockWiring, TaskWiring
 
 MOST_SNAPSHOTS = 32
@@ -42,7 +42,7 @@ class WaitingCopy:
     line: Connection
     pid: int
 
-    def can_be(self, wiring: Wiring) -> bool:
+    def can_continue_as(self, wiring: Wiring) -> bool:
         """Return True if the copy can continue with a wiring.
 
         Only the context of its level may differ from its present wiring.
@@ -52,7 +52,7 @@ class WaitingCopy:
             return replace(before, context=wiring.context) == wiring
         return before == wiring
 
-    def go_on(self, wiring: Wiring, rack: str) -> int:
+    def continue_as(self, wiring: Wiring, rack: str) -> int:
         """Let the copy continue as a board of a rack. Its successor reports by a note later.
 
         Args:
@@ -68,12 +68,12 @@ class WaitingCopy:
         context = None
         if isinstance(wiring, TaskWiring) and wiring != self.wiring:
             context = wiring.context
-        self.line.send(GoOn(os.getpid(), rack, context))
+        self.line.send(ContinueRequest(os.getpid(), rack, context))
         pid = self.pid
         self.pid = 0
         return pid
 
-    def show(self) -> str:
+    def read_attributes(self) -> str:
         """Return the attributes of the copy's level as JSON. Empty if the copy has ended."""
         with suppress(EOFError, OSError):
             self.line.send(None)
@@ -100,7 +100,7 @@ class HeldSnapshot:
     private_bytes: int = 0
     is_whole: bool = False
 
-    def measure(self) -> None:
+    def measure_memory(self) -> None:
         """Measure the memory that the snapshot does not share with other processes."""
         self.private_bytes = os.fstat(self.memory).st_size
         for copy in self.copies.values():
@@ -133,10 +133,10 @@ class SnapshotShelf:
         self._most_bytes = sum(int(kib) << 10 for kib in sizes) // MEMORY_PART
 
     @property
-    def _held(self) -> list[HeldSnapshot]:
+    def _whole_snapshots(self) -> list[HeldSnapshot]:
         return [snapshot for snapshot in self._snapshots if snapshot.is_whole]
 
-    def take_note(self, wirings: Mapping[str, Wiring]) -> None:
+    def receive_note(self, wirings: Mapping[str, Wiring]) -> None:
         """Receive the next note of a board about its copy.
 
         Args:
@@ -144,13 +144,13 @@ class SnapshotShelf:
         """
         note, files = receive_note(self.line)
         if not files:
-            for snapshot in self._held:
+            for snapshot in self._whole_snapshots:
                 if snapshot.tick == note.tick:
                     snapshot.copies[note.name].pid = note.pid
             return
         unfinished = next((held for held in self._snapshots if not held.is_whole), None)
         if unfinished is not None and unfinished.tick != note.tick:
-            self.drop(unfinished)
+            self.drop_snapshot(unfinished)
             unfinished = None
         if unfinished is None:
             unfinished = HeldSnapshot(note.tick)
@@ -161,30 +161,30 @@ class SnapshotShelf:
             unfinished.memory = fd
         if unfinished.memory >= 0 and unfinished.copies.keys() == wirings.keys():
             self._snapshots.remove(unfinished)
-            self._hold(unfinished)
+            self._add_whole_snapshot(unfinished)
 
-    def _hold(self, snapshot: HeldSnapshot) -> None:
+    def _add_whole_snapshot(self, snapshot: HeldSnapshot) -> None:
         """Add a whole snapshot, replace one of the same tick, and drop others to stay in bounds."""
-        for before in self._held:
+        for before in self._whole_snapshots:
             if before.tick == snapshot.tick:
-                self.drop(before)
-        for before in self._held[-1:]:
+                self.drop_snapshot(before)
+        for before in self._whole_snapshots[-1:]:
             # The pages that the rack has changed since are now private to the previous snapshot.
-            before.measure()
+            before.measure_memory()
         self._snapshots.append(snapshot)
         snapshot.is_whole = True
         snapshot.private_bytes = os.fstat(snapshot.memory).st_size
         while len(self) > MOST_SNAPSHOTS or (
             len(self) > 2 and self.private_bytes > self._most_bytes
         ):
-            self.drop(self._most_dispensable())
+            self.drop_snapshot(self._choose_dispensable())
 
-    def _most_dispensable(self) -> HeldSnapshot:
+    def _choose_dispensable(self) -> HeldSnapshot:
         """Return the snapshot of the older half whose removal leaves the smallest gap.
 
         The newest snapshot and the one with the first tick are never chosen.
         """
-        held = self._held
+        held = self._whole_snapshots
         ticks = sorted(snapshot.tick for snapshot in held)
         older = held[: max(2, len(held) // 2)]
         candidates = [old for old in older if old.tick != ticks[0] and old is not held[-1]]
@@ -196,29 +196,29 @@ class SnapshotShelf:
         return min(candidates, key=gap, default=held[0])
 
     def __len__(self) -> int:
-        return len(self._held)
+        return len(self._whole_snapshots)
 
     @property
     def private_bytes(self) -> int:
         """Memory that all snapshots together do not share, bytes."""
-        return sum(snapshot.private_bytes for snapshot in self._held)
+        return sum(snapshot.private_bytes for snapshot in self._whole_snapshots)
 
     @property
     def pids(self) -> set[int]:
         """Processes of all copies, as far as they are known."""
         return {copy.pid for held in self._snapshots for copy in held.copies.values()} - {0}
 
-    def nearest(self, tick: int) -> HeldSnapshot | None:
+    def find_nearest(self, tick: int) -> HeldSnapshot | None:
         """Return the last whole snapshot at or before `tick`. None if there is none."""
-        earlier = [held for held in self._held if held.tick <= tick]
+        earlier = [held for held in self._whole_snapshots if held.tick <= tick]
         for snapshot in sorted(earlier, key=lambda held: held.tick, reverse=True):
             # A line that is readable has lost its other end: that copy has ended.
             if all(copy.pid and not copy.line.poll() for copy in snapshot.copies.values()):
                 return snapshot
-            self.drop(snapshot)
+            self.drop_snapshot(snapshot)
         return None
 
-    def drop(self, snapshot: HeldSnapshot) -> None:
+    def drop_snapshot(self, snapshot: HeldSnapshot) -> None:
         """Remove a snapshot and kill its processes."""
         for copy in snapshot.copies.values():
             if copy.pid:
@@ -227,10 +227,10 @@ class SnapshotShelf:
         snapshot.close()
         self._snapshots.remove(snapshot)
 
-    def clear(self) -> None:
+    def drop_all(self) -> None:
         """Remove all snapshots."""
         for snapshot in [*self._snapshots]:
-            self.drop(snapshot)
+            self.drop_snapshot(snapshot)
 
     def close_inherited(self) -> None:
         """Close all descriptors in a process that was forked from the crate."""

@@ -8,27 +8,27 @@ from contextlib import suppress
 from multiprocessing.connection import wait
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.checked import pick
+from rack.backplane.checked import select_item
 from rack.backplane.errors import DamageError, EmergencyStopError
 from rack.backplane.lines import UtilityLines
-from rack.backplane.mailbox.history import digest
+from rack.backplane.mailbox.history import compute_digest
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System
 from rack.boards.config.resolved import Resolved
-from rack.boards.crate.alarm_events import AlarmWatch
+from rack.boards.crate.alarm_events import AlarmReader
 from rack.boards.crate.heartbeat import Heartbeat
 from rack.boards.crate.lateness import judge_lost_cycles
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.patience import Patience, RackAwaited
-from rack.boards.crate.recovery import UP, Recovery, Supervision
+from rack.boards.crate.patience import PeerWaitReporter, ReportedWait
+from rack.boards.crate.recovery import UP_STATES, Recovery, RestartPolicy
 from rack.boards.crate.requests import Ended, Forked, ForkFailed
-from rack.boards.errors import UNKEPT, LaunchError
-from rack.boards.events import SUCCESSES, Cause, Ending, Journal, Outcome, brakings
+from rack.boards.errors import NO_SNAPSHOTS_PREFIX, LaunchError
+from rack.boards.events import SUCCESSES, Cause, Ending, Journal, Outcome, list_brakings
 
 MOST_TICKS = 1 << 48
 """Number of ticks that no run reaches. A larger number in the segment is damage."""
-LAST_S = 0.2
+LAST_CYCLES_S = 0.2
 """Time that boards have to finish their last cycles before these are counted."""
 STOP_S = 0.8
 """Time that the clock has to end the run after a stop request. Then the Rack ends it."""
@@ -53,16 +53,16 @@ class Supervisor:
     ) -> None:
         self.segment = segment
         self.plan = plan
-        self.policy = Supervision(plan.config, plan.layout)
+        self.policy = RestartPolicy(plan.config, plan.layout)
         self.recovery = Recovery(segment, self.policy, crate, journal)
-        self.alarms = AlarmWatch(segment)
+        self.alarms = AlarmReader(segment)
         self.pids: dict[str, int] = {}
         self.is_armed = False
         self.outcome: Outcome | None = None
         self._crate = crate
         self._journal = journal
         self._heartbeat = Heartbeat(segment)
-        self._awaited = RackAwaited(segment, journal)
+        self._awaited = PeerWaitReporter(segment, journal)
         self._why_stopped = ""
         self._stop_by: float | None = None
 
@@ -75,45 +75,47 @@ class Supervisor:
         Raises:
             LaunchError: A board failed, or the time limit is exceeded.
         """
-        patience = Patience(self._journal, limit_s)
-        tasks = {task.name: self.segment.block(task.name) for task in self.plan.layout.tasks}
-        while absent := [name for name, block in tasks.items() if block[Block.STATE] not in UP]:
-            self._listen(patience.left_s)
+        patience = ReportedWait(self._journal, limit_s)
+        tasks = {task.name: self.segment.get_block(task.name) for task in self.plan.layout.tasks}
+        while absent := [
+            name for name, block in tasks.items() if block[Block.STATE] not in UP_STATES
+        ]:
+            self._wait_for_messages(patience.left_s)
             if self.recovery.faults:
-                printed = self._crate.printed()
+                printed = self._crate.read_output()
                 raise LaunchError("\n".join(printed) or self.recovery.faults[0])
             if patience.is_over:
                 raise LaunchError(f"boards {', '.join(absent)}: not ready within {limit_s:g} s")
-            patience.report(f"boards {', '.join(absent)} are starting")
+            patience.report_if_due(f"boards {', '.join(absent)} are starting")
 
     def watch(self, timeout_s: float) -> bool:
         """Supervise the boards for `timeout_s` or until the run ends. Return False if it has."""
         deadline = time.monotonic() + timeout_s
         while self.outcome is None:
-            self._listen(min(deadline, self._stop_by or deadline) - time.monotonic())
+            self._wait_for_messages(min(deadline, self._stop_by or deadline) - time.monotonic())
             if self._why_stopped and self._stop_by is None:
                 self._stop_by = time.monotonic() + STOP_S
-                self._journal.add("stop", "", self._why_stopped)
+                self._journal.add_event("stop", "", self._why_stopped)
             self._record_printed()
-            for rung in self.alarms.drain():
+            for rung in self.alarms.read_alarms():
                 # Record each alarm as an event, and kill a process that hangs.
-                self._journal.keep(rung.event)
+                self._journal.record_event(rung.event)
                 if rung.alarm == Alarm.HANG:
-                    task = pick(self.plan.layout.tasks, rung.subject, "task")
-                    self.recovery.end_hanging(task.name)
+                    task = select_item(self.plan.layout.tasks, rung.subject, "task")
+                    self.recovery.kill_hanging(task.name)
                 elif rung.alarm == Alarm.CLOCK_STOPPED and rung.subject == self.pids.get(CLOCK):
                     # Kill only the clock that was reported. Its successor may already be running.
-                    self.recovery.end_hanging(CLOCK)
-            for board in self._heartbeat.hanging():
+                    self.recovery.kill_hanging(CLOCK)
+            for board in self._heartbeat.find_hanging():
                 self.recovery.report_hanging(board)
-                self.recovery.end_hanging(board)
-            self._awaited.look()
-            self.recovery.advance()
+                self.recovery.kill_hanging(board)
+            self._awaited.report_if_due()
+            self.recovery.restart_due_boards()
             if not self.is_armed:
                 self.reset_latch()
             is_late = self._stop_by is not None and time.monotonic() >= self._stop_by
             if self._is_stopped or self.recovery.is_beyond_help or is_late:
-                self._end()
+                self._end_run()
             if time.monotonic() >= deadline:
                 break
         return self.outcome is None
@@ -136,24 +138,26 @@ class Supervisor:
         self.segment.words[System.STATE] = Run.STOPPED
 
     def _record_printed(self) -> None:
-        for line in self._crate.printed():
-            self._journal.add("ready" if line.startswith(UNKEPT) else "printed", "", line)
+        for line in self._crate.read_output():
+            self._journal.add_event(
+                "ready" if line.startswith(NO_SNAPSHOTS_PREFIX) else "printed", "", line
+            )
 
-    def _listen(self, timeout_s: float) -> None:
+    def _wait_for_messages(self, timeout_s: float) -> None:
         """Wait for a message of the crate or an alarm, at most `timeout_s`."""
         attention = self._crate.attention
         for ready in wait([self._crate.line, attention], timeout_s):
             if ready == attention:
                 os.eventfd_read(attention)
             else:
-                self._receive()
+                self._handle_message()
 
-    def _receive(self) -> None:
-        message = self._crate.receive()
+    def _handle_message(self) -> None:
+        message = self._crate.receive_message()
         if isinstance(message, ForkFailed):
             if self.segment.words[System.STATE] == Run.STARTING:
                 raise LaunchError(message.why)
-            self._journal.add("printed", "", message.why)
+            self._journal.add_event("printed", "", message.why)
             message = message.end
         match message:
             case Forked(name, pid):
@@ -165,16 +169,16 @@ class Supervisor:
                 if is_board and not (is_over and status == 0):
                     # If a board died before the run stopped, the restart policy decides, even if
                     # its end is reported later.
-                    died_before = name != CLOCK and self.segment.block(name)[Block.LOST]
+                    died_before = name != CLOCK and self.segment.get_block(name)[Block.LOST]
                     is_late = self._is_stopped and not died_before
-                    self.recovery.lose(end, is_late, self._record_printed)
+                    self.recovery.record_loss(end, is_late, self._record_printed)
             case None:
-                self.recovery.lose_crate()
+                self.recovery.record_crate_loss()
 
-    def _end(self) -> None:
+    def _end_run(self) -> None:
         """Determine the outcome of the run, record it, and let the boards end."""
-        for rung in self.alarms.drain():
-            self._journal.keep(rung.event)
+        for rung in self.alarms.read_alarms():
+            self._journal.record_event(rung.event)
         words = self.segment.words
         stop = words[System.TICK] + 1
         if planned := words[System.STOP_TICK]:
@@ -182,10 +186,10 @@ class Supervisor:
             stop = min(stop, planned)
         if not 0 <= stop < MOST_TICKS:
             raise DamageError(f"a run of {stop} ticks")
-        clock = self.plan.clock(None)
+        clock = self.plan.build_clock_wiring(None)
         ending = Ending(self.segment, clock.ends_run, clock.silent)
-        state, reason = ending.final_state()
-        cause: Cause = ending.cause()
+        state, reason = ending.find_final_state()
+        cause: Cause = ending.find_cause()
         if self.recovery.given_up:
             cause = "board lost"
         elif words[System.STOP_REQUEST]:
@@ -194,38 +198,40 @@ class Supervisor:
         faults = self.recovery.faults
         events = self._journal.events
         tick_ms = self.plan.config.clock_ns * 1e-6
-        braking_periods = brakings(events, stop, tick_ms)
+        braking_periods = list_brakings(events, stop, tick_ms)
         if cause in SUCCESSES:
-            faults += ending.latched()
+            faults += ending.list_latched_faults()
         if cause == "time over":
-            faults += ending.held(events, braking_periods, stop * tick_ms)
-        objects = ending.ends(self.plan.goals)
+            faults += ending.find_long_holds(events, braking_periods, stop * tick_ms)
+        objects = ending.find_object_ends(self.plan.goals)
         if cause == "task done":
             # The comparison is written so that NaN counts as too far.
             faults += [str(end) for end in objects if not end.off_mm <= end.tolerance_mm]
         self.end_boards()
         # Let boards finish the cycles that they have begun.
-        patience = Patience(self._journal, LAST_S)
+        patience = ReportedWait(self._journal, LAST_CYCLES_S)
         while any(map(self._is_cycling, self.pids)) and not patience.is_over:
-            self._listen(patience.left_s)
+            self._wait_for_messages(patience.left_s)
         late, excused = judge_lost_cycles(self.segment, self.plan.config, stop)
         self.outcome = Outcome(
             cause=cause,
             ticks=stop,
             state=state,
             reason=reason,
-            digest=digest(self.segment, stop),
+            digest=compute_digest(self.segment, stop),
             faults=(*faults, *late),
             brakings=braking_periods,
             objects=objects,
             excused=tuple(excused),
         )
-        self._journal.add("end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}")
+        self._journal.add_event(
+            "end", "", f"{cause} after {stop} ticks{': ' + reason if reason else ''}"
+        )
 
     def _is_cycling(self, name: str) -> bool:
         if self.recovery.is_beyond_help or name not in self.segment.map.blocks:
             return False
-        block = self.segment.block(name)
+        block = self.segment.get_block(name)
         return block[Block.DONE] < block[Block.RELEASED] and not block[Block.LOST]
 
     @property

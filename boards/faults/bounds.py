@@ -34,34 +34,38 @@ def cycle_ticks(layout: Layout, board: str) -> int:
     """Return the cycle of a task in ticks: for a planner its time slice, for the clock one tick."""
     if board == CLOCK:
         return 1
-    return layout.task(board).slice
+    return layout.find_task(board).slice
 
 
-def last_read(mailboxes: tuple[str, ...], layout: Layout) -> int:
+def compute_last_read_ticks(mailboxes: tuple[str, ...], layout: Layout) -> int:
     """Return the time until the last message in any of these mailboxes has been read, ticks.
 
     It is counted from the message's release to the read of the slowest reader.
     """
-    boxes = [layout.mailbox(name) for name in mailboxes]
+    boxes = [layout.find_mailbox(name) for name in mailboxes]
     return max(
-        (box.delay + between_reads(layout, box, reader) for box in boxes for reader in box.readers),
+        (
+            box.delay + compute_read_interval(layout, box, reader)
+            for box in boxes
+            for reader in box.readers
+        ),
         default=0,
     )
 
 
-def struck_mailboxes(layout: Layout, at: int, board: str) -> tuple[MailboxSpec, ...]:
+def list_struck_mailboxes(layout: Layout, index: int, board: str) -> tuple[MailboxSpec, ...]:
     """Return the mailboxes that a fault of a task affects.
 
     Args:
         layout: Layout of the rack.
-        at: Index of the mailbox. -1 means all mailboxes that the task writes.
+        index: Index of the mailbox. -1 means all mailboxes that the task writes.
         board: Name of the task. Mailboxes that it does not write are left out.
     """
-    chosen = layout.mailboxes if at < 0 else layout.mailboxes[at : at + 1]
+    chosen = layout.mailboxes if index < 0 else layout.mailboxes[index : index + 1]
     return tuple(mailbox for mailbox in chosen if mailbox.writer == board)
 
 
-def between_reads(layout: Layout, mailbox: MailboxSpec, reader: str) -> int:
+def compute_read_interval(layout: Layout, mailbox: MailboxSpec, reader: str) -> int:
     """Return the longest interval between a task's reads of a mailbox.
 
     Args:
@@ -72,7 +76,7 @@ def between_reads(layout: Layout, mailbox: MailboxSpec, reader: str) -> int:
     Returns:
         The interval in ticks.
     """
-    return max(cycle_ticks(layout, reader), layout.read_grid(mailbox, reader).every)
+    return max(cycle_ticks(layout, reader), layout.find_read_grid(mailbox, reader).every)
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,7 @@ class BoundCase:
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
         """Affected mailboxes that the reader reads or, if no reader is given, any task reads."""
-        struck = struck_mailboxes(self.layout, self.injection.mailbox, self.board)
+        struck = list_struck_mailboxes(self.layout, self.injection.mailbox, self.board)
         if self.reader:
             return tuple(mailbox for mailbox in struck if self.reader in mailbox.readers)
         return tuple(mailbox for mailbox in struck if mailbox.readers)
@@ -107,25 +111,25 @@ class BoundCase:
     @property
     def role(self) -> str:
         """Role of the affected task, or "clock"."""
-        return CLOCK if self.board == CLOCK else self.layout.task(self.board).role
+        return CLOCK if self.board == CLOCK else self.layout.find_task(self.board).role
 
     @property
-    def cycle(self) -> int:
+    def cycle_ticks(self) -> int:
         """Cycle of the affected task, ticks."""
         return cycle_ticks(self.layout, self.board)
 
     @property
-    def write(self) -> int:
+    def write_ticks(self) -> int:
         """Interval between messages in the slowest affected mailbox, ticks."""
         return max(mailbox.every for mailbox in self.mailboxes)
 
     @property
-    def read(self) -> int:
+    def read_ticks(self) -> int:
         """Longest interval between reads of an affected mailbox, ticks.
 
         It applies to the reader or, if no reader is given, to the fastest reader of each mailbox.
         """
-        read_interval = partial(between_reads, self.layout)
+        read_interval = partial(compute_read_interval, self.layout)
         if self.reader:
             return max(
                 (read_interval(m, self.reader) for m in self.mailboxes),
@@ -159,13 +163,13 @@ class Bound:
         return Bound(f"{self.text} + {other.text}", add_terms)
 
 
-def counting(number: float, noun: str) -> str:
+def format_count(number: float, noun: str) -> str:
     """Format a number with its noun, such as "1 tick" or "3 ticks"."""
     text = f"{number:.0f}" if abs(number) < float("inf") else str(number)
     return f"1 {noun}" if text == "1" else f"{text} {noun}s"
 
 
-def cycles(count: int) -> Bound:
+def cycle_bound(count: int) -> Bound:
     """Return a bound of `count` cycles of the task. 0 stands for the cycle in which the fault acts.
 
     A fault of a host board has no such bound.
@@ -173,13 +177,13 @@ def cycles(count: int) -> Bound:
 
     def count_ticks(case: BoundCase) -> int | None:
         """Count the ticks of these cycles."""
-        return None if case.role == "host" else count * case.cycle
+        return None if case.role == "host" else count * case.cycle_ticks
 
-    text = counting(count, "cycle") if count else "the same cycle"
+    text = format_count(count, "cycle") if count else "the same cycle"
     return Bound(text, count_ticks)
 
 
-def cycles_and_time(count: int, time_ns: int) -> Bound:
+def cycle_and_time_bound(count: int, time_ns: int) -> Bound:
     """Return a bound of `count` cycles of the task that is at least `time_ns` long.
 
     The gains of a controller act in time, not in cycles.
@@ -187,34 +191,34 @@ def cycles_and_time(count: int, time_ns: int) -> Bound:
 
     def count_ticks(case: BoundCase) -> int:
         """Count the ticks of these cycles, at least of this time."""
-        return max(count * case.cycle, ceil(time_ns / case.layout.clock_ns))
+        return max(count * case.cycle_ticks, ceil(time_ns / case.layout.clock_ns))
 
-    return Bound(f"{counting(count, 'cycle')}, at least {time_ns * 1e-6:g} ms", count_ticks)
+    return Bound(f"{format_count(count, 'cycle')}, at least {time_ns * 1e-6:g} ms", count_ticks)
 
 
-def clock_ticks(count: int) -> Bound:
+def tick_bound(count: int) -> Bound:
     """Return a bound of `count` ticks."""
-    return Bound(counting(count, "tick"), lambda case: count)
+    return Bound(format_count(count, "tick"), lambda case: count)
 
 
-def writes(count: int) -> Bound:
+def write_bound(count: int) -> Bound:
     """Return a bound of `count` writing periods of the slowest affected mailbox."""
-    return Bound(counting(count, "write"), lambda case: count * case.write)
+    return Bound(format_count(count, "write"), lambda case: count * case.write_ticks)
 
 
-READ = Bound("1 read", lambda case: case.read)
+READ = Bound("1 read", lambda case: case.read_ticks)
 DELIVERY = Bound(
-    "1 delivery", lambda case: max(mailbox.delay for mailbox in case.mailboxes) + case.read
+    "1 delivery", lambda case: max(mailbox.delay for mailbox in case.mailboxes) + case.read_ticks
 )
 """Time from the writer's release until a reader has read the message."""
 MISSING_WRITES = 2
 """Number of writing periods without a message after which a mailbox is stale."""
 MUTE = Bound(
-    counting(MISSING_WRITES, "write"),
-    lambda case: None if case.role == "planner" else MISSING_WRITES * case.write,
+    format_count(MISSING_WRITES, "write"),
+    lambda case: None if case.role == "planner" else MISSING_WRITES * case.write_ticks,
 )
 """Time after which a mailbox is mute. None for a planner, which does not write periodically."""
-DELAY = Bound("the delay", lambda case: int(case.parameters["by"]) * case.write)
+DELAY = Bound("the delay", lambda case: int(case.parameters["by"]) * case.write_ticks)
 SKIP = Bound(
     "the next cycle of the fastest boards",
     lambda case: max(
@@ -228,12 +232,12 @@ DEATH = Bound(
     lambda case: (
         ceil(RACK_NS / case.layout.clock_ns)
         if case.reader is None
-        else DEATH_CYCLES * case.cycle + case.read
+        else DEATH_CYCLES * case.cycle_ticks + case.read_ticks
     ),
 )
 """A death is noticed by the Rack, or by a reader once the newest message is too old."""
-SLICE = Bound("1 time slice", lambda case: case.cycle)
-RELEASE = Bound("1 cycle", lambda case: case.layout.task(case.board).every)
+SLICE = Bound("1 time slice", lambda case: case.cycle_ticks)
+RELEASE = Bound("1 cycle", lambda case: case.layout.find_task(case.board).every)
 """Interval between two releases of the task. A planner has several in its time slice."""
 LOCK_WAIT = Bound(
     "the lock's time-out", lambda case: ceil(LOCK_WAIT_S * 1e9 / case.layout.clock_ns)

@@ -23,15 +23,15 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System, TaskState
-from rack.boards.faults.bounds import struck_mailboxes
-from rack.boards.faults.describe import board_of
-from rack.boards.faults.kind import kind_of
-from rack.boards.faults.message_steps import Babble, forge
+from rack.boards.faults.bounds import list_struck_mailboxes
+from rack.boards.faults.describe import find_board
+from rack.boards.faults.kind import find_kind
+from rack.boards.faults.message_steps import Babble, forge_message
 
-OPEN = (Stage.WAITING, Stage.ACTIVE)
+OPEN_STAGES = (Stage.WAITING, Stage.ACTIVE)
 PHASES = 1000
 """Number of steps into which a phase divides a tick."""
-LEAST_LATE = 0.6
+MIN_LATENESS_TICKS = 0.6
 """Smallest delay of a late tick, in ticks. Boards report a tick as late from 0.5 on."""
 
 
@@ -39,7 +39,7 @@ Strike = Callable[["FaultStage", FaultEntry, int], None]
 """Carries out one step of a fault: takes the stage, the entry of the fault table, and the tick."""
 
 
-def _nothing(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _do_nothing(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Do nothing."""
 
 
@@ -54,96 +54,96 @@ class ClockStep:
         is_void: Returns True if the affected process is gone, so that the fault ends early.
     """
 
-    begin: Strike = _nothing
-    during: Strike = _nothing
-    end: Strike = _nothing
+    begin: Strike = _do_nothing
+    during: Strike = _do_nothing
+    end: Strike = _do_nothing
     is_void: Callable[[FaultStage, FaultEntry], bool] = lambda rack, entry: False
 
 
-def _kill(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _kill_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Kill a task's process, or the clock itself. Wait until the crate has recorded the loss."""
-    task = stage.target(entry)
+    task = stage.find_target(entry)
     if task is None:
         # The clock kills itself. Mark the entry first, so that the restarted clock does not do it
         # again.
-        entry.acted(tick)
+        entry.record_action(tick)
         os.kill(os.getpid(), signal.SIGKILL)
         return
     # The crate first marks the task as lost, then counts the loss, on which the system controller
     # acts. Wait for both.
     words = stage.segment.words
     losses = words[System.LOSSES]
-    if stage.send(entry, tick, task, signal.SIGKILL):
+    if stage.send_signal(entry, tick, task, signal.SIGKILL):
         stage.driver.await_state(task, lambda: task.is_lost and words[System.LOSSES] != losses)
 
 
-def _hang(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _stop_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Stop a task's process."""
-    task = stage.target(entry)
-    if task is not None and stage.send(entry, tick, task, signal.SIGSTOP):
+    task = stage.find_target(entry)
+    if task is not None and stage.send_signal(entry, tick, task, signal.SIGSTOP):
         task.is_stopped = True
         if task.spec.role == "host":
             # The Rack kills a stopped host board at an unknown time, for which lockstep must wait.
             stage.driver.await_state(task, lambda: task.is_lost)
 
 
-def _continue(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _continue_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Let a stopped process continue, unless the Rack has killed it."""
-    task = stage.target(entry)
+    task = stage.find_target(entry)
     if task is not None and task.is_stopped and not task.is_lost:
         with suppress(ProcessLookupError):
             os.kill(task.block[Block.PID], signal.SIGCONT)
         task.is_stopped = False
-        stage.driver.settle()
+        stage.driver.wait_until_settled()
 
 
-def _is_lost(stage: FaultStage, entry: FaultEntry) -> bool:
+def _is_process_lost(stage: FaultStage, entry: FaultEntry) -> bool:
     """Return True if the affected process is lost."""
-    task = stage.target(entry)
+    task = stage.find_target(entry)
     return task is not None and task.is_lost
 
 
-def _masquerade(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _forge_message(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Publish a forged message."""
-    entry.acted(tick)
-    forge(stage.segment, stage.segment.layout.mailboxes[entry.mailbox].name, tick)
+    entry.record_action(tick)
+    forge_message(stage.segment, stage.segment.layout.mailboxes[entry.mailbox].name, tick)
 
 
 def _stop_clock(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Stop the clock's own process."""
-    entry.acted(tick)
+    entry.record_action(tick)
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
-def _skip(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _skip_ticks(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Let the clock skip ticks."""
-    entry.acted(tick)
+    entry.record_action(tick)
     stage.driver.skip = int(entry.parameters[0])
     stage.driver.count_skipped(tick, stage.driver.skip)
 
 
-def _delay(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
+def _delay_tick(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
     """Delay a tick by a random part of its period."""
-    entry.acted(tick)
-    delay = random.Random(entry.seed + tick).uniform(LEAST_LATE, entry.parameters[0])
-    until_ns = stage.clock.time_of(tick) + int(delay * stage.clock.period_ns)
+    entry.record_action(tick)
+    delay = random.Random(entry.seed + tick).uniform(MIN_LATENESS_TICKS, entry.parameters[0])
+    until_ns = stage.clock.compute_time_ns(tick) + int(delay * stage.clock.period_ns)
     # The delay is less than a tick period, so the clock's grid is not shifted.
     time.sleep(max(0, until_ns - time.monotonic_ns()) * 1e-9)
 
 
-KILL = ClockStep(_kill)
-HANG = ClockStep(_hang, end=_continue, is_void=_is_lost)
-MASQUERADE = ClockStep(_masquerade)
+KILL = ClockStep(_kill_process)
+HANG = ClockStep(_stop_process, end=_continue_process, is_void=_is_process_lost)
+MASQUERADE = ClockStep(_forge_message)
 CLOCK_STOP = ClockStep(_stop_clock)
-CLOCK_SKIP = ClockStep(_skip)
-CLOCK_JITTER = ClockStep(during=_delay)
+CLOCK_SKIP = ClockStep(_skip_ticks)
+CLOCK_JITTER = ClockStep(during=_delay_tick)
 ELSEWHERE = ClockStep()
 """Empty step of a fault that acts in another process."""
 
 
-def _step(entry: FaultEntry) -> ClockStep:
+def _find_step(entry: FaultEntry) -> ClockStep:
     """Return the step of a fault on the clock's board."""
-    step = kind_of(entry).step
+    step = find_kind(entry).step
     return step if isinstance(step, ClockStep) else ELSEWHERE
 
 
@@ -152,7 +152,7 @@ def _next_change(entry: FaultEntry, tick: int) -> int:
     if entry.stage == Stage.WAITING:
         return tick + 1 if entry.when_box >= 0 else max(tick + 1, entry.tick)
     if entry.stage == Stage.ACTIVE:
-        may_end_early = kind_of(entry).once or _step(entry) is not ELSEWHERE
+        may_end_early = find_kind(entry).once or _find_step(entry) is not ELSEWHERE
         return tick + 1 if may_end_early else entry.until
     return NEVER
 
@@ -185,15 +185,15 @@ class FaultStage:
         """By index of a mailbox, the tick from which a new message is awaited."""
         if self._words[System.STATE] == Run.RUNNING:
             # A restarted clock does not know which messages have been seen before.
-            for entry in self._table.staged((Stage.OVER,)):
+            for entry in self._table.list_entries((Stage.OVER,)):
                 self._await_messages(entry)
         self._phased: list[FaultEntry] = []
 
-    def target(self, entry: FaultEntry) -> ReleasedTask | None:
+    def find_target(self, entry: FaultEntry) -> ReleasedTask | None:
         """Return the task or host board that a fault affects. None if it affects the clock."""
         return next((task for task in self.driver.processes if task.index == entry.task), None)
 
-    def send(
+    def send_signal(
         self, entry: FaultEntry, tick: int, task: ReleasedTask, number: signal.Signals
     ) -> bool:
         """Send a signal to a task's process and record that the fault acted.
@@ -212,64 +212,66 @@ class FaultStage:
         # A process may also have ended without the crate having noticed.
         if task.is_lost or task.block[Block.STATE] > TaskState.RUNNING or pid <= 0:
             return False
-        entry.acted(tick)
+        entry.record_action(tick)
         try:
             os.kill(pid, number)
         except ProcessLookupError:
             return False
         return True
 
-    def advance(self, tick: int) -> None:
+    def advance_faults(self, tick: int) -> None:
         """Begin the faults that are due at `tick` and end the ones that are over."""
         self.injected = self._words[System.INJECTED]
-        faults = self._table.staged(OPEN)
+        faults = self._table.list_entries(OPEN_STAGES)
         active = [entry for entry in faults if entry.stage == Stage.ACTIVE]
         waiting = [entry for entry in faults if entry.stage == Stage.WAITING]
         over = [entry for entry in active if self._is_over(entry, tick)]
         due = [entry for entry in waiting if self._is_due(entry, tick)]
         if over or due:
             # Let running cycles finish with the faults with which they began.
-            self.driver.settle()
+            self.driver.wait_until_settled()
         for entry in over:
             entry.stage = Stage.OVER
             # Faults that act once, or whose process is gone, end early.
             entry.until = min(entry.until, tick)
             self._words[System.FAULTS] += 1
-            _step(entry).end(self, entry, tick)
-            self.driver.alarms.ring(tick, Alarm.FAULT_ENDS, entry.index, entry.count)
+            _find_step(entry).end(self, entry, tick)
+            self.driver.alarms.raise_alarm(tick, Alarm.FAULT_ENDS, entry.index, entry.count)
             self._await_messages(entry)
         for entry in due:
-            self._begin(entry, tick)
+            self._begin_fault(entry, tick)
         active = [entry for entry in faults if entry.stage == Stage.ACTIVE]
         for entry in active:
-            _step(entry).during(self, entry, tick)
-        self.driver.is_flooded = any(kind_of(entry).step is Babble for entry in active)
+            _find_step(entry).during(self, entry, tick)
+        self.driver.is_flooded = any(find_kind(entry).step is Babble for entry in active)
         for box, since_tick in list(self._awaited.items()):
             observer = self._observer(box)
-            if observer.read(tick - 1).is_there and observer.newest >= since_tick:
+            if observer.read(tick - 1).has_message and observer.newest >= since_tick:
                 del self._awaited[box]
-                self.driver.alarms.ring(tick, Alarm.FLOWS, box, tick - since_tick, since_tick)
+                self.driver.alarms.raise_alarm(
+                    tick, Alarm.FLOWS, box, tick - since_tick, since_tick
+                )
         # While messages flood the rings, do one tick at a time, so that the recorder keeps up.
         must_look = self._awaited or self.driver.is_flooded
         changes = [tick + 1] if must_look else [_next_change(entry, tick) for entry in faults]
         self.next_tick = min(changes, default=NEVER)
 
-    def within(self, tick: int) -> None:
+    def act_within_tick(self, tick: int) -> None:
         """Carry out the faults that have a phase in `tick`. Call it after the releases."""
         if not self._phased:
             return
         clock = self.clock
         for entry in sorted(self._phased, key=lambda e: e.phase):
-            at_ns = clock.time_of(tick) + entry.phase * clock.period_ns // PHASES
+            at_ns = clock.compute_time_ns(tick) + entry.phase * clock.period_ns // PHASES
             time.sleep(max(0, at_ns - time.monotonic_ns()) * 1e-9)
-            _step(entry).begin(self, entry, tick)
+            _find_step(entry).begin(self, entry, tick)
         self._phased.clear()
 
     def _is_over(self, entry: FaultEntry, tick: int) -> bool:
         """Return True if a fault has reached its end, has acted once, or has lost its process."""
-        kind = kind_of(entry)
+        kind = find_kind(entry)
         has_acted = kind.once and kind.is_of_task and entry.count > 0
-        return entry.until <= tick or has_acted or _step(entry).is_void(self, entry)
+        return entry.until <= tick or has_acted or _find_step(entry).is_void(self, entry)
 
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
         """Return True if a fault must begin at this tick.
@@ -282,11 +284,11 @@ class FaultStage:
         observer = self._observer(entry.when_box)
         reading = observer.read(tick - 1)
         field = observer.spec.fields[entry.when_field].name
-        return reading.is_there and int(getattr(reading.message, field)) == entry.when_value
+        return reading.has_message and int(getattr(reading.message, field)) == entry.when_value
 
-    def _begin(self, entry: FaultEntry, tick: int) -> None:
+    def _begin_fault(self, entry: FaultEntry, tick: int) -> None:
         """Activate a fault and carry it out, or schedule it within the tick if it has a phase."""
-        kind = kind_of(entry)
+        kind = find_kind(entry)
         entry.tick = tick
         duration_ticks = entry.ticks
         if kind.once and not kind.is_of_task:
@@ -296,15 +298,15 @@ class FaultStage:
         entry.until = tick + duration_ticks if duration_ticks else NEVER
         entry.stage = Stage.ACTIVE
         self._words[System.FAULTS] += 1
-        self.driver.alarms.ring(tick, Alarm.FAULT_BEGINS, entry.index)
+        self.driver.alarms.raise_alarm(tick, Alarm.FAULT_BEGINS, entry.index)
         if entry.phase and not self.clock.is_lockstep:
             self._phased.append(entry)
         else:
-            _step(entry).begin(self, entry, tick)
+            _find_step(entry).begin(self, entry, tick)
 
     def _await_messages(self, entry: FaultEntry) -> None:
         """Start to watch for the first new message in each mailbox that a fault has affected."""
         layout = self.segment.layout
-        if kind_of(entry).takes_mailbox:
-            for box in struck_mailboxes(layout, entry.mailbox, board_of(entry, layout)):
+        if find_kind(entry).takes_mailbox:
+            for box in list_struck_mailboxes(layout, entry.mailbox, find_board(entry, layout)):
                 self._awaited[layout.mailboxes.index(box)] = entry.until

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from rack.backplane.checked import pick
+from rack.backplane.checked import select_item
 from rack.backplane.layout import Layout
 from rack.levels.tables import Finite, Moment, Table, Tick
 
@@ -18,7 +18,7 @@ _DURATION = re.compile(r"\s*([0-9.]+(?:e-?[0-9]+)?)\s*(ms|s|min)\s*")
 _UNIT_S = {"ms": 1e-3, "s": 1.0, "min": 60.0}
 
 
-def as_seconds(value: Any) -> Any:
+def parse_seconds(value: Any) -> Any:
     """Convert a duration such as "20ms" to seconds. Values other than text are returned unchanged.
 
     Raises:
@@ -32,13 +32,13 @@ def as_seconds(value: Any) -> Any:
     return float(match[1]) * _UNIT_S[match[2]]
 
 
-def _number(value: Any) -> Any:
+def _to_number(value: Any) -> Any:
     """Convert a boolean to 0 or 1, because all parameters are numbers: `random = true` means 1."""
     return float(value) if isinstance(value, bool) else value
 
 
-Parameter = Annotated[Finite, BeforeValidator(_number)]
-Seconds = Annotated[float, BeforeValidator(as_seconds), Field(gt=0, le=1e6, allow_inf_nan=False)]
+Parameter = Annotated[Finite, BeforeValidator(_to_number)]
+Seconds = Annotated[float, BeforeValidator(parse_seconds), Field(gt=0, le=1e6, allow_inf_nan=False)]
 
 
 class FaultConfig(Table):
@@ -74,7 +74,7 @@ class FaultConfig(Table):
         return dict(self.__pydantic_extra__ or {})
 
 
-def condition(text: str, layout: Layout) -> tuple[int, int, int]:
+def parse_condition(text: str, layout: Layout) -> tuple[int, int, int]:
     """Parse a condition such as "elemental_move.status.verb == grasp".
 
     Returns:
@@ -116,9 +116,9 @@ def condition(text: str, layout: Layout) -> tuple[int, int, int]:
     return mailboxes[mailbox.name], mailbox.fields.index(field), value
 
 
-def condition_text(when: tuple[int, int, int], layout: Layout) -> str:
+def format_condition(when: tuple[int, int, int], layout: Layout) -> str:
     """Return a condition as a user writes it. This is the inverse of `parse_condition`."""
-    mailbox = pick(layout.mailboxes, when[0], "mailbox")
-    field = pick(mailbox.fields, when[1], "field")
+    mailbox = select_item(layout.mailboxes, when[0], "mailbox")
+    field = select_item(mailbox.fields, when[1], "field")
     names = {number: name for name, number in field.values}
     return f"{mailbox.name}.{field.name} == {names.get(when[2], when[2])}"

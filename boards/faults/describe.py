@@ -6,22 +6,24 @@ from collections.abc import Sequence
 from typing import Any
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.checked import as_named, as_whole, pick
+from rack.backplane.checked import select_item, to_enum, to_integer
 from rack.backplane.fault_table import NEVER, FaultEntry, Stage
 from rack.backplane.layout import Layout
-from rack.boards.faults.kind import kind_of
+from rack.boards.faults.kind import find_kind
 
 ALL_JOINTS = "all joints"
 
 
-def board_of(entry: FaultEntry, layout: Layout) -> str:
+def find_board(entry: FaultEntry, layout: Layout) -> str:
     """Return the name of the task that a fault affects, or "clock"."""
     return (
-        CLOCK if (task_index := entry.task) < 0 else pick(layout.processes, task_index, "task").name
+        CLOCK
+        if (task_index := entry.task) < 0
+        else select_item(layout.processes, task_index, "task").name
     )
 
 
-def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
+def find_subject(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
     """Return the mailbox or the joint that a fault affects.
 
     Args:
@@ -33,19 +35,19 @@ def subject_of(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
         An empty string if the fault affects its whole task.
     """
     if entry.mailbox >= 0:
-        return pick(layout.mailboxes, entry.mailbox, "mailbox").name
-    joint = kind_of(entry).values(entry).get("joint")
-    return "" if joint is None else joint_name(as_whole(joint), joints)
+        return select_item(layout.mailboxes, entry.mailbox, "mailbox").name
+    joint = find_kind(entry).read_parameters(entry).get("joint")
+    return "" if joint is None else format_joint(to_integer(joint), joints)
 
 
-def joint_name(at: int, joints: Sequence[str]) -> str:
+def format_joint(index: int, joints: Sequence[str]) -> str:
     """Return the name of a joint by its index. -1 stands for all joints."""
-    if at < 0:
+    if index < 0:
         return ALL_JOINTS
-    return joints[at] if at < len(joints) else f"joint {at}"
+    return joints[index] if index < len(joints) else f"joint {index}"
 
 
-def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[str, Any]:
+def to_document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[str, Any]:
     """Return an entry of the fault table as plain data.
 
     Args:
@@ -56,18 +58,18 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
     Returns:
         A JSON document. Ticks that are not known are -1; `until` is None if the end is not known.
     """
-    kind = kind_of(entry)
-    stage = as_named(Stage, entry.stage)
+    kind = find_kind(entry)
+    stage = to_enum(Stage, entry.stage)
     until_tick = None
     if stage in (Stage.ACTIVE, Stage.OVER) and entry.until != NEVER:
         until_tick = entry.until
     return {
         "fault": entry.index,
         "kind": kind.name,
-        "board": board_of(entry, layout),
-        "mailbox": subject_of(entry, layout, joints) if entry.mailbox >= 0 else "",
-        "parameters": kind.values(entry),
-        "text": describe(entry, layout, joints),
+        "board": find_board(entry, layout),
+        "mailbox": find_subject(entry, layout, joints) if entry.mailbox >= 0 else "",
+        "parameters": kind.read_parameters(entry),
+        "text": describe_fault(entry, layout, joints),
         "stage": stage.name.lower(),
         "begins": entry.tick,
         "until": until_tick,
@@ -77,7 +79,7 @@ def document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dict[s
     }
 
 
-def describe(
+def describe_fault(
     entry: FaultEntry, layout: Layout, joints: Sequence[str], with_board: bool = True
 ) -> str:
     """Describe a fault in one line.
@@ -91,9 +93,9 @@ def describe(
     Returns:
         Kind, task, mailbox or joint, and parameters.
     """
-    kind = kind_of(entry)
-    target = f" of {board_of(entry, layout)}" if with_board else ""
-    details = [subject_of(entry, layout, joints)]
+    kind = find_kind(entry)
+    target = f" of {find_board(entry, layout)}" if with_board else ""
+    details = [find_subject(entry, layout, joints)]
     for parameter, value in zip(kind.parameters, entry.parameters, strict=False):
         if parameter.name != "joint":
             unit = "" if parameter.unit in ("1", parameter.name) else f" {parameter.unit}"

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from random import Random
 
-BEYOND = 20.0
+MAX_SIZE_RATIO = 20.0
 """Ratio of the largest size drawn to the smallest size that must be detected."""
 
 
@@ -38,42 +38,42 @@ Draw = Callable[[Drawing], float]
 DrawTicks = Callable[[Drawing], int]
 
 
-def number(least: float, most: float) -> Draw:
+def uniform_number(least: float, most: float) -> Draw:
     """Return a draw that is uniform between two numbers."""
-    return lambda d: _short(d.rng.uniform(least, most))
+    return lambda d: _round_as_saved(d.rng.uniform(least, most))
 
 
-def whole(least: int, most: int) -> Draw:
+def uniform_integer(least: int, most: int) -> Draw:
     """Return a draw that is uniform among the integers between two numbers, both included."""
     return lambda d: d.rng.randint(least, most)
 
 
-def magnitude(least: float, most: float) -> Draw:
+def log_uniform_number(least: float, most: float) -> Draw:
     """Return a draw that is log-uniform between two numbers."""
-    return lambda d: _short(math.exp(d.rng.uniform(math.log(least), math.log(most))))
+    return lambda d: _round_as_saved(math.exp(d.rng.uniform(math.log(least), math.log(most))))
 
 
-def joint(d: Drawing) -> int:
+def draw_joint(d: Drawing) -> int:
     """Draw the index of a joint. In one of ten cases it is -1, which means all joints."""
     return d.rng.randrange(d.joints) if d.rng.random() < 0.9 else -1
 
 
-def joint_or_all(d: Drawing) -> int:
+def draw_joint_or_all(d: Drawing) -> int:
     """Draw the index of a joint. In half of all cases it is -1, which means all joints."""
     return d.rng.choice((-1, d.rng.randrange(d.joints)))
 
 
-def seconds(least: float, most: float) -> DrawTicks:
+def uniform_seconds(least: float, most: float) -> DrawTicks:
     """Return a draw of a duration that is uniform between two simulated times in s."""
     return lambda d: max(1, round(d.rng.uniform(least, most) * d.second))
 
 
-def cycles(least: int, most: int) -> DrawTicks:
+def uniform_cycles(least: int, most: int) -> DrawTicks:
     """Return a draw of a duration that is uniform between two numbers of the task's cycles."""
     return lambda d: d.rng.randint(least, most) * d.cycle
 
 
-def messages(least: int, most: int) -> DrawTicks:
+def uniform_messages(least: int, most: int) -> DrawTicks:
     """Return a draw of a duration that lasts for a number of messages.
 
     It is at least two cycles of the fastest reader, so that the reader sees the fault.
@@ -81,12 +81,12 @@ def messages(least: int, most: int) -> DrawTicks:
     return lambda d: max(d.rng.randint(least, most) * d.cycle, 2 * d.reader)
 
 
-def longest(*lengths: DrawTicks) -> DrawTicks:
+def longest_of(*lengths: DrawTicks) -> DrawTicks:
     """Return a draw that takes the longest of several durations."""
     return lambda d: max(draw(d) for draw in lengths)
 
 
-def silence(least: float, most: float) -> DrawTicks:
+def uniform_silence(least: float, most: float) -> DrawTicks:
     """Return a draw of a duration without messages.
 
     It is a multiple of the time within which the fastest reader must notice a silent mailbox.
@@ -94,7 +94,7 @@ def silence(least: float, most: float) -> DrawTicks:
     return lambda d: round((2 * d.cycle + d.reader) * d.rng.uniform(least, most))
 
 
-def swept(least: float, visible: float, count: int) -> list[float]:
+def list_sweep_sizes(least: float, visible: float, count: int) -> list[float]:
     """Return the sizes at which detection delay is measured, a geometric series.
 
     Args:
@@ -103,10 +103,10 @@ def swept(least: float, visible: float, count: int) -> list[float]:
             size.
         count: Number of sizes.
     """
-    ratio = BEYOND * visible / least
-    return [_short(least * ratio ** (index / max(1, count - 1))) for index in range(count)]
+    ratio = MAX_SIZE_RATIO * visible / least
+    return [_round_as_saved(least * ratio ** (index / max(1, count - 1))) for index in range(count)]
 
 
-def _short(value: float) -> float:
+def _round_as_saved(value: float) -> float:
     """Round a value as files show it, so that a plan that is read back is the same plan."""
     return float(f"{value:.4g}")

@@ -22,7 +22,13 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import PARAMETERS, FaultEntry, Injection
 from rack.backplane.layout import Layout
 from rack.backplane.watch.alarms import Alarm
-from rack.boards.faults.bounds import NOT_ARMED, Bound, BoundCase, cycle_ticks, struck_mailboxes
+from rack.boards.faults.bounds import (
+    NOT_ARMED,
+    Bound,
+    BoundCase,
+    cycle_ticks,
+    list_struck_mailboxes,
+)
 from rack.boards.faults.drawing import Draw, DrawTicks
 
 Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
@@ -172,11 +178,11 @@ class Kind:
             return None
         return next(p for p in self.parameters if p.name == "size")
 
-    def values(self, fault: FaultEntry | Injection) -> dict[str, float]:
+    def read_parameters(self, fault: FaultEntry | Injection) -> dict[str, float]:
         """Return the parameters of a fault of this kind, by name."""
         return {p.name: value for p, value in zip(self.parameters, fault.parameters, strict=False)}
 
-    def bound_ticks(
+    def compute_bound_ticks(
         self, injection: Injection, layout: Layout, reader: str | None = None
     ) -> int | None:
         """Compute the detection bound of a fault.
@@ -191,11 +197,11 @@ class Kind:
             Ticks from the fault's first effect to its detection. None if there is no bound, as for
             a mailbox that nobody reads.
         """
-        case = BoundCase(layout, injection, self.values(injection), reader)
+        case = BoundCase(layout, injection, self.read_parameters(injection), reader)
         needs_reader = self.takes_mailbox or (self.detected_as == (DIED,) and reader is not None)
         return None if needs_reader and not case.mailboxes else self.bound.ticks(case)
 
-    def recovery_ticks(self, board: str, layout: Layout, restart_s: float) -> int:
+    def compute_recovery_ticks(self, board: str, layout: Layout, restart_s: float) -> int:
         """Compute the time within which the rack must have recovered.
 
         A restarted board continues at its next release; the executor of a restarted planner
@@ -214,7 +220,8 @@ class Kind:
         cycle = cycle_ticks(layout, board) if ends and board != CLOCK else 0
         if self.takes_mailbox:
             cycle += max(
-                (box.every + box.delay for box in struck_mailboxes(layout, -1, board)), default=0
+                (box.every + box.delay for box in list_struck_mailboxes(layout, -1, board)),
+                default=0,
             )
         return cycle + ceil(
             (self.consequence.recovery_s + ends * restart_s) * 1e9 / layout.clock_ns
@@ -252,7 +259,7 @@ class Kinds:
                 )
             self._by_name[kind.name] = self._by_number[kind.number] = kind
 
-    def adopt(self, kinds: Iterable[Kind]) -> None:
+    def add_missing(self, kinds: Iterable[Kind]) -> None:
         """Add the kinds that a rack has published and that this process does not know."""
         self.add(*(kind for kind in kinds if kind.number not in self._by_number))
 
@@ -285,6 +292,6 @@ class Kinds:
 KINDS = Kinds()
 
 
-def kind_of(entry: FaultEntry) -> Kind:
+def find_kind(entry: FaultEntry) -> Kind:
     """Return the kind of an entry of the fault table."""
     return KINDS[entry.kind]

@@ -39,18 +39,22 @@ _sensor = partial(Kind, where="arm", consequence=SENSOR)
 _motor = partial(Kind, where="arm", consequence=MOTOR)
 # The limit gate finds a bad torque in the same cycle, before it reaches the arm.
 _torque = partial(
-    Kind, where="arm", consequence=COMMAND, bound=bounds.cycles(0), lasts=draw.seconds(0.01, 0.2)
+    Kind,
+    where="arm",
+    consequence=COMMAND,
+    bound=bounds.cycle_bound(0),
+    lasts=draw.uniform_seconds(0.01, 0.2),
 )
 
 
-def _joint(drawn: draw.Draw = draw.joint, default: float = 0) -> Parameter:
+def _joint_parameter(drawn: draw.Draw = draw.draw_joint, default: float = 0) -> Parameter:
     """Return the parameter that selects a joint."""
     return Parameter(
         "joint", "1", "joint, counted from 0; -1: all", default, -1, 15, is_whole=True, drawn=drawn
     )
 
 
-def _probability(default: float, most: float) -> Parameter:
+def _probability_parameter(default: float, most: float) -> Parameter:
     """Return the parameter for the probability that a message is affected."""
     return Parameter(
         "probability",
@@ -59,11 +63,11 @@ def _probability(default: float, most: float) -> Parameter:
         default,
         0.001,
         1.0,
-        drawn=draw.number(0.5, most),
+        drawn=draw.uniform_number(0.5, most),
     )
 
 
-def _size(meaning: str, visible: float, least: float, most: float) -> Parameter:
+def _size_parameter(meaning: str, visible: float, least: float, most: float) -> Parameter:
     """Return the parameter for the size of a sensor error. Draws start at the visible size."""
     return Parameter(
         "size",
@@ -72,7 +76,7 @@ def _size(meaning: str, visible: float, least: float, most: float) -> Parameter:
         visible,
         least,
         most,
-        drawn=draw.magnitude(visible, draw.BEYOND * visible),
+        drawn=draw.log_uniform_number(visible, draw.MAX_SIZE_RATIO * visible),
     )
 
 
@@ -97,20 +101,26 @@ KINDS.add(
         tasks=("executor", "planner", "host"),
         detected_as=(Alarm.HANG,),
         # Four missed releases, plus the release at which the reader notices them.
-        bound=bounds.cycles(4 + 1),
+        bound=bounds.cycle_bound(4 + 1),
         consequence=DEATH,
-        lasts=draw.cycles(7, 10),
+        lasts=draw.uniform_cycles(7, 10),
         within_tick=True,
     ),
     Kind(
         name="overrun",
         where="load",
         means="the executor computes longer",
-        step=tasks.overrun,
+        step=tasks.extend_cycle,
         tasks=("executor",),
         parameters=(
             Parameter(
-                "by", "cycles", "extra computing time", 1.5, 0.0, 100.0, drawn=draw.number(1.2, 2.5)
+                "by",
+                "cycles",
+                "extra computing time",
+                1.5,
+                0.0,
+                100.0,
+                drawn=draw.uniform_number(1.2, 2.5),
             ),
             Parameter(
                 "random", "1", "1: uniform between 0 and by; 0: always by", 0, 0, 1, is_whole=True
@@ -118,15 +128,15 @@ KINDS.add(
         ),
         detected_as=(Alarm.LATE, Alarm.STARVED),
         # The cycle is still running at its next release.
-        bound=bounds.cycles(1),
-        lasts=draw.cycles(1, 4),
+        bound=bounds.cycle_bound(1),
+        lasts=draw.uniform_cycles(1, 4),
         realtime=True,
     ),
     Kind(
         name="planner-slow",
         where="load",
         means="the planner exceeds its time slice",
-        step=tasks.slow_plan,
+        step=tasks.extend_time_slice,
         tasks=("planner",),
         parameters=(
             Parameter(
@@ -136,12 +146,12 @@ KINDS.add(
                 2.0,
                 0.5,
                 100.0,
-                drawn=draw.number(1.5, 4.0),
+                drawn=draw.uniform_number(1.5, 4.0),
             ),
         ),
         detected_as=(Alarm.PLAN_LATE,),
         bound=bounds.SLICE + bounds.RELEASE,
-        lasts=draw.longest(draw.cycles(3, 6), draw.seconds(1.0, 2.0)),
+        lasts=draw.longest_of(draw.uniform_cycles(3, 6), draw.uniform_seconds(1.0, 2.0)),
         realtime=True,
     ),
     Kind(
@@ -150,8 +160,8 @@ KINDS.add(
         means="a higher-priority process takes the board's core",
         step=tasks.take_core,
         detected_as=(Alarm.STARVED,),
-        bound=bounds.cycles(4 + 1),
-        lasts=draw.longest(draw.cycles(7, 9), draw.seconds(0.1, 0.3)),
+        bound=bounds.cycle_bound(4 + 1),
+        lasts=draw.longest_of(draw.uniform_cycles(7, 9), draw.uniform_seconds(0.1, 0.3)),
         realtime=True,
     ),
     _message(
@@ -163,18 +173,18 @@ KINDS.add(
         # A message is stale after two periods, but that proves nothing until its writer has
         # finished another release.
         bound=bounds.MUTE + bounds.READ,
-        lasts=draw.silence(1.2, 2.0),
+        lasts=draw.uniform_silence(1.2, 2.0),
     ),
     _message(
         name="drop",
         means="messages are lost",
         step=messages.Drop,
-        parameters=(_probability(0.3, 0.9),),
+        parameters=(_probability_parameter(0.3, 0.9),),
         detected_as=(Alarm.GAP,),
         # The gap in serials shows with the next message.
-        bound=bounds.writes(1) + bounds.DELIVERY,
+        bound=bounds.write_bound(1) + bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.MUTE,)),
-        lasts=draw.messages(4, 8),
+        lasts=draw.uniform_messages(4, 8),
     ),
     _message(
         name="delay",
@@ -189,7 +199,7 @@ KINDS.add(
                 1,
                 50,
                 is_whole=True,
-                drawn=draw.whole(1, 5),
+                drawn=draw.uniform_integer(1, 5),
             ),
         ),
         # Until the first delayed message arrives, the mailbox is silent.
@@ -197,26 +207,26 @@ KINDS.add(
         bound=bounds.DELAY + bounds.DELIVERY,
         # Afterwards the first punctual messages overtake the last delayed ones.
         consequence=Consequence(own=(Alarm.DISORDER,)),
-        lasts=draw.messages(9, 13),
+        lasts=draw.uniform_messages(9, 13),
     ),
     _message(
         name="reorder",
         means="consecutive messages are swapped",
         step=messages.Reorder,
-        parameters=(_probability(0.3, 0.9),),
+        parameters=(_probability_parameter(0.3, 0.9),),
         # The last message may have no successor with which to be swapped. It is then only late.
         detected_as=(Alarm.DISORDER, Alarm.HELD_BACK),
         not_queued="the messages of one cycle have the same tick: nothing would show their order",
-        bound=bounds.writes(1) + bounds.DELIVERY,
+        bound=bounds.write_bound(1) + bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.MUTE,)),
-        lasts=draw.messages(4, 8),
+        lasts=draw.uniform_messages(4, 8),
     ),
     _message(
         name="corrupt",
         means="bits of a message are flipped",
         step=messages.Corrupt,
         parameters=(
-            _probability(1.0, 1.0),
+            _probability_parameter(1.0, 1.0),
             Parameter(
                 "bits",
                 "1",
@@ -225,13 +235,13 @@ KINDS.add(
                 1,
                 64,
                 is_whole=True,
-                drawn=draw.whole(1, 16),
+                drawn=draw.uniform_integer(1, 16),
             ),
         ),
         detected_as=(Alarm.DAMAGED,),
         bound=bounds.DELIVERY,
         consequence=DAMAGE,
-        lasts=draw.messages(4, 8),
+        lasts=draw.uniform_messages(4, 8),
     ),
     _message(
         name="babble",
@@ -246,7 +256,7 @@ KINDS.add(
                 3,
                 1000,
                 is_whole=True,
-                drawn=draw.whole(8, 64),
+                drawn=draw.uniform_integer(8, 64),
             ),
         ),
         detected_as=(Alarm.BABBLE,),
@@ -255,7 +265,7 @@ KINDS.add(
         ),
         bound=bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.DISORDER, Alarm.GAP)),
-        lasts=draw.cycles(3, 6),
+        lasts=draw.uniform_cycles(3, 6),
     ),
     Kind(
         name="masquerade",
@@ -282,7 +292,7 @@ KINDS.add(
                 0,
                 1,
                 is_whole=True,
-                drawn=draw.whole(0, 1),
+                drawn=draw.uniform_integer(0, 1),
             ),
         ),
         detected_as=(Alarm.LOCKED, DIED),
@@ -296,9 +306,9 @@ KINDS.add(
         means="SIGSTOP stops the clock's process",
         step=clock_board.CLOCK_STOP,
         detected_as=(Alarm.CLOCK_STOPPED,),
-        bound=bounds.clock_ticks(3),
+        bound=bounds.tick_bound(3),
         consequence=Consequence(reactions=("restart",), ends_process=True),
-        lasts=draw.seconds(0.05, 0.3),
+        lasts=draw.uniform_seconds(0.05, 0.3),
         realtime=True,
         once=True,
         within_tick=True,
@@ -316,7 +326,7 @@ KINDS.add(
                 1,
                 20,
                 is_whole=True,
-                drawn=draw.whole(1, 20),
+                drawn=draw.uniform_integer(1, 20),
             ),
         ),
         detected_as=(Alarm.CLOCK_SKIPPED,),
@@ -335,80 +345,83 @@ KINDS.add(
                 0.9,
                 0.65,
                 0.95,
-                drawn=draw.number(0.75, 0.95),
+                drawn=draw.uniform_number(0.75, 0.95),
             ),
         ),
         detected_as=(Alarm.CLOCK_LATE,),
-        bound=bounds.clock_ticks(2),
-        lasts=draw.seconds(0.2, 0.6),
+        bound=bounds.tick_bound(2),
+        lasts=draw.uniform_seconds(0.2, 0.6),
         realtime=True,
     ),
     _sensor(
         name="sensor-nan",
         means="a joint position is NaN",
-        step=arm.SensorStep(arm.position_nan),
-        parameters=(_joint(),),
+        step=arm.SensorStep(arm.set_position_nan),
+        parameters=(_joint_parameter(),),
         detected_as=(Alarm.SENSOR_RANGE,),
-        bound=bounds.cycles(1),
-        lasts=draw.seconds(0.02, 0.3),
+        bound=bounds.cycle_bound(1),
+        lasts=draw.uniform_seconds(0.02, 0.3),
     ),
     _sensor(
         name="sensor-stuck",
         means="joint position and velocity freeze",
-        step=arm.SensorStep(arm.sample_stuck),
+        step=arm.SensorStep(arm.freeze_sample),
         # A stuck sensor does not show on a joint at rest, so some draws freeze all joints for long
         # enough.
-        parameters=(_joint(draw.joint_or_all),),
+        parameters=(_joint_parameter(draw.draw_joint_or_all),),
         # A joint that is driven but shows no velocity looks like one whose motor produces no
         # torque.
         detected_as=(Alarm.SENSOR_STUCK, Alarm.SENSOR_MODEL, Alarm.ACTUATOR),
-        bound=bounds.cycles(20),
-        lasts=draw.seconds(0.5, 1.5),
+        bound=bounds.cycle_bound(20),
+        lasts=draw.uniform_seconds(0.5, 1.5),
     ),
     _sensor(
         name="sensor-dropout",
         means="no new samples arrive",
-        step=arm.SensorStep(arm.sample_missing),
+        step=arm.SensorStep(arm.repeat_last_sample),
         detected_as=(Alarm.SENSOR_SILENT,),
-        bound=bounds.cycles(2),
-        lasts=draw.seconds(0.02, 0.3),
+        bound=bounds.cycle_bound(2),
+        lasts=draw.uniform_seconds(0.02, 0.3),
     ),
     _sensor(
         name="sensor-bias",
         means="a joint position has an offset",
-        step=arm.SensorStep(arm.position_biased),
-        parameters=(_joint(), _size("offset", BIAS_RAD, 1e-5, 3.0)),
+        step=arm.SensorStep(arm.bias_position),
+        parameters=(_joint_parameter(), _size_parameter("offset", BIAS_RAD, 1e-5, 3.0)),
         detected_as=(Alarm.SENSOR_MODEL,),
         bound=bounds.BY_SIZE,
-        lasts=draw.seconds(0.1, 0.5),
+        lasts=draw.uniform_seconds(0.1, 0.5),
         visible_from=BIAS_RAD,
     ),
     _sensor(
         name="sensor-noise",
         means="a joint position is noisy",
-        step=arm.SensorStep(arm.position_noisy),
-        parameters=(_joint(), _size("standard deviation", NOISE_RAD, 1e-6, 1.0)),
+        step=arm.SensorStep(arm.add_position_noise),
+        parameters=(
+            _joint_parameter(),
+            _size_parameter("standard deviation", NOISE_RAD, 1e-6, 1.0),
+        ),
         detected_as=(Alarm.SENSOR_MODEL,),
         bound=bounds.BY_SIZE,
-        lasts=draw.seconds(0.1, 0.5),
+        lasts=draw.uniform_seconds(0.1, 0.5),
         visible_from=NOISE_RAD,
     ),
     _motor(
         name="actuator-off",
         means="a motor produces no torque",
         step=arm.MotorStep(lambda fault: 0.0),
-        parameters=(_joint(default=1),),
+        parameters=(_joint_parameter(default=1),),
         detected_as=(Alarm.ACTUATOR,),
         # Dry friction hides the fault for a time, which is more cycles if cycles are shorter.
-        bound=bounds.cycles_and_time(5, 12_500_000),
-        lasts=draw.seconds(0.05, 0.4),
+        bound=bounds.cycle_and_time_bound(5, 12_500_000),
+        lasts=draw.uniform_seconds(0.05, 0.4),
     ),
     _motor(
         name="actuator-saturated",
         means="a motor produces only part of its torque",
         step=arm.MotorStep(lambda fault: fault["part"]),
         parameters=(
-            _joint(default=1),
+            _joint_parameter(default=1),
             Parameter(
                 "part",
                 "1",
@@ -416,7 +429,7 @@ KINDS.add(
                 0.1,
                 0.0,
                 0.9,
-                drawn=draw.number(0.0, 0.05),
+                drawn=draw.uniform_number(0.0, 0.05),
             ),
         ),
         detected_as=(Alarm.ACTUATOR,),
@@ -426,8 +439,8 @@ KINDS.add(
         # deliver at least 0.3 of that. In the worst case, reversing dry friction hides all of the
         # missing torque at first, which gives 1 / (0.3 * 0.3) cycles. The time is a lower limit
         # because the command rises by less in each cycle if cycles are shorter.
-        bound=bounds.cycles_and_time(12, 30_000_000),
-        lasts=draw.seconds(0.05, 0.4),
+        bound=bounds.cycle_and_time_bound(12, 30_000_000),
+        lasts=draw.uniform_seconds(0.05, 0.4),
     ),
     Kind(
         name="tendon-torn",
@@ -435,27 +448,27 @@ KINDS.add(
         means="a tendon of a hand gives no tension",
         step=arm.TendonStep(),
         parameters=(
-            _joint(),
+            _joint_parameter(),
             Parameter("side", "1", "0: the flexor; 1: the extensor", 0, 0, 1, is_whole=True),
         ),
         detected_as=(Alarm.TENDON,),
         # Five successive cycles with slack; the first sample after the tear is one cycle late.
-        bound=bounds.cycles(5 + 1),
-        lasts=draw.seconds(0.05, 0.4),
+        bound=bounds.cycle_bound(5 + 1),
+        lasts=draw.uniform_seconds(0.05, 0.4),
     ),
     _torque(
         name="command-nan",
         means="a commanded torque is NaN",
-        step=arm.CommandStep(arm.torque_nan),
-        parameters=(_joint(),),
+        step=arm.CommandStep(arm.set_torque_nan),
+        parameters=(_joint_parameter(),),
         detected_as=(Alarm.COMMAND_INVALID,),
     ),
     _torque(
         name="command-limit",
         means="a commanded torque is far beyond its limit",
-        step=arm.CommandStep(arm.torque_excessive),
+        step=arm.CommandStep(arm.exceed_torque),
         parameters=(
-            _joint(),
+            _joint_parameter(),
             Parameter(
                 "factor",
                 "1",
@@ -463,7 +476,7 @@ KINDS.add(
                 5.0,
                 1.1,
                 1e6,
-                drawn=draw.magnitude(3.0, 1000.0),
+                drawn=draw.log_uniform_number(3.0, 1000.0),
             ),
         ),
         detected_as=(Alarm.COMMAND_LIMIT,),

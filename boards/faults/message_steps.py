@@ -16,10 +16,10 @@ from typing import NamedTuple
 from rack.backplane.fault_table import FaultEntry
 from rack.backplane.mailbox.mailbox import Writer
 from rack.backplane.mailbox.protocols import LockWriter
-from rack.backplane.mailbox.slots import Slots, claim
+from rack.backplane.mailbox.slots import Slots, build_signature
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box
-from rack.boards.faults.kind import kind_of
+from rack.boards.faults.kind import find_kind
 
 
 class Outgoing(NamedTuple):
@@ -62,22 +62,22 @@ class MessageStep:
         self.held: list[Outgoing] = []
         self._seed = f"{entry.seed} {index}"
 
-    def send(self, message: Outgoing) -> None:
+    def send_message(self, message: Outgoing) -> None:
         """Process a message and pass on the result."""
         self.onward(message)
 
-    def flush(self, tick: int, visible_at: int) -> None:
+    def flush_due(self, tick: int, visible_at: int) -> None:
         """Pass on the delayed messages that are due at `tick`."""
 
-    def acts(self, message: Outgoing) -> None:
+    def count_action(self, message: Outgoing) -> None:
         """Record in the fault table that the fault acted, in the cycle that writes the message."""
-        self.entry.acted(message.at)
+        self.entry.record_action(message.at)
 
-    def chance(self, message: Outgoing) -> random.Random:
+    def create_random(self, message: Outgoing) -> random.Random:
         """Return a random generator seeded by the fault and the message's release alone."""
         return random.Random(f"{self._seed} {message.released}")
 
-    def hold(self, message: Outgoing) -> None:
+    def hold_message(self, message: Outgoing) -> None:
         """Delay a message. Its content is copied, because the writer's buffer will be reused."""
         content = message.content or bytes(self.writer.message.raw)
         self.held.append(message._replace(content=content))
@@ -86,19 +86,19 @@ class MessageStep:
 class Mute(MessageStep):
     """Suppresses all messages."""
 
-    def send(self, message: Outgoing) -> None:
+    def send_message(self, message: Outgoing) -> None:
         """Discard the message."""
-        self.acts(message)
+        self.count_action(message)
 
 
 class Drop(MessageStep):
     """Loses messages in transit: their serials are used up, but their slots are not filled."""
 
-    def send(self, message: Outgoing) -> None:
+    def send_message(self, message: Outgoing) -> None:
         """Lose the message with the fault's probability, else pass it on."""
-        if self.chance(message).random() < self.entry.parameters[0]:
-            self.acts(message)
-            self.writer.lose()
+        if self.create_random(message).random() < self.entry.parameters[0]:
+            self.count_action(message)
+            self.writer.lose_message()
         else:
             self.onward(message)
 
@@ -106,12 +106,12 @@ class Drop(MessageStep):
 class Delay(MessageStep):
     """Delays every message by a number of cycles."""
 
-    def send(self, message: Outgoing) -> None:
+    def send_message(self, message: Outgoing) -> None:
         """Hold the message back."""
-        self.acts(message)
-        self.hold(message)
+        self.count_action(message)
+        self.hold_message(message)
 
-    def flush(self, tick: int, visible_at: int) -> None:
+    def flush_due(self, tick: int, visible_at: int) -> None:
         """Pass on the messages whose delay is over."""
         delay_ticks = round(self.entry.parameters[0]) * self.writer.spec.every
         due = [message for message in self.held if message.at + delay_ticks <= tick]
@@ -123,15 +123,15 @@ class Delay(MessageStep):
 class Reorder(MessageStep):
     """Swaps messages with their successors."""
 
-    def send(self, message: Outgoing) -> None:
+    def send_message(self, message: Outgoing) -> None:
         """Pass the message on before the one held back, or hold it back at random."""
         if self.held:
             self.onward(message)
             held_message = self.held.pop()
             self.onward(held_message._replace(at=message.at, visible_at=message.visible_at))
-        elif self.chance(message).random() < self.entry.parameters[0]:
-            self.acts(message)
-            self.hold(message)
+        elif self.create_random(message).random() < self.entry.parameters[0]:
+            self.count_action(message)
+            self.hold_message(message)
         else:
             self.onward(message)
 
@@ -139,13 +139,13 @@ class Reorder(MessageStep):
 class Corrupt(MessageStep):
     """Flips bits of messages in their slots at random."""
 
-    def send(self, message: Outgoing) -> None:
+    def send_message(self, message: Outgoing) -> None:
         """Choose bits to flip with the fault's probability, and pass the message on."""
         probability, bits, *_ = self.entry.parameters
-        chance = self.chance(message)
+        chance = self.create_random(message)
         size = 8 * self.writer.spec.size
         if chance.random() < probability:
-            self.acts(message)
+            self.count_action(message)
             # Sample without repetition: a second flip would restore a bit.
             message = message._replace(
                 damage=tuple(chance.sample(range(size), min(size, round(bits))))
@@ -156,9 +156,9 @@ class Corrupt(MessageStep):
 class Babble(MessageStep):
     """Writes each message many times."""
 
-    def send(self, message: Outgoing) -> None:
+    def send_message(self, message: Outgoing) -> None:
         """Pass the message on as often as the fault says."""
-        self.acts(message)
+        self.count_action(message)
         for _ in range(round(self.entry.parameters[0])):
             self.onward(message)
 
@@ -166,12 +166,12 @@ class Babble(MessageStep):
 class HoldLock(MessageStep):
     """Stops or kills the process once, while it holds the mailbox's lock."""
 
-    def send(self, message: Outgoing) -> None:
+    def send_message(self, message: Outgoing) -> None:
         """Take the lock and stop or die. A stopped process releases the lock when it continues."""
         writer = self.writer
         is_killed = bool(self.entry.parameters[0])
         if isinstance(writer, LockWriter) and not self.entry.count and writer.lock.acquire():
-            self.acts(message)
+            self.count_action(message)
             number = signal.SIGKILL if is_killed else signal.SIGSTOP
             os.kill(os.getpid(), number)
             writer.lock.release()
@@ -188,18 +188,18 @@ class FaultyWriter:
         self._writer = writer
         self._index = index
         self._steps: dict[int, MessageStep] = {}
-        self._first = self._publish
+        self._first = self._publish_message
         self._late: list[Outgoing] = []
         self._written = True
 
-    def apply(self, faults: Sequence[FaultEntry]) -> None:
+    def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
         """Set the active faults. Faults that were already active keep their delayed messages.
 
         Delayed messages of faults that have ended are published in the next cycle.
         """
         steps = {}
         for entry in faults:
-            kind = kind_of(entry).step
+            kind = find_kind(entry).step
             assert isinstance(kind, type), "it acts on messages"
             assert issubclass(kind, MessageStep)
             running_step = self._steps.get(entry.index)
@@ -208,10 +208,10 @@ class FaultyWriter:
             if index not in steps:
                 self._late += step.held
         self._steps = steps
-        onward = self._publish
+        onward = self._publish_message
         for step in reversed(steps.values()):
             step.onward = onward
-            onward = step.send
+            onward = step.send_message
         self._first = onward
 
     @property
@@ -233,44 +233,44 @@ class FaultyWriter:
         Returns:
             False if the message was written too late for its readers.
         """
-        self.flush(tick, now)
+        self.flush_due(tick, now)
         self._written = True
-        visible_at = self._writer.visible_at(tick, now)
-        for _ in self._writer.outgoing():
+        visible_at = self._writer.compute_visible_tick(tick, now)
+        for _ in self._writer.iterate_outgoing():
             self._first(Outgoing(tick, tick, visible_at, tick if basis is None else basis))
-        self._show()
+        self._show_messages()
         return self._written and self._writer.is_in_time(tick, now)
 
-    def flush(self, tick: int, now: int | None = None) -> None:
+    def flush_due(self, tick: int, now: int | None = None) -> None:
         """Publish the delayed messages that are due at `tick`."""
-        visible_at = self._writer.visible_at(tick, now)
+        visible_at = self._writer.compute_visible_tick(tick, now)
         late_messages = self._late
         self._late = []
         for message in late_messages:
-            self._publish(message._replace(at=tick, visible_at=visible_at))
+            self._publish_message(message._replace(at=tick, visible_at=visible_at))
         for step in self._steps.values():
-            step.flush(tick, visible_at)
-        self._show()
+            step.flush_due(tick, visible_at)
+        self._show_messages()
 
-    def _show(self) -> None:
+    def _show_messages(self) -> None:
         """Update the count of delayed messages and show published messages to readers."""
         self._writer.held = len(self._late) + sum(len(step.held) for step in self._steps.values())
-        self._writer.show()
+        self._writer.show_published()
 
-    def _publish(self, message: Outgoing) -> None:
+    def _publish_message(self, message: Outgoing) -> None:
         """Publish a message with its own content and restore the writer's buffer."""
         raw = self._writer.message.raw
         # Restore the buffer afterwards, because it contains the level's newest message.
         present = bytes(raw)
         raw[:] = message.content or present
-        if not self._writer.publish(
+        if not self._writer.publish_message(
             message.released, message.visible_at, message.basis, message.damage
         ):
             self._written = False
         raw[:] = present
 
 
-def forge(segment: Segment, mailbox: str, tick: int) -> None:
+def forge_message(segment: Segment, mailbox: str, tick: int) -> None:
     """Publish a message as a second writer that has not claimed the mailbox.
 
     Its content is the newest message with all bits inverted, so that a reader that accepts it is
@@ -281,10 +281,10 @@ def forge(segment: Segment, mailbox: str, tick: int) -> None:
         mailbox: Name of the mailbox.
         tick: Tick at which the message becomes visible.
     """
-    slots = Slots(segment, segment.layout.mailbox(mailbox))
+    slots = Slots(segment, segment.layout.find_mailbox(mailbox))
     head = slots.box[Box.HEAD]
     if head:
-        slots.fetch(head)
+        slots.fetch_message(head)
     slots.message.raw[:] = bytes(byte ^ 0xFF for byte in slots.message.raw)
-    slots.resume(claim(slots.box[Box.EPOCH], os.getpid()))
-    slots.publish(tick, tick, tick)
+    slots.resume_writing(build_signature(slots.box[Box.EPOCH], os.getpid()))
+    slots.publish_message(tick, tick, tick)

@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, cast
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import FaultEntry, FaultTable, Stage
 from rack.backplane.layout import TaskSpec
-from rack.backplane.process import pin
+from rack.backplane.process import pin_to_core
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
-from rack.boards.faults.kind import kind_of
+from rack.boards.faults.kind import find_kind
 from rack.levels.fault_steps import Fault
 
 if TYPE_CHECKING:
     from rack.levels.level import Executor, Planner
 
-LEAST_S = 0.001
+MIN_POLL_S = 0.001
 """Shortest polling interval of a waiting hog."""
-LOOK_S = 0.05
+MAX_POLL_S = 0.05
 """Longest polling interval of a waiting hog, which must notice the end of the run."""
 
 
@@ -44,10 +44,10 @@ class ExtraComputing:
     clock: SystemClock
     until: LoadStep
 
-    def burn(self, tick: int) -> None:
+    def burn_time(self, tick: int) -> None:
         """Keep the processor busy until the time that the step computes."""
         now_ns = monotonic_ns()
-        self.entry.acted(tick)
+        self.entry.record_action(tick)
         end_ns = self.until(self, tick, now_ns)
         while monotonic_ns() < end_ns:
             pass
@@ -64,35 +64,35 @@ Times are CLOCK_MONOTONIC in ns.
 """
 
 
-def overrun(load: ExtraComputing, tick: int, now: int) -> int:
+def extend_cycle(load: ExtraComputing, tick: int, now_ns: int) -> int:
     """Extend an executor's cycle by `by` cycles, or by a random part of that.
 
     Args:
         load: The extra computing; its fault has the parameters `by` and `random`.
         tick: Release of the cycle.
-        now: Current CLOCK_MONOTONIC, ns.
+        now_ns: Current CLOCK_MONOTONIC, ns.
 
     Returns:
         CLOCK_MONOTONIC at which the computing ends, ns.
     """
     by, is_random, *_ = load.entry.parameters
     fraction = random.Random(load.entry.seed + tick).random() if is_random else 1.0
-    return now + load.cycles_ns(fraction * by)
+    return now_ns + load.cycles_ns(fraction * by)
 
 
-def slow_plan(load: ExtraComputing, tick: int, now: int) -> int:
+def extend_time_slice(load: ExtraComputing, tick: int, now_ns: int) -> int:
     """Extend a planner's time slice by `by` cycles.
 
     Args:
         load: The extra computing; its fault has the parameter `by`.
         tick: Release of the slice.
-        now: Current CLOCK_MONOTONIC, ns.
+        now_ns: Current CLOCK_MONOTONIC, ns.
 
     Returns:
         CLOCK_MONOTONIC at which the computing ends, ns.
     """
-    slice_end = load.clock.time_of(tick + load.spec.slice)
-    return max(now, slice_end) + load.cycles_ns(load.entry.parameters[0])
+    slice_end = load.clock.compute_time_ns(tick + load.spec.slice)
+    return max(now_ns, slice_end) + load.cycles_ns(load.entry.parameters[0])
 
 
 class TaskFaults:
@@ -124,7 +124,7 @@ class TaskFaults:
         self._arm: list[FaultEntry] = []
         self.loads: list[ExtraComputing] = []
 
-    def refresh(self, tick: int) -> int:
+    def refresh_faults(self, tick: int) -> int:
         """Apply the faults that are active at `tick`.
 
         Returns:
@@ -133,8 +133,8 @@ class TaskFaults:
             the grid; the next cycle must call this again.
         """
         generation = self._table.generation
-        entries = self._table.staged((Stage.ACTIVE,))
-        begun = [(kind_of(entry), entry) for entry in entries if entry.task == self._index]
+        entries = self._table.list_entries((Stage.ACTIVE,))
+        begun = [(find_kind(entry), entry) for entry in entries if entry.task == self._index]
         active = [(kind, entry) for kind, entry in begun if entry.tick <= tick]
         self.loads = [
             ExtraComputing(entry, self._spec, self._clock, kind.step)
@@ -146,21 +146,21 @@ class TaskFaults:
         self._arm = [entry for _, entry in arm_faults]
         if self._spec.role == "executor":
             faults = [
-                Fault(kind.name, kind.values(entry), entry.seed, entry.tick, kind.step)
+                Fault(kind.name, kind.read_parameters(entry), entry.seed, entry.tick, kind.step)
                 for kind, entry in arm_faults
             ]
             cast("Executor", self._level).inject(faults)
         return generation if len(active) == len(begun) else -1
 
-    def burn(self, tick: int) -> None:
+    def burn_time(self, tick: int) -> None:
         """Spend the extra computing time of all active faults."""
         for load in self.loads:
-            load.burn(tick)
+            load.burn_time(tick)
 
-    def count(self, acted: Mapping[int, bool], tick: int) -> None:
+    def count_actions(self, acted: Mapping[int, bool], tick: int) -> None:
         """Record which faults of the arm acted in a cycle: see `Executor.acted`."""
         for index, shows in acted.items():
-            self._arm[index].acted(tick, shows)
+            self._arm[index].record_action(tick, shows)
 
 
 def take_core(segment: Segment, entry: FaultEntry) -> None:
@@ -173,19 +173,19 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
             core from a board.
     """
     task = segment.layout.tasks[entry.task]
-    block = segment.block(task.name)
+    block = segment.get_block(task.name)
     clock = SystemClock(segment)
-    pin(block[Block.CORE])
+    pin_to_core(block[Block.CORE])
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(min(99, block[Block.PRIORITY] + 1)))
     while entry.stage == Stage.WAITING and not clock.is_stopped:
-        wait_ns = clock.time_of(max(entry.tick, clock.tick + 1)) - time.monotonic_ns()
+        wait_ns = clock.compute_time_ns(max(entry.tick, clock.tick + 1)) - time.monotonic_ns()
         # Wake on the clock's grid, at the first tick at which the fault can begin or at the next
         # one. If that tick has passed, or the run has not started, sleep briefly, because at this
         # priority a busy wait would starve all other processes.
-        wait_s = wait_ns * 1e-9 if wait_ns > 0 else LEAST_S
-        time.sleep(min(wait_s, LOOK_S))
-    end = clock.time_of(entry.until)
-    entry.acted(clock.now())
+        wait_s = wait_ns * 1e-9 if wait_ns > 0 else MIN_POLL_S
+        time.sleep(min(wait_s, MAX_POLL_S))
+    end = clock.compute_time_ns(entry.until)
+    entry.record_action(clock.compute_tick())
     while time.monotonic_ns() < end and not clock.is_stopped:
         pass
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
@@ -197,7 +197,7 @@ def act_on_core(segment: Segment, index: int) -> int:
     Called in a process that the crate has forked. Returns the exit status.
     """
     entry = FaultTable(segment).entries[index]
-    step = kind_of(entry).step
+    step = find_kind(entry).step
     assert callable(step), "a fault of a core has a function"
     step(segment, entry)
     return 0

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from rack.backplane.layout import Layout
 from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
-from rack.boards.wiring import Entries
+from rack.boards.wiring import ExchangedEntries
 from rack.levels.level import Executor, LevelContext, Reading
 
 STATUS = "status"
@@ -31,12 +31,12 @@ class Adapter(Executor):
         super().__init__(context)
         self.readings: dict[str, Reading[AnyMessage]] = {}
 
-    def input_table(self, port: str) -> dict[str, Any]:
+    def find_input_table(self, port: str) -> dict[str, Any]:
         """Return the table in which the board stores the readings of a port."""
         return self.readings
 
     @classmethod
-    def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
+    def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
         """Return the outputs that a replay writes from the recording.
 
         Args:
@@ -49,7 +49,7 @@ class Adapter(Executor):
         """
         return {}
 
-    def attach(self, segment: Segment, entries: Entries | None) -> None:
+    def attach_segment(self, segment: Segment, entries: ExchangedEntries | None) -> None:
         """Receive the segment. This is called before the self-test.
 
         Args:
@@ -57,7 +57,7 @@ class Adapter(Executor):
             entries: In a replay, the recorded messages that replace the outside. Otherwise None.
         """
 
-    def open(self) -> None:
+    def open_connections(self) -> None:
         """Open connections to the outside.
 
         The board has its core and priority when this is called, and threads inherit both.

@@ -17,16 +17,16 @@ from rack.backplane.errors import MailboxError
 from rack.backplane.process import adopt_orphans
 from rack.backplane.segment import Segment
 from rack.boards.classes import find_class
-from rack.boards.errors import LONGEST_REASON, one_line
+from rack.boards.errors import MAX_REASON_LENGTH, to_one_line
 from rack.boards.host.bus import HostBus
 from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
 
-RELEASED_S = 2.0
+CLAIM_S = 2.0
 """Longest wait for the end of processes that the previous process of this board has forked."""
 LOOK_S = 0.01
 """Time between two attempts to open the bus."""
-FAILED = 1
+FAILED_STATUS = 1
 """Exit status of a host board whose program raised an exception."""
 
 
@@ -51,32 +51,32 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
     os.dup2(output, 2)
     # The crate ignores this signal. Here it ends the program like `sys.exit`, so that the program
     # leaves its `with` and `finally` blocks.
-    signal.signal(signal.SIGTERM, _leave)
-    bus = _opened(segment, wiring)
+    signal.signal(signal.SIGTERM, _exit_on_signal)
+    bus = _open_bus(segment, wiring)
     os.eventfd_write(attention, 1)
     try:
         bus.await_turn()
         # Import the program only in this process: it may start threads, and the crate must stay
         # single-threaded.
         program = find_class(wiring.target, HostProgram)(wiring.context)
-        bus.connect(program)
+        bus.connect_ports(program)
         program.run(bus)
     except SystemExit as end:
         if end.code and not bus.is_over:
-            return _failed(wiring.board, end)
+            return _report_failure(wiring.board, end)
     except Exception as error:
-        return _failed(wiring.board, error)
-    bus.finish()
+        return _report_failure(wiring.board, error)
+    bus.declare_done()
     return 0
 
 
-def _opened(segment: Segment, wiring: HostWiring) -> HostBus:
+def _open_bus(segment: Segment, wiring: HostWiring) -> HostBus:
     """Open the bus, and try again for a while if it is still claimed.
 
     Processes that the previous process of this board has forked may hold the claim until the crate
     has killed them.
     """
-    deadline = time.monotonic() + RELEASED_S
+    deadline = time.monotonic() + CLAIM_S
     while True:
         try:
             return HostBus(segment, wiring)
@@ -86,15 +86,15 @@ def _opened(segment: Segment, wiring: HostWiring) -> HostBus:
             time.sleep(LOOK_S)
 
 
-def _leave(number: int, frame: FrameType | None) -> None:
+def _exit_on_signal(number: int, frame: FrameType | None) -> None:
     raise SystemExit(f"ended by {signal.Signals(number).name}")
 
 
-def _failed(board: str, error: BaseException) -> int:
+def _report_failure(board: str, error: BaseException) -> int:
     """Print an exception as one line, which becomes an event, and return the exit status."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
-    text = one_line(f"{type(error).__name__}: {error}", LONGEST_REASON)
+    text = to_one_line(f"{type(error).__name__}: {error}", MAX_REASON_LENGTH)
     # The crate passes the output of host boards on to the Rack.
     print(f"host board '{board}': {text}{place}", file=sys.stderr, flush=True)
-    return FAILED
+    return FAILED_STATUS

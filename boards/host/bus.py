@@ -13,7 +13,7 @@ from rack.backplane.mailbox.host_ring import HostWriter
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reading
 from rack.backplane.message import COMMAND_ID, AnyMessage, Message
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import done_semaphore, wake_semaphore
+from rack.backplane.semaphores import get_done_semaphore, get_wake_semaphore
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
@@ -34,7 +34,7 @@ class BusReceiver:
         """Return the newest message, together with the unread messages before it."""
         before = self._reader.serial
         reading = self._reader.peek()
-        return self._reader.with_earlier(reading, before) if before else reading
+        return self._reader.add_earlier(reading, before) if before else reading
 
 
 class BusSender:
@@ -49,18 +49,18 @@ class BusSender:
         self._writer = writer
         # The message is stored in the writer's memory.
         self.message: Any = kind(writer.message.record.dtype, writer.message.raw)
-        self._begin()
+        self._clear_message()
 
-    def _begin(self) -> None:
+    def _clear_message(self) -> None:
         self.message.clear()
         if COMMAND_ID in (self.message.record.dtype.names or ()):
             self.message.id = self.sent + 1
 
     def send(self) -> bool:
         """Send a copy of the message and clear it. Return False if too many messages wait."""
-        is_sent = self._writer.send(self._bus.tick)
+        is_sent = self._writer.send_message(self._bus.tick)
         if is_sent:
-            self._begin()
+            self._clear_message()
         return is_sent
 
     @property
@@ -91,9 +91,11 @@ class HostBus:
         self._words = segment.words
         self._wiring = wiring
         layout = segment.layout
-        self._is_paced = self._words[System.LOCKSTEP] and layout.pacers(layout.task(wiring.board))
-        self.block = segment.block(wiring.board)
-        self._claim = _claim(segment, wiring.board)
+        self._is_paced = self._words[System.LOCKSTEP] and layout.find_pacers(
+            layout.find_task(wiring.board)
+        )
+        self.block = segment.get_block(wiring.board)
+        self._claim = _claim_board(segment, wiring.board)
         self._writers: dict[str, HostWriter] = {}
         try:
             for port, mailbox in wiring.outputs.items():
@@ -101,14 +103,14 @@ class HostBus:
         except MailboxError:
             self.close()
             raise
-        self._semaphore = wake_semaphore(segment, wiring.board)
+        self._semaphore = get_wake_semaphore(segment, wiring.board)
         # Faults send signals to this process id. If the program runs in another PID namespace, they
         # would strike another process, so no id is published.
         self.block[Block.PID] = os.getpid() if segment.launcher else 0
         self.block[Block.WAITS_UNTIL] = 0
         self.block[Block.STATE] = TaskState.RUNNING
 
-    def connect(self, program: HostProgram) -> None:
+    def connect_ports(self, program: HostProgram) -> None:
         """Set the ports of a program to objects that receive and send its messages."""
         ports = vars(program)
         for port, mailbox in self._wiring.inputs.items():
@@ -166,14 +168,14 @@ class HostBus:
         block = self.block
         block[Block.DEADLINE] = self.tick + self._wiring.computing
         block[Block.DONE] = block[Block.RELEASED]
-        done_semaphore(self._segment, self._wiring.board).release()
+        get_done_semaphore(self._segment, self._wiring.board).release()
 
     @property
     def tasks(self) -> list[str]:
         """Names of the crate's tasks."""
         return [task.name for task in self._segment.layout.tasks]
 
-    def address(self, name: str) -> int:
+    def find_address(self, name: str) -> int:
         """Return the bus address of a mailbox, or of the control block of a task.
 
         Raises:
@@ -185,7 +187,7 @@ class HostBus:
             raise LookupError(f"nothing on the bus is called '{name}'; known: {', '.join(known)}")
         return known[name]
 
-    def words(self, address: int, count: int = 1) -> list[int]:
+    def read_words(self, address: int, count: int = 1) -> list[int]:
         """Read words of the crate's memory.
 
         Args:
@@ -204,7 +206,7 @@ class HostBus:
             )
         return list(self._words[address // WORD : last // WORD])
 
-    def finish(self) -> None:
+    def declare_done(self) -> None:
         """Record that the program is finished, as its return does."""
         self.block[Block.STATE] = TaskState.ENDED
         if self._is_paced:
@@ -217,11 +219,11 @@ class HostBus:
         self._claim.close()
 
 
-def _claim(segment: Segment, board: str) -> ByteLock:
+def _claim_board(segment: Segment, board: str) -> ByteLock:
     claim = ByteLock(segment.fd, segment.map.blocks[board] + WORD * Block.PID)
     if not claim.take():
         claim.close()
-        pid = segment.launcher and segment.block(board)[Block.PID]
+        pid = segment.launcher and segment.get_block(board)[Block.PID]
         where = f" (process {pid})" if pid else " in another PID namespace"
         raise MailboxError(f"host board '{board}' is already running{where}")
     return claim

@@ -39,19 +39,19 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.host.adapter import STATUS, Adapter
 from rack.boards.host.entries import (
+    ActiveEntry,
     AdapterEntry,
     AdapterParams,
-    Crossing,
     EntryConfig,
-    EntryCount,
-    Inward,
-    Outward,
-    Replayed,
-    last_written,
+    EntryCounters,
+    InwardEntry,
+    OutwardEntry,
+    ReplayedEntry,
+    read_last_written,
 )
-from rack.boards.wiring import Entries
+from rack.boards.wiring import ExchangedEntries
 from rack.levels.errors import CannotGoOn
-from rack.levels.level import Input, LevelContext, MadePorts, Output, QueuedOutput, Sender
+from rack.levels.level import ConfiguredPorts, Input, LevelContext, Output, QueuedOutput, Sender
 from rack.levels.tables import read_params
 
 LONGEST_S = 30.0
@@ -71,22 +71,24 @@ class BusAdapter(Adapter):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._tables = read_params(AdapterParams, context.params).entries
-        self._counts = {port: EntryCount() for port in self._tables}
-        self._entries: list[tuple[EntryConfig, Crossing]] = []
+        self._counts = {port: EntryCounters() for port in self._tables}
+        self._entries: list[tuple[EntryConfig, ActiveEntry]] = []
         self._turns: list[HostTurn] = []
         self._hosts: dict[str, memoryview] = {}
         self._before: dict[str, bytes] = {}
-        self._statuses: Replayed | None = None
+        self._statuses: ReplayedEntry | None = None
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
+    def build_ports(
+        cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
+    ) -> ConfiguredPorts:
         """Return the ports that the entries add: an input and an output each, and the status.
 
         Args:
             params: Parameters of the adapter's board.
             types: Message classes of the mailboxes known so far.
         """
-        entries = AdapterParams.entries_of(params)
+        entries = AdapterParams.read_entries(params)
         known = {port: entry for port, entry in entries.items() if entry.source in types}
         inputs = {
             port: Input(types.get(entry.source, AdapterEntry), entry.source)
@@ -101,20 +103,22 @@ class BusAdapter(Adapter):
             for port, entry in known.items()
         }
         is_whole = bool(entries) and known == entries
-        return MadePorts(inputs, {**outputs, STATUS: Output(status_of(entries))}, is_whole)
+        return ConfiguredPorts(
+            inputs, {**outputs, STATUS: Output(build_status_class(entries))}, is_whole
+        )
 
     @classmethod
-    def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
+    def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
         """Return the ports with messages of host boards, and the status."""
         hosts = {host.name for host in layout.hosts}
         sent = {
             port: entry.asynchronous
-            for port, entry in AdapterParams.entries_of(params).items()
-            if layout.mailbox(entry.source).writer in hosts
+            for port, entry in AdapterParams.read_entries(params).items()
+            if layout.find_mailbox(entry.source).writer in hosts
         }
         return {**sent, STATUS: False}
 
-    def attach(self, segment: Segment, entries: Entries | None) -> None:
+    def attach_segment(self, segment: Segment, entries: ExchangedEntries | None) -> None:
         """Open the mailboxes of the host side, or in a replay the recorded messages.
 
         Args:
@@ -125,32 +129,34 @@ class BusAdapter(Adapter):
         hosts = {host.name for host in layout.hosts}
         board = self.context.board
         # If the bridge was restarted, continue with what its previous process has written.
-        status, tick = last_written(segment, f"{board}.{STATUS}")
+        status, tick = read_last_written(segment, f"{board}.{STATUS}")
         for port, table in self._tables.items():
             count = self._counts[port]
             if status is not None:
-                count.resume(getattr(status, port), tick)
+                count.restore_counts(getattr(status, port), tick)
             mailbox = f"{board}.{port}"
-            before, since = last_written(segment, mailbox)
-            writer = layout.mailbox(table.source).writer
-            entry: Crossing
+            before, since = read_last_written(segment, mailbox)
+            writer = layout.find_mailbox(table.source).writer
+            entry: ActiveEntry
             if writer not in hosts:
-                entry = Outward(segment, mailbox, port, table, count)
+                entry = OutwardEntry(segment, mailbox, port, table, count)
             else:
                 if before is not None:
                     self._before[port] = bytes(before.raw)
                 if entries is None:
-                    self._hosts[writer] = segment.block(writer)
-                    entry = Inward(segment, port, table, count)
+                    self._hosts[writer] = segment.get_block(writer)
+                    entry = InwardEntry(segment, port, table, count)
                 else:
-                    entry = Replayed(entries[port], port, table.asynchronous, since)
+                    entry = ReplayedEntry(entries[port], port, table.asynchronous, since)
             self._entries.append((table, entry))
         if segment.words[System.LOCKSTEP] and entries is None:
             self._turns = [
-                HostTurn(segment, host) for host in layout.hosts if board in layout.pacers(host)
+                HostTurn(segment, host)
+                for host in layout.hosts
+                if board in layout.find_pacers(host)
             ]
         if entries is not None:
-            self._statuses = Replayed(entries[STATUS], STATUS, is_sent=False)
+            self._statuses = ReplayedEntry(entries[STATUS], STATUS, is_sent=False)
 
     def process(self, tick: int) -> None:
         """Exchange the entries that are due. In lockstep, let programs run afterwards."""
@@ -161,17 +167,17 @@ class BusAdapter(Adapter):
         cycle = (tick - self.context.phase) // self.context.every
         for table, entry in self._entries:
             if table.is_due(cycle):
-                entry.exchange(self.readings, self.ports, tick)
+                entry.exchange_messages(self.readings, self.ports, tick)
         for turn in self._turns:
-            turn.take(tick)
+            turn.run_turn(tick)
         if self._statuses is not None:
-            self._statuses.exchange(self.readings, self.ports, tick)
+            self._statuses.exchange_messages(self.readings, self.ports, tick)
         else:
-            self._report(self.ports[STATUS], tick)
+            self._write_status(self.ports[STATUS], tick)
 
-    def _report(self, status: Status, tick: int) -> None:
+    def _write_status(self, status: Status, tick: int) -> None:
         for port, count in self._counts.items():
-            count.fill(getattr(status, port), tick)
+            count.write_counts(getattr(status, port), tick)
         states = {name: block[Block.STATE] for name, block in self._hosts.items()}
         lost = [name for name, block in self._hosts.items() if block[Block.LOST]]
         gone = [name for name, state in states.items() if state == TaskState.GIVEN_UP]
@@ -200,7 +206,7 @@ class HostTurn(ReleasedTask):
         super().__init__(segment, host)
         self._segment = segment
 
-    def take(self, tick: int) -> None:
+    def run_turn(self, tick: int) -> None:
         """If the program is due in the cycle released at `tick`, let it run until it waits.
 
         Raises:
@@ -211,7 +217,7 @@ class HostTurn(ReleasedTask):
         if (
             block[Block.STATE] > TaskState.RUNNING
             or block[Block.WAITS_UNTIL] > tick
-            or not self.is_free(tick)
+            or not self.can_take_release(tick)
         ):
             return
         block[Block.RELEASED] = tick
@@ -232,7 +238,7 @@ class HostTurn(ReleasedTask):
             block[Block.LOST] = tick + 1
 
 
-def status_of(entries: Mapping[str, EntryConfig]) -> type[Status]:
+def build_status_class(entries: Mapping[str, EntryConfig]) -> type[Status]:
     """Return the class of a bridge's status, with a group of counters for each entry."""
     groups = {port: field(AdapterEntry, doc=f"entry {port}") for port in entries}
     return make_message("adapter_status", 1, Status, groups)

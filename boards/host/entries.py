@@ -15,9 +15,9 @@ from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer, open_writer
 from rack.backplane.message import AnyMessage, Message, field, fill_counts
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.semaphores import get_wake_semaphore
 from rack.backplane.words import Block
-from rack.boards.wiring import Rows
+from rack.boards.wiring import EntityRows
 from rack.levels.tables import LAST_TICK, Table
 
 NEVER = -1
@@ -27,7 +27,7 @@ RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clea
 """Names that no port may have, because the status of an adapter has fields of these names."""
 
 
-def counter(doc: str) -> Any:
+def declare_counter(doc: str) -> Any:
     """Declare a counter among the fields of an adapter's status. `doc` is its meaning."""
     return field("u4", unit="1", doc=doc)
 
@@ -35,11 +35,15 @@ def counter(doc: str) -> Any:
 class AdapterEntry(Message, version=1):
     """Counters of one entry, as a group of fields in the status of its adapter."""
 
-    passed: int = counter("messages passed to the other side")
-    refused: int = counter("messages refused: damaged, forged, or not what its type permits")
-    superseded: int = counter("messages that a newer one overtook before the exchange")
-    full: int = counter("messages that the host board could not send, since too many waited")
-    waiting: int = counter("messages that wait for the next cycles")
+    passed: int = declare_counter("messages passed to the other side")
+    refused: int = declare_counter(
+        "messages refused: damaged, forged, or not what its type permits"
+    )
+    superseded: int = declare_counter("messages that a newer one overtook before the exchange")
+    full: int = declare_counter(
+        "messages that the host board could not send, since too many waited"
+    )
+    waiting: int = declare_counter("messages that wait for the next cycles")
     arrived: int = field(
         unit="tick", doc="tick at which the newest message reached the other side; -1: none yet"
     )
@@ -64,7 +68,7 @@ class EntryConfig(Table):
     """largest number of messages of a host board that one cycle processes; further ones wait"""
 
     @model_validator(mode="after")
-    def _has_one_mode(self) -> Self:
+    def _check_mode(self) -> Self:
         if self.phase >= self.every:
             raise ValueError(f"phase = {self.phase}: must be less than every, {self.every}")
         if self.asynchronous and self.every > 1:
@@ -85,7 +89,7 @@ class AdapterParams(Table):
     """mailboxes to pass, by port of the adapter"""
 
     @model_validator(mode="after")
-    def _has_ports(self) -> Self:
+    def _check_ports(self) -> Self:
         for port in self.entries:
             if not PORT.fullmatch(port) or port in RESERVED:
                 why = f"valid: a-z, 0-9 and _, except {', '.join(RESERVED)}"
@@ -93,7 +97,7 @@ class AdapterParams(Table):
         return self
 
     @classmethod
-    def entries_of(cls, params: Mapping[str, Any]) -> dict[str, EntryConfig]:
+    def read_entries(cls, params: Mapping[str, Any]) -> dict[str, EntryConfig]:
         """Return the entries in a table of parameters. Empty if the table has mistakes."""
         try:
             return cls.model_validate(params).entries
@@ -102,7 +106,7 @@ class AdapterParams(Table):
 
 
 @dataclass
-class EntryCount:
+class EntryCounters:
     """Counters of one entry. See the fields of `AdapterEntry`.
 
     Attributes:
@@ -117,7 +121,7 @@ class EntryCount:
     arrived: int = NEVER
     written: int = NEVER
 
-    def resume(self, record: Any, tick: int) -> None:
+    def restore_counts(self, record: Any, tick: int) -> None:
         """Take over the counters from the status of an earlier cycle.
 
         Args:
@@ -129,13 +133,13 @@ class EntryCount:
             setattr(self, name, int(record[name]))
         self.written = NEVER if age == NEVER else tick - age
 
-    def passes(self, tick: int, written: int) -> None:
+    def count_passed(self, tick: int, written: int) -> None:
         """Count a message that reaches the other side at `tick` and was written at `written`."""
         self.passed += 1
         self.arrived = tick
         self.written = written
 
-    def fill(self, record: Any, tick: int) -> None:
+    def write_counts(self, record: Any, tick: int) -> None:
         """Write the counters to a status.
 
         Args:
@@ -146,7 +150,7 @@ class EntryCount:
         fill_counts(record, (*(getattr(self, name) for name in _COUNTED), age))
 
 
-class Inward:
+class InwardEntry:
     """Entry into real time: from the ring of a host board to a mailbox of the adapter.
 
     Levels read that mailbox at ticks.
@@ -158,16 +162,18 @@ class Inward:
         count: Its counters.
     """
 
-    def __init__(self, segment: Segment, port: str, table: EntryConfig, count: EntryCount) -> None:
+    def __init__(
+        self, segment: Segment, port: str, table: EntryConfig, count: EntryCounters
+    ) -> None:
         self._ring = HostReader(segment, table.source)
         self._port = port
         self._table = table
         self._count = count
         self._ring.refused = count.refused
         self._ring.superseded = count.superseded
-        self._writer = segment.block(self._ring.spec.writer)
+        self._writer = segment.get_block(self._ring.spec.writer)
 
-    def exchange(
+    def exchange_messages(
         self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> None:
         """Take waiting messages from the ring, check them, and pass them on.
@@ -182,23 +188,23 @@ class Inward:
         ring = self._ring
         count = self._count
         out = write[self._port]
-        waiting = ring.waiting if self._writer[Block.DEADLINE] <= tick else 0
+        waiting = ring.waiting_count if self._writer[Block.DEADLINE] <= tick else 0
         if self._table.asynchronous:
             for _ in range(min(waiting, self._table.most, out.room())):
-                if (message := ring.take()) is not None:
+                if (message := ring.take_oldest()) is not None:
                     out.message.copy_from(message)
                     out.send()
-                    count.passes(tick, ring.written)
+                    count.count_passed(tick, ring.written_tick)
         elif waiting and (message := ring.take_newest(self._table.most)) is not None:
             out.copy_from(message)
-            count.passes(tick, ring.written)
+            count.count_passed(tick, ring.written_tick)
         count.refused = ring.refused
         count.superseded = ring.superseded
-        count.full = ring.full
-        count.waiting = ring.waiting
+        count.full = ring.full_count
+        count.waiting = ring.waiting_count
 
 
-class Outward:
+class OutwardEntry:
     """Entry out of real time: from a level's mailbox to one that host boards read.
 
     The host boards are woken.
@@ -212,7 +218,7 @@ class Outward:
     """
 
     def __init__(
-        self, segment: Segment, mailbox: str, port: str, table: EntryConfig, count: EntryCount
+        self, segment: Segment, mailbox: str, port: str, table: EntryConfig, count: EntryCounters
     ) -> None:
         self._writer = open_writer(segment, mailbox)
         self._port = port
@@ -220,9 +226,11 @@ class Outward:
         self._count = count
         self._source = open_observer(segment, table.source)
         readers = self._writer.spec.readers
-        self._readers = [(segment.block(name), wake_semaphore(segment, name)) for name in readers]
+        self._readers = [
+            (segment.get_block(name), get_wake_semaphore(segment, name)) for name in readers
+        ]
 
-    def exchange(
+    def exchange_messages(
         self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> None:
         """Copy the messages that the adapter has read, and wake the host boards that read them.
@@ -233,14 +241,14 @@ class Outward:
             tick: Tick at which the cycle was released.
         """
         reading = read[self._port]
-        if not reading.is_there or (self._table.asynchronous and not reading.is_new):
+        if not reading.has_message or (self._table.asynchronous and not reading.is_new):
             return
         for message in (*reading.earlier, reading.message):
             self._writer.message.copy_from(message)
             self._writer.write(tick)
         # A reading does not contain the tick at which its message was written.
         self._source.read(tick)
-        self._count.passes(tick, self._source.newest)
+        self._count.count_passed(tick, self._source.newest)
         for block, semaphore in self._readers:
             # In lockstep the program of the host board is now due.
             block[Block.WAITS_UNTIL] = 0
@@ -249,7 +257,7 @@ class Outward:
                 semaphore.release()
 
 
-def last_written(segment: Segment, mailbox: str) -> tuple[AnyMessage | None, int]:
+def read_last_written(segment: Segment, mailbox: str) -> tuple[AnyMessage | None, int]:
     """Return the newest message of a mailbox and the tick at which it was written.
 
     Returns:
@@ -257,10 +265,10 @@ def last_written(segment: Segment, mailbox: str) -> tuple[AnyMessage | None, int
     """
     observer = open_observer(segment, mailbox)
     reading = observer.peek()
-    return (reading.message, observer.newest) if reading.is_there else (None, NEVER)
+    return (reading.message, observer.newest) if reading.has_message else (None, NEVER)
 
 
-class Replayed:
+class ReplayedEntry:
     """Entry in a replay: writes the messages of the recorded run again, at the same ticks.
 
     Args:
@@ -270,13 +278,13 @@ class Replayed:
         since: Tick up to which messages were already sent, before a restart of the adapter.
     """
 
-    def __init__(self, rows: Rows, port: str, is_sent: bool, since: int = NEVER) -> None:
+    def __init__(self, rows: EntityRows, port: str, is_sent: bool, since: int = NEVER) -> None:
         self._rows = rows
         self._port = port
         self._is_sent = is_sent
         self._at = sum(tick <= since for tick, _, _ in rows) if is_sent else 0
 
-    def exchange(
+    def exchange_messages(
         self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> bool:
         """Write the recorded messages up to this cycle.
@@ -302,5 +310,5 @@ class Replayed:
         return self._at > before
 
 
-Crossing = Inward | Outward | Replayed
+ActiveEntry = InwardEntry | OutwardEntry | ReplayedEntry
 """An entry in operation. Its `exchange` is called in the cycles in which the entry is due."""

@@ -38,11 +38,11 @@ Rule = tuple[str, Sequence[str], Sequence[str]]
 """Direction, kinds of messages and keys that are allowed."""
 
 
-def access_control(own: str, table: LanTable, is_operator: bool) -> dict[str, Any]:
+def build_access_control(rack: str, table: LanTable, is_operator: bool) -> dict[str, Any]:
     """Return the value of zenoh's `access_control` for a session.
 
     Args:
-        own: Name of the rack, or of the operator.
+        rack: Name of the rack, or of the operator.
         table: The `[adapter.lan]` table.
         is_operator: Whether the session belongs to an operator, who may only set emergency stops.
     """
@@ -52,37 +52,37 @@ def access_control(own: str, table: LanTable, is_operator: bool) -> dict[str, An
         # An operator may set the emergency stop of any rack.
         by_subject[ANYONE] = [
             (IN, ("declare_queryable",), [estop_key("*", "*")]),
-            (OUT, ("query",), [estop_key(own, "*")]),
-            (IN, ("reply",), [estop_key(own, "*")]),
+            (OUT, ("query",), [estop_key(rack, "*")]),
+            (IN, ("reply",), [estop_key(rack, "*")]),
             (OUT, WATCH_TOKENS, [ALL_ALIVE]),
             (IN, TOKEN, [ALL_ALIVE]),
         ]
     elif not is_known:
-        exported = [out_key(own, entry.source) for entry in table.exports.values()]
+        exported = [out_key(rack, entry.source) for entry in table.exports.values()]
         by_subject[ANYONE] = [
-            *_visible(own),
-            *_shown(exported),
+            *_list_presence_rules(rack),
+            *_list_export_rules(exported),
             # Let others measure this rack's clock: they cannot use messages of unknown age.
-            (OUT, SUBSCRIBE, [ping_key("*", own)]),
-            (IN, PUT, [ping_key("*", own)]),
+            (OUT, SUBSCRIBE, [ping_key("*", rack)]),
+            (IN, PUT, [ping_key("*", rack)]),
             (IN, SUBSCRIBE, [pong_key("*", "*")]),
-            (OUT, PUT, [pong_key(own, "*")]),
+            (OUT, PUT, [pong_key(rack, "*")]),
         ]
     for peer in dict.fromkeys([*table.racks, *table.estop_from]):
         rules = by_subject.setdefault(peer if is_known else ANYONE, [])
-        rules += _visible(own)
+        rules += _list_presence_rules(rack)
         if peer in table.racks:
-            rules += _exchange(own, peer, table)
+            rules += _list_exchange_rules(rack, peer, table)
         if peer in table.estop_from:
             rules += [
-                (OUT, ("declare_queryable",), [estop_key("*", own)]),
-                (IN, ("query",), [estop_key(peer, own)]),
-                (OUT, ("reply",), [estop_key(peer, own)]),
+                (OUT, ("declare_queryable",), [estop_key("*", rack)]),
+                (IN, ("query",), [estop_key(peer, rack)]),
+                (OUT, ("reply",), [estop_key(peer, rack)]),
             ]
-    return _configured(by_subject)
+    return _build_settings(by_subject)
 
 
-def _exchange(rack: str, peer: str, table: LanTable) -> list[Rule]:
+def _list_exchange_rules(rack: str, peer: str, table: LanTable) -> list[Rule]:
     """Return the rules for a rack with which this rack exchanges mailboxes."""
     imports = [
         out_key(peer, entry.mailbox) for entry in table.imports.values() if entry.rack == peer
@@ -93,23 +93,23 @@ def _exchange(rack: str, peer: str, table: LanTable) -> list[Rule]:
         (OUT, SUBSCRIBE, [*taken, ping_key("*", rack), pong_key("*", rack)]),
         (IN, PUT, taken),
         (IN, SUBSCRIBE, [ping_key("*", peer), pong_key("*", peer)]),
-        *_shown([*exports, step_key(rack), ping_key(rack, peer), pong_key(rack, peer)]),
+        *_list_export_rules([*exports, step_key(rack), ping_key(rack, peer), pong_key(rack, peer)]),
         (OUT, WATCH_TOKENS, [ALL_ALIVE, any_alive(peer)]),
         (IN, TOKEN, [any_alive(peer)]),
     ]
 
 
-def _shown(keys: Sequence[str]) -> list[Rule]:
+def _list_export_rules(keys: Sequence[str]) -> list[Rule]:
     """Return the rules for keys to which others may subscribe."""
     return [(IN, SUBSCRIBE, keys), (OUT, PUT, keys)] if keys else []
 
 
-def _visible(rack: str) -> list[Rule]:
+def _list_presence_rules(rack: str) -> list[Rule]:
     """Return the rules that let others see the liveliness tokens of this rack."""
     return [(IN, WATCH_TOKENS, [ALL_ALIVE, any_alive(rack)]), (OUT, TOKEN, [any_alive(rack)])]
 
 
-def _configured(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
+def _build_settings(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
     """Return the rules of each subject in the form that zenoh expects."""
     return {
         "enabled": True,

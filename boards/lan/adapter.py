@@ -21,9 +21,9 @@ from xxhash import xxh3_64_intdigest as xxh3
 from rack.backplane.layout import Layout
 from rack.backplane.message import Message, State, fill_counts
 from rack.backplane.segment import Segment
-from rack.backplane.words import Head, System, switch
+from rack.backplane.words import Head, System, encode_switch
 from rack.boards.host.adapter import STATUS, Adapter
-from rack.boards.host.entries import last_written
+from rack.boards.host.entries import read_last_written
 from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.entries import Export, Import
@@ -32,13 +32,13 @@ from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import RETRY_MS, LanLink
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import Peers
-from rack.boards.lan.remote_estop import Desk
+from rack.boards.lan.remote_estop import EstopResponder
 from rack.boards.lan.replayed import ReplayedNetwork
-from rack.boards.lan.status import status_of
-from rack.boards.wiring import Entries
+from rack.boards.lan.status import build_status_class
+from rack.boards.wiring import ExchangedEntries
 from rack.levels.errors import LevelError
-from rack.levels.level import Input, LevelContext, MadePorts, Output, TimedOutput
-from rack.levels.peer import PeerPresence, peer_port
+from rack.levels.level import ConfiguredPorts, Input, LevelContext, Output, TimedOutput
+from rack.levels.peer import PeerPresence, format_peer_port
 from rack.levels.tables import read_params
 
 _LAUNCH_MASK = (1 << 62) - 1
@@ -66,20 +66,22 @@ class LanAdapter(Adapter):
         self._replayed: ReplayedNetwork | None = None
 
     @classmethod
-    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+    def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the other racks and the operators who may set the emergency stop.
 
         Alarms refer to them by their index in this sequence.
         """
-        table = _table_in(params)
+        table = _read_table(params)
         return () if table is None else tuple(dict.fromkeys([*table.racks, *table.estop_from]))
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
+    def build_ports(
+        cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
+    ) -> ConfiguredPorts:
         """Return an input for each export, an output for each import and rack, and the status."""
-        table = _table_in(params)
+        table = _read_table(params)
         if table is None:
-            return MadePorts(is_whole=False)
+            return ConfiguredPorts(is_whole=False)
         known_exports = {
             port: entry for port, entry in table.exports.items() if entry.source in types
         }
@@ -88,26 +90,26 @@ class LanAdapter(Adapter):
         }
         # The status depends on the export of the same name, if there is one.
         rests_on = inputs.get(STATUS)
-        status = Output(status_of(table.exports, table.imports), rests_on=rests_on)
+        status = Output(build_status_class(table.exports, table.imports), rests_on=rests_on)
         outputs: dict[str, Output[Any]] = {STATUS: status}
         for port, entry in table.imports.items():
             try:
-                outputs[port] = TimedOutput(entry.message_class(), entry.max_age_ms * 1e-3)
+                outputs[port] = TimedOutput(entry.find_message_class(), entry.max_age_ms * 1e-3)
             except LookupError:
                 continue
         is_whole = len(known_exports) == len(table.exports) and len(outputs) == 1 + len(
             table.imports
         )
-        outputs |= {peer_port(rack): Output(PeerPresence) for rack in table.racks}
-        return MadePorts(inputs, outputs, is_whole)
+        outputs |= {format_peer_port(rack): Output(PeerPresence) for rack in table.racks}
+        return ConfiguredPorts(inputs, outputs, is_whole)
 
     @classmethod
-    def replayed(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
+    def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
         """Return the ports that are written in a replay. Only imports are sent one by one."""
         imports = read_params(LanTable, params).imports
-        return {port: port in imports for port in cls.made_ports(params, {}).outputs}
+        return {port: port in imports for port in cls.build_ports(params, {}).outputs}
 
-    def attach(self, segment: Segment, entries: Entries | None) -> None:
+    def attach_segment(self, segment: Segment, entries: ExchangedEntries | None) -> None:
         """Attach to the segment and continue from the state of the mailboxes.
 
         Args:
@@ -128,37 +130,37 @@ class LanAdapter(Adapter):
             (table.lease_ms + RETRY_MS[1]) * 1e6
         )
         for peer in self._peers:
-            last_presence, _ = last_written(segment, f"{board}.{peer_port(peer.rack)}")
+            last_presence, _ = read_last_written(segment, f"{board}.{format_peer_port(peer.rack)}")
             if last_presence is not None:
-                peer.resume(last_presence, confirm_by_tick)
+                peer.restore_state(last_presence, confirm_by_tick)
         self._imports = {
             port: Import(segment, f"{board}.{port}", entry, self._peers[entry.rack], self._grid)
             for port, entry in table.imports.items()
         }
         if entries is not None:
             self._replayed = ReplayedNetwork(segment, board, entries, self._peers, self._imports)
-            self._peers.watch(self._replayed.changes, is_lockstep=True)
+            self._peers.set_source(self._replayed.take_changes, is_lockstep=True)
             return
         self._clocks = Clocks(segment, self._peers, launch, self._grid)
         self._exports = {
             port: Export(segment, entry, launch, self._grid)
             for port, entry in table.exports.items()
         }
-        sender_names = self.names(self.context.params)
+        sender_names = self.list_names(self.context.params)
         subjects = {name: sender_names.index(name) for name in table.estop_from}
-        self._desk = Desk(segment, self._grid, subjects, self.findings)
-        status, tick = last_written(segment, f"{board}.{STATUS}")
+        self._desk = EstopResponder(segment, self._grid, subjects, self.findings)
+        status, tick = read_last_written(segment, f"{board}.{STATUS}")
         if status is not None:
             for port, export in self._exports.items():
-                export.resume(getattr(status, f"export_{port}"))
+                export.restore_counts(getattr(status, f"export_{port}"))
             for port, entry in self._imports.items():
-                entry.resume(getattr(status, f"import_{port}"), tick)
-            self._desk.resume(status.desk)
+                entry.restore_counts(getattr(status, f"import_{port}"), tick)
+            self._desk.restore_counts(status.desk)
             self._flaws = status.flaws.tolist()
         if self._grid.is_lockstep and table.racks:
-            self._barrier = Barrier(segment, board, table.racks, self._peers.lost)
+            self._barrier = Barrier(segment, board, table.racks, self._peers.lost_racks)
 
-    def open(self) -> None:
+    def open_connections(self) -> None:
         """Open the session. In a replay, do nothing.
 
         The session's threads inherit the core and the priority of the board.
@@ -169,7 +171,7 @@ class LanAdapter(Adapter):
         if self._replayed is not None:
             return
         self._link = link = LanLink(self._rack, self._table)
-        link.sealer.resume(self._flaws)
+        link.sealer.resume_counts(self._flaws)
         barrier = self._barrier
         # A step has one seal for everything that it contains.
         sealer = Sealer(most_bytes=self._table.most_bytes) if barrier else link.sealer
@@ -184,78 +186,78 @@ class LanAdapter(Adapter):
             # The previous adapter may have died before its last step had left the machine.
             if barrier.done >= 0:
                 for export in self._exports.values():
-                    export.recall(barrier.done, self.context.every)
-                barrier.prepare(barrier.done)
-        self._peers.watch(
-            link.watch_alive() if barrier is None else barrier.changes, barrier is not None
+                    export.resend_last(barrier.done, self.context.every)
+                barrier.prepare_step(barrier.done)
+        self._peers.set_source(
+            link.watch_tokens() if barrier is None else barrier.take_changes, barrier is not None
         )
         # The token comes last: a rack that sees it also sees all subscriptions and loses nothing.
-        link.declare_alive(self._launch, 0 if barrier is None else barrier.cycle_ns)
+        link.declare_token(self._launch, 0 if barrier is None else barrier.cycle_ns)
 
     def process(self, tick: int) -> None:
         """Exchange the messages that are due in this cycle."""
         if self._replayed is not None:
-            self._replayed.begin(tick)
-            self._look(tick)
-            self._replayed.give(self.ports, tick)
+            self._replayed.start_cycle(tick)
+            self._update_presence(tick)
+            self._replayed.write_recorded(self.ports, tick)
             return
         cycle = tick // self.context.every
         if self._barrier is None:
-            self._look(tick)
+            self._update_presence(tick)
         for export in self._exports.values():
             if cycle % export.every == 0:
-                export.exchange(tick)
+                export.send_newest(tick)
         if self._barrier is not None:
-            if not self._barrier.meet(tick):
+            if not self._barrier.exchange_steps(tick):
                 return
-            self._look(tick)
+            self._update_presence(tick)
         for port, entry in self._imports.items():
-            entry.look(tick)
+            entry.update_presence(tick)
             if cycle % entry.every == 0:
-                entry.exchange(self.ports[port], tick)
-        self._clocks.exchange()
-        self._desk.answer(tick)
-        self._report(tick)
+                entry.deliver_newest(self.ports[port], tick)
+        self._clocks.exchange_pings()
+        self._desk.answer_requests(tick)
+        self._write_status(tick)
 
-    def _look(self, tick: int) -> None:
+    def _update_presence(self, tick: int) -> None:
         """Update which racks are present, and set or clear the stop of the arm on a lost rack."""
         arrivals = self._peers.arrivals
-        self.findings += self._peers.look(tick)
-        must_stop = self._table.on_peer_loss == "stop" and bool(self._peers.lost)
+        self.findings += self._peers.update_presence(tick)
+        must_stop = self._table.on_peer_loss == "stop" and bool(self._peers.lost_racks)
         if must_stop != bool(self._words[System.PEER_STOP] & 1):
             # In lockstep, other boards and the clock may be ahead of `tick` within this cycle.
             since = tick + self.context.every if self._grid.is_lockstep else tick
-            self._words[System.PEER_STOP] = switch(since, must_stop)
+            self._words[System.PEER_STOP] = encode_switch(since, must_stop)
         if self._peers.arrivals != arrivals:
             for export in self._exports.values():
                 export.is_asked = True
 
-    def _report(self, tick: int) -> None:
+    def _write_status(self, tick: int) -> None:
         """Write the counters, the state of each rack and the reason for holding to the outputs."""
         status = self.ports[STATUS]
-        self._clocks.count(status.clocks)
+        self._clocks.write_counts(status.clocks)
         for port, export in self._exports.items():
-            export.fill(getattr(status, f"export_{port}"))
+            export.write_counts(getattr(status, f"export_{port}"))
         for port, entry in self._imports.items():
-            entry.fill(getattr(status, f"import_{port}"), tick)
-        self._desk.fill(status.desk)
+            entry.write_counts(getattr(status, f"import_{port}"), tick)
+        self._desk.write_counts(status.desk)
         for peer in self._peers:
-            out = self.ports[peer_port(peer.rack)]
-            self._clocks.fill(out, peer.rack, tick)
-            peer.fill(out, self._grid.is_lockstep)
+            out = self.ports[format_peer_port(peer.rack)]
+            self._clocks.write_clock(out, peer.rack, tick)
+            peer.write_presence(out, self._grid.is_lockstep)
         if self._link is not None and not self._grid.is_lockstep:
             fill_counts(status.flaws, self._link.sealer.flaws.values())
-        status.reason = reason = self._trouble(tick)
+        status.reason = reason = self._find_trouble(tick)
         status.state = State.HOLDING if reason else State.EXECUTING
 
-    def _trouble(self, tick: int) -> str:
+    def _find_trouble(self, tick: int) -> str:
         """Return the reason why the exchange is incomplete, or an empty string."""
         for peer in self._peers:
-            if not peer.is_there:
+            if not peer.is_present:
                 return f"rack '{peer.rack}' is {'lost' if peer.launches else 'not there yet'}"
             if len(peer.tokens) > 1:
                 return f"{len(peer.tokens)} racks are named '{peer.rack}'"
-            if self._clocks.is_unanswered(peer, tick):
+            if self._clocks.is_unmeasured(peer, tick):
                 return f"clock of rack '{peer.rack}' is not known: it does not answer pings"
         ports = [port for port, entry in self._imports.items() if entry.is_old(tick)]
         return f"'{self._table.imports[ports[0]].source}' is older than max_age_ms" if ports else ""
@@ -268,7 +270,7 @@ class LanAdapter(Adapter):
             self._link.close()
 
 
-def _table_in(params: Mapping[str, Any]) -> LanTable | None:
+def _read_table(params: Mapping[str, Any]) -> LanTable | None:
     """Return the table in the parameters, or None if they contain mistakes."""
     try:
         return read_params(LanTable, params)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from enum import IntEnum
 
 from rack.backplane.bounded_toml import load_toml
-from rack.backplane.checked import as_named, pick
+from rack.backplane.checked import select_item, to_enum
 from rack.backplane.errors import DamageError
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
@@ -19,7 +19,7 @@ GIVE_UP_S = 20.0
 _PLACES = 8
 
 
-class Why(IntEnum):
+class WaitReason(IntEnum):
     """Reasons for waiting for a rack."""
 
     UNSEEN = 0
@@ -28,26 +28,26 @@ class Why(IntEnum):
 
 
 _TEXTS = {
-    Why.UNSEEN: "it has not connected yet, or its config does not name this rack",
-    Why.SLOWER: "it is slower, or held",
-    Why.GONE: f"its adapter has ended; the rack counts as lost after {GIVE_UP_S:g} s",
+    WaitReason.UNSEEN: "it has not connected yet, or its config does not name this rack",
+    WaitReason.SLOWER: "it is slower, or held",
+    WaitReason.GONE: f"its adapter has ended; the rack counts as lost after {GIVE_UP_S:g} s",
 }
 
 
-def word_of(place: int, why: Why) -> int:
+def encode_wait(index: int, why: WaitReason) -> int:
     """Encode the rack that an adapter waits for and the reason.
 
     Args:
-        place: Index of the rack in `LanTable.racks`.
+        index: Index of the rack in `LanTable.racks`.
         why: Reason for waiting.
 
     Returns:
         A nonzero word for `Block.AWAITS`. Zero means that the adapter does not wait.
     """
-    return 1 + place + (why << _PLACES)
+    return 1 + index + (why << _PLACES)
 
 
-def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
+def find_waits(segment: Segment) -> Iterator[tuple[str, str]]:
     """Yield each adapter that waits for another rack, and a text with the rack and the reason.
 
     Raises:
@@ -55,7 +55,7 @@ def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
             not exist.
     """
     for task in segment.layout.tasks:
-        if word := segment.block(task.name)[Block.AWAITS]:
+        if word := segment.get_block(task.name)[Block.AWAITS]:
             # Imported late because the import is slow and most racks have no network.
             from rack.boards.lan.config import LanTable
 
@@ -65,5 +65,5 @@ def awaited(segment: Segment) -> Iterator[tuple[str, str]]:
                 raise DamageError(f"'{task.board}' waits for another rack and is no adapter")
             keys = {field.alias or name for name, field in LanTable.model_fields.items()}
             racks = LanTable.model_validate({key: table[key] for key in keys & table.keys()}).racks
-            rack = pick(racks, index, "rack")
-            yield task.board, f"waits for rack '{rack}': {_TEXTS[as_named(Why, why)]}"
+            rack = select_item(racks, index, "rack")
+            yield task.board, f"waits for rack '{rack}': {_TEXTS[to_enum(WaitReason, why)]}"

@@ -21,14 +21,14 @@ import numpy as np
 from rack.backplane.message import fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
+from rack.boards.lan.envelope import Envelope, Flaw, Sealer, compute_kind
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import ping_key, pong_key
-from rack.boards.lan.link import Arrived, LanLink
-from rack.boards.lan.peers import NONE, PeerRack, Peers
+from rack.boards.lan.link import LanLink, ReceivedMessage
+from rack.boards.lan.peers import NO_LAUNCH, PeerRack, Peers
 from rack.levels.peer import DRIFT_PPM
 
-RECENT = 32
+MAX_ROUND_TRIPS = 32
 """Number of recent round trips among which the best one is used."""
 PING_NS = 500_000_000
 EAGER_NS = 20_000_000
@@ -36,23 +36,23 @@ EAGER_NS = 20_000_000
 
 After `EAGER_ROUND_TRIPS` answers the interval is `PING_NS`.
 """
-EAGER = 8
-UNANSWERED = 64
+EAGER_ROUND_TRIPS = 8
+MAX_UNANSWERED = 64
 """Number of recent pings to a rack whose answers are accepted.
 
 A round trip may therefore take more than a second.
 """
 ANSWER_NS = 5_000_000
 """Shortest interval between two answers to one rack, so that a flood of pings is not answered."""
-MOST_ASKERS = 1024
+MAX_ASKERS = 1024
 """Maximum number of racks that get answers."""
-UNKNOWN_NS = 1_000_000_000
+REPORT_UNKNOWN_NS = 1_000_000_000
 """Time after which an unknown clock offset is reported."""
-UNREAD = 64
+MAX_UNREAD = 64
 """Maximum number of answers that wait for a cycle. A newer answer overwrites the oldest."""
 _PONG = Struct("<Q4q")
-_PING_KIND = kind_of("ping", 1, np.dtype([]))
-_PONG_KIND = kind_of("pong", 1, np.dtype([("launch", "<u8"), ("stamps", "<i8", 4)]))
+_PING_KIND = compute_kind("ping", 1, np.dtype([]))
+_PONG_KIND = compute_kind("pong", 1, np.dtype([("launch", "<u8"), ("stamps", "<i8", 4)]))
 
 
 class RoundTrip(NamedTuple):
@@ -67,7 +67,7 @@ class RoundTrip(NamedTuple):
     arrived: int
 
     @property
-    def lasted_ns(self) -> int:
+    def duration_ns(self) -> int:
         """Time that the ping and the answer spent on the network, both together."""
         return (self.arrived - self.sent) - (self.answered - self.received)
 
@@ -76,14 +76,14 @@ class RoundTrip(NamedTuple):
         """The other clock minus ours, assuming that both directions take equally long."""
         return (self.received - self.sent + self.answered - self.arrived) // 2
 
-    def uncertainty_ns(self, now_ns: int) -> int:
+    def compute_uncertainty_ns(self, now_ns: int) -> int:
         """Return the largest error of the offset at the time `now_ns` of our clock.
 
         It grows with the age of the measurement, because the clocks may drift apart.
         """
         # The 1 covers the rounding of two divisions by 2, here and in the offset.
         age_ns = max(0, now_ns - self.sent)
-        return self.lasted_ns // 2 + 1 + -(-age_ns * DRIFT_PPM // 1_000_000)
+        return self.duration_ns // 2 + 1 + -(-age_ns * DRIFT_PPM // 1_000_000)
 
 
 class ClockOffset:
@@ -99,29 +99,31 @@ class ClockOffset:
     """
 
     def __init__(self) -> None:
-        self._recent: deque[RoundTrip] = deque(maxlen=RECENT)
+        self._recent: deque[RoundTrip] = deque(maxlen=MAX_ROUND_TRIPS)
         self.best: RoundTrip | None = None
         self.steps = 0
 
     def __len__(self) -> int:
         return len(self._recent)
 
-    def add(self, trip: RoundTrip) -> bool:
+    def add_round_trip(self, trip: RoundTrip) -> bool:
         """Add a round trip. Return False if its stamps are impossible."""
-        if trip.lasted_ns < 0 or trip.arrived < trip.sent or trip.answered < trip.received:
+        if trip.duration_ns < 0 or trip.arrived < trip.sent or trip.answered < trip.received:
             return False
         now_ns = trip.arrived
         best = self.best
         if best is not None:
             difference_ns = abs(trip.offset_ns - best.offset_ns)
-            if difference_ns > trip.uncertainty_ns(now_ns) + best.uncertainty_ns(now_ns):
+            if difference_ns > trip.compute_uncertainty_ns(now_ns) + best.compute_uncertainty_ns(
+                now_ns
+            ):
                 self._recent.clear()
                 self.steps += 1
         self._recent.append(trip)
-        self.best = min(self._recent, key=lambda recent: recent.uncertainty_ns(now_ns))
+        self.best = min(self._recent, key=lambda recent: recent.compute_uncertainty_ns(now_ns))
         return True
 
-    def forget(self) -> None:
+    def discard_round_trips(self) -> None:
         """Discard all round trips."""
         self._recent.clear()
         self.best = None
@@ -148,12 +150,12 @@ class PeerClock:
     offset: ClockOffset = field(default_factory=ClockOffset)
     sent: dict[int, int] = field(default_factory=dict)
     due_ns: int = 0
-    met: tuple[int, int] = (NONE, 0)
+    met: tuple[int, int] = (NO_LAUNCH, 0)
     epoch_ns: int = 0
     period_ns: int = 1
     clock_ns: int = 0
 
-    def begin(self) -> None:
+    def discard_if_outdated(self) -> None:
         """Discard measurements that were made before a new launch or a loss of the rack."""
         met = (self.peer.launch, self.peer.losses)
         if met != self.met:
@@ -161,10 +163,10 @@ class PeerClock:
             self.due_ns = 0
             self.epoch_ns = 0
             self.clock_ns = 0
-            self.offset.forget()
+            self.offset.discard_round_trips()
             self.sent.clear()
 
-    def time_ns(self, stamp_ns: int) -> int:
+    def to_simulated_ns(self, stamp_ns: int) -> int:
         """Convert a CLOCK_MONOTONIC stamp of the other machine to the rack's simulated time, ns.
 
         Returns:
@@ -195,7 +197,7 @@ class Clocks:
         self._launch = launch
         self._grid = grid
         self._clocks = {peer.rack: PeerClock(peer) for peer in peers}
-        self._arrived: deque[tuple[int, Arrived]] = deque(maxlen=UNREAD)
+        self._arrived: deque[tuple[int, ReceivedMessage]] = deque(maxlen=MAX_UNREAD)
         self.taken = self.answered = self.withheld = self.refused = 0
         self._put: dict[str, Any] = {}
         self._again: dict[str, int] = {}
@@ -211,24 +213,24 @@ class Clocks:
             return
         self._link = link
         self._sealer = sealer
-        link.on(ping_key("*", self._rack), self._on_ping)
+        link.call_on_arrival(ping_key("*", self._rack), self._answer_ping)
         # Appending a tuple to a deque is atomic, so no lock is needed.
-        link.on(
+        link.call_on_arrival(
             pong_key("*", self._rack), lambda pong: self._arrived.append((monotonic_ns(), pong))
         )
         for rack, clock in self._clocks.items():
             clock.put = link.publish(ping_key(self._rack, rack))
 
-    def _on_ping(self, ping: Arrived) -> None:
+    def _answer_ping(self, ping: ReceivedMessage) -> None:
         """Answer a ping, unless it is malformed or too early. Called in a thread of zenoh."""
         received = monotonic_ns()
         asker = ping.key.split("/")[1]
         with self._lock:
             next_ns = self._again.get(asker)
-            if received < (next_ns or 0) or (next_ns is None and len(self._again) == MOST_ASKERS):
+            if received < (next_ns or 0) or (next_ns is None and len(self._again) == MAX_ASKERS):
                 self.withheld += 1
                 return
-            head = self._sealer.opened(*ping)
+            head = self._sealer.open_message(*ping)
             if isinstance(head, Flaw) or head.kind != _PING_KIND:
                 self.refused += 1
                 return
@@ -245,39 +247,39 @@ class Clocks:
             )
             self._put[asker](content, self._sealer.seal(key, pong, content))
 
-    def exchange(self) -> None:
+    def exchange_pings(self) -> None:
         """Process the answers that have arrived and send the pings that are due."""
         if self._grid.is_lockstep:
             return
         for clock in self._clocks.values():
-            clock.begin()
+            clock.discard_if_outdated()
         for _ in range(len(self._arrived)):
-            if self._is_taken(*self._arrived.popleft()):
+            if self._accept_answer(*self._arrived.popleft()):
                 self.taken += 1
             else:
                 with self._lock:
                     self.refused += 1
         self._now_ns = now_ns = monotonic_ns()
         for rack, clock in self._clocks.items():
-            if clock.peer.is_there and now_ns >= clock.due_ns:
-                self._ask(rack, clock, now_ns)
+            if clock.peer.is_present and now_ns >= clock.due_ns:
+                self._send_ping(rack, clock, now_ns)
             best = clock.offset.best
             clock.peer.offset_ns = None if best is None else best.offset_ns
-            clock.peer.uncertainty_ns = 0 if best is None else best.uncertainty_ns(now_ns)
+            clock.peer.uncertainty_ns = 0 if best is None else best.compute_uncertainty_ns(now_ns)
 
-    def _ask(self, rack: str, clock: PeerClock, now_ns: int) -> None:
+    def _send_ping(self, rack: str, clock: PeerClock, now_ns: int) -> None:
         """Send a ping and schedule the next one."""
-        clock.due_ns = now_ns + (PING_NS if len(clock.offset) >= EAGER else EAGER_NS)
+        clock.due_ns = now_ns + (PING_NS if len(clock.offset) >= EAGER_ROUND_TRIPS else EAGER_NS)
         self._serial += 1
-        while len(clock.sent) >= UNANSWERED:
+        while len(clock.sent) >= MAX_UNANSWERED:
             del clock.sent[next(iter(clock.sent))]
         clock.sent[self._serial] = sent_ns = monotonic_ns()
         head = Envelope(_PING_KIND, self._launch, self._serial, self._serial, 0, 0, sent_ns)
         clock.put(b"", self._sealer.seal(ping_key(self._rack, rack), head, b""))
 
-    def _is_taken(self, arrived_ns: int, pong: Arrived) -> bool:
+    def _accept_answer(self, arrived_ns: int, pong: ReceivedMessage) -> bool:
         """Process an answer. Return False if it is damaged or answers no ping of ours."""
-        head = self._sealer.opened(*pong)
+        head = self._sealer.open_message(*pong)
         if isinstance(head, Flaw) or head.kind != _PONG_KIND or len(pong.payload) != _PONG.size:
             return False
         clock = self._clocks.get(pong.key.split("/")[1])
@@ -290,7 +292,7 @@ class Clocks:
         ):
             return False
         sent = clock.sent.pop(head.serial, None)
-        if sent is None or not clock.offset.add(
+        if sent is None or not clock.offset.add_round_trip(
             RoundTrip(sent, received_ns, head.stamp_ns, arrived_ns)
         ):
             return False
@@ -299,19 +301,19 @@ class Clocks:
         clock.clock_ns = clock_ns
         return True
 
-    def is_unanswered(self, peer: PeerRack, tick: int) -> bool:
+    def is_unmeasured(self, peer: PeerRack, tick: int) -> bool:
         """Return True if the clock of a present rack has not been measured for too long.
 
         The messages of such a rack are held back, because their age is unknown.
         """
-        is_unknown = peer.is_there and peer.offset_ns is None and not self._grid.is_lockstep
-        return is_unknown and tick - peer.since > self._grid.ticks_in(UNKNOWN_NS)
+        is_unknown = peer.is_present and peer.offset_ns is None and not self._grid.is_lockstep
+        return is_unknown and tick - peer.since > self._grid.ticks_in(REPORT_UNKNOWN_NS)
 
-    def count(self, record: Any) -> None:
+    def write_counts(self, record: Any) -> None:
         """Write the counters into the group of a status."""
         fill_counts(record, (self.taken, self.answered, self.withheld, self.refused))
 
-    def fill(self, out: Any, rack: str, tick: int) -> None:
+    def write_clock(self, out: Any, rack: str, tick: int) -> None:
         """Write what is known of a rack's clock into its mailbox.
 
         Args:
@@ -327,8 +329,8 @@ class Clocks:
             out.uncertainty = out.round_trip = 0.0 if self._grid.is_lockstep else -1.0
             return
         out.offset = best.offset_ns * 1e-9
-        out.round_trip = best.lasted_ns * 1e-9
-        out.uncertainty = best.uncertainty_ns(self._now_ns) * 1e-9
-        theirs = clock.time_ns(self._grid.stamp_ns(tick) + best.offset_ns)
+        out.round_trip = best.duration_ns * 1e-9
+        out.uncertainty = best.compute_uncertainty_ns(self._now_ns) * 1e-9
+        theirs = clock.to_simulated_ns(self._grid.stamp_ns(tick) + best.offset_ns)
         out.ahead = (theirs - self._grid.time_ns(tick)) * 1e-9
         out.speed = clock.clock_ns / clock.period_ns

@@ -9,12 +9,12 @@ from pydantic import Field, StringConstraints
 
 from rack.backplane.message import Message
 from rack.backplane.rack_name import RACK_NAME
-from rack.levels.references import module_and_name
+from rack.levels.references import import_reference
 from rack.levels.tables import Positive, Table
 
 FASTEST_HZ = 50.0
 """Highest rate of an exchange over a network."""
-MOST_CHAIN = 8192
+MAX_CHAIN_BYTES = 8192
 """Maximum size of a rack's certificates in DER form, bytes. They are sent with every seal."""
 MessageKind = type[Message]
 OnPeerLoss = Literal["hold", "stop", "go on"]
@@ -30,7 +30,7 @@ ENDPOINT_NOTE = (
 )
 
 
-class Credential(Exception):
+class CredentialError(Exception):
     """A credential file that cannot be used.
 
     Attributes:
@@ -75,13 +75,13 @@ class ImportConfig(Table):
         """Name of the mailbox in that rack."""
         return self.source.partition("/")[2]
 
-    def message_class(self) -> MessageKind:
+    def find_message_class(self) -> MessageKind:
         """Import the message class.
 
         Raises:
             LookupError: The module or the class does not exist, or the class is not a message.
         """
-        module, name = module_and_name(self.type)
+        module, name = import_reference(self.type)
         message_class = getattr(module, name, None)
         if not (isinstance(message_class, type) and issubclass(message_class, Message)):
             raise LookupError(f"module '{module.__name__}' has no message class '{name}'")

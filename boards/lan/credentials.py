@@ -47,13 +47,13 @@ from cryptography.x509.verification import (
 )
 
 from rack.backplane.regular_file import read_regular_file
-from rack.boards.lan.config import MOST_CHAIN, Credential
+from rack.boards.lan.config import MAX_CHAIN_BYTES, CredentialError
 
 AUTHORITY = "authority.pem"
 MAX_CREDENTIAL_BYTES = 100_000
-MOST_KNOWN = 1024
+MAX_REMEMBERED = 1024
 """Maximum number of senders whose checked certificates are remembered."""
-OTHERS = stat.S_IRWXG | stat.S_IRWXO
+OTHERS_MODE = stat.S_IRWXG | stat.S_IRWXO
 OWNER_ONLY = 0o600
 MINUTE = "%Y-%m-%d %H:%M"
 _ALGORITHM = ECDSA(Prehashed(SHA256()))
@@ -65,7 +65,7 @@ class KeyPair(NamedTuple):
     chain: bytes
     key: EllipticCurvePrivateKey
 
-    def sign(self, digest: bytes) -> bytes:
+    def sign_digest(self, digest: bytes) -> bytes:
         """Return the signature of a digest of 32 bytes."""
         return self.key.sign(digest, _ALGORITHM)
 
@@ -104,21 +104,22 @@ class Credentials:
         self._known: dict[bytes, Identity] = {}
 
     @cached_property
-    def pair(self) -> KeyPair:
+    def key_pair(self) -> KeyPair:
         """Certificates and key with which the rack seals. Raises `CredentialError`."""
         chain = load_certificates(self.certificate)
         content = b"".join(certificate.public_bytes(Encoding.DER) for certificate in chain)
-        if len(content) > MOST_CHAIN:
-            raise Credential(
+        if len(content) > MAX_CHAIN_BYTES:
+            raise CredentialError(
                 self.certificate,
-                f"the certificates have {len(content)} bytes; at most {MOST_CHAIN} are allowed",
+                f"the certificates have {len(content)} bytes; at most {MAX_CHAIN_BYTES} "
+                "are allowed",
             )
         key = load_private_key(self.key)
         if key.public_key() != chain[0].public_key():
-            raise Credential(self.key, f"the key does not belong to {self.certificate.name}")
+            raise CredentialError(self.key, f"the key does not belong to {self.certificate.name}")
         return KeyPair(content, key)
 
-    def identity(self, chain: bytes) -> Identity | None:
+    def identify_sender(self, chain: bytes) -> Identity | None:
         """Return the identity in certificates that arrived with a seal.
 
         Returns:
@@ -129,20 +130,20 @@ class Credentials:
         """
         identity = self._known.get(chain)
         if identity is None:
-            if (identity := _identified(chain, self._authorities)) is None:
+            if (identity := _identify_chain(chain, self._authority_certificates)) is None:
                 return None
-            if len(self._known) >= MOST_KNOWN:
+            if len(self._known) >= MAX_REMEMBERED:
                 self._known.clear()
             self._known[chain] = identity
         return identity if datetime.now(UTC) < identity.expires else None
 
     @cached_property
-    def _authorities(self) -> list[Certificate]:
+    def _authority_certificates(self) -> list[Certificate]:
         """Certificates of the authority."""
         return load_certificates(self.authority)
 
     @property
-    def expires(self) -> datetime:
+    def expiry_time(self) -> datetime:
         """Time at which the first of the certificates expires. Raises `CredentialError`."""
         return min(
             certificate.not_valid_after_utc
@@ -150,7 +151,7 @@ class Credentials:
             for certificate in load_certificates(path)
         )
 
-    def flaws(self, addresses: Iterable[str] = ()) -> Iterator[Credential]:
+    def find_flaws(self, addresses: Iterable[str] = ()) -> Iterator[CredentialError]:
         """Yield what is wrong with each file at present.
 
         Args:
@@ -161,43 +162,45 @@ class Credentials:
         for path in certificates:
             try:
                 certificates[path] = load_certificates(path)
-            except Credential as flaw:
+            except CredentialError as flaw:
                 yield flaw
         authorities, chain = certificates.values()
         if chain:
-            if (name := _common_name(chain[0])) != self.rack:
-                yield Credential(
+            if (name := _read_common_name(chain[0])) != self.rack:
+                yield CredentialError(
                     self.certificate,
                     f"the certificate is for '{name}' instead of rack '{self.rack}'",
                 )
-            if authorities and not _path(chain, authorities):
-                yield Credential(
+            if authorities and not _find_trust_path(chain, authorities):
+                yield CredentialError(
                     self.certificate, f"the certificate is not signed by {self.authority.name}"
                 )
-            certified = _addresses(chain[0])
+            certified = _list_addresses(chain[0])
             if missing := [address for address in addresses if address not in certified]:
                 why = f"the certificate is not valid for address {', '.join(missing)}"
-                yield Credential(
+                yield CredentialError(
                     self.certificate, f"{why}; valid addresses: {', '.join(certified) or 'none'}"
                 )
         try:
-            _ = self.pair if chain else load_private_key(self.key)
-        except Credential as flaw:
+            _ = self.key_pair if chain else load_private_key(self.key)
+        except CredentialError as flaw:
             yield flaw
 
 
-def _content(path: Path, is_private: bool = False) -> bytes:
+def _read_credential(path: Path, is_private: bool = False) -> bytes:
     """Return the content of a credential file. A private one must be readable by its owner only."""
     try:
-        if is_private and (mode := stat.S_IMODE(path.stat().st_mode)) & OTHERS:
-            raise Credential(
+        if is_private and (mode := stat.S_IMODE(path.stat().st_mode)) & OTHERS_MODE:
+            raise CredentialError(
                 path, f"mode {mode:04o} lets others read it; it must be {OWNER_ONLY:04o}"
             )
         return read_regular_file(path, MAX_CREDENTIAL_BYTES)
     except FileNotFoundError:
-        raise Credential(path, "the file is missing; see rack lan certificates --help") from None
+        raise CredentialError(
+            path, "the file is missing; see rack lan certificates --help"
+        ) from None
     except OSError as error:
-        raise Credential(path, f"cannot be read: {error.strerror}") from None
+        raise CredentialError(path, f"cannot be read: {error.strerror}") from None
 
 
 def load_certificates(path: Path) -> list[Certificate]:
@@ -207,11 +210,11 @@ def load_certificates(path: Path) -> list[Certificate]:
         CredentialError: The file cannot be read, or a certificate is malformed, expired or not yet
             valid.
     """
-    content = _content(path)
+    content = _read_credential(path)
     try:
         certificates = load_pem_x509_certificates(content)
     except (ValueError, InvalidVersion):
-        raise Credential(path, "the file contains no certificate in PEM form") from None
+        raise CredentialError(path, "the file contains no certificate in PEM form") from None
     now_utc = datetime.now(UTC)
     for certificate in certificates:
         first, last = certificate.not_valid_before_utc, certificate.not_valid_after_utc
@@ -221,7 +224,7 @@ def load_certificates(path: Path) -> list[Certificate]:
                 if now_utc < first
                 else f"the certificate expired on {last:{MINUTE}}"
             )
-            raise Credential(path, f"{why} UTC")
+            raise CredentialError(path, f"{why} UTC")
     return certificates
 
 
@@ -231,15 +234,15 @@ def load_private_key(path: Path) -> EllipticCurvePrivateKey:
     Raises:
         CredentialError: The file cannot be read or its key cannot be used.
     """
-    content = _content(path, is_private=True)
+    content = _read_credential(path, is_private=True)
     try:
         key = load_pem_private_key(content, None)
     except TypeError:
-        raise Credential(path, "the key is encrypted; it must have no password") from None
+        raise CredentialError(path, "the key is encrypted; it must have no password") from None
     except (ValueError, UnsupportedAlgorithm):
-        raise Credential(path, "the file contains no private key in PEM form") from None
+        raise CredentialError(path, "the file contains no private key in PEM form") from None
     if not isinstance(key, EllipticCurvePrivateKey) or not _is_p256(key.public_key()):
-        raise Credential(path, "the key is of another kind; it must be on the curve P-256")
+        raise CredentialError(path, "the key is of another kind; it must be on the curve P-256")
     return key
 
 
@@ -248,7 +251,7 @@ def _is_p256(key: object) -> TypeGuard[EllipticCurvePublicKey]:
     return isinstance(key, EllipticCurvePublicKey) and isinstance(key.curve, SECP256R1)
 
 
-def _identified(chain: bytes, authorities: list[Certificate]) -> Identity | None:
+def _identify_chain(chain: bytes, authorities: list[Certificate]) -> Identity | None:
     """Return the identity in a chain of DER certificates, or None if no authority signed it."""
     certificates = []
     try:
@@ -257,8 +260,8 @@ def _identified(chain: bytes, authorities: list[Certificate]) -> Identity | None
             size = 4 + int.from_bytes(chain[2:4], "big")
             certificates.append(load_der_x509_certificate(chain[:size]))
             chain = chain[size:]
-        trusted = _path(certificates, authorities)
-        name = _common_name(certificates[0])
+        trusted = _find_trust_path(certificates, authorities)
+        name = _read_common_name(certificates[0])
         key = certificates[0].public_key()
     except Exception:
         # The bytes come from a stranger, and the parser may raise undocumented exceptions.
@@ -269,13 +272,13 @@ def _identified(chain: bytes, authorities: list[Certificate]) -> Identity | None
     return Identity(name, key, expires)
 
 
-def _common_name(certificate: Certificate) -> str:
+def _read_common_name(certificate: Certificate) -> str:
     """Return the common name of a certificate, or an empty string."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
 
 
-def _addresses(certificate: Certificate) -> list[str]:
+def _list_addresses(certificate: Certificate) -> list[str]:
     """Return the addresses and host names for which a certificate is valid."""
     try:
         alternatives = certificate.extensions.get_extension_for_class(SubjectAlternativeName).value
@@ -287,7 +290,7 @@ def _addresses(certificate: Certificate) -> list[str]:
     ]
 
 
-def _path(chain: list[Certificate], authorities: list[Certificate]) -> list[Certificate]:
+def _find_trust_path(chain: list[Certificate], authorities: list[Certificate]) -> list[Certificate]:
     """Return the certificates from the first of a chain up to an authority.
 
     Returns:

@@ -15,7 +15,7 @@ UNIX = "unix"
 _SHAPE = re.compile(r"(tcp|tls|quic)/(\[[0-9a-fA-F:.]+\]|[A-Za-z0-9._-]+):([0-9]{1,5})", re.ASCII)
 _OWN = re.compile(rf"{UNIX}/({RACK_NAME})")
 _NUMBERS = re.compile(r"[0-9.]*")
-PERMITTED = (
+VALID_ENDPOINTS = (
     "it must be tcp/, tls/ or quic/ with an address or host name and a port from 1 to 65535, or"
     " unix/ with a name"
 )
@@ -33,7 +33,7 @@ class Endpoint(NamedTuple):
     port: int
 
     @classmethod
-    def of(cls, text: str) -> Endpoint:
+    def from_text(cls, text: str) -> Endpoint:
         """Parse an endpoint.
 
         Raises:
@@ -43,14 +43,14 @@ class Endpoint(NamedTuple):
             return cls(UNIX, socket[1], 0)
         match = _SHAPE.fullmatch(text)
         if match is None or not 0 < int(match[3]) <= 65535:
-            raise ValueError(PERMITTED)
+            raise ValueError(VALID_ENDPOINTS)
         host = match[2].strip("[]")
         # Reject incomplete addresses: resolvers would accept 127.1 or 300 as an address.
         if ":" in host or _NUMBERS.fullmatch(host):
             try:
                 ip_address(host)
             except ValueError:
-                raise ValueError(f"'{host}' is not an address; {PERMITTED}") from None
+                raise ValueError(f"'{host}' is not an address; {VALID_ENDPOINTS}") from None
         return cls(match[1], host, int(match[3]))
 
     def __str__(self) -> str:
@@ -77,22 +77,22 @@ class Endpoint(NamedTuple):
         return self.host == "localhost"
 
     @property
-    def is_everywhere(self) -> bool:
+    def is_wildcard(self) -> bool:
         """Whether it stands for all addresses of the machine."""
         with suppress(ValueError):
             return ip_address(self.host).is_unspecified
         return False
 
 
-def endpoints_of(table: LanTable) -> list[Endpoint]:
+def list_endpoints(table: LanTable) -> list[Endpoint]:
     """Return the endpoints of a table. Malformed ones are left out; the rules report them."""
     endpoints = []
     for text in (*table.listen, *table.connect):
         with suppress(ValueError):
-            endpoints.append(Endpoint.of(text))
+            endpoints.append(Endpoint.from_text(text))
     return endpoints
 
 
 def has_tls(table: LanTable) -> bool:
     """Return True if an endpoint uses TLS, so that others are known by their certificates."""
-    return any(endpoint.has_tls for endpoint in endpoints_of(table))
+    return any(endpoint.has_tls for endpoint in list_endpoints(table))

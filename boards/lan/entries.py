@@ -7,31 +7,31 @@ from typing import Any
 
 from rack.backplane.mailbox.host_ring import is_proper
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.message import AnyMessage, fill_counts
 from rack.backplane.segment import Segment
-from rack.backplane.words import Box, switch
+from rack.backplane.words import Box, encode_switch
 from rack.boards.host.entries import NEVER
 from rack.boards.lan.config import ExportConfig, ImportConfig
-from rack.boards.lan.envelope import Envelope, Flaw, Sealer, kind_of
+from rack.boards.lan.envelope import Envelope, Flaw, Sealer, compute_kind
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
-from rack.boards.lan.link import Arrived, LanLink
+from rack.boards.lan.link import LanLink, ReceivedMessage
 from rack.boards.lan.lockstep import Barrier
-from rack.boards.lan.peers import NONE, PeerRack
+from rack.boards.lan.peers import NO_LAUNCH, PeerRack
 from rack.boards.lan.status import LanExport, LanImport, zero_counts
 from rack.levels.ports import Sender
 
-LARGEST = 1 << 62
+NUMBER_LIMIT = 1 << 62
 """Exclusive upper limit of valid launch, serial and message numbers. Larger values are forged."""
 
 
-WINDOW = 64
+WINDOW_MESSAGES = 64
 """Number of recent message numbers whose arrival is remembered."""
-_WHOLE = (1 << WINDOW) - 1
+_WHOLE = (1 << WINDOW_MESSAGES) - 1
 
 
-class MessageOrder:
+class SequenceTracker:
     """Tracks the message numbers of one import and counts gaps, repeats and late arrivals.
 
     Attributes:
@@ -41,15 +41,15 @@ class MessageOrder:
 
     def __init__(self, count: LanImport) -> None:
         self.count = count
-        self.launch = NONE
-        self._came = 0  # bit n is set if message `number` - n has arrived
+        self.launch = NO_LAUNCH
+        self._arrived = 0  # bit n is set if message `number` - n has arrived
 
-    def resume(self) -> None:
+    def resume_from_counts(self) -> None:
         """Continue after the newest message in the counters. All earlier ones count as arrived."""
         self.launch = self.count.launch
-        self._came = _WHOLE
+        self._arrived = _WHOLE
 
-    def admits(self, head: Envelope) -> bool:
+    def accept_message(self, head: Envelope) -> bool:
         """Record a message and decide whether it should be delivered.
 
         Returns:
@@ -60,23 +60,23 @@ class MessageOrder:
         if head.launch != self.launch:
             # After a restart in lockstep, which records no launches, it is the same launch.
             # Otherwise it is a new one, whose messages before this one do not count as missing.
-            if self.launch != NONE or not count.serial:
+            if self.launch != NO_LAUNCH or not count.serial:
                 count.number = head.number
                 count.serial = 0
-                self._came = 0
+                self._arrived = 0
             self.launch = head.launch
         # A restarted sender may use a number twice, so the serial decides what is newer.
         step = head.number - count.number
         if head.serial <= count.serial:
-            bit = 1 << min(max(0, -step), WINDOW)
-            if head.serial == count.serial or self._came & bit:
+            bit = 1 << min(max(0, -step), WINDOW_MESSAGES)
+            if head.serial == count.serial or self._arrived & bit:
                 count.repeated += 1
             else:
                 count.disordered += 1
-                self._came |= bit & _WHOLE
+                self._arrived |= bit & _WHOLE
             return False
         count.missing += max(0, step - 1)
-        self._came = (self._came << min(max(0, step), WINDOW) | 1) & _WHOLE
+        self._arrived = (self._arrived << min(max(0, step), WINDOW_MESSAGES) | 1) & _WHOLE
         count.number = head.number
         count.serial = head.serial
         return True
@@ -95,16 +95,18 @@ class Export:
     def __init__(self, segment: Segment, table: ExportConfig, launch: int, grid: OwnGrid) -> None:
         self._source = open_observer(segment, table.source)
         spec = self._source.spec
-        self._kind = kind_of(spec.message, spec.version, message_dtype(spec.fields, spec.size))
+        self._kind = compute_kind(
+            spec.message, spec.version, build_message_dtype(spec.fields, spec.size)
+        )
         self._launch = launch
         self._key = out_key(segment.rack, table.source)
         self._grid = grid
-        self.every = grid.cycles(table.rate_hz)
+        self.every = grid.compute_period_cycles(table.rate_hz)
         self.is_asked = False
         self.count = zero_counts(LanExport)
         self._put: Callable[[bytes, bytes], None]
 
-    def resume(self, record: Any) -> None:
+    def restore_counts(self, record: Any) -> None:
         """Restore the counters from the status of the previous adapter."""
         self.count.record[...] = record
 
@@ -113,30 +115,30 @@ class Export:
         self._put = carrier.publish(self._key)
         self._sealer = sealer
 
-    def recall(self, tick: int, ticks: int) -> None:
+    def resend_last(self, tick: int, cycle_ticks: int) -> None:
         """Repeat the message that the previous adapter sent at `tick`, if it sent one.
 
         Args:
             tick: Release of the last cycle of the previous adapter.
-            ticks: Length of the adapter's cycle in ticks.
+            cycle_ticks: Length of the adapter's cycle in ticks.
         """
-        if (tick // ticks) % self.every:
+        if (tick // cycle_ticks) % self.every:
             return
-        self._source.read(tick - self.every * ticks)
+        self._source.read(tick - self.every * cycle_ticks)
         previous_serial = self._source.serial
         self._source.read(tick)
         if self._source.serial == self.count.serial != previous_serial:
             self.count.sent -= 1
             self.count.serial = previous_serial
-            self.exchange(tick)
+            self.send_newest(tick)
 
-    def exchange(self, tick: int) -> None:
+    def send_newest(self, tick: int) -> None:
         """Send the newest message if it is new or if a rack that joined needs it."""
         # The reading of the port is not used, because it has no serial and no time of writing.
         source = self._source
         grid = self._grid
         reading = source.read(tick)
-        if not reading.is_there:
+        if not reading.has_message:
             return
         count = self.count
         if source.serial != count.serial:
@@ -151,7 +153,7 @@ class Export:
         head = Envelope(self._kind, self._launch, count.serial, count.sent, *times)
         self._put(payload, self._sealer.seal(self._key, head, payload))
 
-    def fill(self, record: Any) -> None:
+    def write_counts(self, record: Any) -> None:
         """Write the counters into the group of a status."""
         fill_counts(record, self.count.record.item())
 
@@ -169,35 +171,35 @@ class Import:
     """
 
     def __init__(
-        self, segment: Segment, own: str, table: ImportConfig, peer: PeerRack, grid: OwnGrid
+        self, segment: Segment, mailbox: str, table: ImportConfig, peer: PeerRack, grid: OwnGrid
     ) -> None:
-        spec = segment.layout.mailbox(own)
-        dtype = message_dtype(spec.fields, spec.size)
-        self._kind = kind_of(spec.message, spec.version, dtype)
+        spec = segment.layout.find_mailbox(mailbox)
+        dtype = build_message_dtype(spec.fields, spec.size)
+        self._kind = compute_kind(spec.message, spec.version, dtype)
         self._buffer = AnyMessage(dtype)
         self._key = out_key(table.rack, table.mailbox)
         self._fields = spec.fields
         self._max_age = spec.max_age
         self._delay = spec.delay
         self._peer = peer
-        self._box = segment.box(own)
-        self._word = int(Box.KEPT if peer.goes_on else Box.VOID)
+        self._box = segment.get_box(mailbox)
+        self._word = int(Box.KEPT if peer.keeps_messages else Box.VOID)
         self._is_away = bool(self._box[self._word] & 1)
         self._losses = peer.losses
         self._grid = grid
-        self.every = grid.cycles(table.rate_hz)
+        self.every = grid.compute_period_cycles(table.rate_hz)
         self._basis: int | None = None
         # Newest message that arrived before it could be accepted, with the tick of its arrival.
-        self._early: list[tuple[int, Arrived]] = []
+        self._early: list[tuple[int, ReceivedMessage]] = []
         self.count = zero_counts(LanImport)
-        self._order = MessageOrder(self.count)
-        self._arrived: Callable[[], Iterator[Arrived]]
+        self._order = SequenceTracker(self.count)
+        self._arrived: Callable[[], Iterator[ReceivedMessage]]
 
-    def resume(self, record: Any, tick: int) -> None:
+    def restore_counts(self, record: Any, tick: int) -> None:
         """Restore the state from the status that the previous adapter wrote at `tick`."""
         count = self.count
         count.record[...] = record
-        self._order.resume()
+        self._order.resume_from_counts()
         self._basis = None if count.age == NEVER else tick - count.age
 
     def open(self, carrier: LanLink | Barrier, sealer: Sealer) -> None:
@@ -209,24 +211,24 @@ class Import:
         """Return True if the newest message is older than its maximum age."""
         return self._basis is not None and tick - self._basis > self._max_age
 
-    def look(self, tick: int) -> None:
+    def update_presence(self, tick: int) -> None:
         """Mark the mailbox as away if its rack was lost since the last call."""
         if self._peer.losses != self._losses:
             self._losses = self._peer.losses
             if not self._is_away:
-                self._switch(True, tick + self._delay if self._grid.is_lockstep else tick)
+                self._set_away(True, tick + self._delay if self._grid.is_lockstep else tick)
 
-    def comes(self, tick: int) -> None:
+    def mark_present(self, tick: int) -> None:
         """Let readers use the mailbox again, from the message that is written in this cycle."""
         if self._is_away:
-            self._switch(False, tick + self._delay)
+            self._set_away(False, tick + self._delay)
 
-    def _switch(self, is_away: bool, tick: int) -> None:
+    def _set_away(self, is_away: bool, tick: int) -> None:
         """Mark the mailbox as away, or as back, from `tick` on."""
         self._is_away = is_away
-        self._box[self._word] = switch(tick, is_away)
+        self._box[self._word] = encode_switch(tick, is_away)
 
-    def exchange(self, out: Sender[AnyMessage], tick: int) -> None:
+    def deliver_newest(self, out: Sender[AnyMessage], tick: int) -> None:
         """Process the messages that have arrived and write the newest good one.
 
         Args:
@@ -237,17 +239,17 @@ class Import:
         self._early = []
         newest: Envelope | None = None
         for arrival_tick, arrived in waiting:
-            head = self._opened(arrived)
+            head = self._open_message(arrived)
             if (
                 head is not None
-                and self._is_due(head, arrived, arrival_tick, tick)
-                and self._is_next(head, arrived.payload)
+                and self._is_acceptable(head, arrived, arrival_tick, tick)
+                and self._keep_if_newest(head, arrived.payload)
             ):
                 self.count.superseded += newest is not None
                 newest = head
         if newest is None:
             return
-        basis = self._grid.tick_of(newest, self._peer, tick)
+        basis = self._grid.to_local_tick(newest, self._peer, tick)
         if tick - basis > self._max_age:
             self.count.late += 1
             return
@@ -256,25 +258,27 @@ class Import:
         out.message.raw[:] = self._buffer.raw
         # Ticks of mailboxes cannot be negative, but the message may predate this rack's tick 0.
         out.send(max(0, basis))
-        self.comes(tick)
+        self.mark_present(tick)
 
-    def _opened(self, arrived: Arrived) -> Envelope | None:
+    def _open_message(self, arrived: ReceivedMessage) -> Envelope | None:
         """Return the head of a received message, or count the message as refused and return None.
 
         The seal, the type, the length and the range of the numbers are checked.
         """
-        head = self._sealer.opened(*arrived)
+        head = self._sealer.open_message(*arrived)
         if (
             not isinstance(head, Flaw)
             and head.kind == self._kind
             and len(arrived.payload) == len(self._buffer.raw)
-            and max(head[1:4]) < LARGEST
+            and max(head[1:4]) < NUMBER_LIMIT
         ):
             return head
         self.count.refused += 1
         return None
 
-    def _is_due(self, head: Envelope, arrived: Arrived, arrival_tick: int, tick: int) -> bool:
+    def _is_acceptable(
+        self, head: Envelope, arrived: ReceivedMessage, arrival_tick: int, tick: int
+    ) -> bool:
         """Return True if a message is of the present launch and its age is known.
 
         In lockstep that is always true: see `Barrier`. A message that may become acceptable is kept
@@ -288,41 +292,41 @@ class Import:
         """
         if self._grid.is_lockstep:
             return True
-        if self._peer.is_over(head.launch) or tick - arrival_tick > self._max_age:
+        if self._peer.is_superseded(head.launch) or tick - arrival_tick > self._max_age:
             self.count.unknown_launch += 1
             return False
         # Its age is unknown, and may be too great, until the clocks have been compared.
-        if self._is_present(head) and self._peer.offset_ns is not None:
+        if self._is_present_launch(head) and self._peer.offset_ns is not None:
             return True
         for _, kept_message in self._early:
-            kept_head = self._opened(kept_message)
-            if kept_head is not None and self._is_present(kept_head):
+            kept_head = self._open_message(kept_message)
+            if kept_head is not None and self._is_present_launch(kept_head):
                 # Record its arrival, so that it does not count as missing.
-                self.count.superseded += self._order.admits(kept_head)
+                self.count.superseded += self._order.accept_message(kept_head)
             else:
                 self.count.unknown_launch += 1
         self._early = [(arrival_tick, arrived)]
         return False
 
-    def _is_present(self, head: Envelope) -> bool:
+    def _is_present_launch(self, head: Envelope) -> bool:
         """Return True if a message comes from the launch that is present."""
-        return self._peer.is_there and head.launch == self._peer.launch
+        return self._peer.is_present and head.launch == self._peer.launch
 
-    def _is_next(self, head: Envelope, payload: bytes) -> bool:
+    def _keep_if_newest(self, head: Envelope, payload: bytes) -> bool:
         """Keep a message and return True if it is well formed and newer than all before it."""
         message = AnyMessage(self._buffer.record.dtype, memoryview(bytearray(payload)))
         if not is_proper(message.record, self._fields):
             self.count.refused += 1
             return False
-        if not self._order.admits(head):
+        if not self._order.accept_message(head):
             return False
         self._buffer.copy_from(message)
         return True
 
-    def fill(self, record: Any, tick: int) -> None:
+    def write_counts(self, record: Any, tick: int) -> None:
         """Write the counters and the age of the newest message into the group of a status."""
         count = self.count
-        count.launch = NONE if self._grid.is_lockstep else self._order.launch
+        count.launch = NO_LAUNCH if self._grid.is_lockstep else self._order.launch
         count.age = NEVER if self._basis is None else tick - self._basis
         count.age_s = NEVER if count.age == NEVER else count.age * self._grid.tick_s
         fill_counts(record, count.record.item())

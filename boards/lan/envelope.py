@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from xxhash import xxh3_64_intdigest as xxh3
 
-from rack.boards.lan.config import MOST_CHAIN
+from rack.boards.lan.config import MAX_CHAIN_BYTES
 from rack.boards.lan.keys import sender_of
 
 if TYPE_CHECKING:
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
 _HEAD = Struct("<4sIHQQQQqqq")
 _MAGIC = b"RLN2"
-MOST_SEAL = 72
+MAX_SEAL_BYTES = 72
 """Length of the longest seal, bytes."""
-MOST_ENVELOPE = _HEAD.size + MOST_CHAIN + MOST_SEAL
+MAX_ENVELOPE_BYTES = _HEAD.size + MAX_CHAIN_BYTES + MAX_SEAL_BYTES
 
 
 class Envelope(NamedTuple):
@@ -70,7 +70,7 @@ class Flaw(IntEnum):
     OVERSIZED = 3  # longer than permitted
 
 
-def kind_of(name: str, version: int, dtype: np.dtype) -> int:
+def compute_kind(name: str, version: int, dtype: np.dtype) -> int:
     """Return the fingerprint of a message type.
 
     Args:
@@ -94,20 +94,20 @@ class Sealer:
 
     def __init__(self, credentials: Credentials | None = None, most_bytes: int = 1 << 20) -> None:
         self._credentials = credentials
-        self._pair = credentials.pair if credentials else None
+        self._pair = credentials.key_pair if credentials else None
         if credentials and self._pair:
             # Identify once now: the first identification takes as long as a whole cycle.
-            credentials.identity(self._pair.chain)
+            credentials.identify_sender(self._pair.chain)
         self._most = most_bytes
         self.flaws = dict.fromkeys(Flaw, 0)
 
-    def taking(self, most_bytes: int) -> Sealer:
+    def with_limit(self, most_bytes: int) -> Sealer:
         """Return a sealer with the same credentials and counters but another length limit."""
         sealer = Sealer(self._credentials, most_bytes)
         sealer.flaws = self.flaws
         return sealer
 
-    def resume(self, flaws: Iterable[int]) -> None:
+    def resume_counts(self, flaws: Iterable[int]) -> None:
         """Continue from the counts of the previous adapter, in the order of `Flaw`."""
         self.flaws |= zip(Flaw, flaws, strict=False)
 
@@ -121,10 +121,10 @@ class Sealer:
         """
         chain = self._pair.chain if self._pair else b""
         packed = _HEAD.pack(_MAGIC, head.flags, len(chain), *head[:7]) + chain
-        digest = _digest(key, packed, payload)
-        return packed + (self._pair.sign(digest) if self._pair else digest)
+        digest = _compute_digest(key, packed, payload)
+        return packed + (self._pair.sign_digest(digest) if self._pair else digest)
 
-    def opened(self, key: str, envelope: bytes | None, payload: bytes) -> Envelope | Flaw:
+    def open_message(self, key: str, envelope: bytes | None, payload: bytes) -> Envelope | Flaw:
         """Check a received message and return its head. A flaw is counted.
 
         Args:
@@ -136,38 +136,38 @@ class Sealer:
             The head, or the flaw for which the message must be rejected.
         """
         if len(payload) > self._most:
-            return self._flawed(Flaw.OVERSIZED)
+            return self._count_flaw(Flaw.OVERSIZED)
         if (
             envelope is None
-            or not _HEAD.size < len(envelope) <= MOST_ENVELOPE
+            or not _HEAD.size < len(envelope) <= MAX_ENVELOPE_BYTES
             or envelope[:4] != _MAGIC
         ):
-            return self._flawed(Flaw.MALFORMED)
+            return self._count_flaw(Flaw.MALFORMED)
         _, flags, chain_bytes, *fields = _HEAD.unpack_from(envelope)
         end = _HEAD.size + chain_bytes
-        digest = _digest(key, envelope[:end], payload)
-        if not self._is_sealed(key, digest, envelope[_HEAD.size : end], envelope[end:]):
-            return self._flawed(Flaw.UNSIGNED)
+        digest = _compute_digest(key, envelope[:end], payload)
+        if not self._has_valid_seal(key, digest, envelope[_HEAD.size : end], envelope[end:]):
+            return self._count_flaw(Flaw.UNSIGNED)
         return Envelope._make((*fields, flags))
 
-    def _is_sealed(self, key: str, digest: bytes, chain: bytes, seal: bytes) -> bool:
+    def _has_valid_seal(self, key: str, digest: bytes, chain: bytes, seal: bytes) -> bool:
         """Return True if the seal was made by the sender that the key expression names."""
         if self._credentials is None:
             return compare_digest(seal, digest)
-        identity = self._credentials.identity(chain)
+        identity = self._credentials.identify_sender(chain)
         return (
             identity is not None
             and identity.name == sender_of(key)
             and identity.has_signed(digest, seal)
         )
 
-    def _flawed(self, flaw: Flaw) -> Flaw:
+    def _count_flaw(self, flaw: Flaw) -> Flaw:
         """Count a flaw and return it."""
         self.flaws[flaw] += 1
         return flaw
 
 
-def _digest(key: str, packed: bytes, payload: bytes | memoryview) -> bytes:
+def _compute_digest(key: str, packed: bytes, payload: bytes | memoryview) -> bytes:
     """Return the SHA-256 of head, certificates, key expression and payload."""
     digest = sha256(packed)
     # Include the length of the key, so that no bytes can move between key and payload.

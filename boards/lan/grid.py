@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import ceil
 
-from rack.backplane.clock.system_clock import SystemClock, ticks_of
+from rack.backplane.clock.system_clock import SystemClock, compute_period_ticks
 from rack.backplane.segment import Segment
 from rack.boards.lan.envelope import Envelope
 from rack.boards.lan.peers import PeerRack
@@ -28,13 +28,13 @@ class OwnGrid:
         self.is_lockstep = self._clock.is_lockstep
         self.tick_s = self._clock_ns * 1e-9
 
-    def cycles(self, rate_hz: float) -> int:
+    def compute_period_cycles(self, rate_hz: float) -> int:
         """Return the period of an exchange in cycles of the adapter.
 
         Raises:
             ClockError: The rate does not divide the adapter's rate.
         """
-        return ticks_of(rate_hz, self._cycle_ns, "an exchange")
+        return compute_period_ticks(rate_hz, self._cycle_ns, "an exchange")
 
     def ticks_in(self, real_ns: float) -> int:
         """Return the number of ticks after which at least `real_ns` of real time have passed."""
@@ -46,9 +46,9 @@ class OwnGrid:
 
     def stamp_ns(self, tick: int) -> int:
         """Return the CLOCK_MONOTONIC of a tick here, ns. In lockstep, its simulated time."""
-        return self.time_ns(tick) if self.is_lockstep else self._clock.time_of(tick)
+        return self.time_ns(tick) if self.is_lockstep else self._clock.compute_time_ns(tick)
 
-    def tick_of(self, head: Envelope, peer: PeerRack, tick: int) -> int:
+    def to_local_tick(self, head: Envelope, peer: PeerRack, tick: int) -> int:
         """Convert the time at which another rack wrote a message to a tick of this rack.
 
         The result is early by the uncertainty of the clock comparison, so a message never counts as
@@ -62,4 +62,4 @@ class OwnGrid:
         if self.is_lockstep:
             return min(tick, head.time_ns // self._clock_ns)
         here_ns = head.stamp_ns - (peer.offset_ns or 0) - peer.uncertainty_ns
-        return min(tick, (here_ns - self._clock.time_of(0)) // self._clock.period_ns)
+        return min(tick, (here_ns - self._clock.compute_time_ns(0)) // self._clock.period_ns)

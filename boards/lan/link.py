@@ -21,19 +21,19 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 import zenoh
 
 from rack.backplane.json_text import encode_json
-from rack.boards.lan.access import access_control
-from rack.boards.lan.config import Credential, LanTable
-from rack.boards.lan.endpoint import Endpoint, endpoints_of, has_tls
-from rack.boards.lan.envelope import MOST_ENVELOPE, Sealer
+from rack.boards.lan.access import build_access_control
+from rack.boards.lan.config import CredentialError, LanTable
+from rack.boards.lan.endpoint import Endpoint, has_tls, list_endpoints
+from rack.boards.lan.envelope import MAX_ENVELOPE_BYTES, Sealer
 from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
 from rack.levels.errors import LevelError
 
 if TYPE_CHECKING:
     from rack.boards.lan.credentials import Credentials
 
-UNREAD = 32
+MAX_UNREAD = 32
 """Maximum number of messages of one import that wait for a cycle."""
-TOKENS = 1024
+MAX_TOKENS = 1024
 """Maximum number of liveliness changes between two cycles of an adapter."""
 RETRY_MS = (50, 200)
 """Shortest and longest interval between two attempts to connect."""
@@ -41,7 +41,7 @@ KEEP_ALIVES = 4
 """Number of keep-alive messages within a lease."""
 HANDSHAKE_MS = 3000
 """Maximum time to open a connection."""
-MOST_STEP = 65_536
+MAX_STEP_BYTES = 65_536
 """Maximum length of a step in lockstep, bytes."""
 ZENOH_BYTES = 1024
 """Maximum overhead that zenoh adds to a message: key expression, lengths and options."""
@@ -50,7 +50,7 @@ SOCKET = "unixsock-stream"
 NO_WAIT = {"messages": ["query"], "flows": ["ingress"], "overwrite": {"congestion_control": "drop"}}
 
 
-class Arrived(NamedTuple):
+class ReceivedMessage(NamedTuple):
     """A received message: its key expression, its envelope if it has one, and its content."""
 
     key: str
@@ -58,9 +58,9 @@ class Arrived(NamedTuple):
     payload: bytes
 
     @classmethod
-    def of(cls, sample: zenoh.Sample) -> Self:
+    def from_sample(cls, sample: zenoh.Sample) -> Self:
         """Copy a message out of a sample of zenoh."""
-        return cls(str(sample.key_expr), _bytes_of(sample.attachment), sample.payload.to_bytes())
+        return cls(str(sample.key_expr), _to_bytes(sample.attachment), sample.payload.to_bytes())
 
 
 class Question(NamedTuple):
@@ -69,7 +69,7 @@ class Question(NamedTuple):
     The query ends when the next question is taken, or when none is left.
     """
 
-    asked: Arrived
+    asked: ReceivedMessage
     reply: Callable[[bytes, bytes], None]
 
 
@@ -99,13 +99,13 @@ class LanLink:
             credentials = Credentials(Path(table.certificates), rack)
         try:
             self.sealer = Sealer(credentials, table.most_bytes)
-            self.session = zenoh.open(_settings(rack, table, credentials, is_operator))
+            self.session = zenoh.open(_build_settings(rack, table, credentials, is_operator))
         except zenoh.ZError as error:
             why = " ".join(str(error).split())
             raise LevelError(
                 f"adapter.lan: cannot listen on {', '.join(table.listen) or 'no endpoint'}: {why}"
             ) from None
-        except Credential as flaw:
+        except CredentialError as flaw:
             raise LevelError(f"adapter.lan: {flaw}") from None
         self._kept: list[Any] = []
 
@@ -123,7 +123,7 @@ class LanLink:
         put = publisher.put
         return lambda payload, envelope: put(payload, attachment=envelope)
 
-    def _channel(
+    def _open_channel(
         self, declare: Callable[..., Any], key: str, unread: int, **options: bool
     ) -> Callable[[], Iterator[Any]]:
         """Open a subscription or a query channel with a bounded buffer.
@@ -150,41 +150,45 @@ class LanLink:
 
         return take_samples
 
-    def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
+    def subscribe(self, key: str) -> Callable[[], Iterator[ReceivedMessage]]:
         """Return a function that yields the new messages under a key expression, oldest first."""
-        waiting = self._channel(self.session.declare_subscriber, key, UNREAD)
-        return lambda: map(Arrived.of, waiting())
+        waiting = self._open_channel(self.session.declare_subscriber, key, MAX_UNREAD)
+        return lambda: map(ReceivedMessage.from_sample, waiting())
 
-    def on(self, key: str, callback: Callable[[Arrived], None]) -> None:
+    def call_on_arrival(self, key: str, callback: Callable[[ReceivedMessage], None]) -> None:
         """Call a function for each message under a key expression, in a thread of zenoh."""
 
         def pass_sample(sample: zenoh.Sample) -> None:
             """Pass a sample on as a message."""
-            callback(Arrived.of(sample))
+            callback(ReceivedMessage.from_sample(sample))
 
         # Indirect callbacks would add the wake-up of another thread and an unbounded queue.
         handler = zenoh.handlers.Callback(pass_sample, indirect=False)
         self._kept.append(self.session.declare_subscriber(key, handler))
 
-    def answer(self, key: str, unread: int = UNREAD) -> Callable[[], Iterator[Question]]:
+    def open_questions(
+        self, key: str, unread: int = MAX_UNREAD
+    ) -> Callable[[], Iterator[Question]]:
         """Return a function that yields the new questions under a key expression, oldest first.
 
         A query with a wildcard in its key is dropped unanswered.
         """
-        waiting = self._channel(self.session.declare_queryable, key, unread)
+        waiting = self._open_channel(self.session.declare_queryable, key, unread)
 
         def take_questions() -> Iterator[Question]:
             """Yield the questions in the buffer, oldest first."""
             for query in waiting():
                 with query:
-                    content = _bytes_of(query.payload) or b""
-                    question = Arrived(str(query.key_expr), _bytes_of(query.attachment), content)
+                    content = _to_bytes(query.payload) or b""
+                    question = ReceivedMessage(
+                        str(query.key_expr), _to_bytes(query.attachment), content
+                    )
                     if "*" not in question.key:
-                        yield Question(question, _reply(query))
+                        yield Question(question, _build_reply(query))
 
         return take_questions
 
-    def declare_alive(self, launch: int, cycle_ns: int = 0) -> None:
+    def declare_token(self, launch: int, cycle_ns: int = 0) -> None:
         """Declare the liveliness token of this launch.
 
         Call it last: a rack that sees the token may send at once. In lockstep, `cycle_ns` is the
@@ -194,13 +198,13 @@ class LanLink:
             self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns))
         )
 
-    def watch_alive(self) -> Callable[[], Iterator[tuple[str, int, bool]]]:
+    def watch_tokens(self) -> Callable[[], Iterator[tuple[str, int, bool]]]:
         """Return a function that yields the changes of other racks' tokens since its last call.
 
         It yields the rack, its launch, and True if the token has appeared or False if it has gone.
         """
         declare = self.session.liveliness().declare_subscriber
-        waiting = self._channel(declare, ALL_ALIVE, TOKENS, history=True)
+        waiting = self._open_channel(declare, ALL_ALIVE, MAX_TOKENS, history=True)
 
         def take_changes() -> Iterator[tuple[str, int, bool]]:
             """Yield the changes in the buffer, oldest first."""
@@ -216,24 +220,24 @@ class LanLink:
         self.session.close()  # type: ignore[no-untyped-call]
 
 
-def _bytes_of(content: zenoh.ZBytes | None) -> bytes | None:
+def _to_bytes(content: zenoh.ZBytes | None) -> bytes | None:
     """Return the bytes of a payload or an attachment, if there is one."""
     return None if content is None else content.to_bytes()
 
 
-def _reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
+def _build_reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
     """Return a function that answers a query under the query's own key."""
     return lambda payload, envelope: query.reply(query.key_expr, payload, attachment=envelope)
 
 
-def _settings(
+def _build_settings(
     rack: str, table: LanTable, credentials: Credentials | None, is_operator: bool
 ) -> zenoh.Config:
     """Return the configuration of zenoh for a session."""
     timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if has_tls(table) else ""
     shortest, longest = RETRY_MS
     protocols = {
-        SOCKET if endpoint.is_private else endpoint.protocol for endpoint in endpoints_of(table)
+        SOCKET if endpoint.is_private else endpoint.protocol for endpoint in list_endpoints(table)
     }
     settings: dict[str, Any] = {
         "mode": "peer",
@@ -242,8 +246,8 @@ def _settings(
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
         "adminspace/enabled": False,
-        "listen/endpoints": [f"{_locator(endpoint)}{timed}" for endpoint in table.listen],
-        "connect/endpoints": list(map(_locator, table.connect)),
+        "listen/endpoints": [f"{_to_locator(endpoint)}{timed}" for endpoint in table.listen],
+        "connect/endpoints": list(map(_to_locator, table.connect)),
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
         # Do not wait for peers: opening would otherwise block for half a second for each.
@@ -253,13 +257,13 @@ def _settings(
             "period_max_ms": longest,
             "period_increase_factor": 1,
         },
-        "access_control": access_control(rack, table, is_operator),
+        "access_control": build_access_control(rack, table, is_operator),
         "transport/link/protocols": sorted(protocols) or ["tcp"],
         # Drop connections that are opened but never used.
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/unicast/open_timeout": HANDSHAKE_MS,
         "transport/link/rx/max_message_size": (
-            max(table.most_bytes, MOST_STEP) + MOST_ENVELOPE + ZENOH_BYTES
+            max(table.most_bytes, MAX_STEP_BYTES) + MAX_ENVELOPE_BYTES + ZENOH_BYTES
         ),
         "transport/link/tx/lease": round(table.lease_ms),
         "transport/link/tx/keep_alive": KEEP_ALIVES,
@@ -291,13 +295,13 @@ def _settings(
     return config
 
 
-def _locator(text: str) -> str:
+def _to_locator(text: str) -> str:
     """Return an endpoint in zenoh's notation, and create the folder for this user's sockets.
 
     Raises:
         LevelError: The folder cannot be made, or users other than this one can access it.
     """
-    endpoint = Endpoint.of(text)
+    endpoint = Endpoint.from_text(text)
     if not endpoint.is_private:
         return text
     folder = Path(os.environ.get("XDG_RUNTIME_DIR") or "/tmp") / f"rack-{os.getuid()}"

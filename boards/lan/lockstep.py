@@ -32,11 +32,11 @@ from zenoh.ext import Int64, ZDeserializeError, z_deserialize, z_serialize
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
-from rack.boards.lan.awaited import GIVE_UP_S, Why, word_of
+from rack.boards.lan.awaited import GIVE_UP_S, WaitReason, encode_wait
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE, launch_and_cycle, step_key
-from rack.boards.lan.link import MOST_STEP, Arrived, LanLink
-from rack.boards.lan.peers import NONE
+from rack.boards.lan.link import MAX_STEP_BYTES, LanLink, ReceivedMessage
+from rack.boards.lan.peers import NO_LAUNCH
 from rack.levels.errors import CannotGoOn
 
 STEP_KIND = xxh3(b"rack step 2")
@@ -64,10 +64,10 @@ class Step(NamedTuple):
     head: Envelope
     cycle_ns: int
     racks: list[str]
-    exports: list[Arrived]
+    exports: list[ReceivedMessage]
 
 
-def pack_step(cycle_ns: int, racks: Iterable[str], exports: Sequence[Arrived]) -> bytes:
+def pack_step(cycle_ns: int, racks: Iterable[str], exports: Sequence[ReceivedMessage]) -> bytes:
     """Serialise a step.
 
     Args:
@@ -87,14 +87,14 @@ def unpack_step(head: Envelope, content: bytes) -> Step | None:
         cycle_ns, racks, export_tuples = z_deserialize(_CONTENT, zenoh.ZBytes(content))
     except ZDeserializeError:
         return None
-    exports = [Arrived(*export) for export in export_tuples]
+    exports = [ReceivedMessage(*export) for export in export_tuples]
     # The deserialiser ignores trailing bytes, so compare with what the step packs to.
     if pack_step(cycle_ns, racks, exports) != content:
         return None
     return Step(head, cycle_ns, racks, exports)
 
 
-LOOK_S = 0.1
+CHECK_INTERVAL_S = 0.1
 """Interval at which a waiting adapter checks for the end of the run and for lost racks."""
 NEVER = -1
 
@@ -117,21 +117,21 @@ class Partner:
     def __init__(self, rack: str, place: int) -> None:
         self.rack = rack
         self.place = place
-        self.forget()
+        self.reset_state()
 
-    def forget(self) -> None:
+    def reset_state(self) -> None:
         """Return to the initial state, in which the rack is awaited."""
-        self.launch = NONE
+        self.launch = NO_LAUNCH
         self.time_ns = NEVER
         self.steps: deque[Step] = deque()
         self.is_out = self.is_there = False
         self.gone_s: float | None = None
 
     @property
-    def word(self) -> int:
+    def wait_word(self) -> int:
         """Code for `Block.AWAITS` that says that this rack is awaited, and why."""
-        why = Why.UNSEEN if self.launch == NONE else Why.SLOWER
-        return word_of(self.place, why if self.gone_s is None else Why.GONE)
+        why = WaitReason.UNSEEN if self.launch == NO_LAUNCH else WaitReason.SLOWER
+        return encode_wait(self.place, why if self.gone_s is None else WaitReason.GONE)
 
     def is_gone_for(self, time_s: float) -> bool:
         """Return True if its adapter has been gone for longer than `time_s`, s."""
@@ -141,7 +141,7 @@ class Partner:
         """Return True if no further step up to this simulated time is to be expected from it."""
         return self.time_ns >= now_ns or self.is_out
 
-    def take(self, step: Step) -> None:
+    def add_step(self, step: Step) -> None:
         """Record a step. One that is not newer is not delivered again."""
         self.gone_s = None
         if step.head.time_ns > self.time_ns:
@@ -149,7 +149,7 @@ class Partner:
             self.steps.append(step)
         self.is_out = bool(step.head.flags & StepFlag.OVER)
 
-    def passed(self, now_ns: int) -> Iterator[Step]:
+    def take_steps(self, now_ns: int) -> Iterator[Step]:
         """Remove and yield the steps up to this simulated time."""
         while self.steps and self.steps[0].head.time_ns <= now_ns:
             yield self.steps.popleft()
@@ -178,12 +178,12 @@ class Barrier:
             lost: Those that the previous adapter has already lost. They take no part.
         """
         self._segment = segment
-        self._block = segment.block(board)
+        self._block = segment.get_block(board)
         self._partners = {rack: Partner(rack, place) for place, rack in enumerate(racks)}
         for rack in lost:
             self._partners[rack].is_out = True
         self._tick_ns = segment.layout.clock_ns
-        self.cycle_ns = segment.layout.task(board).every * self._tick_ns
+        self.cycle_ns = segment.layout.find_task(board).every * self._tick_ns
         self.done = self._block[Block.DONE]
         self._is_restarted = self.done >= 0
         # Exports up to this time were delivered before the restart and are not delivered again.
@@ -192,8 +192,8 @@ class Barrier:
         self._has_begun = self._is_restarted
         self._has_refused = False
         self._block[Block.AWAITS] = 0
-        self._exports: list[Arrived] = []
-        self._imports: dict[str, deque[Arrived]] = {}
+        self._exports: list[ReceivedMessage] = []
+        self._imports: dict[str, deque[ReceivedMessage]] = {}
         self._changes: list[tuple[str, int, bool]] = []
         # Another rack can lack the newest two steps at most.
         self._steps: deque[tuple[int, bytes]] = deque(maxlen=2)
@@ -206,7 +206,7 @@ class Barrier:
         """Start to receive steps. Call it before the token of this launch is declared."""
         self._rack = link.rack
         self._launch = launch
-        self._sealer = link.sealer.taking(MOST_STEP)
+        self._sealer = link.sealer.with_limit(MAX_STEP_BYTES)
         self._key = step_key(link.rack)
         self._put = link.publish(self._key, reliable=True)
         # Called in a thread of zenoh: it only wakes the waiting cycle.
@@ -222,20 +222,22 @@ class Barrier:
 
     def publish(self, key: str) -> Callable[[bytes, bytes], None]:
         """Return a function that adds a payload and its envelope to the step of this cycle."""
-        return lambda payload, envelope: self._exports.append(Arrived(key, envelope, payload))
+        return lambda payload, envelope: self._exports.append(
+            ReceivedMessage(key, envelope, payload)
+        )
 
-    def subscribe(self, key: str) -> Callable[[], Iterator[Arrived]]:
+    def subscribe(self, key: str) -> Callable[[], Iterator[ReceivedMessage]]:
         """Return a function that yields the messages under a key up to this cycle, each once."""
         waiting = self._imports.setdefault(key, deque())
         return lambda: (waiting.popleft() for _ in range(len(waiting)))
 
-    def changes(self) -> Iterator[tuple[str, int, bool]]:
+    def take_changes(self) -> Iterator[tuple[str, int, bool]]:
         """Yield rack, launch and presence for each change of presence since the last call."""
         changes = self._changes
         self._changes = []
         yield from changes
 
-    def prepare(self, tick: int) -> None:
+    def prepare_step(self, tick: int) -> None:
         """Pack the exports since the last step into the step of this cycle.
 
         Raises:
@@ -244,13 +246,14 @@ class Barrier:
         awaited = [partner.rack for partner in self._partners.values() if not partner.is_out]
         content = pack_step(self.cycle_ns, awaited, self._exports)
         self._exports = []
-        if len(content) > MOST_STEP:
-            self._refuse(
-                f"a cycle exports {len(content)} bytes; in lockstep at most {MOST_STEP} are allowed"
+        if len(content) > MAX_STEP_BYTES:
+            self._refuse_lockstep(
+                f"a cycle exports {len(content)} bytes; in lockstep at most "
+                f"{MAX_STEP_BYTES} are allowed"
             )
         self._steps.append((tick * self._tick_ns, content))
 
-    def meet(self, tick: int) -> bool:
+    def exchange_steps(self, tick: int) -> bool:
         """Send the step of this cycle and wait for the steps of all other racks.
 
         Returns:
@@ -260,26 +263,26 @@ class Barrier:
             CannotGoOn: Another rack cannot run in lockstep with this one.
         """
         self._now_ns = now_ns = tick * self._tick_ns
-        self.prepare(tick)
+        self.prepare_step(tick)
         if self._is_first:
-            self._send_again(StepFlag.FIRST)
+            self._resend_steps(StepFlag.FIRST)
         else:
-            self._send(*self._steps[-1], StepFlag(0))
+            self._send_step(*self._steps[-1], StepFlag(0))
         while late_partners := [
             partner for partner in self._partners.values() if not partner.has_reached(now_ns)
         ]:
             try:
-                self._note(self._events.get(timeout=LOOK_S))
+                self._process_sample(self._events.get(timeout=CHECK_INTERVAL_S))
             except Empty:
                 if self._is_over:
                     return False
                 # Show which rack is awaited, and give it up if its adapter is gone for too long.
                 awaited = late_partners[0]
-                self._block[Block.AWAITS] = awaited.word
+                self._block[Block.AWAITS] = awaited.wait_word
                 awaited.is_out |= awaited.is_gone_for(GIVE_UP_S)
         self._block[Block.AWAITS] = 0
         for partner in self._partners.values():
-            self._pass_on(partner)
+            self._deliver_exports(partner)
         self._is_first = False
         self._has_begun = True
         return True
@@ -290,9 +293,9 @@ class Barrier:
         Nothing is sent if only this board ends, because it may be restarted.
         """
         if self._steps and (self._is_over or self._has_refused):
-            self._send(*self._steps[-1], StepFlag.OVER | self._first)
+            self._send_step(*self._steps[-1], StepFlag.OVER | self._first_flag)
 
-    def _send(self, time_ns: int, content: bytes, flags: StepFlag) -> None:
+    def _send_step(self, time_ns: int, content: bytes, flags: StepFlag) -> None:
         """Send a step with these flags."""
         self._sent += 1
         tick = time_ns // self._tick_ns
@@ -301,13 +304,13 @@ class Barrier:
         )
         self._put(content, self._sealer.seal(self._key, head, content))
 
-    def _send_again(self, flags: StepFlag) -> None:
+    def _resend_steps(self, flags: StepFlag) -> None:
         """Repeat the newest steps for a rack that may have missed them. Others ignore them."""
         for time_ns, content in self._steps:
-            self._send(time_ns, content, flags)
+            self._send_step(time_ns, content, flags)
 
     @property
-    def _first(self) -> StepFlag:
+    def _first_flag(self) -> StepFlag:
         """`FIRST` until the first exchange is over, else no flag."""
         return StepFlag.FIRST if self._is_first else StepFlag(0)
 
@@ -316,7 +319,7 @@ class Barrier:
         """Whether the run is over or was asked to stop."""
         return bool(self._segment.words[System.STOP_REQUEST]) or self._segment.run_is_over
 
-    def _note(self, sample: zenoh.Sample) -> None:
+    def _process_sample(self, sample: zenoh.Sample) -> None:
         """Process a received sample, which is a step or a change of a liveliness token."""
         key = str(sample.key_expr)
         partner = self._partners.get(key.split("/")[1])
@@ -324,83 +327,83 @@ class Barrier:
             return
         if key != step_key(partner.rack):
             if (parsed := launch_and_cycle(key)) is not None:
-                self._note_sign(partner, *parsed, sample.kind == zenoh.SampleKind.PUT)
+                self._process_token(partner, *parsed, sample.kind == zenoh.SampleKind.PUT)
             return
-        arrived = Arrived.of(sample)
-        head = self._sealer.opened(*arrived)
+        arrived = ReceivedMessage.from_sample(sample)
+        head = self._sealer.open_message(*arrived)
         step = None if isinstance(head, Flaw) else unpack_step(head, arrived.payload)
-        if step is not None and self._is_of(partner, step.head.launch):
-            self._note_step(partner, step)
+        if step is not None and self._is_partner_launch(partner, step.head.launch):
+            self._process_step(partner, step)
 
-    def _note_sign(self, partner: Partner, launch: int, cycle_ns: int, is_there: bool) -> None:
+    def _process_token(self, partner: Partner, launch: int, cycle_ns: int, is_there: bool) -> None:
         """Process a change of another rack's liveliness token."""
-        if is_there and partner.launch in (NONE, launch):
+        if is_there and partner.launch in (NO_LAUNCH, launch):
             self._check_cycle(partner, cycle_ns)
             partner.gone_s = None
             # It has just appeared, so it has missed the steps that were sent before.
-            self._send_again(self._first)
+            self._resend_steps(self._first_flag)
         elif is_there:
-            self._is_of(partner, launch)
+            self._is_partner_launch(partner, launch)
         elif partner.launch == launch:
             partner.gone_s = time.monotonic()
             if not self._has_begun:
-                partner.forget()
+                partner.reset_state()
 
-    def _note_step(self, partner: Partner, step: Step) -> None:
+    def _process_step(self, partner: Partner, step: Step) -> None:
         """Process a step of another rack. Refuse lockstep if the racks do not fit together."""
         self._check_cycle(partner, step.cycle_ns)
         flags = step.head.flags
         if not flags & StepFlag.OVER and self._rack not in step.racks:
-            self._refuse(
+            self._refuse_lockstep(
                 f"rack '{partner.rack}' does not wait for '{self._rack}' in lockstep: name it in"
                 " adapter.lan.peers there, and restart all racks"
             )
         time_ns = step.head.time_ns
         if not self._has_begun and partner.time_ns == NEVER and time_ns > self._now_ns:
-            self._refuse(
+            self._refuse_lockstep(
                 f"rack '{partner.rack}' is already at {time_ns * 1e-9:g} s: racks in lockstep"
                 " must begin together; restart all racks"
             )
-        partner.take(step)
+        partner.add_step(step)
         if partner.is_out and flags & StepFlag.FIRST and not self._has_begun:
             # Neither run has begun, so the other rack may be started again.
-            partner.forget()
+            partner.reset_state()
         elif flags & StepFlag.FIRST:
             # The other rack may have started too late to receive the step of this cycle. Repeat it
             # before this rack continues.
-            self._send_again(StepFlag(0))
+            self._resend_steps(StepFlag(0))
 
-    def _is_of(self, partner: Partner, launch: int) -> bool:
+    def _is_partner_launch(self, partner: Partner, launch: int) -> bool:
         """Return True if a launch is the one that runs in lockstep with this rack.
 
         Once the run has begun, a second launch of a rack takes no part, and the first one is over.
         """
         if partner.launch != launch:
-            if self._has_begun and partner.launch != NONE:
+            if self._has_begun and partner.launch != NO_LAUNCH:
                 partner.is_out = True
                 return False
-            partner.forget()
+            partner.reset_state()
             partner.launch = launch
         return True
 
     def _check_cycle(self, partner: Partner, cycle_ns: int) -> None:
         """Refuse lockstep if the other rack runs in real time or has another cycle."""
         if not cycle_ns:
-            self._refuse(f"rack '{partner.rack}' runs in real time, this one in lockstep")
+            self._refuse_lockstep(f"rack '{partner.rack}' runs in real time, this one in lockstep")
         if cycle_ns != self.cycle_ns:
-            self._refuse(
+            self._refuse_lockstep(
                 f"cycles of adapter.lan differ: {cycle_ns * 1e-6:g} ms in rack '{partner.rack}', "
                 f"{self.cycle_ns * 1e-6:g} ms in this rack; they must be equal in lockstep"
             )
 
-    def _refuse(self, why: str) -> NoReturn:
+    def _refuse_lockstep(self, why: str) -> NoReturn:
         """Raise `CannotGoOn`, which ends this board, with the reason why lockstep is impossible."""
         self._has_refused = True
         raise CannotGoOn(why)
 
-    def _pass_on(self, partner: Partner) -> None:
+    def _deliver_exports(self, partner: Partner) -> None:
         """Deliver the exports of a rack up to this cycle, and record a change of its presence."""
-        for step in partner.passed(self._now_ns):
+        for step in partner.take_steps(self._now_ns):
             # After a restart, steps arrive again that were delivered before it.
             for export in step.exports if step.head.time_ns > self._passed_ns else ():
                 if export.key.split("/")[1] == partner.rack and export.key in self._imports:

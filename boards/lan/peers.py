@@ -25,8 +25,8 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.level import Finding
 from rack.levels.peer import PeerPresence, Presence
 
-NONE = 0
-REMEMBERED = 16
+NO_LAUNCH = 0
+MAX_LAUNCHES = 16
 """Maximum number of launches remembered, and of tokens tracked, for each rack."""
 Changes = Callable[[], Iterator[tuple[str, int, bool]]]
 
@@ -54,9 +54,9 @@ class PeerRack:
 
     rack: str
     number: int = 0
-    goes_on: bool = False
+    keeps_messages: bool = False
     presence: Presence = Presence.AWAITED
-    launch: int = NONE
+    launch: int = NO_LAUNCH
     launches: int = 0
     losses: int = 0
     since: int = 0
@@ -65,32 +65,32 @@ class PeerRack:
     tokens: list[int] = field(default_factory=list)
     confirm_by: int = -1
     findings: list[Finding] = field(default_factory=list)
-    _seen: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
-    _over: deque[int] = field(default_factory=lambda: deque(maxlen=REMEMBERED))
+    _seen: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_LAUNCHES))
+    _over: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_LAUNCHES))
 
     @property
-    def is_there(self) -> bool:
+    def is_present(self) -> bool:
         """Whether the rack is present."""
         return self.presence is Presence.THERE
 
-    def is_over(self, launch: int) -> bool:
+    def is_superseded(self, launch: int) -> bool:
         """Return True if another launch has replaced this one and its token has expired."""
         return launch in self._over
 
-    def comes(self, launch: int, tick: int) -> None:
+    def add_token(self, launch: int, tick: int) -> None:
         """Record that the liveliness token of a launch has appeared."""
-        if launch in self._over or (launch not in self.tokens and len(self.tokens) == REMEMBERED):
+        if launch in self._over or (launch not in self.tokens and len(self.tokens) == MAX_LAUNCHES):
             return
         if launch not in self.tokens:
             self.tokens.append(launch)
-        if self.is_there and self.launch in (NONE, launch):
+        if self.is_present and self.launch in (NO_LAUNCH, launch):
             # The launch is unknown if the state was restored from lockstep, which records none.
             self.launch = launch
             self.confirm_by = -1
         else:
-            self._enters(launch, tick)
+            self._mark_present(launch, tick)
 
-    def goes(self, launch: int, tick: int) -> None:
+    def remove_token(self, launch: int, tick: int) -> None:
         """Record that the liveliness token of a launch has expired."""
         if launch in self.tokens:
             self.tokens.remove(launch)
@@ -99,13 +99,13 @@ class PeerRack:
         if launch != self.launch:
             self._over.append(launch)
         elif self.tokens:
-            self._enters(self.tokens[-1], tick)
+            self._mark_present(self.tokens[-1], tick)
         else:
-            self.leaves(tick)
+            self.mark_lost(tick)
 
-    def leaves(self, tick: int) -> None:
+    def mark_lost(self, tick: int) -> None:
         """Mark the rack as lost. Has no effect if it is not present."""
-        if self.is_there:
+        if self.is_present:
             self.presence = Presence.LOST
             self.since = tick
             self.confirm_by = -1
@@ -113,9 +113,9 @@ class PeerRack:
             self.offset_ns = None
             self.findings.append(Finding(Alarm.PEER_LOST, self.number))
 
-    def _enters(self, launch: int, tick: int) -> None:
+    def _mark_present(self, launch: int, tick: int) -> None:
         """Make a launch the present one and note whether the rack was restarted or has returned."""
-        self.leaves(tick)
+        self.mark_lost(tick)
         if launch != self.launch:
             self.offset_ns = None
         is_first = self.presence is Presence.AWAITED
@@ -132,7 +132,7 @@ class PeerRack:
         self.since = tick
         self.confirm_by = -1
 
-    def joins(self, launch: int, tick: int) -> None:
+    def join_lockstep(self, launch: int, tick: int) -> None:
         """Mark the rack as present in lockstep.
 
         The rack joins at the start of the run, or is still present when this adapter has been
@@ -145,7 +145,7 @@ class PeerRack:
         self.launch = launch
         self.confirm_by = -1
 
-    def resume(self, message: PeerPresence | AnyMessage, confirm_by: int) -> None:
+    def restore_state(self, message: PeerPresence | AnyMessage, confirm_by: int) -> None:
         """Restore the state that the adapter wrote before it was restarted.
 
         Args:
@@ -157,17 +157,17 @@ class PeerRack:
         self.launches = message.launches
         self.losses = message.losses
         self.since = message.since
-        self.confirm_by = confirm_by if self.is_there else -1
+        self.confirm_by = confirm_by if self.is_present else -1
         if self.launch:
             self._seen.append(self.launch)
 
-    def fill(self, message: PeerPresence, is_lockstep: bool) -> None:
+    def write_presence(self, message: PeerPresence, is_lockstep: bool) -> None:
         """Write the presence of the rack into its message.
 
         The launch is left out in lockstep, because launch numbers differ from run to run.
         """
         message.presence = self.presence
-        message.launch = NONE if is_lockstep else self.launch
+        message.launch = NO_LAUNCH if is_lockstep else self.launch
         message.launches = self.launches
         message.losses = self.losses
         message.since = self.since
@@ -180,13 +180,15 @@ class Peers:
         arrivals: Number of tokens that have appeared, of any rack.
     """
 
-    def __init__(self, racks: Iterable[str], go_on: bool = False) -> None:
-        self._peers = {rack: PeerRack(rack, number, go_on) for number, rack in enumerate(racks)}
+    def __init__(self, racks: Iterable[str], keep_messages: bool = False) -> None:
+        self._peers = {
+            rack: PeerRack(rack, number, keep_messages) for number, rack in enumerate(racks)
+        }
         self._changes: Changes = lambda: iter(())
         self._is_lockstep = False
         self.arrivals = 0
 
-    def watch(self, changes: Changes, is_lockstep: bool = False) -> None:
+    def set_source(self, changes: Changes, is_lockstep: bool = False) -> None:
         """Set the function from which changes of presence are read.
 
         Args:
@@ -197,7 +199,7 @@ class Peers:
         self._changes = changes
         self._is_lockstep = is_lockstep
 
-    def look(self, tick: int) -> list[Finding]:
+    def update_presence(self, tick: int) -> list[Finding]:
         """Process the changes of presence since the last call and return the resulting findings."""
         for rack, launch, is_there in self._changes():
             self.arrivals += is_there
@@ -205,22 +207,22 @@ class Peers:
             if peer is None:
                 continue
             if not self._is_lockstep:
-                (peer.comes if is_there else peer.goes)(launch, tick)
+                (peer.add_token if is_there else peer.remove_token)(launch, tick)
             elif is_there:
-                peer.joins(launch, tick)
+                peer.join_lockstep(launch, tick)
             else:
-                peer.leaves(tick)
+                peer.mark_lost(tick)
         findings: list[Finding] = []
         for peer in self:
             if 0 <= peer.confirm_by <= tick:
-                peer.leaves(tick)
+                peer.mark_lost(tick)
             if peer.findings:
                 findings += peer.findings
                 peer.findings.clear()
         return findings
 
     @property
-    def lost(self) -> list[str]:
+    def lost_racks(self) -> list[str]:
         """Names of the racks that were present and are now lost."""
         return [peer.rack for peer in self if peer.presence is Presence.LOST]
 

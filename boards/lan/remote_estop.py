@@ -24,13 +24,13 @@ from rack.boards.lan.status import LanDesk, zero_counts
 from rack.levels.level import Finding
 
 ESTOP_KIND = xxh3(b"rack estop 1")
-CHECK = 1
+CHECK_FLAG = 1
 """Flag of a request that is answered like a stop but sets none."""
 REQUESTS_A_CYCLE = 16
 """Maximum number of requests that wait for a cycle and are processed in it."""
 
 
-class Desk:
+class EstopResponder:
     """Sets the emergency stop of one rack and reports each one in the `findings`.
 
     Attributes:
@@ -61,12 +61,12 @@ class Desk:
         self._sealer = link.sealer
         self._launch = launch
         if self._askers:
-            self._requests = link.answer(estop_key("*", self._rack), REQUESTS_A_CYCLE)
+            self._requests = link.open_questions(estop_key("*", self._rack), REQUESTS_A_CYCLE)
 
-    def answer(self, tick: int) -> None:
+    def answer_requests(self, tick: int) -> None:
         """Answer the requests that have arrived, and latch the emergency stop if one demands it."""
         for request, reply in self._requests():
-            head = self._sealer.opened(*request)
+            head = self._sealer.open_message(*request)
             asker = request.key.split("/")[1]
             if isinstance(head, Flaw) or head.kind != ESTOP_KIND or request.payload:
                 self.count.dropped += 1
@@ -75,7 +75,7 @@ class Desk:
                 self.count.refused += 1
                 continue
             self.count.answered += 1
-            if head.flags != CHECK:
+            if head.flags != CHECK_FLAG:
                 if not self._lines.emergency_stop:
                     self._findings.append(Finding(Alarm.REMOTE_STOP, self._askers[asker]))
                 self._lines.latch_emergency_stop()
@@ -83,11 +83,11 @@ class Desk:
             answer = Envelope(ESTOP_KIND, self._launch, head.serial, head.launch, tick, 0, 0)
             reply(b"", self._sealer.seal(estop_answer_key(self._rack, asker), answer, b""))
 
-    def resume(self, record: Any) -> None:
+    def restore_counts(self, record: Any) -> None:
         """Restore the counters from the last status of the previous adapter."""
         self.count.record[...] = record
 
-    def fill(self, record: object) -> None:
+    def write_counts(self, record: object) -> None:
         """Write the counters into the group of a status.
 
         Nothing is written in lockstep, because the counters do not depend on ticks alone.

@@ -12,11 +12,11 @@ from typing import Any
 
 from rack.backplane.segment import Segment
 from rack.boards.host.adapter import STATUS
-from rack.boards.host.entries import NEVER, Replayed, last_written
+from rack.boards.host.entries import NEVER, ReplayedEntry, read_last_written
 from rack.boards.lan.entries import Import
-from rack.boards.lan.peers import NONE, Peers
-from rack.boards.wiring import Entries, Rows
-from rack.levels.peer import PeerPresence, Presence, peer_port
+from rack.boards.lan.peers import NO_LAUNCH, Peers
+from rack.boards.wiring import EntityRows, ExchangedEntries
+from rack.levels.peer import PeerPresence, Presence, format_peer_port
 
 
 class ReplayedNetwork:
@@ -26,34 +26,41 @@ class ReplayedNetwork:
         self,
         segment: Segment,
         board: str,
-        entries: Entries,
+        entries: ExchangedEntries,
         peers: Peers,
         imports: Mapping[str, Import],
     ) -> None:
-        self._imports: dict[str, tuple[Import, Replayed]] = {}
+        self._imports: dict[str, tuple[Import, ReplayedEntry]] = {}
         for port, entry in imports.items():
             # Continue after the last message that the adapter sent before a restart.
-            _, sent = last_written(segment, f"{board}.{port}")
-            self._imports[port] = entry, Replayed(entries[port], port, is_sent=True, since=sent)
-        ports = {peer.rack: peer_port(peer.rack) for peer in peers}
+            _, sent = read_last_written(segment, f"{board}.{port}")
+            self._imports[port] = (
+                entry,
+                ReplayedEntry(entries[port], port, is_sent=True, since=sent),
+            )
+        ports = {peer.rack: format_peer_port(peer.rack) for peer in peers}
         self._shown = [
-            Replayed(entries[port], port, is_sent=False) for port in (*ports.values(), STATUS)
+            ReplayedEntry(entries[port], port, is_sent=False) for port in (*ports.values(), STATUS)
         ]
-        changes = [change for rack, port in ports.items() for change in _seen(rack, entries[port])]
+        changes = [
+            change
+            for rack, port in ports.items()
+            for change in _list_presence_changes(rack, entries[port])
+        ]
         self._changes = sorted(changes)
         self._tick = NEVER
 
-    def begin(self, tick: int) -> None:
+    def start_cycle(self, tick: int) -> None:
         """Start the cycle released at `tick`, up to which changes are reported."""
         self._tick = tick
 
-    def changes(self) -> Iterator[tuple[str, int, bool]]:
+    def take_changes(self) -> Iterator[tuple[str, int, bool]]:
         """Yield the changes of presence up to this cycle, in the form of `Barrier.take_changes`."""
         while self._changes and self._changes[0][0] <= self._tick:
             _, rack, is_there = self._changes.pop(0)
-            yield rack, NONE, is_there
+            yield rack, NO_LAUNCH, is_there
 
-    def give(self, write: Mapping[str, Any], tick: int) -> None:
+    def write_recorded(self, write: Mapping[str, Any], tick: int) -> None:
         """Write the messages that were recorded in this cycle.
 
         Args:
@@ -61,14 +68,14 @@ class ReplayedNetwork:
             tick: Release of the cycle.
         """
         for entry, sent in self._imports.values():
-            entry.look(tick)
-            if sent.exchange({}, write, tick):
-                entry.comes(tick)
+            entry.update_presence(tick)
+            if sent.exchange_messages({}, write, tick):
+                entry.mark_present(tick)
         for shown in self._shown:
-            shown.exchange({}, write, tick)
+            shown.exchange_messages({}, write, tick)
 
 
-def _seen(rack: str, rows: Rows) -> Iterator[tuple[int, str, bool]]:
+def _list_presence_changes(rack: str, rows: EntityRows) -> Iterator[tuple[int, str, bool]]:
     """Yield the tick, the rack and True when it appeared, or False when it was lost."""
     message = PeerPresence.zeros({})
     last_presence = int(Presence.AWAITED)

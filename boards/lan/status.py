@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from rack.backplane.message import Message, Status, field, make_message
-from rack.boards.host.entries import counter
+from rack.boards.host.entries import declare_counter
 
 C = TypeVar("C", bound=Message)
 
@@ -26,23 +26,25 @@ def zero_counts(group: type[C]) -> C:
 class LanExport(Message, version=1):
     """Counters of one export in the status of the network adapter."""
 
-    sent: int = counter("messages sent")
+    sent: int = declare_counter("messages sent")
     serial: int = field(unit="1", doc="serial of the newest message sent, 0 if there is none")
 
 
 class LanImport(Message, version=1):
     """Counters of one import, and its newest message, in the status of the network adapter."""
 
-    taken: int = counter("messages passed to the backplane")
-    missing: int = counter("messages that never arrived or arrived after a later one")
-    disordered: int = counter("messages that arrived after a later one and were not passed on")
-    repeated: int = counter("messages that arrived twice")
-    late: int = counter("messages that were older than max_age_ms when they arrived")
-    refused: int = counter(
+    taken: int = declare_counter("messages passed to the backplane")
+    missing: int = declare_counter("messages that never arrived or arrived after a later one")
+    disordered: int = declare_counter(
+        "messages that arrived after a later one and were not passed on"
+    )
+    repeated: int = declare_counter("messages that arrived twice")
+    late: int = declare_counter("messages that were older than max_age_ms when they arrived")
+    refused: int = declare_counter(
         "messages refused because they are malformed, unsigned, oversized or of another type"
     )
-    unknown_launch: int = counter("messages of a launch that is over, or not there")
-    superseded: int = counter("messages that a newer one overtook before the exchange")
+    unknown_launch: int = declare_counter("messages of a launch that is over, or not there")
+    superseded: int = declare_counter("messages that a newer one overtook before the exchange")
     launch: int = field(
         unit="1",
         doc="launch that wrote the newest message taken, 0 if there is none or in lockstep",
@@ -60,24 +62,24 @@ class LanImport(Message, version=1):
 class LanFlaws(Message, version=1):
     """Counters of received messages that were dropped unread, by cause."""
 
-    malformed: int = counter(
+    malformed: int = declare_counter(
         "not of this protocol or of another version of it, always 0 in lockstep"
     )
-    unsigned: int = counter(
+    unsigned: int = declare_counter(
         "changed on the way, under another key or not sealed by its sender, always 0 in lockstep"
     )
-    oversized: int = counter("longer than most_bytes, always 0 in lockstep")
+    oversized: int = declare_counter("longer than most_bytes, always 0 in lockstep")
 
 
 class LanClocks(Message, version=1):
     """Counters of the round trips by which racks compare their clocks."""
 
-    taken: int = counter("round trips measured")
-    answered: int = counter("pings of other racks answered")
-    withheld: int = counter(
+    taken: int = declare_counter("round trips measured")
+    answered: int = declare_counter("pings of other racks answered")
+    withheld: int = declare_counter(
         "pings not answered because they arrived too fast or from too many racks"
     )
-    refused: int = counter(
+    refused: int = declare_counter(
         "pings and answers refused because they are malformed, unsigned or unexpected"
     )
 
@@ -85,18 +87,18 @@ class LanClocks(Message, version=1):
 class LanDesk(Message, version=1):
     """Counters of the emergency stops that other machines requested."""
 
-    answered: int = counter(
+    answered: int = declare_counter(
         "emergency stops from other machines that were set, always 0 in lockstep"
     )
-    refused: int = counter(
+    refused: int = declare_counter(
         "emergency stops refused because they are not permitted, always 0 in lockstep"
     )
-    dropped: int = counter(
+    dropped: int = declare_counter(
         "requests dropped: malformed, unsigned or oversized, always 0 in lockstep"
     )
 
 
-def status_of(exports: Iterable[str], imports: Iterable[str]) -> type[Status]:
+def build_status_class(exports: Iterable[str], imports: Iterable[str]) -> type[Status]:
     """Build the message class of an adapter's status, with a group for each export and import."""
     groups = {
         "clocks": field(LanClocks, doc="round trips to compare clocks; none in lockstep"),

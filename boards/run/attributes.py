@@ -16,15 +16,15 @@ import numpy as np
 
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.layout import Layout
-from rack.backplane.message import Message, text_of
+from rack.backplane.message import Message, decode_text
 from rack.backplane.segment import Segment
-from rack.boards.run.settings import attribute_names, has_attributes
+from rack.boards.run.settings import has_attributes, list_attribute_names
 
-MOST = 24
+MAX_ITEMS = 24
 """Maximum number of array elements or items that are shown. Of larger ones the size is shown."""
-DEPTH = 5
+MAX_DEPTH = 5
 """Maximum nesting of objects."""
-OMITTED = (ByteLock, Layout, Segment)
+OMITTED_CLASSES = (ByteLock, Layout, Segment)
 """Classes of objects that are never shown."""
 _NOTHING = object()
 
@@ -38,90 +38,95 @@ class AttributeView:
 
     def __init__(self, level: object) -> None:
         self._level = level
-        self._built = _Reading().attributes(level, DEPTH)
+        self._built = _AttributeReader().read_attributes(level, MAX_DEPTH)
 
-    def show(self) -> Mapping[str, Any]:
+    def read_attributes(self) -> Mapping[str, Any]:
         """Return the attributes by name, as JSON values.
 
         These are numbers, texts, lists, and dictionaries for objects.
         """
-        now = _Reading().attributes(self._level, DEPTH)
-        return _present(
-            (name, _changed(value, self._built.get(name)))
+        now = _AttributeReader().read_attributes(self._level, MAX_DEPTH)
+        return _omit_missing(
+            (name, _find_changes(value, self._built.get(name)))
             if isinstance(value, ObjectAttributes)
             else (name, value)
             for name, value in now.items()
         )
 
 
-def _changed(now: Any, built: Any) -> Any:
+def _find_changes(now: Any, built: Any) -> Any:
     """Return the attributes of an object that differ from the built object."""
     if not isinstance(now, ObjectAttributes) or not isinstance(built, ObjectAttributes):
         return _NOTHING if now == built else now
-    changes = ((name, _changed(value, built.get(name, _NOTHING))) for name, value in now.items())
-    return _present(changes) or _NOTHING
+    changes = (
+        (name, _find_changes(value, built.get(name, _NOTHING))) for name, value in now.items()
+    )
+    return _omit_missing(changes) or _NOTHING
 
 
-def _present(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+def _omit_missing(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     """Return the items as a dictionary, without omitted values."""
     return {name: value for name, value in items if value is not _NOTHING}
 
 
-class _Reading:
+class _AttributeReader:
     """One pass over objects, each shown only at the first place that leads to it."""
 
     def __init__(self) -> None:
         self._seen: set[int] = set()
 
-    def attributes(self, thing: object, depth: int) -> ObjectAttributes:
+    def read_attributes(self, thing: object, depth: int) -> ObjectAttributes:
         """Return the attributes of an object as plain data."""
         self._seen.add(id(thing))
         plain = [
-            (name, self._plain(getattr(thing, name), depth)) for name in attribute_names(thing)
+            (name, self._to_plain(getattr(thing, name), depth))
+            for name in list_attribute_names(thing)
         ]
-        return ObjectAttributes(_present(plain))
+        return ObjectAttributes(_omit_missing(plain))
 
-    def _plain(self, thing: Any, depth: int) -> Any:
+    def _to_plain(self, thing: Any, depth: int) -> Any:
         """Return a value as plain data, or `_NOTHING` if it is not shown."""
         match thing:
             case Enum():
                 return thing.name.lower()
             case bytes() | bytearray():
-                return thing.hex() if b"\x00" in thing else text_of(thing)
+                return thing.hex() if b"\x00" in thing else decode_text(thing)
             case float() if not isfinite(thing):
                 # JSON has no representation of these values.
                 return str(thing)
             case None | bool() | str() | int() | float():
                 return thing
             case Message():
-                return self._array(thing.record, depth)
+                return self._array_to_plain(thing.record, depth)
             case np.ndarray() | np.generic():
-                return self._array(thing, depth)
+                return self._array_to_plain(thing, depth)
             case Mapping() | list() | deque() | tuple() | set() | frozenset():
-                return self._items(thing, depth)
-        is_omitted = isinstance(thing, OMITTED) or not has_attributes(thing)
+                return self._items_to_plain(thing, depth)
+        is_omitted = isinstance(thing, OMITTED_CLASSES) or not has_attributes(thing)
         if is_omitted or id(thing) in self._seen or not depth:
             return _NOTHING
-        return self.attributes(thing, depth - 1) or _NOTHING
+        return self.read_attributes(thing, depth - 1) or _NOTHING
 
-    def _array(self, array: Any, depth: int) -> Any:
+    def _array_to_plain(self, array: Any, depth: int) -> Any:
         """Return an array, a numpy number or a record as plain data."""
-        if array.size > MOST:
+        if array.size > MAX_ITEMS:
             sizes = " x ".join(map(str, array.shape))
             return f"{sizes} of {array.dtype.name}"
         if array.shape:
-            return [self._array(row, depth) for row in array]
+            return [self._array_to_plain(row, depth) for row in array]
         if array.dtype.names is None:
-            return self._plain(array.item(), depth)
-        return {name: self._array(array[name], depth) for name in array.dtype.names}
+            return self._to_plain(array.item(), depth)
+        return {name: self._array_to_plain(array[name], depth) for name in array.dtype.names}
 
-    def _items(self, thing: Any, depth: int) -> Any:
+    def _items_to_plain(self, thing: Any, depth: int) -> Any:
         """Return a collection as plain data, or its size if it is too large."""
-        if len(thing) > MOST:
+        if len(thing) > MAX_ITEMS:
             return f"{len(thing)} items"
         if isinstance(thing, Mapping):
-            return _present((str(key), self._plain(value, depth)) for key, value in thing.items())
-        plain = [self._plain(item, depth) for item in thing]
+            return _omit_missing(
+                (str(key), self._to_plain(value, depth)) for key, value in thing.items()
+            )
+        plain = [self._to_plain(item, depth) for item in thing]
         return [
             f"a {type(item).__name__}" if shown is _NOTHING else shown
             for item, shown in zip(thing, plain, strict=True)

@@ -15,21 +15,21 @@ from rack.backplane.errors import BackplaneError
 from rack.backplane.lines import UtilityLines
 from rack.backplane.memory import hold_memory, touch_memory
 from rack.backplane.process import (
-    cores_kept_awake,
     die_with_parent,
+    disable_timer_slack,
+    keep_cores_awake,
     name_process,
     set_priority,
     take_core,
-    wake_up_exactly,
 )
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
 from rack.boards.classes import find_class
-from rack.boards.errors import CANNOT_GO_ON
+from rack.boards.errors import UNRECOVERABLE_STATUS
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.copying import Copier
-from rack.boards.run.snapshots import TaskCopies, takes_snapshots
+from rack.boards.run.snapshots import TaskCopies, wants_snapshots
 from rack.boards.run.system_controller import run_clock
 from rack.boards.wiring import ClockWiring, TaskWiring
 from rack.levels.errors import CannotGoOn, LevelError
@@ -37,19 +37,19 @@ from rack.levels.level import Executor, Planner
 
 SELF_TEST_FAILED = 3
 """Exit status of a board whose start-up test failed."""
-REPEATS = 1 << 16
+REPEATS_FACTOR = 1 << 16
 """Factor by which the word of a failure combines place and number of repeats.
 
 The word is the place, a checksum, times this factor, plus the number of repeats.
 """
-FAST_NS = 10_000_000
+MAX_TOUCHED_CYCLE_NS = 10_000_000
 """Longest cycle for which memory is touched in advance.
 
 Touching takes a tenth of a second, and longer cycles have time for page faults.
 """
 
 
-def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:
+def run_board(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:
     """Run a board in a process forked by the crate.
 
     Args:
@@ -69,7 +69,7 @@ def enter(crate: int, name: str, segment: Segment, board: Callable[[Segment], in
         return board(segment)
     except (BackplaneError, LevelError) as error:
         print(f"board '{name}': {error}", file=sys.stderr, flush=True)
-        return CANNOT_GO_ON if isinstance(error, CannotGoOn) else SELF_TEST_FAILED
+        return UNRECOVERABLE_STATUS if isinstance(error, CannotGoOn) else SELF_TEST_FAILED
     except Exception as error:
         print(_describe_failure(segment, name, error), file=sys.stderr, flush=True)
         return 1
@@ -81,11 +81,11 @@ def _describe_failure(segment: Segment, name: str, error: Exception) -> str:
     If the board's previous process ended in the same place, only the number of repeats is given.
     """
     if name in segment.map.blocks:
-        block = segment.block(name)
+        block = segment.get_block(name)
         place = crc32("".join(traceback.format_tb(error.__traceback__)).encode())
-        last_place, repeats = divmod(block[Block.FAILED], REPEATS)
+        last_place, repeats = divmod(block[Block.FAILED], REPEATS_FACTOR)
         repeats = repeats + 1 if place == last_place else 0
-        block[Block.FAILED] = place * REPEATS + repeats
+        block[Block.FAILED] = place * REPEATS_FACTOR + repeats
         if repeats:
             reason = "".join(traceback.format_exception_only(error)).rstrip()
             return f"board '{name}' failed again in the same place ({repeats} repeats): {reason}"
@@ -104,14 +104,14 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies:
     Returns:
         The exit status of the board.
     """
-    block = segment.block(wiring.task)
+    block = segment.get_block(wiring.task)
     block[Block.PID] = os.getpid()
     block[Block.STATE] = TaskState.STARTING
     try:
         _run_level(segment, wiring, attention, copies)
     except BaseException:
         block[Block.STATE] = TaskState.FAILED
-        UtilityLines(segment).assert_sysfail(segment.layout.task(wiring.task).slot)
+        UtilityLines(segment).assert_sysfail(segment.layout.find_task(wiring.task).slot)
         raise
     block[Block.STATE] = TaskState.ENDED
     return 0
@@ -119,32 +119,32 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies:
 
 def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> None:
     """Build and test the level of a task, then run its cycles."""
-    spec = segment.layout.task(wiring.task)
-    copier = Copier(segment, wiring.task, copies) if takes_snapshots(segment) else None
-    block = segment.block(wiring.task)
+    spec = segment.layout.find_task(wiring.task)
+    copier = Copier(segment, wiring.task, copies) if wants_snapshots(segment) else None
+    block = segment.get_block(wiring.task)
     kind: type[Executor] | type[Planner] = find_class(
         wiring.target, Executor if spec.role == "executor" else Planner
     )
     level = kind(wiring.context)
     if isinstance(level, Adapter):
-        level.attach(segment, wiring.entries)
+        level.attach_segment(segment, wiring.entries)
     try:
         level.self_test()
         if wiring.fails_self_test:
             raise LevelError("self-test failed: injected by a fault in the config")
         UtilityLines(segment).release_sysfail(spec.slot)
-        is_fast = spec.every * segment.layout.clock_ns <= FAST_NS
+        is_fast = spec.every * segment.layout.clock_ns <= MAX_TOUCHED_CYCLE_NS
         lockstep = bool(segment.words[System.LOCKSTEP])
         if is_fast and spec.priority and not lockstep:
             # This is done at ordinary priority, because a restarted board must not delay another
             # board's cycle.
             touch_memory()
         block[Block.PRIORITY] = take_core(spec.core, spec.priority, wiring.reservation)
-        wake_up_exactly()
+        disable_timer_slack()
         hold_memory(lockstep)
         block[Block.CORE] = spec.core
         if isinstance(level, Adapter):
-            level.open()
+            level.open_connections()
         task = (
             VirtualControlLoop(segment, wiring, level, attention)
             if isinstance(level, Executor)
@@ -174,11 +174,11 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copie
     Returns:
         The exit status of the board.
     """
-    copier = Copier(segment, CLOCK, copies) if takes_snapshots(segment) else None
+    copier = Copier(segment, CLOCK, copies) if wants_snapshots(segment) else None
     take_core(wiring.core, wiring.priority, wiring.reservation)
     # The memory is not touched in advance, because every board waits for the clock's start, and its
     # lead over the grid has room for a page fault.
     hold_memory(wiring.lockstep)
-    with cores_kept_awake() if wiring.keeps_awake else nullcontext():
+    with keep_cores_awake() if wiring.keeps_awake else nullcontext():
         run_clock(segment, wiring, attention, copier)
     return 0

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.mailbox.mailbox import GOOD, NOT_YET
+from rack.backplane.mailbox.mailbox import GOOD_OFFSET, NO_MESSAGE_TICK
 from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_BITS, SIGNED_FROM, Slots
 from rack.backplane.words import Slot
 from rack.boards.run.instructions import (
@@ -23,23 +23,23 @@ from rack.boards.run.instructions import (
     fence,
     instruction,
     load,
-    pointer,
     store_release,
+    to_pointer,
     xxh3,
 )
 from rack.levels.compiled import compiled, compiled_for
 
 
-def _words(*names: str) -> np.dtype:
+def _build_dtype(*names: str) -> np.dtype:
     """Build a numpy dtype of 64-bit words."""
     return np.dtype([(name, "i8") for name in names])
 
 
-SLOT = _words("stamp", "signature", "chain", "check", "basis", "serial", "tick", "visible")
+SLOT = _build_dtype("stamp", "signature", "chain", "check", "basis", "serial", "tick", "visible")
 """Words of a slot's head: see `rack.backplane.words.Slot`."""
-STATE = _words("found", "accesses", "transfers", "judged", "judged_tick", *(SLOT.names or ()))
+STATE = _build_dtype("found", "accesses", "transfers", "judged", "judged_tick", *(SLOT.names or ()))
 """Words of a reader's state: see `Reader`."""
-PORT = _words(
+PORT = _build_dtype(
     # Addresses of the mailbox's head, of its first slot, and of the local record of its reader or
     # writer.
     "head",
@@ -72,19 +72,19 @@ PORT = _words(
 _SIGNATURE = 8 * Slot.EPOCH
 _VISIBLE = 8 * Slot.VISIBLE_AT
 _PORT_SIZE = PORT.itemsize
-OLD, NEW, ODD, SILENT, SLOW = 0, 1, 2, 4, 8
+OLD_RESULT, NEW_RESULT, JUDGE_MESSAGES, JUDGE_SILENCE, READ_IN_PYTHON = 0, 1, 2, 4, 8
 """Results of a read.
 
 The last three ask Python to judge the messages, to judge the silence, or to do the read itself.
 """
-MOST_PORTS = 60
+MAX_PORTS = 60
 """Maximum number of ports of a table, since each has a bit in the result of a call."""
 
 
 # Functions that give compiled code the record at an address.
-port_at = instruction(pointer, PORT)
-state_at = instruction(pointer, STATE)
-slot_at = instruction(pointer, SLOT)
+port_at = instruction(to_pointer, PORT)
+state_at = instruction(to_pointer, STATE)
+slot_at = instruction(to_pointer, SLOT)
 
 
 @compiled
@@ -111,7 +111,7 @@ def take(port: Any, serial: int) -> bool:
     check: int = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain)
     if check != received.check:
         return False
-    copy(port.state + GOOD, port.record, port.size)
+    copy(port.state + GOOD_OFFSET, port.record, port.size)
     state.transfers += 1
     return True
 
@@ -124,11 +124,11 @@ def read_port(port: Any, tick: int) -> int:
     oldest = max(state.serial, serial - port.depth)
     while port.is_sliced and serial > oldest and load(slot_of(port, serial) + _VISIBLE) > tick:
         serial -= 1
-    result = OLD
+    result = OLD_RESULT
     if serial != state.serial:
         if not port.is_watched or not take(port, serial):
-            return SLOW
-        result = NEW
+            return READ_IN_PYTHON
+        result = NEW_RESULT
     state.accesses += 1
     state.found = serial
     if port.is_watched:
@@ -139,9 +139,9 @@ def read_port(port: Any, tick: int) -> int:
             state.judged = serial
             state.judged_tick = state.tick
         elif serial != state.judged:
-            result |= ODD
+            result |= JUDGE_MESSAGES
         if tick - state.tick >= port.quiet or load(port.lost):
-            result |= SILENT
+            result |= JUDGE_SILENCE
     return result
 
 
@@ -158,13 +158,13 @@ def publish(port: Any, tick: int, stamp: int) -> int:
     intruder = 0
     if load(port.head) != before:
         intruder = load(slot + _SIGNATURE) >> EPOCH_BITS
-    basis = NOT_YET
+    basis = NO_MESSAGE_TICK
     for at in range(port.source_count):
         state = state_at(load(port.sources + 8 * at))
         if state.serial:
             basis = min(basis, state.basis)
     record.stamp = stamp
-    record.basis = tick if basis == NOT_YET else basis
+    record.basis = tick if basis == NO_MESSAGE_TICK else basis
     record.serial = before + 1
     record.tick = tick
     record.visible = tick + port.delay
@@ -200,7 +200,7 @@ def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
             result = read_port(port, tick)
         elif (tick + port.ahead) % port.every == 0:
             result = publish(port, tick, stamp)
-        if result > NEW or result != port.result:
+        if result > NEW_RESULT or result != port.result:
             touched |= 1 << at
         port.result = result
     return touched
@@ -215,5 +215,5 @@ def order() -> None:
 def load_machine_code() -> None:
     """Load the compiled functions of mailboxes, before a crate forks its boards."""
     access_ports.preload()
-    Slots.fence = staticmethod(order.load())  # type: ignore[method-assign]  # the reference needs none on x86-64
+    Slots.fence = staticmethod(order.load_machine_code())  # type: ignore[method-assign]  # the reference needs none on x86-64
     Slots.fence()

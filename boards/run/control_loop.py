@@ -15,8 +15,8 @@ from rack.backplane.segment import Segment
 from rack.backplane.trace import Flag
 from rack.backplane.watch.alarms import CLEAN_READS, Alarm
 from rack.backplane.words import Block, Demand, System
-from rack.boards.exchange import EXCHANGE, ExchangeRecord
-from rack.boards.run.task import ClockGuard, Task, in_turn, slowed
+from rack.boards.exchange import EXCHANGE_PORT, ExchangeRecord
+from rack.boards.run.task import ClockGuard, Task, chain_accesses, slow_access
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 from rack.levels.messages import ArmState
@@ -55,23 +55,25 @@ class VirtualControlLoop(Task):
         self._guard = ClockGuard(segment, self.alarms, self.block) if wiring.guards_clock else None
         self._has_cycled = False
         self._raised: dict[int, int] = {}  # ticks of the level's own findings, by number
-        self._due = segment.layout.due(self.spec)
+        self._due = segment.layout.compute_due_ticks(self.spec)
         times = wiring.transfer
-        self.exchange = slowed(self.inputs.exchange, times.exchange_ns)
+        self.exchange = slow_access(self.inputs.exchange_plan, times.exchange_ns)
         record = None
         if wiring.exchange:
-            message = self.outputs.writers[EXCHANGE].message
-            record = ExchangeRecord(self.inputs.taken, message).fill
-        reads = in_turn(self.inputs.read_command_and_status, record)
+            message = self.outputs.writers[EXCHANGE_PORT].message
+            record = ExchangeRecord(self.inputs.taken, message).fill_message
+        reads = chain_accesses(self.inputs.read_command_and_status, record)
         settings = executor.take_settings if executor.is_set_by_board else None
-        self.read_command_and_status = in_turn(self.serve, slowed(reads, times.read_ns), settings)
-        self.write_command_and_status = slowed(self.outputs.write, times.write_ns)
+        self.read_command_and_status = chain_accesses(
+            self.serve, slow_access(reads, times.read_ns), settings
+        )
+        self.write_command_and_status = slow_access(self.outputs.write, times.write_ns)
 
     def cycle(self, tick: int) -> None:
         """Run the cycle released at `tick`."""
         watch = self.stopwatch
         deadline = tick + self._due
-        watch.start(tick, self.next_cycle.skipped)
+        watch.start_cycle(tick, self.next_cycle.skipped)
         if watch.is_late:
             self._handle_delay(tick)
         guard = self._guard
@@ -84,9 +86,9 @@ class VirtualControlLoop(Task):
         watch.read_ns = monotonic_ns()
         self.process(tick)
         watch.process_ns = monotonic_ns()
-        in_time = self.write_command_and_status(tick, watch.now(deadline))
+        in_time = self.write_command_and_status(tick, watch.find_late_tick(deadline))
         watch.end_ns = monotonic_ns()
-        watch.finish(in_time, deadline, done=tick)
+        watch.finish_cycle(in_time, deadline, done=tick)
 
     def _handle_delay(self, tick: int) -> None:
         """Record a pause in reading, and check the clock if the cycle begins late.
@@ -107,19 +109,19 @@ class VirtualControlLoop(Task):
         for complete_cycle in executor.complete_cycle:
             complete_cycle(self._arm_state)
         if executor.findings or executor.acted or self.faults.loads:
-            self._report(tick)
+            self._report_findings(tick)
 
-    def _report(self, tick: int) -> None:
+    def _report_findings(self, tick: int) -> None:
         """Raise alarms for the level's findings, and update the faults that act in the cycle."""
         executor = self.executor
         for finding in executor.findings:
             # A level may raise user-defined findings in every cycle. Raise one alarm per episode.
             if finding.alarm is not Alarm.OWN or self._begins_episode(finding.subject, tick):
-                self.alarms.ring(tick, *finding)
+                self.alarms.raise_alarm(tick, *finding)
         executor.findings.clear()
-        self.faults.count(executor.acted, tick)
+        self.faults.count_actions(executor.acted, tick)
         executor.acted.clear()
-        self.faults.burn(tick)
+        self.faults.burn_time(tick)
 
     def _begins_episode(self, number: int, tick: int) -> bool:
         """Record a user-defined finding. Returns True if it begins an episode."""
@@ -147,26 +149,26 @@ class PlannerLoop(Task):
         super().__init__(segment, wiring, planner, attention)
         self.planner = planner
         self.slice = self.spec.slice
-        self.read = in_turn(self.serve, self.inputs.read)
-        self.write_plan = slowed(self.outputs.write, wiring.transfer.update_ns)
+        self.read = chain_accesses(self.serve, self.inputs.read)
+        self.write_plan = slow_access(self.outputs.write, wiring.transfer.update_ns)
         self._critical_priority = wiring.critical_priority
         self._priority = self.block[Block.PRIORITY]
 
     def cycle(self, tick: int) -> None:
         """Plan in the cycle released at `tick`, if a plan is wanted."""
         watch = self.stopwatch
-        watch.start(tick, self.next_cycle.skipped)
+        watch.start_cycle(tick, self.next_cycle.skipped)
         self.read(tick)
         watch.read_ns = monotonic_ns()
         if not self.planner.wanted(tick):
-            self._pass(tick)
+            self._pass_release(tick)
             return
         # Claim the time slice of a plan, until whose end the clock does not release this task.
-        self.next_cycle.hold_until(tick + self.slice)
+        self.next_cycle.skip_until(tick + self.slice)
         self.block[Block.DEADLINE] = tick + self.slice
         self.stopwatch.notify_clock()
         self.planner.plan(tick)
-        self.faults.burn(tick)
+        self.faults.burn_time(tick)
         if self._critical_priority:
             # At this priority the executor cannot preempt the update of the plan.
             set_priority(self._critical_priority)
@@ -174,7 +176,7 @@ class PlannerLoop(Task):
             # Take the stamps inside the section. Before it and after it, the executor may run
             # first.
             watch.process_ns = monotonic_ns()
-            in_time = self.write_plan(tick, watch.now(tick + self.slice))
+            in_time = self.write_plan(tick, watch.find_late_tick(tick + self.slice))
             watch.end_ns = monotonic_ns()
         finally:
             if self._critical_priority:
@@ -182,17 +184,17 @@ class PlannerLoop(Task):
         self.block[Block.PLANS] += 1
         # A plan begun late gets its whole slice, and counts for every release within it.
         done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
-        watch.finish(in_time, tick + self.slice, done, Flag.PLANNED)
+        watch.finish_cycle(in_time, tick + self.slice, done, Flag.PLANNED)
 
-    def _pass(self, tick: int) -> None:
+    def _pass_release(self, tick: int) -> None:
         """Let a release pass without a plan.
 
         The cycle is traced if it came too late or other cycles were skipped.
         """
-        self.outputs.flush(tick, self.clock.now())
-        in_time = self.clock.now() < tick + self.slice
+        self.outputs.flush_delayed(tick, self.clock.compute_tick())
+        in_time = self.clock.compute_tick() < tick + self.slice
         if in_time and not self.next_cycle.skipped:
-            self.stopwatch.idle()
+            self.stopwatch.finish_idle_cycle()
             return
         self.stopwatch.process_ns = self.stopwatch.end_ns = monotonic_ns()
-        self.stopwatch.finish(in_time, tick + self.slice, tick)
+        self.stopwatch.finish_cycle(in_time, tick + self.slice, tick)

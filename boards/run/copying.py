@@ -27,15 +27,15 @@ from typing import Any
 
 from rack.backplane import copies
 from rack.backplane.json_text import encode_json
-from rack.backplane.mailbox.mailbox import claim_again
-from rack.backplane.process import COPY, die_with_parent, name_process
+from rack.backplane.mailbox.mailbox import reclaim_mailboxes
+from rack.backplane.process import COPY_PREFIX, die_with_parent, name_process
 from rack.backplane.segment import Segment
 from rack.boards.errors import SnapshotError
 from rack.levels.level import LevelContext
 
-MOST_BYTES = 4096
+MAX_NOTE_BYTES = 4096
 """Maximum size of a board's note."""
-MOST_FILES = 2
+MAX_NOTE_FILES = 2
 """Maximum number of descriptors sent with a note."""
 _DESCRIPTORS = Path("/proc/self/fd")
 _THREADS = Path("/proc/self/task")
@@ -53,7 +53,7 @@ class CopyNote:
     name: str
     pid: int
 
-    def send(self, line: socket, *files: int) -> None:
+    def send_note(self, line: socket, *files: int) -> None:
         """Send the note with open files.
 
         Raises:
@@ -64,12 +64,12 @@ class CopyNote:
 
 def receive_note(line: socket) -> tuple[CopyNote, list[int]]:
     """Return the next note, and the files sent with it."""
-    data, files, *_ = recv_fds(line, MOST_BYTES, MOST_FILES)
+    data, files, *_ = recv_fds(line, MAX_NOTE_BYTES, MAX_NOTE_FILES)
     return CopyNote(**json.loads(data)), files
 
 
 @dataclass(frozen=True)
-class GoOn:
+class ContinueRequest:
     """The crate's request to a copy to continue in the segment of `rack`.
 
     The other request, None, is answered with the attributes of the level as JSON.
@@ -95,12 +95,12 @@ class Copier:
         self._segment = segment
         self._name = name
         self._line = line
-        self._before = _open_files()
+        self._before = _list_open_files()
         self._copies: list[int] = []
 
-    def copy(
+    def fork_copy(
         self, tick: int, *memory: int, show: Callable[[], Mapping[str, Any]] = dict
-    ) -> GoOn | None:
+    ) -> ContinueRequest | None:
         """Fork a copy before `tick`.
 
         Args:
@@ -115,12 +115,12 @@ class Copier:
         Raises:
             SnapshotError: The process cannot be copied, with the reason.
         """
-        if why := "; ".join(self._refused(memory)):
+        if why := "; ".join(self._list_obstacles(memory)):
             raise SnapshotError(f"{self._name}: {why}")
         offsets = {
             fd: os.lseek(fd, 0, os.SEEK_CUR)
-            for fd in _open_files()
-            if _is_only_read(fd) and stat.S_ISREG(os.fstat(fd).st_mode)
+            for fd in _list_open_files()
+            if _is_read_only(fd) and stat.S_ISREG(os.fstat(fd).st_mode)
         }
         seeds = random.getstate()
         here, theirs = Pipe()
@@ -130,7 +130,7 @@ class Copier:
             except OSError as error:
                 raise SnapshotError(f"{self._name}: cannot be copied: {error.strerror}") from None
             if pid:
-                CopyNote(tick, self._name, pid).send(self._line, here.fileno(), *memory)
+                CopyNote(tick, self._name, pid).send_note(self._line, here.fileno(), *memory)
                 # Reap the copies that have ended, which are children of this process.
                 self._copies = [
                     copy for copy in self._copies if not os.waitpid(copy, os.WNOHANG)[0]
@@ -138,13 +138,13 @@ class Copier:
                 self._copies.append(pid)
                 return None
             here.close()
-            copies.leave(self._segment)
-            name_process(f"{COPY}{self._name}")
+            copies.detach_segment(self._segment)
+            name_process(f"{COPY_PREFIX}{self._name}")
             request, successor = self._await_request(theirs, offsets, seeds, show)
         die_with_parent(request.crate)
-        copies.enter(self._segment, request.rack)
-        claim_again()
-        CopyNote(tick, self._name, successor).send(self._line)
+        copies.switch_segment(self._segment, request.rack)
+        reclaim_mailboxes()
+        CopyNote(tick, self._name, successor).send_note(self._line)
         self._copies = [successor]
         name_process(f"{self._segment.rack}:{self._name}")
         return request
@@ -155,7 +155,7 @@ class Copier:
         offsets: Mapping[int, int],
         seeds: Any,
         show: Callable[[], Mapping[str, Any]],
-    ) -> tuple[GoOn, int]:
+    ) -> tuple[ContinueRequest, int]:
         """Wait in a copy until a rack continues from it. The process ends with the crate.
 
         Args:
@@ -178,7 +178,7 @@ class Copier:
             random.setstate(seeds)
             try:
                 # The request is trusted, because it comes from the crate.
-                request: GoOn | None = crate.recv()
+                request: ContinueRequest | None = crate.recv()
                 if request is None:
                     crate.send_bytes(encode_json(show()).encode())
                 elif successor := os.fork():
@@ -187,7 +187,7 @@ class Copier:
                 # The crate has ended, or the system refuses a fork, which the crate notices.
                 os._exit(os.EX_OSERR)
 
-    def _refused(self, memory: Collection[int]) -> list[str]:
+    def _list_obstacles(self, memory: Collection[int]) -> list[str]:
         """Describe the resources of the process that a copy cannot have.
 
         Args:
@@ -196,12 +196,12 @@ class Copier:
         segment = os.fstat(self._segment.fd)
         resources = [
             f"it holds {name}"
-            for fd, name in _open_files().items()
+            for fd, name in _list_open_files().items()
             if self._before.get(fd) != name
             and fd not in memory
             # Locks hold descriptors of the segment, too.
             and not os.path.samestat(os.fstat(fd), segment)
-            and not _is_only_read(fd)
+            and not _is_read_only(fd)
         ]
         threads = [path for path in _THREADS.iterdir() if path.name != str(os.getpid())]
         return resources + [
@@ -209,7 +209,7 @@ class Copier:
         ]
 
 
-def _open_files() -> dict[int, str]:
+def _list_open_files() -> dict[int, str]:
     """Return the open files of this process with their names."""
     name_by_descriptor = {}
     for entry in [*_DESCRIPTORS.iterdir()]:
@@ -219,7 +219,7 @@ def _open_files() -> dict[int, str]:
     return name_by_descriptor
 
 
-def _is_only_read(fd: int) -> bool:
+def _is_read_only(fd: int) -> bool:
     """Check whether an open file is a device, or a file or folder open only for reading."""
     kind = os.fstat(fd).st_mode
     has_content = stat.S_ISREG(kind) or stat.S_ISDIR(kind)

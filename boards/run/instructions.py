@@ -30,7 +30,7 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
         super().__init__(emit)
         self._record = record
 
-    def source(self) -> Iterator[bytes]:
+    def iterate_source(self) -> Iterator[bytes]:
         """Yield this file and the type of the record, on which the code of a caller depends."""
         yield Path(__file__).read_bytes()
         yield repr(self._record).encode()
@@ -54,7 +54,7 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
         return intrinsic(define)
 
 
-def pointer(builder: Any, address: Any) -> Any:
+def to_pointer(builder: Any, address: Any) -> Any:
     """Emit the conversion of an address to a pointer to a word."""
     from llvmlite import ir
 
@@ -64,13 +64,13 @@ def pointer(builder: Any, address: Any) -> Any:
 @instruction
 def load(builder: Any, address: Any) -> Any:
     """Load the word at an address atomically. No later access is moved before it."""
-    return builder.load_atomic(pointer(builder, address), "acquire", 8)
+    return builder.load_atomic(to_pointer(builder, address), "acquire", 8)
 
 
 @instruction
 def store_release(builder: Any, address: Any, value: Any) -> None:
     """Store a word at an address atomically. No earlier access is moved after it."""
-    builder.store_atomic(value, pointer(builder, address), "release", 8)
+    builder.store_atomic(value, to_pointer(builder, address), "release", 8)
 
 
 @instruction
@@ -84,7 +84,7 @@ def copy(builder: Any, target: Any, source: Any, size: Any) -> None:
     """Copy `size` bytes from the address `source` to the address `target`."""
     from numba.core.cgutils import raw_memcpy
 
-    ends = pointer(builder, target), pointer(builder, source)
+    ends = to_pointer(builder, target), to_pointer(builder, source)
     raw_memcpy(builder, *ends, size, 1)  # type: ignore[no-untyped-call]
 
 

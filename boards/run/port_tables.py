@@ -14,29 +14,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.address_map import slot_stride
+from rack.backplane.address_map import compute_slot_stride
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reader, Writer
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.message import AnyMessage
-from rack.backplane.watch.watched_reader import Watched, WatchedReader
+from rack.backplane.watch.watched_reader import MailboxWatcher, WatchedReader
 from rack.backplane.words import Block
 from rack.boards.run.compiled_mailbox import (
-    MOST_PORTS,
-    NEW,
-    ODD,
+    JUDGE_MESSAGES,
+    JUDGE_SILENCE,
+    MAX_PORTS,
+    NEW_RESULT,
     PORT,
-    SILENT,
-    SLOW,
+    READ_IN_PYTHON,
     access_ports,
 )
 from rack.levels.level import Reading
 
-WORD = 8
+WORD_BYTES = 8
 """Bytes of a word, and the alignment of all memory that is accessed by address."""
 
 
-class Line(NamedTuple):
+class InputMailbox(NamedTuple):
     """One mailbox to read.
 
     Attributes:
@@ -49,7 +49,7 @@ class Line(NamedTuple):
     values: dict[str, Reading[AnyMessage]]
     key: str
     read: Callable[[int], Reading[AnyMessage]]
-    watched: Watched
+    watched: MailboxWatcher
 
 
 class PortTable:
@@ -58,32 +58,34 @@ class PortTable:
     def __init__(self, slots: Sequence[Slots]) -> None:
         self._ports = np.zeros(len(slots), PORT)
         for port, each in zip(self._ports, slots, strict=True):
-            port["head"] = address_of(each.box)
-            port["slots"] = address_of(each.places[0])
-            port["record"] = address_of(each.record)
-            port["stride"] = slot_stride(each.spec)
+            port["head"] = get_address(each.box)
+            port["slots"] = get_address(each.places[0])
+            port["record"] = get_address(each.record)
+            port["stride"] = compute_slot_stride(each.spec)
             port["depth"] = each.depth
             port["size"] = len(each.record)
         self._access: Callable[..., int] = lambda *_: 0
         if slots:
-            self._access = partial(access_ports.load(), self._ports.ctypes.data, len(slots))
+            self._access = partial(
+                access_ports.load_machine_code(), self._ports.ctypes.data, len(slots)
+            )
 
 
 class ReadTable(PortTable):
     """The reads of one step. Compiled code does the reads that it supports, Python the others."""
 
-    def __init__(self, lines: Sequence[Line]) -> None:
-        self._lines = [line for line in lines if can_read(line)][:MOST_PORTS]
+    def __init__(self, lines: Sequence[InputMailbox]) -> None:
+        self._lines = [line for line in lines if can_read(line)][:MAX_PORTS]
         self._others = [line for line in lines if line not in self._lines]
         super().__init__([line.watched.reader.slots for line in self._lines])
         for port, line in zip(self._ports, self._lines, strict=True):
             watched = line.watched
-            port["state"] = address_of(watched.reader.words)
+            port["state"] = get_address(watched.reader.words)
             port["is_sliced"] = type(watched.reader) is Reader
             port["result"] = -1
             if isinstance(watched, WatchedReader):
                 port["is_watched"] = True
-                port["lost"] = address_of(watched.writer[Block.LOST : Block.LOST + 1])
+                port["lost"] = get_address(watched.writer[Block.LOST : Block.LOST + 1])
                 port["late_from"] = watched.watch.late_from
                 port["quiet"] = watched.watch.quiet
 
@@ -96,13 +98,16 @@ class ReadTable(PortTable):
                     continue
                 result = int(self._ports["result"][at])
                 watched = line.watched
-                if result & SLOW:
+                if result & READ_IN_PYTHON:
                     reading = line.read(tick)
                 else:
-                    reading = watched.reader.reading(bool(result & NEW))
+                    reading = watched.reader.get_reading(bool(result & NEW_RESULT))
                     if isinstance(watched, WatchedReader):
-                        is_odd, is_silent = bool(result & ODD), bool(result & SILENT)
-                        reading = watched.conclude(
+                        is_odd, is_silent = (
+                            bool(result & JUDGE_MESSAGES),
+                            bool(result & JUDGE_SILENCE),
+                        )
+                        reading = watched.judge_reading(
                             tick, reading, is_odd=is_odd, is_silent=is_silent
                         )
                 line.values[line.key] = reading
@@ -110,22 +115,23 @@ class ReadTable(PortTable):
             line.values[line.key] = line.read(tick)
 
 
-def can_read(line: Line) -> bool:
+def can_read(line: InputMailbox) -> bool:
     """Check whether compiled code can read a mailbox: at every tick, without a lock."""
     watched = line.watched
     return line.read == watched.read and type(watched.reader) in (Reader, DoubleBufferReader)
 
 
-def address_of(memory: memoryview) -> int:
+def get_address(memory: memoryview) -> int:
     """Return the address of memory.
 
     Raises:
         MailboxError: The memory is not aligned to words.
     """
     address = int(np.frombuffer(memory, np.uint8).ctypes.data)
-    if address % WORD:
+    if address % WORD_BYTES:
         raise MailboxError(
-            f"memory at {address:#x} is not aligned to {WORD} bytes, as atomic access requires"
+            f"memory at {address:#x} is not aligned to {WORD_BYTES} bytes, as atomic "
+            "access requires"
         )
     return address
 
@@ -143,7 +149,7 @@ class WriteTable(PortTable):
         """
         self._writers = [writer for writer, _ in writers]
         self._sources = [
-            np.array([address_of(reader.words) for reader in sources], np.int64)
+            np.array([get_address(reader.words) for reader in sources], np.int64)
             for _, sources in writers
         ]
         super().__init__([writer.slots for writer in self._writers])
@@ -153,7 +159,7 @@ class WriteTable(PortTable):
             port["source_count"] = len(sources)
             port["every"] = spec.every
             port["ahead"] = spec.ahead - spec.phase
-            port["delay"] = writer.visible_at(0, None)
+            port["delay"] = writer.compute_visible_tick(0, None)
 
     def write(self, tick: int) -> bool:
         """Write the messages that are due, in a cycle whose end has not come.

@@ -10,17 +10,17 @@ from rack.backplane.layout import ExchangeSpec
 from rack.backplane.mailbox.interrupt import BoardInbox
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.mailbox.queue import QueueWriter, taken_name
+from rack.backplane.mailbox.queue import QueueWriter, get_position_mailbox
 from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
-from rack.backplane.watch.watched_reader import GridReader, watched
-from rack.boards.exchange import Taken
-from rack.boards.faults.kind import kind_of
+from rack.backplane.watch.watched_reader import GridReader, open_watched
+from rack.boards.exchange import MonitoredPort
+from rack.boards.faults.kind import find_kind
 from rack.boards.faults.message_steps import FaultyWriter
-from rack.boards.run.compiled_mailbox import MOST_PORTS
-from rack.boards.run.port_tables import Line, ReadTable, WriteTable, can_write
+from rack.boards.run.compiled_mailbox import MAX_PORTS
+from rack.boards.run.port_tables import InputMailbox, ReadTable, WriteTable, can_write
 from rack.boards.wiring import Source
 from rack.levels.level import LevelSection, Reading, Verdict
 from rack.levels.ports import Sender
@@ -59,20 +59,24 @@ class InputPorts:
             inbox: Inbox of the task's board.
         """
         self.task = ReadingTask(inbox)
-        self.taken: list[Taken] = []
+        self.taken: list[MonitoredPort] = []
         self.readers: dict[str, Reader] = {}
         # Readings go to the ports themselves or, for a port that reads several mailboxes, to its
         # dictionary.
-        plans: list[Line] = []
-        self._rest: list[Line] = []
+        plans: list[InputMailbox] = []
+        self._rest: list[InputMailbox] = []
         for port, source in sources.items():
             boxes = {port: source} if isinstance(source, str) else source
-            values = level.input_table(port)
+            values = level.find_input_table(port)
             if not isinstance(source, str):
                 values[port] = values = {}
             rule = (exchange or {}).get(port)
             open_port = partial(
-                watched, segment, alarms=alarms, task=self.task, room=partial(level.room, port)
+                open_watched,
+                segment,
+                alarms=alarms,
+                task=self.task,
+                count_room=partial(level.max_messages, port),
             )
             for key, mailbox in boxes.items():
                 if port in level.inputs:
@@ -87,16 +91,18 @@ class InputPorts:
                 )
                 """Read every mailbox as of `tick`."""
                 values[key] = Reading(watched_reader.reader.message, Verdict.NONE)
-                line = Line(values, key, read, watched_reader)
+                line = InputMailbox(values, key, read, watched_reader)
                 (plans if mailbox == plan else self._rest).append(line)
-                self.taken.append(Taken(values, key, watched_reader.reader))
+                self.taken.append(MonitoredPort(values, key, watched_reader.reader))
                 self.readers[mailbox] = watched_reader.reader
         self.reads_plan = bool(plans)
         self._plan_table = ReadTable(plans)
         self._table = ReadTable(self._rest)
         self._readers = [entry.reader for entry in self.taken]
 
-    def follow(self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter) -> None:
+    def read_queue_position(
+        self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter
+    ) -> None:
         """Read the position of the reader of a queue that the task writes.
 
         It is read together with the mailboxes of the ports.
@@ -106,24 +112,26 @@ class InputPorts:
             queue: Writer of the queue.
             alarms: Ring for alarms about faults of messages.
         """
-        position_reader = watched(segment, taken_name(queue.spec.name), alarms, self.task)
+        position_reader = open_watched(
+            segment, get_position_mailbox(queue.spec.name), alarms, self.task
+        )
 
         def read_and_note(tick: int) -> Reading[AnyMessage]:
             reading = position_reader.read(tick)
             queue.taken = reading.message.taken
             return reading
 
-        self._rest.append(Line({}, "", read_and_note, position_reader))
+        self._rest.append(InputMailbox({}, "", read_and_note, position_reader))
         self._table = ReadTable(self._rest)
         self._readers.append(position_reader.reader)
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
-        self.task.reads(tick)
-        self.exchange(tick)
+        self.task.record_read(tick)
+        self.exchange_plan(tick)
         self.read_command_and_status(tick)
 
-    def exchange(self, tick: int) -> None:
+    def exchange_plan(self, tick: int) -> None:
         """Transfer the plan over the bus, as of `tick`."""
         self._plan_table.read(tick)
 
@@ -179,24 +187,24 @@ class OutputPort:
         self.value: AnyMessage | Sender[AnyMessage] = writer.message
         """Object that the level gets in its port: the message, or a `Sender`."""
         if self._is_on_demand:
-            self.value = Sender(writer.message, self._send, lambda: 1)
+            self.value = Sender(writer.message, self._mark_sent, lambda: 1)
         elif isinstance(writer, QueueWriter) and sends:
-            self.value = Sender(writer.message, writer.send, writer.room)
+            self.value = Sender(writer.message, writer.send, writer.count_free_places)
         # A message that is not written in every cycle becomes visible at multiples of its period,
         # counted from its phase.
         self._ahead = spec.ahead - spec.phase
-        self._index = segment.layout.index(spec.name)
+        self._index = segment.layout.find_mailbox_index(spec.name)
         self._episodes = Episodes(segment, spec.name, alarms)
         self._faulty: FaultyWriter | None = None
         self._held_up = self._refused = 0
 
-    def _send(self, basis: int | None = None) -> bool:
+    def _mark_sent(self, basis: int | None = None) -> bool:
         """Mark the message of a port on demand to be written in this cycle."""
         self._is_sent = True
         self._basis = basis
         return True
 
-    def apply(self, faults: Sequence[FaultEntry]) -> None:
+    def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
         """Apply the faults that concern the mailbox.
 
         Messages delayed by earlier faults are published with the next write.
@@ -205,12 +213,12 @@ class OutputPort:
             entry
             for entry in faults
             if entry.mailbox in (-1, self._index)
-            and not (self._is_queue and kind_of(entry).not_queued)
+            and not (self._is_queue and find_kind(entry).not_queued)
         ]
         if chosen and self._faulty is None:
             self._faulty = FaultyWriter(self.writer, self._index)
         if self._faulty is not None:
-            self._faulty.apply(chosen)
+            self._faulty.apply_faults(chosen)
 
     @property
     def is_faulty(self) -> bool:
@@ -224,7 +232,7 @@ class OutputPort:
             self._faulty = None
         in_time = True
         if (tick + self._ahead) % writer.spec.every or not self._is_sent:
-            self.flush(tick, now)
+            self.flush_delayed(tick, now)
         else:
             basis = min([source.basis for source in self.sources if source.serial], default=tick)
             if self._is_on_demand:
@@ -234,27 +242,29 @@ class OutputPort:
                 writer.send()
             in_time = (self._faulty or writer).write(tick, now, basis)
         if writer.intruder or writer.held_up or writer.refused:
-            self.report(tick)
+            self.report_findings(tick)
         return in_time
 
-    def flush(self, tick: int, now: int | None) -> None:
+    def flush_delayed(self, tick: int, now: int | None) -> None:
         """Publish delayed messages that are due."""
         if self._faulty is not None:
-            self._faulty.flush(tick, now)
+            self._faulty.flush_due(tick, now)
 
-    def report(self, tick: int) -> None:
+    def report_findings(self, tick: int) -> None:
         """Raise alarms for an intruder, refused messages or a held lock."""
         writer = self.writer
         if writer.refused != self._refused:
             refused = writer.refused - self._refused
             self._refused = writer.refused
-            self._episodes.find(Alarm.QUEUE_FULL, writer.serial + writer.refused, tick, refused)
+            self._episodes.record_finding(
+                Alarm.QUEUE_FULL, writer.serial + writer.refused, tick, refused
+            )
         if writer.intruder:
-            self._episodes.find(Alarm.MASQUERADE, writer.serial, tick, writer.intruder)
+            self._episodes.record_finding(Alarm.MASQUERADE, writer.serial, tick, writer.intruder)
             writer.intruder = 0
         if writer.held_up != self._held_up:
             self._held_up = writer.held_up
-            self._episodes.find(Alarm.LOCKED, writer.serial, tick)
+            self._episodes.record_finding(Alarm.LOCKED, writer.serial, tick)
 
 
 class OutputPorts:
@@ -297,16 +307,16 @@ class OutputPorts:
             self._ports.append(output)
             level.place_output(port, output.value)
             if isinstance(writer, QueueWriter):
-                inputs.follow(segment, writer, alarms)
-        self._compiled = [port for port in self._ports if can_write(port.writer)][:MOST_PORTS]
+                inputs.read_queue_position(segment, writer, alarms)
+        self._compiled = [port for port in self._ports if can_write(port.writer)][:MAX_PORTS]
         self._table = WriteTable([(port.writer, port.sources) for port in self._compiled])
         self._others = [port for port in self._ports if port not in self._compiled]
         self._is_faulty = False
 
-    def apply(self, faults: Sequence[FaultEntry]) -> None:
+    def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
         """Apply these faults from now on, and no others."""
         for port in self._ports:
-            port.apply(faults)
+            port.apply_faults(faults)
         self._is_faulty = any(port.is_faulty for port in self._ports)
 
     @property
@@ -329,7 +339,7 @@ class OutputPorts:
             ports = self._others
             if self._table.write(tick):
                 for port in self._compiled:
-                    port.report(tick)
+                    port.report_findings(tick)
         in_time = True
         for port in ports:
             if not port.write(tick, now):
@@ -338,10 +348,10 @@ class OutputPorts:
             self._is_faulty = any(port.is_faulty for port in self._ports)
         return in_time
 
-    def flush(self, tick: int, now: int | None) -> None:
+    def flush_delayed(self, tick: int, now: int | None) -> None:
         """Publish delayed messages that are due, in a cycle that writes nothing else."""
         for port in self._ports:
-            port.flush(tick, now)
+            port.flush_delayed(tick, now)
 
     @property
     def traffic(self) -> tuple[int, int]:

@@ -29,33 +29,33 @@ def change_settings(level: Executor | Planner, context: LevelContext) -> None:
     """
     before, after = type(level)(level.context), type(level)(context)
     try:
-        _Change().apply(level, before, after)
+        _SettingsChange().apply_to(level, before, after)
     finally:
         before.close()
         after.close()
     level.context = context
 
 
-class _Change:
+class _SettingsChange:
     """Differences between two objects, to be applied to a third object of their class."""
 
     def __init__(self) -> None:
         self._seen: set[int] = set()
 
-    def apply(self, live: object, before: object, after: object) -> None:
+    def apply_to(self, live: object, before: object, after: object) -> None:
         """Apply the differences between `before` and `after` to `live`."""
         if id(live) in self._seen:
             return
         self._seen.add(id(live))
-        for name in attribute_names(before):
+        for name in list_attribute_names(before):
             if hasattr(live, name) and hasattr(after, name):
                 now = getattr(live, name)
-                changed = self._merged(now, getattr(before, name), getattr(after, name))
+                changed = self._merge_values(now, getattr(before, name), getattr(after, name))
                 if changed is not now:
                     # This works for frozen dataclasses, too.
                     object.__setattr__(live, name, changed)
 
-    def _merged(self, now: Any, old: Any, new: Any) -> Any:
+    def _merge_values(self, now: Any, old: Any, new: Any) -> Any:
         """Return a value after the change from `old` to `new`. Objects are changed in place."""
         if not type(now) is type(old) is type(new):
             # For example, None has become an object.
@@ -69,11 +69,11 @@ class _Change:
             case dict() | list() if len(now) == len(old) == len(new):
                 for key in now if isinstance(now, dict) else range(len(now)):
                     if isinstance(now, list) or (key in old and key in new):
-                        now[key] = self._merged(now[key], old[key], new[key])
+                        now[key] = self._merge_values(now[key], old[key], new[key])
             case None | bool() | int() | float() | complex() | str() | bytes() | BaseModel():
                 return new if old != new and now == old else now
             case _ if has_attributes(now):
-                self.apply(now, old, new)
+                self.apply_to(now, old, new)
         return now
 
 
@@ -83,7 +83,7 @@ def has_attributes(thing: object) -> bool:
     return not is_whole and (hasattr(thing, "__dict__") or hasattr(type(thing), "__slots__"))
 
 
-def attribute_names(thing: object) -> Iterable[str]:
+def list_attribute_names(thing: object) -> Iterable[str]:
     """Return the names of an object's attributes, including slots."""
     slots = [getattr(kind, "__slots__", ()) for kind in type(thing).__mro__]
     names = [name for slot_names in slots for name in slot_names if hasattr(thing, name)]

@@ -16,7 +16,7 @@ from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.copies import copy_memory
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System, TaskState
-from rack.boards.errors import UNKEPT, SnapshotError
+from rack.boards.errors import NO_SNAPSHOTS_PREFIX, SnapshotError
 from rack.boards.run.attributes import AttributeView
 from rack.boards.run.copying import Copier
 from rack.boards.run.settings import change_settings
@@ -25,11 +25,11 @@ from rack.levels.level import Executor, Planner
 
 FIRST_COST_S = 0.03
 """Assumed standstill for a snapshot before the first one is taken."""
-REFUSED = -1
+COPY_REFUSED = -1
 """Value of `Block.COPY` of a task that cannot be copied."""
 
 
-def takes_snapshots(segment: Segment) -> bool:
+def wants_snapshots(segment: Segment) -> bool:
     """Check whether the rack wants snapshots."""
     words = segment.words
     return any(
@@ -54,17 +54,17 @@ class TaskCopies:
         """Fork a copy and continue. The copy continues when a rack continues from it."""
         block = self._block
         try:
-            request = self._copier.copy(block[Block.COPY] - 1, show=self._view.show)
+            request = self._copier.fork_copy(block[Block.COPY] - 1, show=self._view.read_attributes)
         except SnapshotError as error:
-            print(f"{UNKEPT}{error}", file=sys.stderr, flush=True)
-            block[Block.COPY] = REFUSED
+            print(f"{NO_SNAPSHOTS_PREFIX}{error}", file=sys.stderr, flush=True)
+            block[Block.COPY] = COPY_REFUSED
         else:
             if request is not None:
                 if request.context is not None:
                     change_settings(self._level, request.context)
                 block[Block.PID] = os.getpid()
                 block[Block.STATE] = TaskState.RUNNING
-                self._stopwatch.begin()
+                self._stopwatch.start_counting()
                 os.eventfd_write(self._attention, 1)
             block[Block.COPY] = 0
         self._stopwatch.notify_clock()
@@ -103,9 +103,9 @@ class ClockCopies:
         )
         if tick == requested_tick or is_due:
             tasks = self._driver.tasks
-            self._driver.settle()
+            self._driver.wait_until_settled()
             are_there = [task.is_settled() and not task.is_lost | task.is_stopped for task in tasks]
-            if all(are_there) and self._take(tick):
+            if all(are_there) and self._take_snapshot(tick):
                 # This is the copy. Apply the snapshot policy of the rack that continues from it.
                 return self(tick)
         next_requested = requested_tick if requested_tick > tick else sys.maxsize
@@ -113,7 +113,7 @@ class ClockCopies:
             min(next_requested, max(self._taken_at + every, tick + 1)) if every else next_requested
         )
 
-    def _take(self, tick: int) -> bool:
+    def _take_snapshot(self, tick: int) -> bool:
         """Take a snapshot. Returns True in a copy of the clock that continues from it."""
         started_s = time.monotonic()
         tasks = self._driver.tasks
@@ -132,9 +132,9 @@ class ClockCopies:
         memory = copy_memory(self._segment)
         goes_on = False
         try:
-            goes_on = self._copier.copy(tick, memory) is not None
+            goes_on = self._copier.fork_copy(tick, memory) is not None
         except SnapshotError as error:
-            print(f"{UNKEPT}{error}", file=sys.stderr, flush=True)
+            print(f"{NO_SNAPSHOTS_PREFIX}{error}", file=sys.stderr, flush=True)
         os.close(memory)
         words = self._segment.words
         now_s = time.monotonic()

@@ -11,7 +11,7 @@ from time import monotonic_ns, thread_time_ns
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import done_semaphore
+from rack.backplane.semaphores import get_done_semaphore
 from rack.backplane.trace import SKIPPED_SHIFT, Flag, TraceWriter
 from rack.backplane.words import Block, System
 from rack.boards.run.ports import InputPorts, OutputPorts
@@ -34,7 +34,7 @@ class Stopwatch:
     def __init__(
         self, segment: Segment, task: str, inputs: InputPorts, outputs: OutputPorts
     ) -> None:
-        self._block = segment.block(task)
+        self._block = segment.get_block(task)
         self._words = segment.words
         self._clock = SystemClock(segment)
         self._inputs = inputs
@@ -50,7 +50,7 @@ class Stopwatch:
                 self._status = writer.message.raw
                 self._state_at = fields["state"][1]
         self._trace = TraceWriter(segment, task)
-        self._lockstep_done = done_semaphore(segment, task) if self._clock.is_lockstep else None
+        self._lockstep_done = get_done_semaphore(segment, task) if self._clock.is_lockstep else None
         self._troubles = self._bus_errors = self._corrupt = 0
         self._cycles = self._block[Block.CYCLES]
         self._state = self._block[Block.LEVEL_STATE]
@@ -68,11 +68,11 @@ class Stopwatch:
         self.process_ns = 0  # the level has processed, or planned (X, P)
         self.end_ns = 0  # every output is written (W, U)
 
-    def begin(self) -> None:
+    def start_counting(self) -> None:
         """Start to count processor time."""
         self._processor_ns = thread_time_ns()
 
-    def start(self, tick: int, skipped: int) -> None:
+    def start_cycle(self, tick: int, skipped: int) -> None:
         """Begin the cycle released at `tick`, after `skipped` missed releases."""
         self._tick = tick
         self._skipped = skipped
@@ -82,17 +82,17 @@ class Stopwatch:
         self._release_ns = release_ns
         self.is_late = skipped > 0 or start_ns - release_ns > self._late_ns or not self._closed_ns
 
-    def now(self, deadline: int) -> int | None:
+    def find_late_tick(self, deadline: int) -> int | None:
         """Return the clock's tick at the end of the level's `process`.
 
         The result is None if tick `deadline` has not come.
         """
-        if self._lockstep_done is None and self.process_ns < self._time_of(deadline):
+        if self._lockstep_done is None and self.process_ns < self._compute_time_ns(deadline):
             return None
-        now = self._clock.now()
+        now = self._clock.compute_tick()
         return now if now >= deadline else None
 
-    def finish(self, in_time: bool, deadline: int, done: int, flags: int = 0) -> None:
+    def finish_cycle(self, in_time: bool, deadline: int, done: int, flags: int = 0) -> None:
         """Close the cycle: trace it, count it, and report releases as done.
 
         Args:
@@ -105,7 +105,9 @@ class Stopwatch:
         tick = self._tick
         skipped = self._skipped
         lockstep_done = self._lockstep_done
-        is_missed = not in_time or (lockstep_done is None and self.end_ns > self._time_of(deadline))
+        is_missed = not in_time or (
+            lockstep_done is None and self.end_ns > self._compute_time_ns(deadline)
+        )
         if self._reading.troubles != self._troubles or not in_time:
             flags |= self._count_troubles()
         if is_missed:
@@ -140,14 +142,14 @@ class Stopwatch:
             # This was the last release of a batch.
             lockstep_done.release()
         if not self._cycles % BUS_COUNT_CYCLES:
-            self.count_bus()
+            self.update_bus_counters()
         self._closed_ns = monotonic_ns()
 
-    def _time_of(self, tick: int) -> int:
+    def _compute_time_ns(self, tick: int) -> int:
         """Return the time of a tick, in ns of CLOCK_MONOTONIC."""
         return self._release_ns + (tick - self._tick) * self._period_ns
 
-    def idle(self) -> None:
+    def finish_idle_cycle(self) -> None:
         """Close a cycle in which a planner had nothing to plan. It is counted but not traced."""
         # Exclude its processor time from the next plan's record.
         self._processor_ns = thread_time_ns()
@@ -173,7 +175,7 @@ class Stopwatch:
         self._block[Block.CORRUPT] += new_corrupt
         return (new_errors > 0) * _BUS_ERROR | (new_corrupt > 0) * _DAMAGED
 
-    def count_bus(self) -> None:
+    def update_bus_counters(self) -> None:
         """Update the bus counters of the control block.
 
         An update in every cycle would cost too much.

@@ -11,7 +11,7 @@ import sys
 import time
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.checked import as_named
+from rack.backplane.checked import to_enum
 from rack.backplane.clock.driver import ClockDriver, RealtimeDriver
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.released_task import ReleasedTask
@@ -26,20 +26,20 @@ from rack.backplane.operator_table import (
 )
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import PEER, Alarm, AlarmWriter
-from rack.backplane.words import Block, Demand, Run, System, is_on
+from rack.backplane.words import Block, Demand, Run, System, is_switched_on
 from rack.boards.faults.clock_board import FaultStage
-from rack.boards.operator import hold
+from rack.boards.operator import build_hold_command
 from rack.boards.run.copying import Copier
 from rack.boards.run.snapshots import ClockCopies
 from rack.boards.wiring import ClockWiring
-from rack.levels.operator import DRIVES, SETTINGS, Answer
+from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer
 
-HEAD_START_NS = 20_000_000
+START_DELAY_NS = 20_000_000
 """Time from the start of the clock's board to tick 0.
 
 It keeps the board's start-up from delaying a tick.
 """
-SILENT_NS = 1_000_000_000
+OPERATOR_TIMEOUT_NS = 1_000_000_000
 """Time after which an operator under a lease that was not heard counts as gone.
 
 It is measured in real time, at the clock's speed.
@@ -60,19 +60,19 @@ class SystemController:
         self._wiring = wiring
         self._driver = driver
         self._faults = FaultStage(segment, driver)
-        self._desk = OperatorDesk(segment, driver.alarms)
+        self._desk = OperatorCommandIssuer(segment, driver.alarms)
         self._settled: tuple[int, int, int, int] | None = None
-        self._demand = as_named(Demand, self._words[System.DEMAND])
+        self._demand = to_enum(Demand, self._words[System.DEMAND])
 
-    def begin(self, tick: int) -> None:
+    def begin_tick(self, tick: int) -> None:
         """Do the work that is due before the tasks of `tick` are released."""
         words = self._words
         faults = self._faults
         desk = self._desk
         if tick >= faults.next_tick or words[System.INJECTED] != faults.injected:
-            faults.advance(tick)
+            faults.advance_faults(tick)
         if tick >= desk.next_tick or words[System.REQUESTED] != desk.requested:
-            desk.advance(tick)
+            desk.issue_due_commands(tick)
         if self._settled != (
             words[System.LOSSES],
             self._driver.watchdog.losses,
@@ -81,11 +81,11 @@ class SystemController:
         ):
             self._handle_losses(tick)
 
-    def released(self, tick: int) -> None:
+    def finish_release(self, tick: int) -> None:
         """Do the work that is due after the release."""
-        self._faults.within(tick)
+        self._faults.act_within_tick(tick)
 
-    def rests_until(self, tick: int) -> int:
+    def find_next_work_tick(self, tick: int) -> int:
         """Return the first tick after `tick` that needs `begin_tick` or may end the run."""
         if self._settled is None:
             return tick + 1
@@ -112,14 +112,14 @@ class SystemController:
         ]
         if emergency:
             asked.append((Demand.BRAKE, -1))
-        if is_on(peer, tick):
+        if is_switched_on(peer, tick):
             asked.append((Demand.STOP, PEER))
         demand, subject = max(asked, default=(Demand.NONE, -1))
         if demand != self._demand:
-            self._driver.settle()
+            self._driver.wait_until_settled()
             self._demand = demand
             words[System.DEMAND] = demand
-            self._driver.alarms.ring(tick, Alarm.DEMAND, subject, demand)
+            self._driver.alarms.raise_alarm(tick, Alarm.DEMAND, subject, demand)
         # A switch in the future, or a loss that the crate is recording, must be looked at again.
         is_settled = not lost and peer >> 1 <= tick and seen[0] % 2 == 0
         self._settled = (*seen, emergency, peer) if is_settled else None
@@ -132,13 +132,13 @@ class SystemController:
         self._driver.await_state(task, lambda: task.is_ready or task.is_given_up)
         if task.is_ready:
             away = tick - task.lost_tick
-            self._driver.settle()
-            task.rejoin()
-            self._driver.alarms.ring(tick, Alarm.REJOINED, task.index, away)
+            self._driver.wait_until_settled()
+            task.admit_new_process()
+            self._driver.alarms.raise_alarm(tick, Alarm.REJOINED, task.index, away)
         elif task.is_given_up and task.spec.role == "host":
             # From this tick on the adapter of the host board reports the loss.
-            self._driver.settle()
-            task.rejoin()
+            self._driver.wait_until_settled()
+            task.admit_new_process()
         elif task.is_given_up:
             # Do this even if the latch is already set, as it is before the start.
             self._words[System.EMERGENCY_STOP] = 1
@@ -147,7 +147,7 @@ class SystemController:
             self._words[System.STOP_TICK] = min(self._words[System.STOP_TICK] or ends, ends)
 
 
-class OperatorDesk:
+class OperatorCommandIssuer:
     """Issues operator commands at the start of a tick, before any task is released.
 
     Each command goes into its level's mailbox. Nothing is due before `next_tick` unless more than
@@ -180,14 +180,14 @@ class OperatorDesk:
         """Serial of the newest command that replaces earlier ones, by mailbox."""
         # A tick of lockstep has no length in real time.
         in_time = not self._words[System.LOCKSTEP]
-        self._silent = SILENT_NS // segment.layout.clock_ns if in_time else sys.maxsize
+        self._silent = OPERATOR_TIMEOUT_NS // segment.layout.clock_ns if in_time else sys.maxsize
 
-    def advance(self, tick: int) -> None:
+    def issue_due_commands(self, tick: int) -> None:
         """Issue all commands due at `tick`."""
         if self._words[System.REQUESTED] != self.requested:
             self.requested = self._words[System.REQUESTED]
-            self._waiting = self._table.waiting()
-            self._leased = self._table.leased()
+            self._waiting = self._table.list_waiting()
+            self._leased = self._table.list_leased()
         for entry in list(self._leased):
             self._check_lease(entry, tick)
         for entry in [entry for entry in self._waiting if entry.tick <= tick]:
@@ -196,13 +196,13 @@ class OperatorDesk:
             # it uses the opposite order.
             entry.given_tick = tick
             if self._table.is_waiting(entry):
-                self._give(entry, tick)
+                self._issue_command(entry, tick)
             else:
                 entry.given_tick = -1
         due = [tick + 1] if self._leased else [entry.tick for entry in self._waiting]
         self.next_tick = min(due, default=sys.maxsize)
 
-    def _give(self, entry: RequestEntry, tick: int) -> None:
+    def _issue_command(self, entry: RequestEntry, tick: int) -> None:
         """Issue the command of a waiting request."""
         writer = self._writers[entry.mailbox]
         if not entry.serial:
@@ -213,34 +213,34 @@ class OperatorDesk:
         message = writer.message
         message.raw[:] = entry.message[: len(message.raw)]
         message.id = entry.serial
-        writer.write(tick, self._clock.now())
+        writer.write(tick, self._clock.compute_tick())
         entry.stage = RequestStage.GIVEN
-        if message.what not in (*SETTINGS, *DRIVES):
+        if message.what not in (*SETTINGS, *DRIVE_OPERATIONS):
             self._newest[entry.mailbox] = message.id
-        self._alarms.ring(tick, Alarm.COMMANDED, entry.index, entry.serial)
+        self._alarms.raise_alarm(tick, Alarm.COMMANDED, entry.index, entry.serial)
         if entry.client == Client.LEASES:
             self._leased.append(entry)
 
     def _check_lease(self, entry: RequestEntry, tick: int) -> None:
         """Make a level hold if its operator has gone while the command is in force."""
         mailbox = entry.mailbox
-        if self._is_over(entry):
-            self._table.release(entry)
+        if self._is_superseded(entry):
+            self._table.release_lease(entry)
         if entry.client == Client.LEASES:
             heard = max(entry.given_tick, entry.heard)
-            if self._table.client_lives(entry) and tick - heard <= self._silent:
+            if self._table.is_client_alive(entry) and tick - heard <= self._silent:
                 return
             # Issue the hold at once, without a request, because the table may be full.
             writer = self._writers[mailbox]
             self._words[System.COMMANDED] += 1
-            writer.message.raw[:] = hold(self._boxes[mailbox]).raw
+            writer.message.raw[:] = build_hold_command(self._boxes[mailbox]).raw
             writer.message.id = self._words[System.COMMANDED]
-            writer.write(tick, self._clock.now())
-            self._table.release(entry)
-            self._alarms.ring(tick, Alarm.OPERATOR_GONE, entry.index, writer.message.id)
+            writer.write(tick, self._clock.compute_tick())
+            self._table.release_lease(entry)
+            self._alarms.raise_alarm(tick, Alarm.OPERATOR_GONE, entry.index, writer.message.id)
         self._leased.remove(entry)
 
-    def _is_over(self, entry: RequestEntry) -> bool:
+    def _is_superseded(self, entry: RequestEntry) -> bool:
         """Check whether the level has refused the command or accepted a newer one instead."""
         mailbox = entry.mailbox
         serial = entry.serial
@@ -248,7 +248,7 @@ class OperatorDesk:
         if mailbox not in self._statuses:
             return newest > serial
         status = self._statuses[mailbox].peek()
-        if not status.is_there:
+        if not status.has_message:
             return False
         order = status.message.order
         if order == serial:
@@ -275,7 +275,7 @@ class EndOfRun:
         self._every = 1
         self._phase = 0
         if self._reader is not None:
-            self._writer = segment.block(self._reader.spec.writer)
+            self._writer = segment.get_block(self._reader.spec.writer)
             if self._reader.spec.is_by_ticks:
                 self._every = self._reader.spec.every
                 self._phase = self._reader.spec.phase
@@ -321,17 +321,17 @@ def run_clock(
     words[System.CLOCK_PID] = os.getpid()
     alarms = AlarmWriter(segment, CLOCK, attention)
     if words[System.STATE] != Run.RUNNING:
-        words[System.EPOCH_NS] = time.monotonic_ns() + HEAD_START_NS
+        words[System.EPOCH_NS] = time.monotonic_ns() + START_DELAY_NS
     else:
-        now = SystemClock(segment).now()
+        now = SystemClock(segment).compute_tick()
         newest = words[System.TICK]
-        alarms.ring(now, Alarm.REJOINED, value=now - newest, since=newest)
+        alarms.raise_alarm(now, Alarm.REJOINED, value=now - newest, since=newest)
     end_of_run = EndOfRun(segment, wiring)
     driver: ClockDriver
     if wiring.lockstep:
         layout = segment.layout
         one_at_a_time = not all(mailbox.is_repeatable for mailbox in layout.mailboxes)
-        one_at_a_time |= any(len(layout.pacers(host)) > 1 for host in layout.hosts)
+        one_at_a_time |= any(len(layout.find_pacers(host)) > 1 for host in layout.hosts)
         driver = LockstepDriver(segment, end_of_run, one_at_a_time, wiring.history, alarms)
         if copier is not None:
             driver.snapshot = ClockCopies(segment, driver, copier)

@@ -36,8 +36,8 @@ class Task(ABC):
         level: Executor | Planner,
         attention: int | None = None,
     ) -> None:
-        self.spec = spec = segment.layout.task(wiring.task)
-        self.block = segment.block(wiring.task)
+        self.spec = spec = segment.layout.find_task(wiring.task)
+        self.block = segment.get_block(wiring.task)
         self.words = segment.words
         self.clock = SystemClock(segment)
         self.alarms = AlarmWriter(segment, wiring.task, attention)
@@ -47,8 +47,8 @@ class Task(ABC):
         inbox = open_inbox(segment, wiring.task)
         self.serve: Callable[[int], None] | None = None
         # The first task of a board serves its interrupts.
-        if inbox is not None and wiring.task == segment.layout.handler(spec.slot):
-            self.serve = InterruptHandler(segment, wiring.task, inbox, self.alarms).serve
+        if inbox is not None and wiring.task == segment.layout.find_interrupt_task(spec.slot):
+            self.serve = InterruptHandler(segment, wiring.task, inbox, self.alarms).serve_messages
         self.inputs = InputPorts(
             segment,
             level,
@@ -58,12 +58,12 @@ class Task(ABC):
             exchange=wiring.exchange,
             inbox=inbox,
         )
-        self.inputs.task.now = self.clock.now
+        self.inputs.task.now = self.clock.compute_tick
         self.outputs = OutputPorts(
             segment, level, wiring.outputs, self.alarms, self.inputs, wiring.sent
         )
         self.stopwatch = Stopwatch(segment, wiring.task, self.inputs, self.outputs)
-        self.faults = TaskFaults(segment, spec, self.outputs.apply, level)
+        self.faults = TaskFaults(segment, spec, self.outputs.apply_faults, level)
         self._generation = 0
 
     def wait_until_next_cycle(self) -> int | None:
@@ -75,16 +75,16 @@ class Task(ABC):
         if tick is None:
             return None
         if self.words[System.FAULTS] != self._generation:
-            self._generation = self.faults.refresh(tick)
+            self._generation = self.faults.refresh_faults(tick)
         return tick
 
     def run(self) -> None:
         """Cycle until the run is over."""
         self.block[Block.STATE] = TaskState.RUNNING
-        self.stopwatch.begin()
+        self.stopwatch.start_counting()
         while (tick := self.wait_until_next_cycle()) is not None:
             self.cycle(tick)
-        self.stopwatch.count_bus()
+        self.stopwatch.update_bus_counters()
 
     @abstractmethod
     def cycle(self, tick: int) -> None:
@@ -119,20 +119,22 @@ class ClockGuard:
         # cycle reports these.
         if tick >= since:
             counted = words[System.CLOCK_SKIPPED]
-            self._alarms.ring(tick, Alarm.CLOCK_SKIPPED, value=counted - self.reported, since=since)
+            self._alarms.raise_alarm(
+                tick, Alarm.CLOCK_SKIPPED, value=counted - self.reported, since=since
+            )
             self.reported = self._block[Block.CLOCK_SKIPPED] = counted
 
     def check_release(self, tick: int) -> None:
         """Check whether the clock was late, in a cycle released at `tick` that begins late."""
         words = self._words
-        late_ns = words[System.TICK_NS] - self._clock.time_of(tick)
+        late_ns = words[System.TICK_NS] - self._clock.compute_time_ns(tick)
         # Check this after the read. The time belongs to this tick only if the clock has not
         # advanced since.
         if self._clock.is_lockstep or words[System.TICK] != tick:
             return
         if late_ns > self._late_ns:
             if tick >= self._quiet_from:
-                self._alarms.ring(tick, Alarm.CLOCK_LATE, value=late_ns)
+                self._alarms.raise_alarm(tick, Alarm.CLOCK_LATE, value=late_ns)
             self._quiet_from = tick + PUNCTUAL_TICKS
 
 
@@ -148,26 +150,26 @@ class InterruptHandler:
 
     def __init__(self, segment: Segment, task: str, inbox: BoardInbox, alarms: AlarmWriter) -> None:
         self._inbox = inbox
-        self._block = segment.block(task)
+        self._block = segment.get_block(task)
         clock = SystemClock(segment)
         self._takes_time = not clock.is_lockstep
         self._lines = [
             (line, Episodes(segment, name, alarms)) for name, line in inbox.lines.items()
         ]
         # Interrupts before the start of this process are neither charged nor counted.
-        inbox.advance(clock.tick)
+        inbox.advance_to(clock.tick)
         inbox.inbox.most_waiting = 0
         self._served = inbox.count
         self._service_ns = inbox.service_ns
         self._lost = [line.lost for line in inbox.lines.values()]
         self._cycles = 0
 
-    def serve(self, tick: int) -> None:
+    def serve_messages(self, tick: int) -> None:
         """Serve all messages that have come up to the release at `tick`."""
         inbox = self._inbox
         begun_ns = process_time_ns()
         self._cycles += 1
-        inbox.advance(tick)
+        inbox.advance_to(tick)
         if inbox.count != self._served:
             self._block[Block.INTERRUPTS] += inbox.count - self._served
             self._served = inbox.count
@@ -182,10 +184,10 @@ class InterruptHandler:
                 if lost := line.lost - self._lost[at]:
                     self._lost[at] = line.lost
                     self._block[Block.INTERRUPTS_LOST] += lost
-                    episodes.find(Alarm.INBOX_FULL, self._cycles, tick, lost)
+                    episodes.record_finding(Alarm.INBOX_FULL, self._cycles, tick, lost)
 
 
-def in_turn(*accesses: Callable[[int], None] | None) -> Callable[[int], None]:
+def chain_accesses(*accesses: Callable[[int], None] | None) -> Callable[[int], None]:
     """Return a function that makes these accesses one after the other, leaving out None.
 
     A single access is returned itself.
@@ -199,7 +201,7 @@ def in_turn(*accesses: Callable[[int], None] | None) -> Callable[[int], None]:
     return make_all if len(present) > 1 else present[0]
 
 
-def slowed(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:
+def slow_access(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:
     """Return `access`, extended to at least `time_ns` of processor time.
 
     This emulates a slower bus: programmed transfers over VME occupied the processor. For 0,

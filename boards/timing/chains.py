@@ -7,18 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 
-def spanned(names: Sequence[str]) -> str:
+def format_names(names: Sequence[str]) -> str:
     """Return names as text. Consecutive numbers are shortened, as in "joint1 ... joint6"."""
     rows: list[list[str]] = []
     for name in names:
-        if rows and name == _following(rows[-1][-1]):
+        if rows and name == _increment_number(rows[-1][-1]):
             rows[-1].append(name)
         else:
             rows.append([name])
     return ", ".join(f"{row[0]} ... {row[-1]}" if len(row) > 2 else ", ".join(row) for row in rows)
 
 
-def _following(name: str) -> str:
+def _increment_number(name: str) -> str:
     """Return the name with a number higher by one. Empty if the name has no number."""
     match = re.fullmatch(r"(.*?)(\d+)(\D*)", name)
     return f"{match[1]}{int(match[2]) + 1}{match[3]}" if match else ""
@@ -43,7 +43,7 @@ class ParallelChains:
     def levels(self) -> tuple[str, ...]:
         """Boards of each level, as text."""
         return tuple(
-            spanned(tuple(dict.fromkeys(boards))) for boards in zip(*self.chains, strict=True)
+            format_names(tuple(dict.fromkeys(boards))) for boards in zip(*self.chains, strict=True)
         )
 
     @property

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, TickGrid
-from rack.boards.timing.rack import RackTiming, grid_wait
-from rack.boards.timing.system_response import mailboxes_along
+from rack.boards.timing.rack import RackTiming, compute_grid_wait
+from rack.boards.timing.system_response import find_path_mailboxes
 
 
 @dataclass(frozen=True)
@@ -34,24 +34,24 @@ class CommandPath:
         """Cycle of each level, ticks."""
         return tuple(releases.every for releases in self.releases)
 
-    def samples_at(self, visible_at: int) -> int:
+    def find_reading_release(self, visible_at: int) -> int:
         """Return the first release that reads a command, from the tick at which it is visible."""
-        return self.reads[0].since(visible_at)
+        return self.reads[0].find_tick(visible_at)
 
-    def acts_at(self, visible_at: int) -> int:
+    def find_acting_release(self, visible_at: int) -> int:
         """Return the release at which the lowest level acts on a command.
 
         Args:
             visible_at: Tick at which the command becomes visible to the first level.
         """
-        release = self.samples_at(visible_at)
+        release = self.find_reading_release(visible_at)
         for cycle, read in zip(self.cycles, self.reads[1:], strict=False):
             # Output becomes visible at the end of the cycle, and the next level reads it at its
             # next release (eq. 3.7).
-            release = read.since(release + cycle)
+            release = read.find_tick(release + cycle)
         return release
 
-    def response(self, given: int, acts: int) -> int:
+    def compute_response(self, given: int, acts: int) -> int:
         """Return the time from a command to the end of the cycle that acts on it, ticks.
 
         Args:
@@ -80,18 +80,18 @@ class CommandPath:
     def longest(self) -> int:
         """Longest response, ticks: the command just misses a release and waits at every level."""
         waits = [
-            grid_wait(written, read)
+            compute_grid_wait(written, read)
             for written, read in zip(self.releases, self.reads[1:], strict=False)
         ]
         return self.delay + self.reads[0].every - 1 + sum(self.cycles) + sum(waits)
 
 
-def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
+def find_command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
     """Return the longest path to the lowest level for each level that an operator can command."""
     boxes = {box.name: box for box in layout.mailboxes}
     paths: dict[str, CommandPath] = {}
     for chain in rack.chains:
-        chain_boxes = mailboxes_along(layout, chain)
+        chain_boxes = find_path_mailboxes(layout, chain)
         for at, level in enumerate(chain):
             operator = boxes.get(f"{level}.operator")
             levels = chain[at:]
@@ -100,7 +100,8 @@ def command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
             path_boxes = (operator, *chain_boxes[len(chain_boxes) - len(levels) + 1 :])
             releases = tuple(rack.boards[name].releases for name in levels)
             reads = tuple(
-                layout.read_grid(box, name) for box, name in zip(path_boxes, levels, strict=True)
+                layout.find_read_grid(box, name)
+                for box, name in zip(path_boxes, levels, strict=True)
             )
             is_exact = all(box.protocol == "time-slice" and box.is_repeatable for box in path_boxes)
             path = CommandPath(levels, releases, reads, operator.delay, is_exact)

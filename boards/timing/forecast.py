@@ -6,10 +6,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rack.boards.timing.frames import CoreFrames, core_frames
+from rack.boards.timing.frames import CoreFrames, compute_core_frames
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.system_response import Prediction, predict
-from rack.boards.timing.verdicts import EquationVerdict, verdicts
+from rack.boards.timing.system_response import Prediction, predict_response
+from rack.boards.timing.verdicts import EquationVerdict, judge_rack
 
 NO_BUDGET = "no budget"
 
@@ -37,7 +37,9 @@ class Forecast:
     uncounted: dict[str, str]
 
     @classmethod
-    def of(cls, rack: RackTiming, has_cores: bool = True, hosts: Iterable[str] = ()) -> Forecast:
+    def from_rack(
+        cls, rack: RackTiming, has_cores: bool = True, hosts: Iterable[str] = ()
+    ) -> Forecast:
         """Compute the forecast of a rack.
 
         Args:
@@ -47,15 +49,15 @@ class Forecast:
         """
         return cls(
             rack=rack,
-            system=predict(rack),
-            verdicts=tuple(verdicts(rack)),
+            system=predict_response(rack),
+            verdicts=tuple(judge_rack(rack)),
             inboxes=tuple(
-                inbox.document(rack.slice_ticks(name) * rack.clock_ns)
+                inbox.to_document(rack.find_slice_ticks(name) * rack.clock_ns)
                 for name, inbox in rack.inboxes.items()
             ),
-            frames=core_frames(rack),
-            notes=tuple(_notes(rack, has_cores)),
-            uncounted=_uncounted(rack) | dict.fromkeys(hosts, "a host board has no rate"),
+            frames=compute_core_frames(rack),
+            notes=tuple(_list_notes(rack, has_cores)),
+            uncounted=_list_uncounted(rack) | dict.fromkeys(hosts, "a host board has no rate"),
         )
 
     @property
@@ -63,20 +65,20 @@ class Forecast:
         """Whether every verdict holds."""
         return all(verdict.holds for verdict in self.verdicts)
 
-    def document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, Any]:
         """Return the forecast as plain data, for JSON. Times with names in _ns are wall-clock."""
         rack = self.rack
         schedule = None
         if rack.schedule is not None:
             minor_ms, major_ms = (ticks * rack.tick_ns * 1e-6 for ticks in rack.schedule)
-            cores = [frames.document() for frames in self.frames]
+            cores = [frames.to_document() for frames in self.frames]
             schedule = {"minor_ms": minor_ms, "major_ms": major_ms, "cores": cores}
         return {
             **asdict(self.system),
             "context_switch_ns": rack.context_switch_ns,
-            "levels": [level.document() for level in rack.levels.values()],
-            "verdicts": [verdict.document() for verdict in self.verdicts],
-            "responses": [response.document() for response in rack.responses],
+            "levels": [level.to_document() for level in rack.levels.values()],
+            "verdicts": [verdict.to_document() for verdict in self.verdicts],
+            "responses": [response.to_document() for response in rack.responses],
             "loads": {str(core): load for core, load in rack.loads.items()},
             "inboxes": list(self.inboxes),
             "schedule": schedule,
@@ -85,7 +87,7 @@ class Forecast:
         }
 
 
-def _uncounted(rack: RackTiming) -> dict[str, str]:
+def _list_uncounted(rack: RackTiming) -> dict[str, str]:
     """Return the tasks without a cost, each with the reason."""
     counted = {task.name for task in rack.tasks if task.cost_ns}
     # A budget with an update but no planning time does not include a plan.
@@ -96,7 +98,7 @@ def _uncounted(rack: RackTiming) -> dict[str, str]:
     return reasons
 
 
-def _notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
+def _list_notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
     if queues := [
         queue for rank in rack.ranks for name in rank for queue in rack.boards[name].queues
     ]:

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.response_time import as_one_part
-from rack.boards.timing.schedule import Span, simulate
+from rack.boards.timing.response_time import merge_parts
+from rack.boards.timing.schedule import Span, simulate_schedule
 from rack.boards.timing.tasks import TimedTask
 
 Work = dict[tuple[str, int], list[Span]]
@@ -58,7 +58,7 @@ class CoreFrames:
     frames: tuple[int, ...]
     places: tuple[FramePlace, ...]
 
-    def document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, Any]:
         """Return the frames as plain data, for JSON. Times are ms."""
         names = ("offset", "job", "limit", "slack")
         places = [
@@ -72,7 +72,7 @@ class CoreFrames:
         return {"core": self.core, "frames": list(self.frames), "places": places}
 
 
-def core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
+def compute_core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
     """Return the distinct frames of each core. Empty without a static schedule.
 
     The frames are taken from the second major frame, so that they include the effect of boards that
@@ -82,23 +82,25 @@ def core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
         return ()
     minor, major = (ticks * rack.tick_ns for ticks in rack.schedule)
     tasks = [
-        as_one_part(task, rack.context_switch_ns) for task in rack.tasks if task.role != "planner"
+        merge_parts(task, rack.context_switch_ns) for task in rack.tasks if task.role != "planner"
     ]
     work: Work = defaultdict(list)
-    for span in simulate(tasks, 2 * major + 2 * minor).spans:
+    for span in simulate_schedule(tasks, 2 * major + 2 * minor).spans:
         work[span.task, span.release_ns].append(span)
     distinct: dict[tuple[int, tuple[FramePlace, ...]], list[int]] = defaultdict(list)
     for core in sorted({task.core for task in tasks if task.role == "executor"}):
         executors = [task for task in tasks if task.core == core and task.role == "executor"]
         for frame in range(major // minor):
-            if places := tuple(_places(executors, work, major + frame * minor, minor)):
+            if places := tuple(_list_places(executors, work, major + frame * minor, minor)):
                 distinct[core, places].append(frame)
     return tuple(
         CoreFrames(core, tuple(frames), places) for (core, places), frames in distinct.items()
     )
 
 
-def _places(tasks: Sequence[TimedTask], work: Work, start: int, minor: int) -> Iterator[FramePlace]:
+def _list_places(
+    tasks: Sequence[TimedTask], work: Work, start: int, minor: int
+) -> Iterator[FramePlace]:
     """Yield the places of one core's tasks in one frame.
 
     Args:

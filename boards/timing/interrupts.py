@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from rack.backplane.mailbox.inbox import Burst, InterruptSource, burst_of
+from rack.backplane.mailbox.inbox import Burst, InterruptSource, compute_burst
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class InboxTiming:
     @property
     def burst(self) -> Burst:
         """Worst case, in which all sources send at once."""
-        return burst_of(self.sources)
+        return compute_burst(self.sources)
 
-    def document(self, cycle_ns: int) -> dict[str, Any]:
+    def to_document(self, cycle_ns: int) -> dict[str, Any]:
         """Return the worst case as plain data, for JSON. `cycle_ns` is the board's cycle, ns."""
         burst = self.burst
         return {
@@ -45,5 +45,5 @@ class InboxTiming:
             "depth": self.depth,
             "waiting": burst.waiting,
             "longest_ns": burst.longest_ns,
-            "fits": burst.fits(self.depth),
+            "fits": burst.fits_depth(self.depth),
         }

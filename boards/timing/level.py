@@ -137,7 +137,7 @@ class LevelTiming:
         """Time from a planner's release until its plan is available, d R_i. None without one."""
         return None if self.within_cycles is None else self.within_cycles * self.cycle_ns
 
-    def document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, Any]:
         """Return all times as plain data, for JSON."""
         derived = (
             "communication_ns",

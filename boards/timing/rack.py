@@ -13,7 +13,7 @@ from rack.backplane.layout import TickGrid
 from rack.boards.timing.chains import ParallelChains
 from rack.boards.timing.interrupts import InboxTiming
 from rack.boards.timing.level import BoardTiming, LevelTiming
-from rack.boards.timing.response_time import TaskResponse, load_of, task_responses
+from rack.boards.timing.response_time import TaskResponse, compute_loads, compute_task_responses
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 
@@ -59,7 +59,7 @@ class RackTiming:
         """One tick, ns of the wall clock."""
         return self.clock.every_ns
 
-    def changed(self, board: str, **changes: Any) -> RackTiming:
+    def replace_board(self, board: str, **changes: Any) -> RackTiming:
         """Return a copy of the rack in which fields of one board have other values."""
         return replace(self, boards={**self.boards, board: replace(self.boards[board], **changes)})
 
@@ -70,18 +70,18 @@ class RackTiming:
         A rack with one board per joint has a chain for each joint.
         """
         lowest = [board.name for board in self.boards.values() if board.above and not board.below]
-        return tuple(chain for name in lowest for chain in self._chains((name,)))
+        return tuple(chain for name in lowest for chain in self._list_chains((name,)))
 
-    def _chains(self, lower_end: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    def _list_chains(self, lower_end: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
         """Yield every chain that ends with these boards."""
         above = self.boards[lower_end[0]].above
         if not above:
             yield lower_end
         for name in above:
-            yield from self._chains((name, *lower_end))
+            yield from self._list_chains((name, *lower_end))
 
     @cached_property
-    def parallel(self) -> tuple[ParallelChains, ...]:
+    def chain_groups(self) -> tuple[ParallelChains, ...]:
         """All chains, grouped.
 
         Chains of equal cycles form a group if they are all combinations of their boards.
@@ -99,17 +99,19 @@ class RackTiming:
     @property
     def hierarchy(self) -> ParallelChains:
         """Group of chains with the longest response. Empty if no board is above another."""
-        return max(self.parallel, key=self.command_ticks, default=ParallelChains((), ()))
+        return max(
+            self.chain_groups, key=self.compute_command_ticks, default=ParallelChains((), ())
+        )
 
-    def command_ticks(self, chains: ParallelChains) -> int:
+    def compute_command_ticks(self, chains: ParallelChains) -> int:
         """Return the longest response of a command along any of these chains, ticks."""
-        return max((self.response_ticks(chain) for chain in chains.chains), default=0)
+        return max((self.compute_response_ticks(chain) for chain in chains.chains), default=0)
 
-    def status_ticks(self, chains: ParallelChains) -> int:
+    def compute_status_ticks(self, chains: ParallelChains) -> int:
         """Return the longest response of a status along any of these chains, ticks."""
-        return max((self.response_ticks(chain[::-1]) for chain in chains.chains), default=0)
+        return max((self.compute_response_ticks(chain[::-1]) for chain in chains.chains), default=0)
 
-    def response_ticks(self, boards: Sequence[str]) -> int:
+    def compute_response_ticks(self, boards: Sequence[str]) -> int:
         """Return the longest response along a row of boards, ticks.
 
         It lasts from the release of the first board to the end of the cycle in which the last board
@@ -121,7 +123,7 @@ class RackTiming:
         """
         row = [self.boards[name] for name in boards]
         waits = [
-            grid_wait(sender.releases, receiver.reads.get(sender.name, receiver.releases))
+            compute_grid_wait(sender.releases, receiver.reads.get(sender.name, receiver.releases))
             for sender, receiver in pairwise(row)
         ]
         return sum(waits) + sum(board.every for board in row)
@@ -159,20 +161,20 @@ class RackTiming:
                 longest |= dict.fromkeys(chain, self.response_goal_ns / self.clock_ns / len(chain))
         return longest
 
-    def level(self, board: str) -> LevelTiming:
+    def build_level(self, board: str) -> LevelTiming:
         """Return the timing of a level. Raises `KeyError` for a board without a budget."""
         table = self.boards[board]
         budget = table.budget
         if budget is None:
             raise KeyError(board)
         has_plan = table.is_plan_budgeted
-        plan_ns = budget.plan_ns + self.interrupted_ns(f"{board}.planner")
+        plan_ns = budget.plan_ns + self.compute_interrupted_ns(f"{board}.planner")
         return LevelTiming(
             board=board,
             coupling=table.coupling,
             cycle_ns=table.every * self.tick_ns,
             longest_cycle_ns=round(self.longest_cycles[board] * self.tick_ns),
-            read_ns=budget.read_ns + self.interrupted_ns(board),
+            read_ns=budget.read_ns + self.compute_interrupted_ns(board),
             execution_ns=budget.process_ns,
             write_ns=budget.write_ns,
             exchange_ns=table.exchange_ns,
@@ -182,15 +184,15 @@ class RackTiming:
             plan_within_ns=table.plan_within_ns if has_plan else None,
         )
 
-    def interrupted_ns(self, task: str) -> int:
+    def compute_interrupted_ns(self, task: str) -> int:
         """Return the processor time of interrupts in one cycle of a task, or in one plan, ns.
 
         0 if the task does not serve an inbox.
         """
         inbox = self.inboxes.get(task)
-        return 0 if inbox is None else inbox.cost_ns(self.slice_ticks(task) * self.clock_ns)
+        return 0 if inbox is None else inbox.cost_ns(self.find_slice_ticks(task) * self.clock_ns)
 
-    def slice_ticks(self, task: str) -> int:
+    def find_slice_ticks(self, task: str) -> int:
         """Return the cycle of an executor, or the time slice of a planner's plan, ticks."""
         board = self.boards[task.removesuffix(".planner")]
         if task == board.name:
@@ -201,7 +203,7 @@ class RackTiming:
     def levels(self) -> dict[str, LevelTiming]:
         """Timing of every level that has a budget, by board."""
         return {
-            name: self.level(name)
+            name: self.build_level(name)
             for name, board in self.boards.items()
             if board.budget is not None
         }
@@ -210,9 +212,12 @@ class RackTiming:
     def tasks(self) -> tuple[TimedTask, ...]:
         """Tasks of the clock, if its cost is known, and of every board that has a budget."""
         clock = (self.clock,) if self.clock.cost_ns else ()
-        return (*clock, *(task for board in self.boards.values() for task in self._tasks(board)))
+        return (
+            *clock,
+            *(task for board in self.boards.values() for task in self._build_tasks(board)),
+        )
 
-    def _tasks(self, board: BoardTiming) -> list[TimedTask]:
+    def _build_tasks(self, board: BoardTiming) -> list[TimedTask]:
         budget = board.budget
         if budget is None:
             return []
@@ -224,9 +229,9 @@ class RackTiming:
             priority=board.priority,
             every_ns=board.every * self.tick_ns,
             phase_ns=board.phase * self.tick_ns,
-            parts=_nonzero(
+            parts=_drop_empty_parts(
                 Part(Unit.EXCHANGE, board.exchange_ns),
-                Part(Unit.READ, budget.read_ns + self.interrupted_ns(board.name)),
+                Part(Unit.READ, budget.read_ns + self.compute_interrupted_ns(board.name)),
                 Part(Unit.PROCESS, budget.process_ns),
                 Part(Unit.WRITE, budget.write_ns),
             ),
@@ -240,8 +245,10 @@ class RackTiming:
             role="planner",
             core=board.planner_core,
             priority=board.planner_priority,
-            parts=_nonzero(
-                Part(Unit.PLAN, budget.plan_ns + self.interrupted_ns(f"{board.name}.planner")),
+            parts=_drop_empty_parts(
+                Part(
+                    Unit.PLAN, budget.plan_ns + self.compute_interrupted_ns(f"{board.name}.planner")
+                ),
                 Part(Unit.UPDATE, budget.update_ns, preemptible=not board.is_critical),
             ),
             within_cycles=board.within_cycles,
@@ -259,26 +266,26 @@ class RackTiming:
                 cores[f"{board.name}.planner"] = board.planner_core
         return cores
 
-    def cores_of(self, board: str) -> set[int]:
+    def find_cores(self, board: str) -> set[int]:
         """Return the cores that the tasks of a board use."""
         return {core for name, core in self.cores.items() if name.partition(".")[0] == board}
 
     @cached_property
     def responses(self) -> tuple[TaskResponse, ...]:
         """Worst case of every task that has a cost."""
-        return task_responses(self.tasks, self.context_switch_ns)
+        return compute_task_responses(self.tasks, self.context_switch_ns)
 
     @cached_property
     def loads(self) -> dict[int, float]:
         """Load of each core. Above 1 a core is overloaded."""
-        return load_of(self.tasks, self.context_switch_ns)
+        return compute_loads(self.tasks, self.context_switch_ns)
 
 
-def _nonzero(*parts: Part) -> tuple[Part, ...]:
+def _drop_empty_parts(*parts: Part) -> tuple[Part, ...]:
     return tuple(part for part in parts if part.time_ns)
 
 
-def grid_wait(written: TickGrid, read: TickGrid) -> int:
+def compute_grid_wait(written: TickGrid, read: TickGrid) -> int:
     """Return the longest time from writing a message to the next read of its reader, ticks.
 
     Args:

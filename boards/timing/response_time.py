@@ -23,7 +23,7 @@ from itertools import pairwise
 from math import lcm
 from typing import Any
 
-from rack.boards.timing.schedule import simulate
+from rack.boards.timing.schedule import simulate_schedule
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 Load = tuple[int, int]
@@ -34,7 +34,7 @@ TURN_NS = 4_000_000
 
 One tick of a 250 Hz kernel. The time slice of Linux is 3 ms.
 """
-HORIZON_DEADLINES = 10
+MAX_DEADLINES = 10
 """Number of deadlines after which the search ends, because it converges slowly near full load."""
 MAX_JOBS = 20_000
 """Largest schedule, in jobs, that is computed for response times. For others the bound is used."""
@@ -42,7 +42,7 @@ MAX_STEPS = 10_000
 """Limit on the steps of one search, which a 10 us tick below a plan of hours would exceed."""
 
 
-def response_time(
+def compute_response_time(
     cost: int,
     above: Sequence[Load],
     blocking: int,
@@ -73,8 +73,8 @@ def response_time(
         return None
 
     def work(until: int) -> int:
-        turns = sum(min(_released(until, load), cost + TURN_NS) for load in sharing)
-        return blocking + cost + turns + sum(_released(until, load) for load in above)
+        turns = sum(min(_sum_released_work(until, load), cost + TURN_NS) for load in sharing)
+        return blocking + cost + turns + sum(_sum_released_work(until, load) for load in above)
 
     # The job ends at the smallest time at which all work released before that time is done.
     end = blocking + cost
@@ -87,12 +87,14 @@ def response_time(
     return None
 
 
-def _released(until: int, load: Load) -> int:
+def _sum_released_work(until: int, load: Load) -> int:
     cost, period = load
     return -(-until // period) * cost
 
 
-def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, int]:
+def _compute_scheduled_responses(
+    tasks: Sequence[TimedTask], context_switch_ns: int
+) -> dict[str, int]:
     """Return exact response times of the tasks of one core from their schedule, by task.
 
     In the worst case every job uses its whole budget, because under fixed priorities a shorter job
@@ -109,8 +111,8 @@ def _scheduled(tasks: Sequence[TimedTask], context_switch_ns: int) -> dict[str, 
     has_planner = any(task.role == "planner" for task in tasks)
     if has_planner or sum(until // task.period_ns for task in tasks) > MAX_JOBS:
         return {}
-    single_part_tasks = [as_one_part(task, context_switch_ns) for task in tasks]
-    chart = simulate(single_part_tasks, until + max(task.period_ns for task in tasks))
+    single_part_tasks = [merge_parts(task, context_switch_ns) for task in tasks]
+    chart = simulate_schedule(single_part_tasks, until + max(task.period_ns for task in tasks))
     priorities = {task.name: task.priority for task in tasks}
     intervals = defaultdict[int, list[tuple[int, int]]](list)
     responses = dict.fromkeys(priorities, 0)
@@ -156,12 +158,12 @@ class TaskResponse:
         """Whether the task always meets its deadline."""
         return self.response_ns is not None and self.response_ns <= self.deadline_ns
 
-    def document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, Any]:
         """Return the worst case as plain data, for JSON."""
         return asdict(self) | {"holds": self.holds}
 
 
-def task_responses(
+def compute_task_responses(
     tasks: Iterable[TimedTask], context_switch_ns: int = 0
 ) -> tuple[TaskResponse, ...]:
     """Compute the worst case of every task that has a cost.
@@ -177,7 +179,9 @@ def task_responses(
     busy = [task for task in tasks if task.cost_ns]
     exact: dict[str, int] = {}
     for core in {task.core for task in busy if task.phase_ns}:
-        exact |= _scheduled([task for task in busy if task.core == core], context_switch_ns)
+        exact |= _compute_scheduled_responses(
+            [task for task in busy if task.core == core], context_switch_ns
+        )
     responses = []
     for task in busy:
         others = [other for other in busy if other.core == task.core and other is not task]
@@ -185,14 +189,14 @@ def task_responses(
         above = [
             other for other in others if other.priority >= task.priority and other not in shares
         ]
-        job = job_ns(task, context_switch_ns)
-        blocking = blocking_ns(task, others)
-        bound = response_time(
+        job = compute_job_ns(task, context_switch_ns)
+        blocking = compute_blocking_ns(task, others)
+        bound = compute_response_time(
             job,
-            [_load(other, context_switch_ns) for other in above],
+            [_compute_demand(other, context_switch_ns) for other in above],
             blocking,
-            sharing=[_load(other, context_switch_ns) for other in shares],
-            horizon=HORIZON_DEADLINES * task.period_ns,
+            sharing=[_compute_demand(other, context_switch_ns) for other in shares],
+            horizon=MAX_DEADLINES * task.period_ns,
         )
         responses.append(
             TaskResponse(
@@ -208,17 +212,17 @@ def task_responses(
     return tuple(responses)
 
 
-def job_ns(task: TimedTask, context_switch_ns: int) -> int:
+def compute_job_ns(task: TimedTask, context_switch_ns: int) -> int:
     """Return the processor time of one job with its two context switches, ns."""
     return task.cost_ns + 2 * context_switch_ns
 
 
-def as_one_part(task: TimedTask, context_switch_ns: int) -> TimedTask:
+def merge_parts(task: TimedTask, context_switch_ns: int) -> TimedTask:
     """Return a copy of a task whose job and context switches are one single part."""
-    return replace(task, parts=(Part(Unit.PROCESS, job_ns(task, context_switch_ns)),))
+    return replace(task, parts=(Part(Unit.PROCESS, compute_job_ns(task, context_switch_ns)),))
 
 
-def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
+def compute_blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
     """Return the longest wait of a task for a task of lower priority on its core, ns.
 
     It waits for one plan update that began before its release, if the ceiling of the update is at
@@ -229,16 +233,16 @@ def blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
     return max(locked, default=0)
 
 
-def load_of(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[int, float]:
+def compute_loads(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[int, float]:
     """Return the load of each core, including context switches. Above 1 a core is overloaded."""
     loads: dict[int, float] = {}
     for task in tasks:
         if task.cost_ns:
             loads[task.core] = (
-                loads.get(task.core, 0.0) + job_ns(task, context_switch_ns) / task.period_ns
+                loads.get(task.core, 0.0) + compute_job_ns(task, context_switch_ns) / task.period_ns
             )
     return dict(sorted(loads.items()))
 
 
-def _load(task: TimedTask, context_switch_ns: int) -> Load:
-    return job_ns(task, context_switch_ns), task.period_ns
+def _compute_demand(task: TimedTask, context_switch_ns: int) -> Load:
+    return compute_job_ns(task, context_switch_ns), task.period_ns

@@ -63,7 +63,7 @@ class Chart:
     spans: tuple[Span, ...]
     jobs: tuple[Job, ...]
 
-    def late(self, task: str) -> list[Job]:
+    def list_late_jobs(self, task: str) -> list[Job]:
         """Return the jobs of a task that missed their deadline, including unfinished jobs."""
         # An unfinished job also misses a deadline at the very end of the chart.
         unfinished = self.end_ns + 1
@@ -74,7 +74,7 @@ class Chart:
             and job.deadline_ns < (unfinished if job.end_ns is None else job.end_ns)
         ]
 
-    def window(self, start_ns: int, end_ns: int) -> Chart:
+    def cut_window(self, start_ns: int, end_ns: int) -> Chart:
         """Return the part of the chart between two times. Spans are cut there, jobs are not.
 
         A job belongs to the window if it is released in it, or if it is unfinished or not yet due
@@ -93,7 +93,7 @@ class Chart:
         return Chart(start_ns, end_ns, spans, jobs)
 
 
-def simulate(
+def simulate_schedule(
     tasks: Sequence[TimedTask],
     until_ns: int,
     context_switch_ns: int = 0,
@@ -111,21 +111,22 @@ def simulate(
         variants: Parts of tasks whose cycles differ. Other tasks use `TimedTask.parts`.
     """
     runners = [
-        _Runner(task, context_switch_ns, (variants or {}).get(task.name, (task.parts,)))
+        _TaskSimulation(task, context_switch_ns, (variants or {}).get(task.name, (task.parts,)))
         for task in tasks
     ]
     for core in {task.core for task in tasks}:
-        _run([runner for runner in runners if runner.task.core == core], until_ns)
+        _simulate_core([runner for runner in runners if runner.task.core == core], until_ns)
     spans = sorted(
         (s for r in runners for s in r.spans), key=lambda span: (span.start_ns, span.core)
     )
     jobs = sorted(
-        (j for r in runners for j in r.jobs(until_ns)), key=lambda job: (job.release_ns, job.task)
+        (j for r in runners for j in r.list_jobs(until_ns)),
+        key=lambda job: (job.release_ns, job.task),
     )
     return Chart(0, until_ns, tuple(spans), tuple(jobs))
 
 
-def _run(runners: list[_Runner], until_ns: int) -> None:
+def _simulate_core(runners: list[_TaskSimulation], until_ns: int) -> None:
     """Simulate the tasks of one core, from one possible preemption to the next."""
     now = 0
     while now < until_ns:
@@ -134,11 +135,11 @@ def _run(runners: list[_Runner], until_ns: int) -> None:
         if not ready:
             now = next_release
             continue
-        first = min(ready, key=_Runner.order)
-        now = first.compute(now, min(next_release, until_ns))
+        first = min(ready, key=_TaskSimulation.compute_rank)
+        now = first.compute_step(now, min(next_release, until_ns))
 
 
-class _Runner:
+class _TaskSimulation:
     """Simulation of one task.
 
     Attributes:
@@ -163,19 +164,19 @@ class _Runner:
         self._slack_ns = 0
         self._ends: dict[int, int | None] = {}
 
-    def order(self) -> tuple[int, bool, int, str]:
+    def compute_rank(self) -> tuple[int, bool, int, str]:
         """Return the rank among the ready tasks. The task with the lowest rank computes."""
         is_locked = self._spent_ns > 0 and not self._steps[0].preemptible
         priority = max(self.task.priority, self.task.ceiling) if is_locked else self.task.priority
         # A protected part that has begun precedes tasks of the same priority released since.
         return -priority, not is_locked, self.ready_at, self.task.name
 
-    def compute(self, now_ns: int, until_ns: int) -> int:
+    def compute_step(self, now_ns: int, until_ns: int) -> int:
         """Compute from `now_ns` until a part ends or until `until_ns`, and return that time."""
         if not self._steps:
-            self._take(now_ns)
+            self._begin_job(now_ns)
         if not self._steps:
-            self._end(now_ns)
+            self._end_job(now_ns)
             return now_ns
         step = self._steps[0]
         end = min(now_ns + step.time_ns - self._spent_ns, until_ns)
@@ -198,10 +199,10 @@ class _Runner:
             if not any(left.unit for left in self._steps):
                 self._ends.setdefault(self._release, end)
             if not self._steps:
-                self._end(end)
+                self._end_job(end)
         return end
 
-    def _take(self, now_ns: int) -> None:
+    def _begin_job(self, now_ns: int) -> None:
         """Begin the job of the oldest release that has not expired."""
         every = self.task.every_ns
         first = self.task.phase_ns
@@ -214,14 +215,14 @@ class _Runner:
         steps = [part for part in parts if part.time_ns]
         self._steps = [*self._switch, *steps, *self._switch]
 
-    def _end(self, now_ns: int) -> None:
+    def _end_job(self, now_ns: int) -> None:
         self._ends.setdefault(self._release, now_ns)
         self.ready_at = self._release + self.task.period_ns
 
-    def jobs(self, until_ns: int) -> Iterator[Job]:
+    def list_jobs(self, until_ns: int) -> Iterator[Job]:
         """Yield the jobs released before `until_ns`. Call this when the schedule is complete."""
         if not self._steps and self.ready_at < until_ns:
-            self._take(until_ns - 1)
+            self._begin_job(until_ns - 1)
         if self._release not in self._ends and self._release >= 0:
             self._ends[self._release] = None
         for release, end in self._ends.items():

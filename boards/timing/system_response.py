@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.mailbox.queue import is_position
+from rack.backplane.mailbox.queue import is_position_mailbox
 from rack.boards.timing.rack import RackTiming
 
 
@@ -32,7 +32,7 @@ class Prediction:
     plan_ms: dict[str, float]
 
 
-def predict(rack: RackTiming) -> Prediction:
+def predict_response(rack: RackTiming) -> Prediction:
     """Predict the system response from the cycles of the boards."""
     hierarchy = rack.hierarchy
     tick_ms = rack.clock_ns * 1e-6
@@ -41,13 +41,13 @@ def predict(rack: RackTiming) -> Prediction:
         levels=hierarchy.levels,
         bound_eq_3_2_ms=hierarchy.bound * tick_ms,
         sum_eq_3_3_ms=sum(hierarchy.cycles) * tick_ms,
-        command_ms=rack.command_ticks(hierarchy) * tick_ms,
-        status_ms=rack.status_ticks(hierarchy) * tick_ms,
+        command_ms=rack.compute_command_ticks(hierarchy) * tick_ms,
+        status_ms=rack.compute_status_ticks(hierarchy) * tick_ms,
         plan_ms={board.name: board.every * board.within_cycles * tick_ms for board in planned},
     )
 
 
-def mailboxes_along(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
+def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
     """Return the mailboxes that carry information along a row of boards.
 
     Each mailbox depends on the one before it. If the path is interrupted, only the longest part
@@ -60,11 +60,15 @@ def mailboxes_along(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec,
     """
     if len(boards) < 2:
         return ()
-    sampled = [box for box in layout.mailboxes if box.protocol != "queue" and not is_position(box)]
-    return _along(layout, boards[:-1], {box.name for box in sampled if boards[-1] in box.readers})
+    sampled = [
+        box for box in layout.mailboxes if box.protocol != "queue" and not is_position_mailbox(box)
+    ]
+    return _find_longest_row(
+        layout, boards[:-1], {box.name for box in sampled if boards[-1] in box.readers}
+    )
 
 
-def _along(
+def _find_longest_row(
     layout: Layout, boards: Sequence[str], taken: Collection[str]
 ) -> tuple[MailboxSpec, ...]:
     """Return the longest row of mailboxes, one per board, that ends with one in `taken`."""
@@ -72,5 +76,7 @@ def _along(
         return ()
     last = [box for box in layout.mailboxes if box.writer == boards[-1] and box.name in taken]
     return max(
-        ((*_along(layout, boards[:-1], box.rests_on), box) for box in last), key=len, default=()
+        ((*_find_longest_row(layout, boards[:-1], box.rests_on), box) for box in last),
+        key=len,
+        default=(),
     )

@@ -38,39 +38,39 @@ UNDISTURBED = 10.0
 
 The median would be too large on a host that suspends the machine during nearly every plan.
 """
-Rows = np.ndarray
+EntityRows = np.ndarray
 """Trace records of one task, oldest first, (n,), of dtype `rack.backplane.trace.RECORD`."""
 Values = np.ndarray
 """One value per record, (n,), unless a function states otherwise."""
 Distribution = dict[str, float]
 
 
-def lateness_ns(rows: Rows) -> Values:
+def compute_lateness_ns(rows: EntityRows) -> Values:
     """Return the time from the release of each cycle to its start, ns."""
     return np.asarray(rows["start_ns"] - rows["release_ns"])
 
 
-def response_ns(rows: Rows) -> Values:
+def compute_response_ns(rows: EntityRows) -> Values:
     """Return the time from the release of each cycle to its end, ns."""
     return np.asarray(rows["end_ns"] - rows["release_ns"])
 
 
-def lasted_ns(rows: Rows) -> Values:
+def compute_duration_ns(rows: EntityRows) -> Values:
     """Return the time from the start of each cycle to its end, including preemption, ns."""
     return np.asarray(rows["end_ns"] - rows["start_ns"])
 
 
-def execution_ns(rows: Rows) -> Values:
+def compute_execution_ns(rows: EntityRows) -> Values:
     """Return t_exec of eq. 3.5, or the planning time of a planner, including preemption, ns."""
     return np.asarray(rows["process_ns"] - rows["read_ns"])
 
 
-def communication_ns(rows: Rows) -> Values:
+def compute_communication_ns(rows: EntityRows) -> Values:
     """Return t_comm of eq. 3.5, all of each cycle that is not execution, ns."""
     return np.asarray(rows["read_ns"] - rows["start_ns"] + rows["end_ns"] - rows["process_ns"])
 
 
-def residual_ns(rows: Rows, slice_ns: int) -> Values:
+def compute_residual_ns(rows: EntityRows, slice_ns: int) -> Values:
     """Return t_residual, the rest of the time slice at the end of each cycle, ns.
 
     It is negative if the deadline was missed.
@@ -78,7 +78,7 @@ def residual_ns(rows: Rows, slice_ns: int) -> Values:
     return np.asarray(rows["release_ns"] + slice_ns - rows["end_ns"])
 
 
-def gaps_ns(rows: Rows, stretches: Values | None = None) -> Values:
+def compute_gaps_ns(rows: EntityRows, stretches: Values | None = None) -> Values:
     """Return the time from each start to the next one, ns, shape (n - 1,).
 
     Args:
@@ -90,22 +90,22 @@ def gaps_ns(rows: Rows, stretches: Values | None = None) -> Values:
     return gaps if stretches is None else gaps[np.diff(stretches) == 0]
 
 
-def is_missed(rows: Rows) -> Values:
+def find_missed(rows: EntityRows) -> Values:
     """Return whether each cycle missed its deadline or wrote a message too late, bool."""
     return np.asarray((rows["flags"] & Flag.MISSED) > 0)
 
 
-def skipped(rows: Rows) -> Values:
+def count_skipped(rows: EntityRows) -> Values:
     """Return the number of releases that were skipped just before each cycle."""
     return np.asarray(rows["flags"] >> SKIPPED_SHIFT)
 
 
-def counts(rows: Rows) -> tuple[int, int]:
+def count_misses_and_skips(rows: EntityRows) -> tuple[int, int]:
     """Return the number of missed cycles and the number of skipped releases."""
-    return int(np.count_nonzero(is_missed(rows))), int(skipped(rows).sum())
+    return int(np.count_nonzero(find_missed(rows))), int(count_skipped(rows).sum())
 
 
-def plans(rows: Rows) -> Values:
+def select_plans(rows: EntityRows) -> Values:
     """Return the records of a planner in which it made a plan.
 
     A release without a plan may also leave a record.
@@ -113,7 +113,7 @@ def plans(rows: Rows) -> Values:
     return rows[(rows["flags"] & Flag.PLANNED) > 0]
 
 
-def newest_visible(ticks: Values, visible_at: Values) -> Values:
+def find_newest_visible(ticks: Values, visible_at: Values) -> Values:
     """Return the index of the newest message that is visible at each tick. -1 before the first.
 
     Args:
@@ -124,7 +124,7 @@ def newest_visible(ticks: Values, visible_at: Values) -> Values:
     return np.asarray(np.searchsorted(np.maximum.accumulate(visible_at), ticks, side="right") - 1)
 
 
-def plan_ages(executor: Values, made: Values, visible_at: Values) -> Values:
+def compute_plan_ages(executor: Values, made: Values, visible_at: Values) -> Values:
     """Return the age of the plan that each cycle of an executor could read, ticks.
 
     Cycles before the first visible plan are left out.
@@ -134,12 +134,12 @@ def plan_ages(executor: Values, made: Values, visible_at: Values) -> Values:
         made: Ticks at which the plans were requested, in order.
         visible_at: Ticks at which the plans became visible, in order.
     """
-    newest = newest_visible(executor, visible_at)
+    newest = find_newest_visible(executor, visible_at)
     seen = newest >= 0
     return np.asarray(executor[seen] - made[newest[seen]])
 
 
-def distribution(values: Values) -> Distribution | None:
+def compute_distribution(values: Values) -> Distribution | None:
     """Return minimum, percentiles and maximum of values of any unit, shape (n,).
 
     Returns:
@@ -173,13 +173,13 @@ class Occupation:
         self._sums = np.cumsum(self.ends - self.starts)
 
     @classmethod
-    def of(cls, rows: Rows) -> Occupation:
+    def from_records(cls, rows: EntityRows) -> Occupation:
         """Return the times in which a task occupied its core, including wake-up and overhead."""
-        half = overhead_ns(rows) // 2
+        half = compute_overhead_ns(rows) // 2
         return cls(rows["start_ns"] - half, rows["end_ns"] + half)
 
     @classmethod
-    def union(cls, many: Sequence[Occupation]) -> Occupation:
+    def merge(cls, many: Sequence[Occupation]) -> Occupation:
         """Return the union of several occupations."""
         empty = np.empty(0, np.int64)
         return cls(
@@ -187,11 +187,13 @@ class Occupation:
             np.concatenate([empty, *(occupation.ends for occupation in many)]),
         )
 
-    def within(self, starts: Values, ends: Values) -> Values:
+    def compute_overlap(self, starts: Values, ends: Values) -> Values:
         """Return the occupied time in each interval from `starts` to `ends`, ns, of their shape."""
-        return np.asarray(self._until(ends) - self._until(starts))
+        return np.asarray(
+            self._compute_occupied_before(ends) - self._compute_occupied_before(starts)
+        )
 
-    def _until(self, times: Values) -> Values:
+    def _compute_occupied_before(self, times: Values) -> Values:
         """Return the occupied time before each of `times`, ns."""
         begun = np.searchsorted(self.starts, times, side="right")
         if not len(self.starts):
@@ -201,27 +203,29 @@ class Occupation:
         return np.asarray(np.where(begun > 0, self._sums[newest] - beyond, 0))
 
 
-def waking_ns(rows: Rows) -> Values:
+def compute_waking_ns(rows: EntityRows) -> Values:
     """Return the processor time that each cycle used to wake up, before its start, ns."""
-    return np.asarray(np.clip(_beyond_stamps(rows), 0, np.maximum(lateness_ns(rows), 0)))
+    return np.asarray(
+        np.clip(_compute_unstamped_ns(rows), 0, np.maximum(compute_lateness_ns(rows), 0))
+    )
 
 
-def overhead_ns(rows: Rows) -> int:
+def compute_overhead_ns(rows: EntityRows) -> int:
     """Return the median processor time for waking up and for closing a cycle, ns.
 
     0 if every cycle was disturbed.
     """
-    beyond = _beyond_stamps(rows)
+    beyond = _compute_unstamped_ns(rows)
     undisturbed = beyond[beyond >= 0]
     return int(np.median(undisturbed)) if len(undisturbed) else 0
 
 
-def _beyond_stamps(rows: Rows) -> Values:
+def _compute_unstamped_ns(rows: EntityRows) -> Values:
     """Return the processor time minus the time from start to end, ns. Negative after preemption."""
-    return np.asarray(rows["processor_ns"] - lasted_ns(rows))
+    return np.asarray(rows["processor_ns"] - compute_duration_ns(rows))
 
 
-def unit_times(rows: Rows, above: Occupation) -> Values:
+def compute_unit_times(rows: EntityRows, above: Occupation) -> Values:
     """Return the processor time of each part of a cycle, ns, shape (n, 4).
 
     The parts of an executor are C, R, X and W, those of a planner are nothing, reading, P and U.
@@ -238,16 +242,16 @@ def unit_times(rows: Rows, above: Occupation) -> Values:
     stamps = np.stack([rows[name] for name in STAMPS], axis=1)
     starts = stamps[:, :-1]
     ends = stamps[:, 1:]
-    parts = ends - starts - above.within(starts, ends)
+    parts = ends - starts - above.compute_overlap(starts, ends)
     beyond = parts.sum(axis=1) - rows["processor_ns"]
-    beyond = np.where(beyond > 0, beyond + overhead_ns(rows), 0)
-    unusual = np.clip(parts - _undisturbed(parts, rows["processor_ns"]), 0, None)
-    parts = parts - _shared_out(beyond, unusual)
+    beyond = np.where(beyond > 0, beyond + compute_overhead_ns(rows), 0)
+    unusual = np.clip(parts - _estimate_undisturbed(parts, rows["processor_ns"]), 0, None)
+    parts = parts - _distribute(beyond, unusual)
     rest = np.clip(parts.sum(axis=1) - rows["processor_ns"], 0, None)
-    return np.asarray(np.rint(parts - _shared_out(rest, parts)), np.int64)
+    return np.asarray(np.rint(parts - _distribute(rest, parts)), np.int64)
 
 
-def _undisturbed(parts: Values, processor_ns: Values) -> Values:
+def _estimate_undisturbed(parts: Values, processor_ns: Values) -> Values:
     """Return the undisturbed time of each part, ns, shape (4,).
 
     Short parts are undisturbed in many cycles. The longest part may be disturbed in all of them, so
@@ -261,7 +265,7 @@ def _undisturbed(parts: Values, processor_ns: Values) -> Values:
     return usual
 
 
-def _shared_out(total: Values, weights: Values) -> Values:
+def _distribute(total: Values, weights: Values) -> Values:
     """Distribute `total`, shape (n,), in proportion to `weights`, shape (n, 4).
 
     No share exceeds its weight.

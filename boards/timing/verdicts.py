@@ -19,7 +19,7 @@ from math import inf, isfinite
 from typing import Any, Literal
 
 from rack.boards.timing.chains import ParallelChains
-from rack.boards.timing.frames import core_frames
+from rack.boards.timing.frames import compute_core_frames
 from rack.boards.timing.level import LevelTiming
 from rack.boards.timing.rack import RackTiming
 
@@ -84,38 +84,38 @@ class EquationVerdict:
         """Identity of the verdict, which a change of the rack's times does not affect."""
         return self.equation, self.subject, self.meaning
 
-    def document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, Any]:
         """Return the verdict as plain data, for JSON. An infinite side becomes None."""
         sides = {"left": self.left, "right": self.right, "margin": self.margin}
         finite = {name: side if isfinite(side) else None for name, side in sides.items()}
         return {**asdict(self), "holds": self.holds, **finite}
 
 
-def verdicts(rack: RackTiming) -> list[EquationVerdict]:
+def judge_rack(rack: RackTiming) -> list[EquationVerdict]:
     """Return all verdicts on a rack, in the order of the equations.
 
     Only what has a budget is judged. A response time without a bound is infinite.
     """
-    levels = (level_verdicts(rack, level) for level in rack.levels.values())
-    beyond = _of_tasks(rack), _of_cores(rack), _of_frames(rack), _of_inboxes(rack)
-    all_verdicts = chain(system_verdicts(rack), *levels, *beyond)
+    levels = (judge_level(rack, level) for level in rack.levels.values())
+    beyond = _judge_tasks(rack), _judge_cores(rack), _judge_frames(rack), _judge_inboxes(rack)
+    all_verdicts = chain(judge_system(rack), *levels, *beyond)
     return sorted(all_verdicts, key=lambda verdict: ORDER.index(verdict.equation))
 
 
-def level_verdicts(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVerdict]:
+def judge_level(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVerdict]:
     """Yield the verdicts on one level, as if it had its own processor."""
-    yield from _of_cycle(level, rack.tick_ns)
-    yield from _of_planner(level, rack.context_switch_ns, rack.small_share)
+    yield from _judge_cycle(level, rack.tick_ns)
+    yield from _judge_planner(level, rack.context_switch_ns, rack.small_share)
 
 
-def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
+def judge_system(rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield the verdicts on the system response along each chain of boards.
 
     If the config has a goal for the response, the cycle of each board in a chain is judged too.
     """
     goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
-    for chains in rack.parallel:
-        yield from _of_chains(rack, chains, goal_ns)
+    for chains in rack.chain_groups:
+        yield from _judge_chains(rack, chains, goal_ns)
     if goal_ns is not None:
         for name in dict.fromkeys(chain(*rack.chains)):
             cycle_ns = rack.boards[name].every * rack.tick_ns
@@ -123,18 +123,18 @@ def system_verdicts(rack: RackTiming) -> Iterator[EquationVerdict]:
             yield EquationVerdict("3.1", name, cycle_ns, "<=", longest_ns, "R_i <= R_max = R_s / n")
 
 
-def response_subject(rack: RackTiming, chains: ParallelChains) -> str:
+def name_response_subject(rack: RackTiming, chains: ParallelChains) -> str:
     """Return the subject of verdicts on the system response along chains.
 
     It contains their names if the rack has other chains too.
     """
-    return SYSTEM if len(rack.parallel) == 1 else f"{SYSTEM}, {chains.text}"
+    return SYSTEM if len(rack.chain_groups) == 1 else f"{SYSTEM}, {chains.text}"
 
 
-def _of_chains(
+def _judge_chains(
     rack: RackTiming, chains: ParallelChains, goal_ns: float | None
 ) -> Iterator[EquationVerdict]:
-    subject = response_subject(rack, chains)
+    subject = name_response_subject(rack, chains)
     bound = goal_ns
     limit = "timing.response_ms"
     if bound is None:
@@ -143,14 +143,14 @@ def _of_chains(
     total = sum(chains.cycles) * rack.tick_ns
     yield EquationVerdict("3.3", subject, total, "<=", bound, f"R_s = sum of R_i <= {limit}")
     for way, ticks in (
-        ("command", rack.command_ticks(chains)),
-        ("status", rack.status_ticks(chains)),
+        ("command", rack.compute_command_ticks(chains)),
+        ("status", rack.compute_status_ticks(chains)),
     ):
         meaning = f"R_s of a {way} with its waits for the grid <= {limit}"
         yield EquationVerdict("3.2", subject, ticks * rack.tick_ns, "<=", bound, meaning)
 
 
-def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
+def _judge_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
     board = level.board
     cycle = level.cycle_ns
     used = level.execution_ns + level.communication_ns
@@ -165,7 +165,7 @@ def _of_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
     yield EquationVerdict("3.7", board, cycle, "=", on_grid, "R_i = k c, k whole")
 
 
-def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
+def _judge_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
     if level.planning_ns is None or level.within_cycles is None or level.slice_ns is None:
         return
     board = level.board
@@ -193,7 +193,7 @@ def _of_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[Eq
     yield EquationVerdict("3.10", board, update, "<=", small, meaning, "1")
 
 
-def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
+def _judge_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
     for task in rack.responses:
         response_ns: float | None = task.response_ns
         endless = ""
@@ -216,15 +216,15 @@ def _of_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
         )
 
 
-def _of_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
+def _judge_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
     for core, load in rack.loads.items():
         meaning = "share of its time that its tasks compute"
         yield EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
 
 
-def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
+def _judge_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield the verdicts on the places of a static schedule, one for all equal frames."""
-    for equal_frames in core_frames(rack):
+    for equal_frames in compute_core_frames(rack):
         for place in equal_frames.places:
             limit = f"'{place.until}' begins" if place.until else "the frame ends"
             meaning = f"done before {limit}, in frame {equal_frames.frames[0]}"
@@ -232,7 +232,7 @@ def _of_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
             yield EquationVerdict(FRAMES, place.board, end_ns, "<=", place.limit_ns, meaning)
 
 
-def _of_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
+def _judge_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
     for name, inbox in rack.inboxes.items():
         burst = inbox.burst
         most = inf

@@ -11,13 +11,13 @@ from rack.levels.systems.joint_boards.messages import ArmStatus
 from rack.levels.systems.trajectory.commands import Motions
 from rack.levels.systems.trajectory.messages import MotionRequest, MotionStatus, RequestEnd
 
-PRESSED = 6.0
+TOUCH_TORQUE = 6.0
 """Change of a joint's torque that counts as touch, N m."""
-LEAST = 0.01
+MIN_OPENING = 0.01
 """Opening of the gripper below which it holds no block, m."""
-PLACE = (0.70, 0.30)
+GOAL = (0.70, 0.30)
 """Goal of the blocks, m."""
-SLOW = 0.03
+GUARDED_SPEED = 0.03
 """Speed of a guarded move, m/s."""
 
 
@@ -32,7 +32,7 @@ def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> boo
     Returns:
         True if the arm touched something.
     """
-    line = motions.line(goal, guard=PRESSED, segment=seconds)
+    line = motions.line(goal, guard=TOUCH_TORQUE, segment=seconds)
     motions.wait(line)
     return motions.end_of(line) is RequestEnd.GUARDED
 
@@ -48,28 +48,28 @@ class Assembly(HostProgram):
         """Carry both blocks."""
         motions = Motions(bus, self.motion, self.requests, self.context)
         for block in ("block1", "block2"):
-            self._fetch(motions, block)
-            touched = self._lower(motions)
+            self._fetch_block(motions, block)
+            touched = self._lower_block(motions)
             motions.wait(motions.release())
             result = "touched at" if touched else "no touch down to"
             print(f"{block}: {result} {motions.where()[2]:.4f} m")
-            motions.wait(motions.line((*PLACE, 0.70)))
+            motions.wait(motions.line((*GOAL, 0.70)))
         motions.wait(motions.move())
 
-    def _fetch(self, motions: Motions, block: str) -> None:
+    def _fetch_block(self, motions: Motions, block: str) -> None:
         """Grip a block and lift it. Raises `RuntimeError` if the gripper closes on nothing."""
         motions.release()
         motions.line((0.0, 0.0, 0.15), body=block)
         motions.line((0.0, 0.0, 0.0), body=block)
         motions.wait(motions.grip())
         opening = self.sensors.read().message.opening
-        if opening < LEAST:
+        if opening < MIN_OPENING:
             raise RuntimeError(f"{block}: the gripper closed to {1e3 * opening:.1f} mm, on nothing")
         motions.wait(motions.line((0.0, 0.0, 0.20), body=block))
 
-    def _lower(self, motions: Motions) -> bool:
+    def _lower_block(self, motions: Motions) -> bool:
         """Lower the block until it touches something, and return whether it did."""
-        above = (*PLACE, 0.62)
-        below = (*PLACE, 0.44)
+        above = (*GOAL, 0.62)
+        below = (*GOAL, 0.44)
         motions.wait(motions.line(above))
-        return guarded_line(motions, below, (above[2] - below[2]) / SLOW)
+        return guarded_line(motions, below, (above[2] - below[2]) / GUARDED_SPEED)

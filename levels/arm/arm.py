@@ -16,8 +16,8 @@ from collections.abc import Callable
 from rack.levels.arm.braked_arm import BrakedArm
 from rack.levels.arm.drivable import ArmLinks
 from rack.levels.arm.faulty import FaultyLink
-from rack.levels.arm.guard import GuardedArm, kept_bounds
-from rack.levels.arm.latency_compensation import present_link
+from rack.levels.arm.guard import GuardedArm, narrow_bounds_by_errors
+from rack.levels.arm.latency_compensation import build_present_link
 from rack.levels.errors import RobotError
 from rack.levels.messages import Scene
 from rack.levels.robot.cell import Cell
@@ -54,25 +54,25 @@ class Arm(BrakedArm):
         holds: Callable[[], bool],
     ) -> ArmLinks:
         """Return the links between servo level and arm; see `DrivableArm.connect`."""
-        link = present_link(self, tick_s)
+        link = build_present_link(self, tick_s)
         if not self.keeps_limits:
             link = self._guard = GuardedArm(self, tick_s, link, speed_fraction)
         return ArmLinks(link, FaultyLink(self, acted, link, holds))
 
-    def permit(self, speed_fraction: float) -> None:
+    def permit_speed(self, speed_fraction: float) -> None:
         """Change the fraction of their limits below which the link keeps velocities."""
         if self._guard is not None:
-            self._guard.permit(speed_fraction)
+            self._guard.permit_speed(speed_fraction)
 
     @classmethod
-    def misfit(cls, cell: Cell, speed_fraction: float) -> str:
+    def find_connect_error(cls, cell: Cell, speed_fraction: float) -> str:
         """Return why `connect` would fail for a cell. Empty if it would not.
 
         Called before the launch.
         """
         try:
             if not cls.keeps_limits:
-                kept_bounds(cell, speed_fraction)
+                narrow_bounds_by_errors(cell, speed_fraction)
         except RobotError as error:
             return str(error)
         return ""
@@ -85,4 +85,4 @@ class Arm(BrakedArm):
         offset = self.cell.encoders.offset
         position = self.sense().position
         self._data.qpos[self.cell.qpos] = position if offset is None else position + offset
-        self._show(scene)
+        self._fill_scene(scene)

@@ -6,7 +6,7 @@ from abc import abstractmethod
 
 import numpy as np
 
-from rack.backplane.watch.alarms import AT_START, NO_TORQUE, Alarm
+from rack.backplane.watch.alarms import BRAKED_AT_START, BRAKED_WITHOUT_TORQUE, Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm.drivable import DrivableArm, DriveState, JointTarget, Sensed
 from rack.levels.arm.plant import Plant
@@ -47,7 +47,7 @@ class BrakedArm(Plant, DrivableArm):
         self.grip_force = 0.0  # N: given to the gripper last
         self.state = DriveState.DISABLED  # of the drives, as of the last `step`
         # Reason (see `Alarm.BRAKES_CLOSED`) and first tick of braking. None while released.
-        self._brakes: tuple[int, int] | None = (AT_START, self.tick)
+        self._brakes: tuple[int, int] | None = (BRAKED_AT_START, self.tick)
         # For the level that drives the arm, and for an arm that senses exactly.
         self.dynamics = Dynamics(cell)
         self._permitted = TORQUE_MARGIN * cell.bounds.torque
@@ -72,7 +72,7 @@ class BrakedArm(Plant, DrivableArm):
         raise NotImplementedError
 
     @classmethod
-    def takes(cls, interface: Interface) -> bool:
+    def has_interface(cls, interface: Interface) -> bool:
         """Return True if the drives have an interface.
 
         `rack check` refuses a config that names another one. By default the methods that the class
@@ -111,17 +111,19 @@ class BrakedArm(Plant, DrivableArm):
             return None
         if np.isfinite(torque).all():
             joint = int((np.abs(torque) / self._permitted).argmax())
-            return self.refuse(Finding(Alarm.COMMAND_LIMIT, joint, float(torque[joint])))
-        return self.refuse(Finding(Alarm.COMMAND_INVALID, int((~np.isfinite(torque)).argmax())))
+            return self.refuse_command(Finding(Alarm.COMMAND_LIMIT, joint, float(torque[joint])))
+        return self.refuse_command(
+            Finding(Alarm.COMMAND_INVALID, int((~np.isfinite(torque)).argmax()))
+        )
 
-    def report_waiting(self) -> None:
+    def report_braking(self) -> None:
         """Report a finding if the arm has engaged its brakes by itself since the last cycle."""
         if self._brakes is None and self.braked:
             if self.state is not DriveState.ENABLED:
                 self._report_brakes(Error.DRIVES, self.tick)
             else:
                 since = self.tick - max(self.waited - self.patience, 1)
-                self._report_brakes(NO_TORQUE, since, self.waited - self.every)
+                self._report_brakes(BRAKED_WITHOUT_TORQUE, since, self.waited - self.every)
 
     def report_cycle(self) -> None:
         """Report, with the reason, every change of the brakes in a cycle, however short."""
@@ -150,19 +152,19 @@ class BrakedArm(Plant, DrivableArm):
         super().restore(state)
         was_disabled = state.error == Error.DISABLED
         self.state = DriveState.DISABLED if was_disabled else DriveState.ENABLED
-        self._brakes = (NO_TORQUE, self.tick) if self.braked else None
+        self._brakes = (BRAKED_WITHOUT_TORQUE, self.tick) if self.braked else None
 
     @property
-    def holds(self) -> bool:
+    def is_holding_object(self) -> bool:
         """True if the gripper touches an object. By default False."""
         return False
 
     @property
-    def leans(self) -> bool:
+    def is_touching_surroundings(self) -> bool:
         """True if the arm, or its load, touches anything else. By default False."""
         return False
 
-    def named(self, contact: tuple[int, int]) -> str:
+    def describe_contact(self, contact: tuple[int, int]) -> str:
         """Describe a `contact` as text. By default it has the numbers of the geoms."""
         return f"geom {contact[0]} touches geom {contact[1]}"
 
@@ -173,7 +175,7 @@ class BrakedArm(Plant, DrivableArm):
         (joints,), N m, or None for intact motors.
         """
 
-    def feel(self) -> Array | None:
+    def sense_wrist(self) -> Array | None:
         """Return the newest sample of the wrist sensor, (6,), N and N m, in its frame.
 
         None, the default, if the arm has none.

@@ -38,7 +38,7 @@ class CommandsAbove:
             for board, pace in context.above.items()
         }
 
-    def missing(
+    def find_missing(
         self, commands: Mapping[str, Reading[SampledCommand]], tick: int, since: int
     ) -> str:
         """Return why commands are missing. Empty if all are fresh.

@@ -12,7 +12,7 @@ from rack.levels.level import Fault, Finding
 from rack.levels.messages import ArmState, Scene
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.tables import Interface, SceneConfig, SensorConfig, named_class
+from rack.levels.tables import Interface, SceneConfig, SensorConfig, validate_class
 
 
 class DriveState(IntEnum):
@@ -45,14 +45,14 @@ class JointTarget(NamedTuple):
     torque: Array  # N m: predicted for the motion, including the payload
 
 
-class Exceeded(NamedTuple):
+class LimitViolation(NamedTuple):
     """Violation of a joint limit by a sample."""
 
     finding: Finding
     text: str  # description for the user
 
 
-def copied(sample: Sensed) -> Sensed:
+def copy_sample(sample: Sensed) -> Sensed:
     """Return a copy of a sample, with arrays that stay valid."""
     return sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
 
@@ -96,7 +96,7 @@ class FaultyPath(Link, Protocol):
 class ArmLinks(NamedTuple):
     """Links between the servo level and an arm, without and with injected faults."""
 
-    sound: Link
+    faultless: Link
     faulty: FaultyPath
 
 
@@ -117,7 +117,7 @@ class DrivableArm(ABC):
     Otherwise it is the predicted torque, and only the following error shows that a motor has
     failed.
     """
-    exceeded: Exceeded | None = None
+    exceeded: LimitViolation | None = None
     """Limit that the newest sample exceeds, if the link judges samples."""
 
     dynamics: Dynamics  # for the level that drives the arm
@@ -171,12 +171,12 @@ class DrivableArm(ABC):
         """
 
     @abstractmethod
-    def permit(self, speed_fraction: float) -> None:
+    def permit_speed(self, speed_fraction: float) -> None:
         """Change the fraction of their limits below which the link keeps velocities."""
 
     @classmethod
     @abstractmethod
-    def misfit(cls, cell: Cell, speed_fraction: float) -> str:
+    def find_connect_error(cls, cell: Cell, speed_fraction: float) -> str:
         """Return why `connect` would fail for a cell. Empty if it would not.
 
         Called before the launch.
@@ -184,7 +184,7 @@ class DrivableArm(ABC):
 
     @classmethod
     @abstractmethod
-    def takes(cls, interface: Interface) -> bool:
+    def has_interface(cls, interface: Interface) -> bool:
         """Return True if the drives have an interface.
 
         `rack check` refuses a config that names another one.
@@ -206,7 +206,7 @@ class DrivableArm(ABC):
         """
 
     @abstractmethod
-    def report_waiting(self) -> None:
+    def report_braking(self) -> None:
         """Report a finding if the arm has engaged its brakes by itself since the last cycle."""
 
     @abstractmethod
@@ -226,11 +226,11 @@ class DrivableArm(ABC):
         """Request that drives in FAULT change to DISABLED, and clear `fault`."""
 
     @abstractmethod
-    def named(self, contact: tuple[int, int]) -> str:
+    def describe_contact(self, contact: tuple[int, int]) -> str:
         """Describe a `contact` as text."""
 
     @abstractmethod
-    def feel(self) -> Array | None:
+    def sense_wrist(self) -> Array | None:
         """Return the newest sample of the wrist sensor, (6,), N and N m, in its frame.
 
         None if the arm has none.
@@ -258,4 +258,4 @@ def find_arm(reference: str) -> type[DrivableArm]:
     Raises:
         ValueError: The class is missing, abstract, or no arm.
     """
-    return named_class(reference, DrivableArm)
+    return validate_class(reference, DrivableArm)

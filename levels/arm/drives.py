@@ -16,17 +16,17 @@ from rack.levels.level import Finding
 from rack.levels.robot.dynamics import FRICTION_SPEED, INERTIA_ROW, Dynamics
 from rack.levels.robot.limits import Bounds, Limits
 
-SPEED_PART = 0.99
+SPEED_FRACTION = 0.99
 """Fraction of a velocity limit that the gate lets a joint reach.
 
 The rest covers model errors within a cycle.
 """
-RANGE_KEPT_RAD = 0.002
+RANGE_MARGIN_RAD = 0.002
 """Distance that the gate keeps from the ends of a joint's range, rad.
 
 It covers model errors within a cycle.
 """
-CLEAR_PART = 0.01
+CLEAR_SPEED_FRACTION = 0.01
 """Fraction of a velocity limit that must remain for one rough prediction to suffice."""
 HARD = 0
 SOFT = 8
@@ -53,21 +53,21 @@ class LimitGate:
             dynamics: Equation of motion of the arm.
         """
         low, high = bounds.position.T
-        fastest = SPEED_PART * bounds.velocity
-        range_ends = low + RANGE_KEPT_RAD, high - RANGE_KEPT_RAD
+        fastest = SPEED_FRACTION * bounds.velocity
+        range_ends = low + RANGE_MARGIN_RAD, high - RANGE_MARGIN_RAD
         # In the row order of `is_clear`.
         self._limits = np.stack((bounds.torque, fastest, *range_ends, braking, dynamics.dry))
         self._torque, self._fastest, self._low, self._high, self._braking, _ = self._limits
         self._period_s = period_s
         self._dynamics = dynamics
-        self._is_clear = is_clear.load()
+        self._is_clear = is_clear.load_machine_code()
         joints = len(braking)
         self._inertia = np.eye(joints)
         self._resisting = np.zeros(joints)
         self._unity = np.eye(joints)
         self._kinds = np.repeat(np.array([SOFT, HARD], dtype=np.int32), joints)
 
-    def admit(self, torque: Array, q: Array, qd: Array) -> tuple[Array, bool]:
+    def limit_torque(self, torque: Array, q: Array, qd: Array) -> tuple[Array, bool]:
         """Return the torques that may pass.
 
         Args:
@@ -82,23 +82,23 @@ class LimitGate:
         if self._is_clear(torque, self._dynamics.newest, self._limits, self._period_s):
             return torque, False
         passed: Array = np.clip(torque, -self._torque, self._torque)
-        lowest_gain = -self._speed_towards(q - self._low, -qd) - qd
-        highest_gain = self._speed_towards(self._high - q, qd) - qd
-        gain = np.clip(self._gain(passed, q, qd), lowest_gain, highest_gain)
+        lowest_gain = -self._limit_speed(q - self._low, -qd) - qd
+        highest_gain = self._limit_speed(self._high - q, qd) - qd
+        gain = np.clip(self._predict_gain(passed, q, qd), lowest_gain, highest_gain)
         # Light joints change speed so much within a cycle that only the state in the middle of the
         # cycle predicts its end.
-        gain = self._gain(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
+        gain = self._predict_gain(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
         if (gain < lowest_gain).any() or (gain > highest_gain).any():
-            passed = self._nearest(gain, lowest_gain, highest_gain)
+            passed = self._find_nearest_torque(gain, lowest_gain, highest_gain)
         return passed, not np.array_equal(passed, torque)
 
-    def _gain(self, torque: Array, q: Array, qd: Array) -> Array:
+    def _predict_gain(self, torque: Array, q: Array, qd: Array) -> Array:
         """Predict the change in velocity that torques cause in one cycle, (joints,), rad/s."""
         self._inertia, bias = self._dynamics.terms(q, qd)
         self._resisting = bias + self._dynamics.friction(qd)
         return np.asarray(solve(self._inertia, torque - self._resisting) * self._period_s)
 
-    def _nearest(self, gain: Array, lowest_gain: Array, highest_gain: Array) -> Array:
+    def _find_nearest_torque(self, gain: Array, lowest_gain: Array, highest_gain: Array) -> Array:
         """Return the torques whose velocity change is nearest to `gain` within bounds.
 
         Args:
@@ -122,9 +122,11 @@ class LimitGate:
             )
         )
 
-    def _speed_towards(self, distance: Array, speed: Array) -> Array:
+    def _limit_speed(self, distance: Array, speed: Array) -> Array:
         """Return the highest permitted speed towards an end of the range, (joints,), rad/s."""
-        return speed_towards(distance, speed, self._fastest, self._braking, self._period_s)
+        return compute_stoppable_speed(
+            distance, speed, self._fastest, self._braking, self._period_s
+        )
 
 
 @compiled_for("f8[::1], f8[:,::1], f8[:,::1], f8")
@@ -158,14 +160,18 @@ def is_clear(
     for joint in range(len(q)):
         speed = fastest[joint]
         deceleration = braking[joint]
-        margin = CLEAR_PART * speed
+        margin = CLEAR_SPEED_FRACTION * speed
         lowest = (
-            -speed_towards(q[joint] - low[joint], -qd[joint], speed, deceleration, period_s)
+            -compute_stoppable_speed(
+                q[joint] - low[joint], -qd[joint], speed, deceleration, period_s
+            )
             - qd[joint]
             + margin
         )
         highest = (
-            speed_towards(high[joint] - q[joint], qd[joint], speed, deceleration, period_s)
+            compute_stoppable_speed(
+                high[joint] - q[joint], qd[joint], speed, deceleration, period_s
+            )
             - qd[joint]
             - margin
         )
@@ -199,7 +205,7 @@ def cholesky_solve(matrix: Array, vector: Array) -> Array:
 
 
 @compiled
-def speed_towards(
+def compute_stoppable_speed(
     distance: Array, speed: Array, fastest: Array, braking: Array, period_s: float
 ) -> Array:
     """Return the highest permitted speed, at the end of the cycle, towards an end of the range.
@@ -220,7 +226,7 @@ def speed_towards(
     return np.minimum(stoppable, fastest)
 
 
-MOST_ACCELERATION = 3.0
+MAX_ACCELERATION_FACTOR = 3.0
 """Multiple of the acceleration limits with which set points may change their velocity.
 
 Curves between set points of the level above need a factor of two, joining the curves another one. A
@@ -256,16 +262,16 @@ class SetPointGate:
         self._period_s = arm.every * tick_s
         self._braking = cell.limits.acceleration
         self._by_position = cell.interface == "position"
-        narrowed = half_planned(bounds, cell.limits)
+        narrowed = narrow_bounds(bounds, cell.limits)
         self._fastest = narrowed.velocity
         self._dynamics = Dynamics(cell)
         self._gate = LimitGate(narrowed, self._braking, span_s, self._dynamics)
-        self._most = MOST_ACCELERATION * self._braking * self._period_s  # rad/s
+        self._most = MAX_ACCELERATION_FACTOR * self._braking * self._period_s  # rad/s
         # No joint can reach a set point farther than this from its sensed position in a cycle.
-        self._reach = self._fastest * self._period_s + cell.encoders.off
+        self._reach = self._fastest * self._period_s + cell.encoders.position_error
         self._last = last
 
-    def admit(self, target: JointTarget, q: Array, qd: Array) -> JointTarget | Finding:
+    def limit_set_point(self, target: JointTarget, q: Array, qd: Array) -> JointTarget | Finding:
         """Return the set point that may pass to the arm.
 
         Refused are numbers that are not finite, a predicted torque beyond its limit, and a first
@@ -286,24 +292,24 @@ class SetPointGate:
             position += max(arm.waited * self._tick_s - self._period_s, 0.0) * velocity
         else:
             position[:] = q
-        refused = arm.refused(target.torque) or self._misplaced(target, q, qd)
+        refused = arm.refused(target.torque) or self._check_set_point(target, q, qd)
         if refused is not None:
             arm.brake()
             return refused
-        wanted_velocity, is_cut = self._approached(target)
+        wanted_velocity, is_cut = self._compute_approach(target)
         change = np.clip(wanted_velocity - velocity, -self._most, self._most)
-        inertia, resisting = self._resisting()
+        inertia, resisting = self._compute_resistance()
         torque = mat_vec(inertia, change / self._period_s) + resisting
-        passed, was_cut = self._gate.admit(torque, position, velocity)
+        passed, was_cut = self._gate.limit_torque(torque, position, velocity)
         if was_cut:
-            inertia, resisting = self._resisting()
+            inertia, resisting = self._compute_resistance()
             change = self._period_s * solve(inertia, passed - resisting)
         arm.clipped += bool(is_cut or (change != wanted_velocity - velocity).any())
         position += self._period_s * (velocity + 0.5 * change)
         velocity += change
         return JointTarget(position.copy(), velocity.copy(), target.torque)
 
-    def _misplaced(self, target: JointTarget, q: Array, qd: Array) -> Finding | None:
+    def _check_set_point(self, target: JointTarget, q: Array, qd: Array) -> Finding | None:
         """Return why a set point is invalid; None if it is valid.
 
         While the arm is braked, or at the first set point, motion starts at the sensed state.
@@ -316,9 +322,9 @@ class SetPointGate:
         if not is_invalid.any():
             return None
         joint = int(is_invalid.argmax())
-        return self._arm.refuse(Finding(Alarm.SET_POINT, joint, float(error[joint])))
+        return self._arm.refuse_command(Finding(Alarm.SET_POINT, joint, float(error[joint])))
 
-    def _approached(self, target: JointTarget) -> tuple[Array, bool]:
+    def _compute_approach(self, target: JointTarget) -> tuple[Array, bool]:
         """Return the velocity to command for the end of the cycle, rad/s.
 
         Also return True if the set point is too far away to reach it in a cycle.
@@ -330,19 +336,21 @@ class SetPointGate:
         missing = target.position - position - 0.5 * period_s * (velocity + target.velocity)
         distance = np.abs(missing)
         at_rest = np.zeros(len(distance))
-        max_speed = speed_towards(distance, at_rest, self._fastest, self._braking, period_s)
+        max_speed = compute_stoppable_speed(
+            distance, at_rest, self._fastest, self._braking, period_s
+        )
         closing = np.copysign(np.minimum(distance / period_s, max_speed), missing)
         # Within this distance `max_speed` does not limit `closing`.
         cut = (distance > self._braking * period_s**2).any()
         return target.velocity + closing, bool(cut)
 
-    def _resisting(self) -> tuple[Array, Array]:
+    def _compute_resistance(self) -> tuple[Array, Array]:
         """Return the inertia and the resisting torques at the last set point."""
         inertia, bias = self._dynamics.terms(*self._last)
         return inertia, bias + self._dynamics.friction(self._last[1])
 
 
-def half_planned(bounds: Bounds, limits: Limits) -> Bounds:
+def narrow_bounds(bounds: Bounds, limits: Limits) -> Bounds:
     """Return bounds halfway between `bounds` and the limits of planned motion.
 
     They apply where they are tighter than `bounds`, because drives overshoot a little.

@@ -15,14 +15,18 @@ from rack.levels.arm.drivable import JointTarget, Link, Sensed
 from rack.levels.fault_steps import ActiveFault, CommandStep, Key, MotorStep, SensorStep
 from rack.levels.level import Fault, Finding
 from rack.levels.robot.dynamics import FRICTION_SPEED
-from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
+from rack.levels.robot.limits import (
+    MAX_CONTACT_FRACTION,
+    MAX_RESTING_CONTACT_FRACTION,
+    MIN_TURNING_JOINTS,
+)
 
-SLIGHT = 0.02
+DETECTABLE_TORQUE_FRACTION = 0.02
 """Fraction of its torque limit that a motor must lack for the fault to be detectable.
 
 This is in addition to the torque that friction and a contact may hide.
 """
-TURNS_FROM = 5.0 * FRICTION_SPEED
+MIN_TURNING_SPEED = 5.0 * FRICTION_SPEED
 """Velocity above which the direction of dry friction in a joint is known, rad/s."""
 
 
@@ -48,12 +52,14 @@ class FaultyLink:
         self._arm = arm
         self._holds = holds
         self._next: Link = link or arm
-        self._acted = acted
+        self._effects = acted
         self._limits = limits = cell.bounds.torque
         # Friction may change from helping to resisting, and so hide twice its value.
-        self._hidden = SLIGHT * limits + 2.0 * cell.model.dof_frictionloss[cell.dof]
+        self._hidden = (
+            DETECTABLE_TORQUE_FRACTION * limits + 2.0 * cell.model.dof_frictionloss[cell.dof]
+        )
         # A contact may change from pushing along to pushing back.
-        self._pressed = 2.0 * MAX_CONTACT_PART * limits
+        self._pressed = 2.0 * MAX_CONTACT_FRACTION * limits
         self._sensors: list[tuple[SensorStep, ActiveFault]] = []
         # With the fraction of its torque limit that a motor still provides.
         self._motors: list[tuple[float, ActiveFault]] = []
@@ -66,7 +72,7 @@ class FaultyLink:
         active = [
             ActiveFault(place, fault, joints, self._arm.every, self._kept)
             for place, fault in enumerate(faults)
-            if (joints := self._joints(fault)).any()
+            if (joints := self._mark_joints(fault)).any()
         ]
         for gone in self._kept.keys() - {a.key for a in active}:
             del self._kept[gone]
@@ -79,7 +85,7 @@ class FaultyLink:
             np.minimum(max_torque, fraction * self._limits, out=max_torque, where=weak.joints)
         self._arm.weaken(max_torque if self._motors else None)
 
-    def _joints(self, fault: Fault) -> Mask:
+    def _mark_joints(self, fault: Fault) -> Mask:
         """Return a mask of the joints that a fault affects, (joints,)."""
         joints = np.arange(len(self._limits))
         return np.asarray((joints == fault.joint) | (fault.joint < 0))
@@ -90,51 +96,51 @@ class FaultyLink:
         for step, active in self._sensors:
             sample, shows = step.act(sample, active)
             if shows is not None:
-                self._acted[active.place] = shows
+                self._effects[active.place] = shows
         return sample
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Pass on torques with the faults applied."""
         if self._commands:
-            torque = self._corrupt(torque)
+            torque = self._corrupt_torque(torque)
         finding = self._next.drive(torque, grip_force)
-        self._show_motors()
+        self._record_motor_faults()
         return finding
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Pass on set points, with command faults applied to the predicted torque."""
         if self._commands:
-            target = target._replace(torque=self._corrupt(target.torque))
+            target = target._replace(torque=self._corrupt_torque(target.torque))
         finding = self._next.follow(target, grip_force)
-        self._show_motors()
+        self._record_motor_faults()
         return finding
 
-    def _show_motors(self) -> None:
+    def _record_motor_faults(self) -> None:
         """Record which motor faults had an effect, and whether it was detectable."""
         if self._motors and not self._arm.braked:
             asked = np.abs(self._arm.torque)
-            hidden = self._hidden + self._pushed()
+            hidden = self._hidden + self._compute_hidden_torque()
             for fraction, active in self._motors:
                 missing = (asked - fraction * self._limits)[active.joints]
                 if (missing > 0.0).any():
-                    self._acted[active.place] = bool((missing > hidden[active.joints]).any())
+                    self._effects[active.place] = bool((missing > hidden[active.joints]).any())
 
-    def _pushed(self) -> Array | float:
+    def _compute_hidden_torque(self) -> Array | float:
         """Return how much of a motor's missing torque a contact may hide, N m."""
-        if self._arm.leans:
+        if self._arm.is_touching_surroundings:
             return self._pressed
-        turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > TURNS_FROM)
+        turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > MIN_TURNING_SPEED)
         return (
-            MAX_RESTING_CONTACT_PART * self._limits
-            if (self._arm.holds or self._holds()) and turning < MIN_TURNING_JOINTS
+            MAX_RESTING_CONTACT_FRACTION * self._limits
+            if (self._arm.is_holding_object or self._holds()) and turning < MIN_TURNING_JOINTS
             else 0.0
         )
 
-    def _corrupt(self, torque: Array) -> Array:
+    def _corrupt_torque(self, torque: Array) -> Array:
         """Return the torques as the active command faults corrupt them, (joints,), N m."""
         corrupt = self._torque
         np.copyto(corrupt, torque)
         for step, active in self._commands:
             np.copyto(corrupt, step.act(torque, self._limits, active), where=active.joints)
-            self._acted[active.place] = True
+            self._effects[active.place] = True
         return corrupt

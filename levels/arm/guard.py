@@ -7,7 +7,7 @@ import numpy as np
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm.braked_arm import BrakedArm
-from rack.levels.arm.drivable import DriveState, Exceeded, JointTarget, Link, Sensed
+from rack.levels.arm.drivable import DriveState, JointTarget, LimitViolation, Link, Sensed
 from rack.levels.arm.drives import LimitGate, SetPointGate
 from rack.levels.arm.latency_compensation import PresentLink
 from rack.levels.errors import RobotError
@@ -18,7 +18,7 @@ from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.limits import Bounds
 
 
-def kept_bounds(cell: Cell, speed_fraction: float) -> Bounds:
+def narrow_bounds_by_errors(cell: Cell, speed_fraction: float) -> Bounds:
     """Return the bounds of a cell, narrowed by the error of the encoders.
 
     `speed_fraction` is the fraction of their limits below which velocities are kept.
@@ -27,8 +27,8 @@ def kept_bounds(cell: Cell, speed_fraction: float) -> Bounds:
         RobotError: The encoders are too coarse to detect a violated limit.
     """
     velocity = speed_fraction * cell.bounds.velocity
-    off = cell.encoders.off
-    speed_off = cell.encoders.speed_off
+    off = cell.encoders.position_error
+    speed_off = cell.encoders.velocity_error
     bounds = Bounds(
         position=cell.bounds.position + np.stack((off, -off), axis=1),
         velocity=velocity - speed_off,
@@ -80,20 +80,20 @@ class GuardedArm:
         self._last_set_point: Array = np.full((2, len(cell.dof)), np.nan)
         self._dynamics = Dynamics(cell)
         self._state: Sensed | None = None
-        self.permit(speed_fraction)
+        self.permit_speed(speed_fraction)
 
-    def permit(self, speed_fraction: float) -> None:
+    def permit_speed(self, speed_fraction: float) -> None:
         """Keep velocities within `speed_fraction` of their limits.
 
         Raises:
             RobotError: The encoders are too coarse to detect a violated limit.
         """
         cell = self._cell
-        bounds = kept_bounds(cell, speed_fraction)
-        off = cell.encoders.off
+        bounds = narrow_bounds_by_errors(cell, speed_fraction)
+        off = cell.encoders.position_error
         self._low = cell.bounds.position[:, 0] - off
         self._high = cell.bounds.position[:, 1] + off
-        self._fastest = speed_fraction * cell.bounds.velocity + cell.encoders.speed_off
+        self._fastest = speed_fraction * cell.bounds.velocity + cell.encoders.velocity_error
         self._gate = LimitGate(bounds, cell.limits.acceleration, self._span_s, self._dynamics)
         if cell.interface != "torque":
             last = self._last_set_point
@@ -102,13 +102,13 @@ class GuardedArm:
     def sense(self) -> Sensed:
         """Return the newest sample, after judging it."""
         if isinstance(self._below, PresentLink):
-            _, state, sample = self._below.look()
+            _, state, sample = self._below.estimate_present()
         else:
             state = sample = self._below.sense()
         is_new = self._state is None or state.tick != self._state.tick
         self._state = state
         if is_new:
-            self._judge(state)
+            self._judge_sample(state)
         return sample
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
@@ -122,7 +122,7 @@ class GuardedArm:
         if arm.exceeded is not None:
             arm.brake()
             return arm.exceeded.finding
-        torque, cut = self._gate.admit(torque, state.position, state.velocity)
+        torque, cut = self._gate.limit_torque(torque, state.position, state.velocity)
         arm.clipped += cut
         return arm.drive(torque, grip_force)
 
@@ -133,10 +133,10 @@ class GuardedArm:
             return self._arm.exceeded.finding
         state = self._state
         assert state is not None, "the arm is sensed before it is driven"
-        passed = self._set_points.admit(target, state.position, state.velocity)
+        passed = self._set_points.limit_set_point(target, state.position, state.velocity)
         return passed if isinstance(passed, Finding) else self._below.follow(passed, grip_force)
 
-    def _judge(self, sample: Sensed) -> None:
+    def _judge_sample(self, sample: Sensed) -> None:
         """Set the arm's `exceeded` to the limit that a sample exceeds, or to None.
 
         A violation while the drives are enabled is counted and reported.
@@ -164,6 +164,6 @@ class GuardedArm:
         if arm.state is DriveState.ENABLED:
             arm.violations += 1
             arm.first_violation = arm.first_violation or f"{text}, at tick {sample.tick}"
-            arm.find(finding)
+            arm.report_finding(finding)
             arm.brake_cause = Error.LIMIT
-        arm.exceeded = Exceeded(finding, text)
+        arm.exceeded = LimitViolation(finding, text)

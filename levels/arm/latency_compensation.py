@@ -13,28 +13,28 @@ import numpy as np
 
 from rack.levels.algebra import Array, solve
 from rack.levels.arm.braked_arm import BrakedArm
-from rack.levels.arm.drivable import JointTarget, Link, Sensed, copied
+from rack.levels.arm.drivable import JointTarget, Link, Sensed, copy_sample
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
 
 
-class Driven(NamedTuple):
+class AppliedTorque(NamedTuple):
     """Torque that has driven an arm until a tick."""
 
     until: int
     torque: Array | None  # (joints,), N m. None if its brakes were engaged
 
 
-class Present(NamedTuple):
+class PresentState(NamedTuple):
     """A sample and the present state derived from it."""
 
     sample: Sensed  # as sensed
     state: Sensed  # extrapolated to the present
     # Like `state`, but a joint whose sample has not changed stays, because its sensor may be stuck.
-    shown: Sensed
+    reported: Sensed
 
 
-def present_link(arm: BrakedArm, tick_s: float) -> Link:
+def build_present_link(arm: BrakedArm, tick_s: float) -> Link:
     """Return a link whose samples are of the present. This is the arm if its samples are."""
     encoders = arm.cell.encoders
     is_present = encoders.offset is None and not encoders.latency_ticks
@@ -58,34 +58,34 @@ class PresentLink:
         self._dynamics = Dynamics(cell)
         self._latency = cell.encoders.latency_ticks
         self._tick_s = tick_s
-        self._driven: deque[Driven] = deque(maxlen=self._latency + 1)
-        self._last: Present | None = None
+        self._driven: deque[AppliedTorque] = deque(maxlen=self._latency + 1)
+        self._last: PresentState | None = None
 
     def sense(self) -> Sensed:
         """Return the newest sample, extrapolated to the present."""
-        return self.look().shown
+        return self.estimate_present().reported
 
-    def look(self) -> Present:
+    def estimate_present(self) -> PresentState:
         """Return the newest sample, and the present state."""
         arm = self._arm
         last = self._last
-        sample = copied(arm.sense())
+        sample = copy_sample(arm.sense())
         if self._offset is not None:
             sample.position[:] += self._offset
         torque = None if arm.braked else arm.torque.copy()
-        self._driven.append(Driven(arm.tick, torque))
+        self._driven.append(AppliedTorque(arm.tick, torque))
         if not 0 < arm.tick - sample.tick <= self._latency:
-            self._last = Present(sample, sample, sample)
+            self._last = PresentState(sample, sample, sample)
             return self._last
-        state = shown = self._led(sample)
+        state = shown = self._extrapolate(sample)
         if last is not None and sample.tick != last.sample.tick:
             is_stuck = sample.position == last.sample.position
             is_stuck &= sample.velocity == last.sample.velocity
             shown = state._replace(
-                position=np.where(is_stuck, last.shown.position, state.position),
-                velocity=np.where(is_stuck, last.shown.velocity, state.velocity),
+                position=np.where(is_stuck, last.reported.position, state.position),
+                velocity=np.where(is_stuck, last.reported.velocity, state.velocity),
             )
-        self._last = Present(sample, state, shown)
+        self._last = PresentState(sample, state, shown)
         return self._last
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
@@ -98,17 +98,21 @@ class PresentLink:
             target = target._replace(position=target.position - self._offset)
         return self._arm.follow(target, grip_force)
 
-    def _led(self, sample: Sensed) -> Sensed:
+    def _extrapolate(self, sample: Sensed) -> Sensed:
         """Return a sample extrapolated to the present."""
-        led = copied(sample)._replace(tick=self._arm.tick)
+        led = copy_sample(sample)._replace(tick=self._arm.tick)
         begun = sample.tick
         for until, torque in self._driven:
             if until > begun:
-                self._pass(led.position, led.velocity, torque, (until - begun) * self._tick_s)
+                self._advance_state(
+                    led.position, led.velocity, torque, (until - begun) * self._tick_s
+                )
                 begun = until
         return led
 
-    def _pass(self, position: Array, velocity: Array, torque: Array | None, time_s: float) -> None:
+    def _advance_state(
+        self, position: Array, velocity: Array, torque: Array | None, time_s: float
+    ) -> None:
         """Advance a state by `time_s`, in place.
 
         Args:

@@ -13,9 +13,9 @@ from rack.levels.robot.cell import Cell
 
 EPISODE_TICKS = 20
 """Ticks without a finding of a kind after which the next one is reported as new."""
-SAVED = ("waited", "braked", "clipped", "touches", "violations", "pushed", "struck")
+SAVED_ATTRIBUTES = ("waited", "braked", "clipped", "touches", "violations", "pushed", "struck")
 """Attributes of a plant that its `ArmState` contains, and that seldom change."""
-read_saved = attrgetter(*SAVED)
+read_saved = attrgetter(*SAVED_ATTRIBUTES)
 
 
 class Plant:
@@ -29,9 +29,9 @@ class Plant:
     def __init__(self, cell: Cell) -> None:
         self.cell = cell
         self.findings: list[Finding] = []  # once per episode
-        if Executor.made_last is not None:
-            self.findings = Executor.made_last.findings
-            Executor.made_last.complete_cycle.append(self.complete_cycle)
+        if Executor.last_constructed is not None:
+            self.findings = Executor.last_constructed.findings
+            Executor.last_constructed.complete_cycle.append(self.complete_cycle)
         self._found_ticks: dict[Alarm, int] = {}  # last finding of each kind
         self._reported_tick = -1  # last cycle that was reported
         self.tick = 0  # present tick
@@ -53,9 +53,9 @@ class Plant:
         self.first_violation = ""  # description of the first violation
         self._saved: tuple[ArmState, object] | None = None  # last state filled, and its values
         self._model = cell.model
-        self._data = cell.start()
+        self._data = cell.build_start_data()
 
-    def _show(self, scene: Scene) -> None:
+    def _fill_scene(self, scene: Scene) -> None:
         """Fill a `Scene` from `_data`."""
         data = self._data
         bodies = self.cell.bodies
@@ -78,20 +78,20 @@ class Plant:
         saved = state, read_saved(self)
         if saved != self._saved:
             self._saved = saved
-            for name in SAVED:
+            for name in SAVED_ATTRIBUTES:
                 setattr(state, name, getattr(self, name))
 
-    def find(self, finding: Finding) -> None:
+    def report_finding(self, finding: Finding) -> None:
         """Report a finding, unless it continues an episode."""
         last = self._found_ticks.get(finding.alarm)
         if last is None or self.tick - last > EPISODE_TICKS:
             self.findings.append(finding)
         self._found_ticks[finding.alarm] = self.tick
 
-    def refuse(self, finding: Finding) -> Finding:
+    def refuse_command(self, finding: Finding) -> Finding:
         """Count and report a refused command; return the finding."""
         self.clipped += 1
-        self.find(finding)
+        self.report_finding(finding)
         self.brake_cause = Error.LIMIT
         return finding
 
@@ -115,5 +115,5 @@ class Plant:
         Called once on a restarted board, before the first `step`.
         """
         self.tick = state.tick
-        for name in SAVED:
+        for name in SAVED_ATTRIBUTES:
             setattr(self, name, getattr(state, name))

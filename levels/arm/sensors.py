@@ -14,7 +14,7 @@ from rack.levels.robot.limits import EDGE_TIMING_S, Encoders
 from rack.levels.robot.wrist import Wrist
 
 AXES = 6
-STREAM = 0x57524953
+WRIST_SEED_OFFSET = 0x57524953
 """Added to the seed, so that the wrist sensor and the encoders have different noise."""
 
 
@@ -29,7 +29,7 @@ class CoarseSensors:
     def __init__(self, encoders: Encoders, seed: int) -> None:
         per_second = np.array([[1.0], [1.0 / EDGE_TIMING_S]])
         self._sensors = seed, encoders.noise * per_second, encoders.resolution * per_second
-        self._sense = sense_coarsely.load()
+        self._sense = sense_coarsely.load_machine_code()
 
     def sample(self, position: Array, velocity: Array, tick: int) -> Array:
         """Return the sensed positions, rad, and velocities, rad/s, (2, joints).
@@ -59,8 +59,8 @@ class WristSensor:
         self._places = wrist.addresses
         self._range = np.repeat(wrist.range, 3)
         noise = np.repeat(wrist.noise, 3)
-        self._sensors = seed + STREAM, np.stack((noise, noise)), np.zeros((2, AXES))
-        self._sense = sense_coarsely.load()
+        self._sensors = seed + WRIST_SEED_OFFSET, np.stack((noise, noise)), np.zeros((2, AXES))
+        self._sense = sense_coarsely.load_machine_code()
 
     def sample(self, tick: int) -> Array:
         """Return force, N, and torque, N m, in the sensor's frame, (6,).
@@ -86,7 +86,7 @@ def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Arra
         step: Resolution, (2, joints). 0 where values are not rounded.
     """
     joints = sample.shape[1]
-    chance = uniform(seed, tick, 2 * joints)
+    chance = draw_uniform(seed, tick, 2 * joints)
     for joint in range(joints):
         # Box and Muller's method makes two independent normal numbers from two uniform numbers.
         length = math.sqrt(-2.0 * math.log(chance[joint]))
@@ -101,7 +101,7 @@ def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Arra
 
 
 @compiled_for("i8, i8, i8")
-def uniform(seed: int, tick: int, count: int) -> Array:
+def draw_uniform(seed: int, tick: int, count: int) -> Array:
     """Return random numbers between 0 and 1, both excluded.
 
     They are a function of the arguments alone.
@@ -111,13 +111,13 @@ def uniform(seed: int, tick: int, count: int) -> Array:
         tick: Tick, for which the numbers are drawn.
         count: How many numbers to return.
     """
-    bits = mixed(np.zeros(count, dtype=np.uint64) + np.uint64(seed))
-    bits = mixed(mixed(bits + np.uint64(tick)) + np.arange(count).astype(np.uint64))
+    bits = mix_bits(np.zeros(count, dtype=np.uint64) + np.uint64(seed))
+    bits = mix_bits(mix_bits(bits + np.uint64(tick)) + np.arange(count).astype(np.uint64))
     return ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
 
 
 @compiled
-def mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+def mix_bits(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Mix bits by SplitMix64 (Steele, Lea and Flood, OOPSLA 2014)."""
     bits = bits + np.uint64(0x9E3779B97F4A7C15)
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

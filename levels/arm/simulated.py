@@ -10,7 +10,7 @@ import numpy as np
 
 from rack.levels.algebra import Array, mat_vec
 from rack.levels.arm.arm import Arm
-from rack.levels.arm.drivable import JointTarget, Sensed, copied
+from rack.levels.arm.drivable import JointTarget, Sensed, copy_sample
 from rack.levels.arm.drives import LimitGate, SetPointGate
 from rack.levels.arm.sensors import CoarseSensors, WristSensor
 from rack.levels.arm.simulation import Simulation
@@ -54,14 +54,14 @@ class SimulatedArm(Simulation, Arm):
         super().__init__(cell, scene, clock_ns, every, seed)
         d = self._data
         joints = len(cell.qpos)
-        self.begin(scene, clock_ns)
+        self.prepare_simulation(scene, clock_ns)
         self._gripper = cell.gripper
         dynamics = self.dynamics
         tick_s = clock_ns * 1e-9
         self._gate = LimitGate(cell.bounds, cell.limits.acceleration, tick_s, dynamics)
         self._rest: Array = cell.begin.copy()  # (joints,), rad: held by the brakes
-        self._most: Array | None = None  # (joints,), N m: limits of weakened motors
-        self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
+        self._weak_limits: Array | None = None  # (joints,), N m: limits of weakened motors
+        self._coarse = None if cell.encoders.is_exact else CoarseSensors(cell.encoders, seed)
         self._latency = cell.encoders.latency_ticks
         # Samples that are delayed by the latency, oldest first.
         self._samples: deque[Sensed] = deque(maxlen=self._latency + 1)
@@ -79,26 +79,26 @@ class SimulatedArm(Simulation, Arm):
             self.reports_torque = every == 1
         # Until the first step, the wrist sensor must sense a braked arm, not a falling one.
         if self._wrist is not None:
-            self._give()
+            self._apply_command()
             mujoco.mj_forward(cell.model, d)
 
     @property
-    def holds(self) -> bool:
+    def is_holding_object(self) -> bool:
         """True if the gripper touches an object."""
-        return bool(self._held().any())
+        return bool(self._mark_held_geoms().any())
 
     @property
-    def leans(self) -> bool:
+    def is_touching_surroundings(self) -> bool:
         """True if the arm, or its load, touches anything else."""
         contact = self._data.contact
-        one_sided = self._ours()[contact.geom].sum(axis=1) == 1
+        one_sided = self._mark_own_geoms()[contact.geom].sum(axis=1) == 1
         return bool((one_sided & (contact.dist < 0.0)).any())
 
     def sense(self) -> Sensed:
         """Return the newest sample of the joints and the gripper."""
-        return self._samples[0] if self._samples else self._sampled()
+        return self._samples[0] if self._samples else self._build_sample()
 
-    def _sampled(self) -> Sensed:
+    def _build_sample(self) -> Sensed:
         """Return a sample of the present state, with the errors of the encoders."""
         position, velocity = self._state
         if self._coarse is not None:
@@ -117,46 +117,46 @@ class SimulatedArm(Simulation, Arm):
 
         See `Link.drive`.
         """
-        self._grip(grip_force)
+        self._apply_grip_force(grip_force)
         finding = self.refused(torque)
         if finding is not None:
             self.brake()
             return finding
         self._command[:] = torque
-        self._release()
+        self._release_brakes()
         return None
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Release the brakes and follow a set point for the coming cycle; see `Link.follow`."""
-        self._grip(grip_force)
+        self._apply_grip_force(grip_force)
         # The encoders measure from another origin.
         if (offset := self.cell.encoders.offset) is not None:
             target = target._replace(position=target.position + offset)
-        passed = self._set_points.admit(target, *self._state)
+        passed = self._set_points.limit_set_point(target, *self._state)
         if isinstance(passed, Finding):
             return passed
         if self.braked and self._drives is not None:
             self._drives.start(target.torque, *self._state)
-        self._release()
+        self._release_brakes()
         return None
 
-    def _release(self) -> None:
+    def _release_brakes(self) -> None:
         """Release the brakes, and apply the command to the motors."""
         self.waited = 0
         self.braked = False
-        self._give()
+        self._apply_command()
 
-    def _grip(self, force: float) -> None:
+    def _apply_grip_force(self, force: float) -> None:
         """Set the force of the gripper, N, unless it is not finite."""
         if self._gripper is not None and math.isfinite(force):
             self._data.ctrl[self._gripper.actuator] = self.grip_force = force
 
     def brake(self) -> None:
         """Engage the brakes. The motors give no torque, and the gripper keeps its force."""
-        self._engage()
-        self._give()
+        self._engage_brakes()
+        self._apply_command()
 
-    def _engage(self) -> None:
+    def _engage_brakes(self) -> None:
         """Engage the brakes, and store the positions that they hold."""
         if not self.braked:
             self.braked = True
@@ -167,7 +167,7 @@ class SimulatedArm(Simulation, Arm):
 
         `most` is (joints,), N m, or None for intact motors.
         """
-        self._most = most
+        self._weak_limits = most
 
     def step(self, ticks: int) -> None:
         """Simulate `ticks` ticks.
@@ -177,21 +177,21 @@ class SimulatedArm(Simulation, Arm):
         self.contact = None
         for _ in range(ticks):
             if self.waited >= self.patience:
-                self._engage()
+                self._engage_brakes()
             if not self._given:
-                self._give()
+                self._apply_command()
             self._given = False
             self.waited += 1
             if not self.fault:
-                self._simulate()
+                self._simulate_tick()
             self.tick += 1
             if self._latency:
-                self._samples.append(copied(self._sampled()))
-        self.report_waiting()
+                self._samples.append(copy_sample(self._build_sample()))
+        self.report_braking()
         if self.fault:
             self._data.time = self._now_s
 
-    def feel(self) -> Array | None:
+    def sense_wrist(self) -> Array | None:
         """Return the sample of the wrist sensor, (6,), N and N m.
 
         It is one substep old, like all of MuJoCo's sensors.
@@ -219,7 +219,7 @@ class SimulatedArm(Simulation, Arm):
         # Torques stay in force. Drives compute a new torque for a set point before the last tick.
         self._given = self._drives is None or self.braked or self.waited == 0
 
-    def _give(self) -> None:
+    def _apply_command(self) -> None:
         """Apply torques through the limit gate.
 
         They are the command for the motors, or the torque of the brakes on the joints.
@@ -228,22 +228,22 @@ class SimulatedArm(Simulation, Arm):
         braked = self.braked
         q, qd = self._state
         if braked:
-            torque = self._braking_torque(q, qd)
+            torque = self._compute_braking_torque(q, qd)
         elif self._drives is None:
             torque = self._command
         else:
-            torque = self._drives.torque(q, qd, self.waited)
-        passed, cut = self._gate.admit(torque, q, qd)
+            torque = self._drives.compute_torque(q, qd, self.waited)
+        passed, cut = self._gate.limit_torque(torque, q, qd)
         self.clipped += cut
         self._data.qfrc_applied[cell.dof] = passed if braked else 0.0
         np.copyto(self.torque, 0.0 if braked else passed)
         torque = self.torque
-        if self._most is not None:
-            torque = np.clip(torque, -self._most, self._most)
+        if self._weak_limits is not None:
+            torque = np.clip(torque, -self._weak_limits, self._weak_limits)
         self._data.ctrl[cell.actuators] = torque
         self._given = True
 
-    def _braking_torque(self, q: Array, qd: Array) -> Array:
+    def _compute_braking_torque(self, q: Array, qd: Array) -> Array:
         """Return the torques that stop the joints or hold them at rest, (joints,), N m.
 
         The brakes apply them even with the motors off.
@@ -299,7 +299,7 @@ class CascadedDrives:
         change = (self._rows[1] - qd) / (self._every * self._tick_s)
         self._rows[2] = torque - mat_vec(self._dynamics.terms(q, qd).inertia, change)
 
-    def torque(self, q: Array, qd: Array, waited: int) -> Array:
+    def compute_torque(self, q: Array, qd: Array, waited: int) -> Array:
         """Return the torques of the coming tick, (joints,), N m.
 
         Args:

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, Mask, norm
 from rack.levels.arm.plant import Plant
-from rack.levels.arm.substeps import advance, copy_state, substeps
+from rack.levels.arm.substeps import copy_state, make_steps, prepare_substeps
 from rack.levels.level import Finding
 from rack.levels.messages import ArmState, Scene
-from rack.levels.robot.cell import unintended_contacts
+from rack.levels.robot.cell import find_unintended_contacts
 from rack.levels.robot.engine import SLEEP, mj_update_sleep, view_state
-from rack.levels.robot.lookup import geom_name
+from rack.levels.robot.lookup import find_geom_name
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 
 STRUCK_TICKS = 40
@@ -30,7 +30,7 @@ STEPS_AT_REST = 10
 
 This is MuJoCo's mjMINAWAKE.
 """
-QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
+CHECKED_QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N m"))
 """Checked quantities of a joint, in the row order of a step."""
 
 
@@ -44,17 +44,17 @@ class Simulation(Plant):
     sleeps: ClassVar[bool] = True
     """True if bodies may sleep, because nothing except MuJoCo moves them."""
 
-    def begin(self, scene: SceneConfig, clock_ns: int) -> None:
+    def prepare_simulation(self, scene: SceneConfig, clock_ns: int) -> None:
         """Prepare the steps of a tick and their checks. One tick is `clock_ns`."""
         cell = self.cell
         if self.sleeps:
-            self._model = sleeping(cell.model, scene)
+            self._model = enable_sleep(cell.model, scene)
         self._clock_ns = clock_ns
         steps = round(clock_ns * 1e-9 / cell.model.opt.timestep)
-        self._steps = substeps(cell, self._model, self._data, steps)
+        self._steps = prepare_substeps(cell, self._model, self._data, steps)
         # True positions and velocities, (joints,) each.
         self._state = (self._steps.seen[-1, 0], self._steps.seen[-1, 1])
-        self._refresh()
+        self._read_joint_state()
         self._is_arm, self._is_gripper = np.zeros((2, cell.model.ngeom), dtype=bool)
         self._is_arm[cell.geoms.arm] = self._is_gripper[cell.geoms.gripper] = True
         self._root = cell.model.body_rootid[cell.model.geom_bodyid]
@@ -70,10 +70,10 @@ class Simulation(Plant):
             for body, name in zip(cell.bodies, scene.objects, strict=False)
             if (pushes := tuple(push for push in scene.push if push.body == name))
         ]
-        self._advance = advance.load()
-        self._copy_state = copy_state.load()
+        self._advance = make_steps.load_machine_code()
+        self._copy_state = copy_state.load_machine_code()
 
-    def _refresh(self) -> None:
+    def _read_joint_state(self) -> None:
         """Read positions and velocities of the joints from MuJoCo's data.
 
         Necessary after the data was changed other than by a step.
@@ -84,12 +84,12 @@ class Simulation(Plant):
 
     def named(self, contact: tuple[int, int] | NDArray[np.int32]) -> str:
         """Describe a `contact` by the names of the geoms."""
-        first, second = (geom_name(self.cell.model, geom) for geom in contact)
+        first, second = (find_geom_name(self.cell.model, geom) for geom in contact)
         return f"'{first}' touches '{second}'"
 
     def look(self, scene: Scene) -> None:
         """Fill a `Scene` with the simulated poses."""
-        self._show(scene)
+        self._fill_scene(scene)
 
     def save(self, state: ArmState) -> None:
         """Fill an `ArmState`, including the state of the simulation."""
@@ -101,7 +101,7 @@ class Simulation(Plant):
         """Continue, bit for bit, from an `ArmState`."""
         super().restore(state)
         restore_state(self._model, self._data, state.state)
-        self._refresh()
+        self._read_joint_state()
 
     @property
     def _now_s(self) -> float:
@@ -111,19 +111,19 @@ class Simulation(Plant):
     def _after_s(self) -> float:
         return (self.tick + 1) * self._clock_ns * 1e-9
 
-    def _simulate(self) -> None:
+    def _simulate_tick(self) -> None:
         """Simulate one tick."""
         for mocap, start, moves in self._motions:
-            self._data.mocap_pos[mocap] = obstacle_position(start, moves, self._now_s)
+            self._data.mocap_pos[mocap] = compute_obstacle_position(start, moves, self._now_s)
         for body, pushes in self._pushes:
-            self._data.xfrc_applied[body, :3] = push_force(pushes, self._now_s)
+            self._data.xfrc_applied[body, :3] = compute_push_force(pushes, self._now_s)
         steps_made = self._advance(0, self._after_s, *self._steps)
         if steps_made < 0:
-            self._look_closer(-steps_made)
+            self._finish_failed_tick(-steps_made)
         elif self.struck:
             self.struck -= 1
 
-    def _look_closer(self, steps_made: int) -> None:
+    def _finish_failed_tick(self, steps_made: int) -> None:
         """Finish a tick in which step `made` failed a check.
 
         If the cause is a fault of the simulation, the state before the tick is restored.
@@ -136,42 +136,42 @@ class Simulation(Plant):
                 steps_made = -steps_made
                 self._count_contacts()
         if self.touches > touches and self.contact is not None:
-            self.find(Finding(Alarm.COLLISION, *self.contact))
+            self.report_finding(Finding(Alarm.COLLISION, *self.contact))
             self.struck = STRUCK_TICKS
-        is_broken = self._judge_limits()
+        is_broken = self._check_limits()
         if self.struck:
             self.struck = STRUCK_TICKS if is_broken else self.struck - 1
-        self.fault = self._broken()
+        self.fault = self._find_fault()
         if self.fault:
             restore_state(self._model, self._data, self._steps.states[0])
-            self._refresh()
+            self._read_joint_state()
         self._data.time = self._after_s
 
     def _count_contacts(self) -> None:
         """Count the unintended contacts of the last step, and store one of the arm or its load."""
-        pairs = unintended_contacts(self._data, self.cell.geoms.touch)
+        pairs = find_unintended_contacts(self._data, self.cell.geoms.touch)
         if not len(pairs):
             return
         if not self.first_touch:
             named = self.named(pairs[0])
             self.first_touch = f"unintended contact: {named} at {self._data.time:.3f} s"
         self.touches += len(pairs)
-        own_pairs = pairs[self._ours()[pairs].any(axis=1)]
+        own_pairs = pairs[self._mark_own_geoms()[pairs].any(axis=1)]
         if len(own_pairs):
             self.contact = int(own_pairs[0, 0]), int(own_pairs[0, 1])
 
-    def _held(self) -> Mask:
+    def _mark_held_geoms(self) -> Mask:
         """Return a mask of the geoms of free bodies that the gripper touches, (ngeom,)."""
         pairs = self._data.contact.geom
         others = pairs[self._is_gripper[pairs].any(axis=1)].ravel()
         roots = self._root[others[~self._is_arm[others]]]
         return np.asarray(np.isin(self._root, roots[roots != 0]))
 
-    def _ours(self) -> Mask:
+    def _mark_own_geoms(self) -> Mask:
         """Return a mask of the geoms of the arm and its load, (ngeom,)."""
-        return np.asarray(self._is_arm | self._held())
+        return np.asarray(self._is_arm | self._mark_held_geoms())
 
-    def _judge_limits(self) -> bool:
+    def _check_limits(self) -> bool:
         """Check the joint limits in all steps of a tick; return True if one is broken.
 
         Positions, velocities and torques (of motor and brake together) are checked. The check
@@ -197,14 +197,14 @@ class Simulation(Plant):
         row, joint = (int(at[0]) for at in np.nonzero(violated[step]))
         value = float(self._steps.seen[step, row, joint])
         if not self.first_violation:
-            quantity, unit = QUANTITIES[row]
+            quantity, unit = CHECKED_QUANTITIES[row]
             where = f"joint '{self.cell.joints[joint]}' at {self._now_s:.4f} s, step {step}"
             low, high = self._steps.judged[:2, row, joint]
             permitted = f"{low:g} to {high:g} is permitted"
             self.first_violation = f"{quantity} {value:.6g} {unit} of {where}; {permitted}"
-        self.find(Finding(Alarm.LIMIT_EXCEEDED, joint, value))
+        self.report_finding(Finding(Alarm.LIMIT_EXCEEDED, joint, value))
 
-    def _broken(self) -> str:
+    def _find_fault(self) -> str:
         """Return a description of the fault of the simulation. Empty if there is none."""
         d = self._data
         warned = np.flatnonzero(d.warning.number)
@@ -215,7 +215,9 @@ class Simulation(Plant):
         return ""
 
 
-def obstacle_position(start: Array, moves: tuple[MotionConfig, ...], time_s: float) -> Array:
+def compute_obstacle_position(
+    start: Array, moves: tuple[MotionConfig, ...], time_s: float
+) -> Array:
     """Return the origin of a moving obstacle, (3,), m.
 
     A move that starts before the previous one has ended cuts that one short.
@@ -238,7 +240,7 @@ def obstacle_position(start: Array, moves: tuple[MotionConfig, ...], time_s: flo
     return place
 
 
-def push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
+def compute_push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
     """Return the sum of the pushes on an object at simulated `time_s`, (3,), N."""
     total = np.zeros(3)
     for push in pushes:
@@ -252,7 +254,7 @@ def push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
     return total
 
 
-def sleeping(model: mujoco.MjModel, scene: SceneConfig) -> mujoco.MjModel:
+def enable_sleep(model: mujoco.MjModel, scene: SceneConfig) -> mujoco.MjModel:
     """Return a copy of the model in which bodies at rest sleep, if that is safe.
 
     It is not safe if a mocap body moves, because that does not wake others, nor with tendon

@@ -14,12 +14,12 @@ from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import (
     INTEGRATION,
-    contact_views,
+    build_common_view,
+    build_contact_views,
+    compute_state_size,
     mj_get_state,
     mj_set_state,
     mj_step,
-    one_view,
-    state_size,
 )
 
 TIME = int(mujoco.mjtState.mjSTATE_TIME)
@@ -53,7 +53,9 @@ class Substeps(NamedTuple):
         return self.judged[2:]
 
 
-def substeps(cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int) -> Substeps:
+def prepare_substeps(
+    cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int
+) -> Substeps:
     """Prepare the arguments of `make_steps`.
 
     Args:
@@ -65,7 +67,7 @@ def substeps(cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int)
     bounds = cell.bounds
     high = np.stack((bounds.position[:, 1], bounds.velocity, bounds.torque))
     low = np.stack((bounds.position[:, 0], -bounds.velocity, -bounds.torque))
-    memory, (qpos, qvel, motors, brakes) = one_view(
+    memory, (qpos, qvel, motors, brakes) = build_common_view(
         data.qpos, data.qvel, data.qfrc_actuator, data.qfrc_applied
     )
     return Substeps(
@@ -75,9 +77,9 @@ def substeps(cell: Cell, model: mujoco.MjModel, data: mujoco.MjData, steps: int)
         memory,
         np.stack((low, high, *np.zeros((steps, *low.shape)))),
         data.tree_asleep,
-        np.zeros((2, state_size(model))),
+        np.zeros((2, compute_state_size(model))),
         data.warning.number,
-        *contact_views(model, data),
+        *build_contact_views(model, data),
         cell.geoms.touch,
     )
 
@@ -102,7 +104,7 @@ def copy_state(model: int, data: int, asleep: NDArray[np.int32], state: Array) -
     "i8, f8, i8, i8, i8[:,::1], f8[::1], f8[:,:,::1], i4[::1], f8[:,::1], i4[:], i4[::1], "
     "i4[:,:], f8[:], b1[:,::1]"
 )
-def advance(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 us
+def make_steps(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.1 us
     begin: int,
     end_s: float,
     model: int,

@@ -5,7 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from rack.backplane.message import State
-from rack.levels.elemental_move.pipeline import ElementalMoveParams, PlanStore, SegmentWindow, joins
+from rack.levels.elemental_move.pipeline import (
+    ElementalMoveParams,
+    PlanStore,
+    SegmentWindow,
+    can_join,
+)
 from rack.levels.level import Executor, Input, LevelContext, Output
 from rack.levels.messages import (
     Error,
@@ -21,7 +26,7 @@ from rack.levels.operator import (
     ABOVE_LOST,
     BELOW_LOST,
     HELD_FROM_ABOVE,
-    HOLDABLE,
+    HOLD_COMMANDS,
     OperatorCommand,
     Orders,
 )
@@ -45,7 +50,7 @@ class ElementalMoveExecutor(Executor):
     # after the restart, and removes them again.
     status = Output(MoveStatus, rests_on=below)
     command = Output(MoveCommand, rests_on=above)
-    commands = HOLDABLE
+    commands = HOLD_COMMANDS
     params = ElementalMoveParams
     settings: ElementalMoveParams
 
@@ -68,51 +73,51 @@ class ElementalMoveExecutor(Executor):
         """Do one cycle: read command, status and plan, and keep the window of segments full."""
         segments = SegmentWindow(self.command)
         if not self._started:
-            self._recall(segments)
+            self._restore_state(segments)
         command = self.above
         status = self.below.message
-        self._orders.take(self.operator)
-        self._plans.take(self.plan, self._done, self._handed_down, self.status.end)
-        self._take_window(command.message, status, segments)
+        self._orders.take_commands(self.operator)
+        self._plans.store_plan(self.plan, self._done, self._handed_down, self.status.end)
+        self._restart_on_new_window(command.message, status, segments)
         if not self._error:
             # Count segments that are done; fail on a grasp that holds nothing.
-            while (taken := segments.take_done(status.done)) is not None:
+            while (taken := segments.pop_done(status.done)) is not None:
                 self._done = int(taken["move"])
                 self._replans_of_move = 0
                 if taken["kind"] == SegmentKind.GRIPPER and (
-                    shut := self._shut(status, taken["opening"])
+                    shut := self._describe_empty_grip(status, taken["opening"])
                 ):
-                    self._fail(Error.GRASP_MISSED, f"{shut}: it holds nothing")
+                    self._set_error(Error.GRASP_MISSED, f"{shut}: it holds nothing")
             self._check_below(status, segments)
         if not self._error:
             self._replan_if_blocked(status, segments, tick)
-            self._fill(command.message, segments, tick)
+            self._fill_window(command.message, segments, tick)
         if self._error:
-            segments.clear()
-        held = command.is_lost or command.message.hold or self._orders.holds
+            segments.withdraw_all()
+        held = command.is_lost or command.message.hold or self._orders.is_holding
         self.command.hold = self._request > 0 or self._error > 0 or held
-        self._report(segments, self.status)
-        self._answer()
+        self._write_status(segments, self.status)
+        self._answer_operator()
 
-    def _recall(self, segments: SegmentWindow) -> None:
+    def _restore_state(self, segments: SegmentWindow) -> None:
         """Continue from the last command and status in the mailboxes. Stored plans are lost."""
         self._started = True
         self.status.end = self.below.message.position
-        if self.last_command.is_there and self.last_status.is_there:
+        if self.last_command.has_message and self.last_status.has_message:
             last = self.last_status.message
             self.command.copy_from(self.last_command.message)
             self._done = last.done
             self._replans = last.replans
             if last.state == State.ERROR:
-                self._fail(Error(last.error), last.reason)
+                self._set_error(Error(last.error), last.reason)
             self._handed_down = max(last.done, *self.command.segments["move"].tolist())
             if self._handed_down >= last.planned:
                 self.status.end = last.end
-            end = segments.end()
+            end = segments.find_path_end()
             if end is not None:
                 self.status.end = end
 
-    def _take_window(
+    def _restart_on_new_window(
         self, command: TaskCommand, status: PrimitiveStatus, segments: SegmentWindow
     ) -> None:
         """Restart on a window that does not continue the last one, once the arm rests.
@@ -125,7 +130,7 @@ class ElementalMoveExecutor(Executor):
         first = int(command.moves["id"][0]) if command.count else 0
         if first <= self._handed_down + 1:
             return
-        segments.clear()
+        segments.withdraw_all()
         self._close_request()
         if status.resting or not self._handed_down:
             self._done = self._handed_down = first - 1
@@ -135,10 +140,10 @@ class ElementalMoveExecutor(Executor):
     def _check_below(self, status: PrimitiveStatus, segments: SegmentWindow) -> None:
         """Fail if the level below has failed, or the held object is lost."""
         if status.state == State.ERROR:
-            self._fail(Error(status.error), status.reason)
+            self._set_error(Error(status.error), status.reason)
         moving = segments.count and segments.first["kind"] == SegmentKind.PATH
-        if moving and status.held >= 0 and (shut := self._shut(status)):
-            self._fail(Error.OBJECT_LOST, f"{shut}: the object is lost")
+        if moving and status.held >= 0 and (shut := self._describe_empty_grip(status)):
+            self._set_error(Error.OBJECT_LOST, f"{shut}: the object is lost")
 
     def _replan_if_blocked(
         self, status: PrimitiveStatus, segments: SegmentWindow, tick: int
@@ -162,15 +167,15 @@ class ElementalMoveExecutor(Executor):
         if not blocked:
             self._close_request()
         elif not self._request and self._replans_of_move >= self.settings.replans:
-            self._fail(
+            self._set_error(
                 Error.BLOCKED, f"{self._replans_of_move} other paths tried, still {status.reason}"
             )
         elif not self._request:
             self._open_request(tick)
-        elif (plan := self._plans.answer(self._request)) is not None:
+        elif (plan := self._plans.find_answer(self._request)) is not None:
             if plan.error:
-                self._wait(plan, tick)
-            elif not joins(plan, status.position):
+                self._wait_for_path(plan, tick)
+            elif not can_join(plan, status.position):
                 # The arm has moved since the request.
                 self._open_request(tick)
             else:
@@ -191,7 +196,7 @@ class ElementalMoveExecutor(Executor):
             self._waiting_since = None
             self._reason = ""
 
-    def _fill(self, command: TaskCommand, segments: SegmentWindow, tick: int) -> None:
+    def _fill_window(self, command: TaskCommand, segments: SegmentWindow, tick: int) -> None:
         """Hand down the next moves, as far as they are planned and the window has room."""
         while not (self._request or self._error or segments.is_full):
             move = find_move(command.moves[: command.count], self._handed_down + 1)
@@ -206,19 +211,19 @@ class ElementalMoveExecutor(Executor):
         if move["verb"] in (Verb.GRASP, Verb.RELEASE):
             gripper = self._gripper
             if gripper is None:
-                self._fail(
+                self._set_error(
                     Error.UNREACHABLE, f"move {move['id']} needs a gripper; the robot has none"
                 )
                 return False
             opening = gripper.closed if move["verb"] == Verb.GRASP else gripper.open
             segments.add_gripper(move, opening, gripper.force)
             return True
-        plan = self._plans.of(int(move["id"]))
+        plan = self._plans.find_plan(int(move["id"]))
         if plan is None:
             return False
         if plan.error:
             if not segments.count:
-                self._wait(plan, tick)
+                self._wait_for_path(plan, tick)
             return False
         # A status from below is read up to a cycle late, and the status of this level becomes
         # visible another cycle later.
@@ -227,16 +232,16 @@ class ElementalMoveExecutor(Executor):
         segments.add_path(move, plan, below_s if by_s > 0.0 else 0.0)
         return True
 
-    def _wait(self, refusal: MovePlan, tick: int) -> None:
+    def _wait_for_path(self, refusal: MovePlan, tick: int) -> None:
         """Wait for a free path within `patience`. Fail at once on any other refusal."""
         if self._waiting_since is None:
             self._waiting_since = tick
         self._reason = refusal.reason
         waited_s = (tick - self._waiting_since) * self.context.tick_s
         if refusal.error != Error.NO_PATH or waited_s > self.settings.patience:
-            self._fail(Error(refusal.error), refusal.reason)
+            self._set_error(Error(refusal.error), refusal.reason)
 
-    def _shut(self, status: PrimitiveStatus, wanted: float | None = None) -> str:
+    def _describe_empty_grip(self, status: PrimitiveStatus, wanted: float | None = None) -> str:
         """Describe how far the gripper has closed if it holds nothing, else return an empty text.
 
         Args:
@@ -247,31 +252,31 @@ class ElementalMoveExecutor(Executor):
         if gripper is None or wanted not in (None, gripper.closed):
             return ""
         opening_gap = status.opening - gripper.closed
-        if not abs(opening_gap) < (self.settings.grasp_gap or gripper.still):
+        if not abs(opening_gap) < (self.settings.grasp_gap or gripper.rest_threshold):
             return ""
         # As a part of the travel, because an opening may be a length or an angle.
         travel_part = opening_gap / (gripper.open - gripper.closed)
         return f"the gripper has closed to {travel_part:.1%} of its way"
 
-    def _fail(self, error: Error, reason: str) -> None:
+    def _set_error(self, error: Error, reason: str) -> None:
         """Set the error of the present window; the first one counts."""
         if not self._error:
             self._error = error
             self._reason = reason
             self._request = 0
 
-    def _report(self, segments: SegmentWindow, report: MoveStatus) -> None:
+    def _write_status(self, segments: SegmentWindow, report: MoveStatus) -> None:
         """Fill the status of this level."""
         command = self.above.message
         status = self.below.message
         report.echo = command.id
-        report.state = self._state(command)
+        report.state = self._find_state(command)
         waits = ""
         if report.state == State.EXECUTING and (waits := self._reason_to_wait()):
             report.state = State.HOLDING
         report.error = self._error
         report.reason = self._reason if self._error else waits
-        report.operated = status.operated or self._orders.stands
+        report.operated = status.operated or self._orders.is_in_force
         # Report the moves done, and the progress of the present one.
         window = command.moves[: command.count]
         under_way = segments.first
@@ -284,11 +289,11 @@ class ElementalMoveExecutor(Executor):
         move = find_move(window, report.current)
         report.verb = Verb.NONE if move is None else move["verb"]
         # The planner continues from the last move that is reported as planned.
-        report.planned = self._plans.reach(window, self._handed_down)
-        end = self._plans.end(report.planned)
+        report.planned = self._plans.find_last_planned_move(window, self._handed_down)
+        end = self._plans.find_path_end(report.planned)
         if end is None:
             # The path was handed down before a restart, or has replaced such a path.
-            end = segments.end()
+            end = segments.find_path_end()
         if report.planned <= self._done and status.resting:
             report.end = status.position
         elif end is not None:
@@ -296,23 +301,23 @@ class ElementalMoveExecutor(Executor):
         report.replan = self._request
         report.start = status.position
 
-    def _answer(self) -> None:
+    def _answer_operator(self) -> None:
         """Answer the operator, and pass down the newest command on which this cycle is based."""
         above = self.above.message.operator
         below = self.below.message
-        self.command.operator = self._orders.rests_on(above)
+        self.command.operator = self._orders.find_basis(above)
         # Rest only counts once the level below has received the command.
         self.status.resting = below.resting and below.operator >= self.command.operator
         if self.status.resting:
-            self._orders.done()
-        self._orders.report(self.status, above)
+            self._orders.report_done()
+        self._orders.fill_status(self.status, above)
 
     def _reason_to_wait(self) -> str:
         """Return why the level waits and what ends the wait, or an empty text if it does not."""
         command = self.above
         below = self.below
-        if self._orders.stands:
-            return self._orders.keeps(self.context.board)
+        if self._orders.is_in_force:
+            return self._orders.format_reason(self.context.board)
         if command.is_lost:
             return ABOVE_LOST
         if below.is_lost:
@@ -323,7 +328,7 @@ class ElementalMoveExecutor(Executor):
             return below.message.reason
         return HELD_FROM_ABOVE if command.message.hold else ""
 
-    def _state(self, command: TaskCommand) -> State:
+    def _find_state(self, command: TaskCommand) -> State:
         """Return the state to report, apart from HOLDING."""
         if self._error:
             return State.ERROR

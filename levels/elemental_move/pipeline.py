@@ -8,14 +8,22 @@ import numpy as np
 from pydantic import Field
 
 from rack.backplane.mailbox.mailbox import Reading
-from rack.backplane.message import copied
+from rack.backplane.message import copy_message
 from rack.levels.algebra import Array
-from rack.levels.messages import SEGMENTS, WINDOW, Error, MoveCommand, MovePlan, SegmentKind, Verb
+from rack.levels.messages import (
+    SEGMENTS,
+    WINDOW_MOVES,
+    Error,
+    MoveCommand,
+    MovePlan,
+    SegmentKind,
+    Verb,
+)
 from rack.levels.tables import Positive, Table
 
 MAX_GAP_RAD = 0.005
 """Two paths join if no joint is farther than this from the end of one at the start of the next."""
-MAX_PLANS = 2 * WINDOW
+MAX_PLANS = 2 * WINDOW_MOVES
 """Maximum number of stored plans. The planner is never farther ahead than its window, and plans of
 done moves are dropped with the next plan."""
 
@@ -43,7 +51,7 @@ class PlanStore:
         self._by_move: dict[int, MovePlan] = {}
         self._answer: MovePlan | None = None
 
-    def take(self, plan: Reading[MovePlan], done: int, handed_down: int, end: Array) -> None:
+    def store_plan(self, plan: Reading[MovePlan], done: int, handed_down: int, end: Array) -> None:
         """Store a new plan of a move that was not handed down, if it joins the path before it.
 
         A plan that does not join is based on a path that was lost or replaced; the planner will
@@ -58,37 +66,37 @@ class PlanStore:
         """
         if not plan.is_new:
             return
-        message = copied(plan.message)
+        message = copy_message(plan.message)
         if message.replan:
             self._answer = message
             return
         for move in [m for m in self._by_move if m < done]:
             del self._by_move[move]
-        before = self.end(message.move - 1)
+        before = self.find_path_end(message.move - 1)
         if before is None:
             before = end
-        if message.move <= handed_down or not (message.error or joins(message, before)):
+        if message.move <= handed_down or not (message.error or can_join(message, before)):
             return
         previous = self._by_move.get(message.move)
         stays = (
             previous is not None
             and not (previous.error or message.error)
-            and is_same(end_of(previous), end_of(message))
+            and is_close(find_end(previous), find_end(message))
         )
         for move in [m for m in self._by_move if m > message.move and not stays]:
             del self._by_move[move]
         if len(self._by_move) < MAX_PLANS:
             self._by_move[message.move] = message
 
-    def of(self, move: int) -> MovePlan | None:
+    def find_plan(self, move: int) -> MovePlan | None:
         """Return the plan of a move, which may be a refusal, or None."""
         return self._by_move.get(move)
 
-    def answer(self, request: int) -> MovePlan | None:
+    def find_answer(self, request: int) -> MovePlan | None:
         """Return the answer to a request for another path, or None."""
         return self._answer if self._answer is not None and self._answer.replan == request else None
 
-    def reach(self, window: Any, handed_down: int) -> int:
+    def find_last_planned_move(self, window: Any, handed_down: int) -> int:
         """Return the last move, at least `handed_down`, before the first one that lacks a path."""
         reached = handed_down
         for move in window:
@@ -100,23 +108,23 @@ class PlanStore:
                 reached += 1
         return reached
 
-    def end(self, move: int) -> Array | None:
+    def find_path_end(self, move: int) -> Array | None:
         """Return the end of the newest path of any move up to `move`, (joints,), rad, or None."""
         paths = [m for m, plan in self._by_move.items() if m <= move and plan.error == Error.NONE]
-        return end_of(self._by_move[max(paths)]) if paths else None
+        return find_end(self._by_move[max(paths)]) if paths else None
 
 
-def joins(plan: MovePlan, position: Array) -> bool:
+def can_join(plan: MovePlan, position: Array) -> bool:
     """Return True if the path of a `MOVE_PLAN` begins at `position`, (joints,), rad."""
-    return is_same(np.asarray(plan.waypoints[0]), position)
+    return is_close(np.asarray(plan.waypoints[0]), position)
 
 
-def end_of(plan: MovePlan) -> Array:
+def find_end(plan: MovePlan) -> Array:
     """Return the end of the path of a `MOVE_PLAN`, (joints,), rad."""
     return np.asarray(plan.waypoints[plan.count - 1])
 
 
-def is_same(a: Array, b: Array) -> bool:
+def is_close(a: Array, b: Array) -> bool:
     """Return True if a path that ends at `a` joins one that begins at `b`, (joints,), rad."""
     return float(np.abs(a - b).max()) <= MAX_GAP_RAD
 
@@ -147,20 +155,20 @@ class SegmentWindow:
         """The oldest segment. All zeros while `count` is 0."""
         return self._segments[0]
 
-    def take_done(self, done: int) -> Any:
+    def pop_done(self, done: int) -> Any:
         """Remove and return the oldest segment if its serial is at most `done`, else None."""
         if not self.count or self._segments["id"][0] > done:
             return None
         segment = self._segments[0].copy()
         self._segments[:-1] = self._segments[1:]
         self._command.count = self.count - 1
-        self._blank()
+        self._clear_unused()
         return segment
 
-    def clear(self) -> None:
+    def withdraw_all(self) -> None:
         """Withdraw every segment."""
         self._command.count = 0
-        self._blank()
+        self._clear_unused()
 
     def add_path(self, move: Any, plan: MovePlan, by_s: float) -> None:
         """Hand down a path.
@@ -170,17 +178,17 @@ class SegmentWindow:
             plan: Plan with its path.
             by_s: Simulated time by which the segment must be done, or 0.
         """
-        segment = self._add(move, SegmentKind.PATH)
+        segment = self._add_segment(move, SegmentKind.PATH)
         segment["touch"] = move["verb"] in (Verb.APPROACH, Verb.DEPART)
         segment["by"] = by_s
-        self._lay(segment, plan)
+        self._write_path(segment, plan)
 
     def replace_first(self, plan: MovePlan) -> None:
         """Withdraw all segments, and hand down the oldest one again with another path."""
         self._command.count = 1
-        self._blank()
+        self._clear_unused()
         self._command.id = self.first["id"] = self._command.id + 1
-        self._lay(self.first, plan)
+        self._write_path(self.first, plan)
 
     def add_gripper(self, move: Any, opening: float, force: float) -> None:
         """Hand down a motion of the gripper.
@@ -190,11 +198,11 @@ class SegmentWindow:
             opening: Opening to reach, m or rad.
             force: Largest force, N or N m.
         """
-        segment = self._add(move, SegmentKind.GRIPPER)
+        segment = self._add_segment(move, SegmentKind.GRIPPER)
         segment["opening"] = opening
         segment["force"] = force
 
-    def end(self, move: int | None = None) -> Array | None:
+    def find_path_end(self, move: int | None = None) -> Array | None:
         """Return the end of the newest path in the window, or of the path of `move`.
 
         Returns:
@@ -205,7 +213,7 @@ class SegmentWindow:
                 return np.array(segment["waypoints"][segment["count"] - 1])
         return None
 
-    def _add(self, move: Any, kind: SegmentKind) -> Any:
+    def _add_segment(self, move: Any, kind: SegmentKind) -> Any:
         """Append a segment with a new serial, and return it."""
         segment = self._segments[self.count]
         self._command.count = self.count + 1
@@ -215,12 +223,12 @@ class SegmentWindow:
         segment["object"] = move["object"]
         return segment
 
-    def _lay(self, segment: Any, plan: MovePlan) -> None:
+    def _write_path(self, segment: Any, plan: MovePlan) -> None:
         """Write the path of a plan to a segment."""
         segment["count"] = plan.count
         segment["waypoints"] = plan.waypoints
         segment["blend"] = plan.blend
 
-    def _blank(self) -> None:
+    def _clear_unused(self) -> None:
         """Clear the unused segments, so that equal windows have equal bytes."""
         self._segments[self.count :] = np.zeros((), self._segments.dtype)

@@ -25,8 +25,8 @@ from rack.levels.messages import (
 )
 from rack.levels.motion.path import Path
 from rack.levels.planning.moves import Move, Situation, read_window
-from rack.levels.planning.pose import Pose, pose
-from rack.levels.robot.cell import cell_of
+from rack.levels.planning.pose import Pose, make_pose
+from rack.levels.robot.cell import build_level_cell
 
 ACKNOWLEDGED_CYCLES = 2
 """Cycles until the status of the executor must acknowledge a plan. Otherwise the plan counts as
@@ -44,7 +44,7 @@ class PlanningJob(NamedTuple):
     request: int = 0  # request of the executor that this job answers, or 0
 
 
-class Published(NamedTuple):
+class PublishedPath(NamedTuple):
     """A path that was handed to the executor."""
 
     move: Move
@@ -90,9 +90,9 @@ class ElementalMovePlanner(Planner):
         # OMPL takes time and memory to import, so only racks that plan motions import it.
         from rack.levels.planning.motion_planner import MotionPlanner
 
-        cell = cell_of(context)
+        cell = build_level_cell(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
-        self._published: list[Published] = []
+        self._published: list[PublishedPath] = []
         self._job: PlanningJob | None = None
         self._window: list[Move] = []
         # Row of the object that is held or will be next, and its pose in the frame of the tool.
@@ -107,7 +107,7 @@ class ElementalMovePlanner(Planner):
         """Return True if a path is requested, blocked or missing."""
         ports = (self.above, self.status, self.primitive, self.scene, self.world)
         # A plan for a lost executor would be based on an old status, so wait until it reports.
-        if not all(port.is_there for port in ports) or self.status.is_lost:
+        if not all(port.has_message for port in ports) or self.status.is_lost:
             return False
         self._window = read_window(self.above.message)
         status = self.status.message
@@ -129,14 +129,17 @@ class ElementalMovePlanner(Planner):
                 if m.verb is Verb.GRASP and m.id > status.done
             ]
             self._grip = next(
-                ((row, grip_of(row, tool, world)) for row, tool in grasps if row is not None), None
+                ((row, compute_grip(row, tool, world)) for row, tool in grasps if row is not None),
+                None,
             )
         elif self._grip is None or self._grip[0] != held:
             scene = self.scene.message
-            tool = pose(scene.tool_position, scene.tool_quaternion)
-            self._grip = (held, grip_of(held, tool, scene))
-        self._job = self._requested(tick) or self._blocked() or self._ahead()
-        return self._job is not None and self._may_try(self._job, self.world.message.revision, tick)
+            tool = make_pose(scene.tool_position, scene.tool_quaternion)
+            self._grip = (held, compute_grip(held, tool, scene))
+        self._job = (
+            self._find_requested_job(tick) or self._find_blocked_job() or self._find_next_job()
+        )
+        return self._job is not None and self._can_try(self._job, self.world.message.revision, tick)
 
     def plan(self, tick: int) -> None:
         """Plan the path of one move, or give the reason why there is none."""
@@ -148,7 +151,7 @@ class ElementalMovePlanner(Planner):
         plan.replan = job.request
         visible_at = tick + self.context.every * self.context.within_cycles
         try:
-            situation = self._situation(job.move)
+            situation = self._predict_situation(job.move)
             path = self._motion.plan(
                 job.move, job.start, situation, attempt=self._tries, goal=job.goal
             )
@@ -167,9 +170,9 @@ class ElementalMovePlanner(Planner):
         plan.kind = SegmentKind.PATH
         plan.count = count
         plan.waypoints[:count], plan.blend[:count] = path
-        self._note_path(job, path, visible_at)
+        self._record_path(job, path, visible_at)
 
-    def _requested(self, tick: int) -> PlanningJob | None:
+    def _find_requested_job(self, tick: int) -> PlanningJob | None:
         """Return the job that the executor requests where the arm is blocked, or None.
 
         The path keeps its end, so that the moves after it remain valid.
@@ -179,11 +182,11 @@ class ElementalMovePlanner(Planner):
             return None
         for move in self._window:
             if move.id == status.current:
-                end = SegmentWindow(self.handed_down.message).end(move.id)
+                end = SegmentWindow(self.handed_down.message).find_path_end(move.id)
                 return PlanningJob(move, np.array(status.start), end, status.replan)
         return None
 
-    def _blocked(self) -> PlanningJob | None:
+    def _find_blocked_job(self) -> PlanningJob | None:
         """Return a job for the first path ahead that a change of the world has blocked, or None.
 
         The path keeps its end, so that the moves after it remain valid.
@@ -194,21 +197,21 @@ class ElementalMovePlanner(Planner):
             return None
         handed_down = max(status.current, status.done) + MAX_HANDED_DOWN
         for move, path, _ in self._published:
-            if move.id > handed_down and not self._motion.still_free(
-                move, path, self._situation(move)
+            if move.id > handed_down and not self._motion.is_still_free(
+                move, path, self._predict_situation(move)
             ):
                 return PlanningJob(move, path.waypoints[0], path.end)
         self._revision = revision
         return None
 
-    def _ahead(self) -> PlanningJob | None:
+    def _find_next_job(self) -> PlanningJob | None:
         """Return a job for the first move without a path, or None."""
         status = self.status.message
         primitive = self.primitive.message
         # The end of a path that the executor reports is exact, but the executor may not have
         # received the newest path yet.
         unseen = [p for p in self._published[-1:] if p.move.id > status.planned]
-        move = next_motion(self._window, unseen[0].move.id if unseen else status.planned)
+        move = find_next_motion(self._window, unseen[0].move.id if unseen else status.planned)
         if move is None:
             return None
         if unseen:
@@ -217,7 +220,7 @@ class ElementalMovePlanner(Planner):
             return PlanningJob(move, np.array(status.end))
         return PlanningJob(move, np.array(primitive.position)) if primitive.resting else None
 
-    def _situation(self, move: Move) -> Situation:
+    def _predict_situation(self, move: Move) -> Situation:
         """Return the situation when `move` begins: the sensed world after the moves before it."""
         world = self.world.message
         held = self.primitive.message.held
@@ -225,16 +228,16 @@ class ElementalMovePlanner(Planner):
         situation = Situation(np.array(world.position), np.array(world.quaternion))
         if held >= 0:
             grip = None if self._grip is None else self._grip[1]
-            situation = situation.holding(held, grip)
+            situation = situation.with_object_held(held, grip)
         for earlier in self._window:
             # A grasp may be reported done only after the object is reported held. It must not count
             # twice.
             is_counted = earlier.verb is Verb.GRASP and earlier.object == situation.held
             if done < earlier.id < move.id and not is_counted:
-                situation = situation.after(earlier)
+                situation = situation.predict_after(earlier)
         return situation
 
-    def _may_try(self, job: PlanningJob, revision: int, tick: int) -> bool:
+    def _can_try(self, job: PlanningJob, revision: int, tick: int) -> bool:
         """Return True if a job may be tried.
 
         A refused job is tried again after a change of the world or after `retry`.
@@ -252,7 +255,7 @@ class ElementalMovePlanner(Planner):
             revision != refusal.revision or tick >= refusal.again_at
         )
 
-    def _note_path(self, job: PlanningJob, path: Path, visible_at: int) -> None:
+    def _record_path(self, job: PlanningJob, path: Path, visible_at: int) -> None:
         """Record a path that was found; it may replace an earlier one.
 
         Args:
@@ -264,7 +267,7 @@ class ElementalMovePlanner(Planner):
         if job.request:
             self._answered = job.request
             self._answer_due = visible_at + ACKNOWLEDGED_CYCLES * self.context.every
-        published = Published(job.move, path, visible_at)
+        published = PublishedPath(job.move, path, visible_at)
         published_ids = [p.move.id for p in self._published]
         if job.move.id in published_ids:
             self._published[published_ids.index(job.move.id)] = published
@@ -272,7 +275,7 @@ class ElementalMovePlanner(Planner):
             self._published.append(published)
 
 
-def next_motion(window: Sequence[Move], newest: int) -> Move | None:
+def find_next_motion(window: Sequence[Move], newest: int) -> Move | None:
     """Return the first motion after move `newest`, or None if the window has a gap before it."""
     for move in window:
         if move.id == newest + 1:
@@ -282,7 +285,7 @@ def next_motion(window: Sequence[Move], newest: int) -> Move | None:
     return None
 
 
-def grip_of(row: int, tool: Pose, seen: Scene | WorldState) -> Pose:
+def compute_grip(row: int, tool: Pose, seen: Scene | WorldState) -> Pose:
     """Return the pose of an object in the frame of the tool.
 
     Args:
@@ -290,4 +293,4 @@ def grip_of(row: int, tool: Pose, seen: Scene | WorldState) -> Pose:
         tool: Pose of the tool.
         seen: Scene or world model that contains the object.
     """
-    return tool.inverse() @ pose(seen.position[row], seen.quaternion[row])
+    return tool.inverse() @ make_pose(seen.position[row], seen.quaternion[row])

@@ -76,7 +76,7 @@ class BlendedPath:
             ValueError: Shapes do not match, values are not finite, or blends are negative or
                 overlap.
         """
-        points, radii = _distinct(*_checked(waypoints, blend))
+        points, radii = _merge_coincident(*_check_arrays(waypoints, blend))
         steps = np.diff(points, axis=0)
         lengths = np.linalg.norm(steps, axis=1)
         _check_overlap(radii, lengths)
@@ -110,10 +110,12 @@ class BlendedPath:
 
     def evaluate(self, s: float) -> PathPoint:
         """Return the point at `s`, clamped to the path. The next call overwrites its arrays."""
-        set_point.load()(self._marks, self._table, min(max(s, 0.0), self.length), self._point)
+        compute_point.load_machine_code()(
+            self._marks, self._table, min(max(s, 0.0), self.length), self._point
+        )
         return PathPoint(*self._point)
 
-    def pieces_at(self, s: ArrayLike) -> Ints:
+    def find_pieces(self, s: ArrayLike) -> Ints:
         """Return the indices of the pieces that contain `s`, rad.
 
         At a break this is the following piece.
@@ -121,13 +123,15 @@ class BlendedPath:
         pieces = np.searchsorted(self.breaks, s, side="right") - 1
         return np.clip(pieces, 0, len(self.breaks) - 2)
 
-    def sample(self, step_rad: float) -> Array:
+    def sample_points(self, step_rad: float) -> Array:
         """Return points along the path, including both ends, (n, joints), rad.
 
         Consecutive points are at most `step_rad` of s apart.
         """
         count = max(int(np.ceil(self.length / step_rad)), 1) + 1 if self.length > 0.0 else 1
-        return points_at.load()(self._marks, self._table, np.linspace(0.0, self.length, count))
+        return compute_points.load_machine_code()(
+            self._marks, self._table, np.linspace(0.0, self.length, count)
+        )
 
     def _lay_pieces(self) -> tuple[list[tuple[int, float]], list[float]]:
         """Divide the path into lines and corners.
@@ -153,7 +157,7 @@ class BlendedPath:
 
 
 @compiled_for("f8[:,::1], f8[:,:,::1], f8, f8[:,::1]")
-def set_point(
+def compute_point(
     marks: Array,
     table: Array,
     s: float,
@@ -191,7 +195,7 @@ def set_point(
 
 
 @compiled_for("f8[:,::1], f8[:,:,::1], f8[::1]")
-def points_at(marks: Array, table: Array, places: Array) -> Array:
+def compute_points(marks: Array, table: Array, places: Array) -> Array:
     """Return points of a path, (n, joints), rad.
 
     Args:
@@ -202,12 +206,12 @@ def points_at(marks: Array, table: Array, places: Array) -> Array:
     points = np.empty((len(places), table.shape[2]))
     point = np.empty((3, table.shape[2]))
     for k in range(len(places)):
-        set_point(marks, table, places[k], point)
+        compute_point(marks, table, places[k], point)
         points[k] = point[0]
     return points
 
 
-def _checked(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]:
+def _check_arrays(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]:
     """Return waypoints and blends as arrays, after checking shapes and values."""
     points = np.array(waypoints, dtype=float)
     radii = np.array(blend, dtype=float)
@@ -226,7 +230,7 @@ def _checked(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]:
     return points, radii
 
 
-def _distinct(points: Array, radii: Array) -> tuple[Array, Array]:
+def _merge_coincident(points: Array, radii: Array) -> tuple[Array, Array]:
     """Merge coincident waypoints, and set the blends of both ends to 0."""
     distinct = [0]
     merged = radii.copy()

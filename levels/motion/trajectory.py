@@ -15,11 +15,11 @@ import numpy as np
 import ruckig
 
 from rack.levels.algebra import Array
-from rack.levels.messages import SECTIONS_A_LINE
+from rack.levels.messages import SECTIONS_PER_LINE
 from rack.levels.motion.path import COINCIDENT_RAD, BlendedPath, PathBounds
 from rack.levels.robot.limits import Limits
 
-SHARES = (1.0, 0.9, 0.75, 0.6)
+SPEED_FRACTIONS = (1.0, 0.9, 0.75, 0.6)
 """Fractions of a curve's highest speed that are tried. The fastest trajectory is used."""
 MIN_SECTION_S = 1e-12
 """Sections shorter than this are dropped."""
@@ -56,12 +56,12 @@ class PathState(NamedTuple):
     dds: float
 
 
-REACHABLE_PART = 1.0 - 1e-7
+REACHABLE_FRACTION = 1.0 - 1e-7
 """Fraction of a reachable change of speed that is used.
 
 At the exact limit, rounding would decide whether the change is reachable.
 """
-MIN_ACCELERATION_PART = 1e-6
+MIN_ACCELERATION_RATIO = 1e-6
 """Ratio of acceleration or jerk to speed, 1/s or 1/s2, below which they count as 0."""
 SMALLEST_LINEAR_TERM = 1e-12
 """Linear coefficient of a cubic below which it is ignored."""
@@ -78,7 +78,7 @@ class SpeedLimits(NamedTuple):
     jerk: float
 
 
-def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits:
+def compute_speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits:
     """Return limits of s that keep every joint within its limits on a piece of a path.
 
     The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds.
@@ -94,27 +94,29 @@ def speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits
     acceleration = limits.acceleration
     jerk = limits.jerk
     curved = bool(second.any())
-    speed = least_ratio(velocity, first)
+    speed = compute_least_ratio(velocity, first)
     if curved:
         speed = min(
             speed,
-            share * math.sqrt(least_ratio(acceleration, second)),
-            share * math.cbrt(least_ratio(jerk, third)),
+            share * math.sqrt(compute_least_ratio(acceleration, second)),
+            share * math.cbrt(compute_least_ratio(jerk, third)),
         )
     acceleration_left = np.maximum(acceleration - second * speed**2, 0.0)
     jerk_left = np.maximum(jerk - third * speed**3, 0.0)
-    max_acceleration = least_ratio(acceleration_left, first)
+    max_acceleration = compute_least_ratio(acceleration_left, first)
     if curved:
-        max_acceleration = min(max_acceleration, 0.5 * least_ratio(jerk_left, 3.0 * second * speed))
-    max_jerk = least_ratio(
+        max_acceleration = min(
+            max_acceleration, 0.5 * compute_least_ratio(jerk_left, 3.0 * second * speed)
+        )
+    max_jerk = compute_least_ratio(
         np.maximum(jerk_left - 3.0 * second * speed * max_acceleration, 0.0), first
     )
-    if min(max_acceleration, max_jerk) < MIN_ACCELERATION_PART * speed:
+    if min(max_acceleration, max_jerk) < MIN_ACCELERATION_RATIO * speed:
         return SpeedLimits(speed, 0.0, 0.0)
     return SpeedLimits(speed, max_acceleration, max_jerk)
 
 
-def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
+def compute_reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
     """Return the highest speed reachable from a given speed over a length, rad/s.
 
     The acceleration is 0 at both ends. By symmetry this is also the highest speed from which
@@ -129,16 +131,16 @@ def reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
     j = limits.jerk
     if a <= 0.0:
         return min(start, limits.speed)
-    change = _root_of_cubic(2.0 * start, length * math.sqrt(j)) ** 2
+    change = _solve_cubic(2.0 * start, length * math.sqrt(j)) ** 2
     if change > a * a / j:
         # (2 start + change) / 2 * (change / a + a / j) = length
         linear = 2.0 * start + a * a / j
         constant = 2.0 * a * (start * a / j - length)
         change = 0.5 * (-linear + math.sqrt(linear * linear - 4.0 * constant))
-    return min(start + change * REACHABLE_PART, limits.speed)
+    return min(start + change * REACHABLE_FRACTION, limits.speed)
 
 
-def boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> list[float]:
+def compute_boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> list[float]:
     """Return the highest speeds at the ends of consecutive stretches, from rest to rest, rad/s.
 
     `lengths` are in rad, one for each stretch.
@@ -146,18 +148,18 @@ def boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> 
     speeds = [0.0]
     for k, (length, limit) in enumerate(zip(lengths, limits, strict=True)):
         following = limits[k + 1].speed if k + 1 < len(limits) else 0.0
-        speeds.append(min(reachable_speed(speeds[k], length, limit), following))
+        speeds.append(min(compute_reachable_speed(speeds[k], length, limit), following))
     for k in range(len(lengths) - 1, -1, -1):
-        speeds[k] = min(speeds[k], reachable_speed(speeds[k + 1], lengths[k], limits[k]))
+        speeds[k] = min(speeds[k], compute_reachable_speed(speeds[k + 1], lengths[k], limits[k]))
     return speeds
 
 
-def least_ratio(room: Array, rate: Array) -> float:
+def compute_least_ratio(room: Array, rate: Array) -> float:
     """Return the least room / rate over the joints that move. Infinite if none does."""
     return float(np.divide(room, rate, out=np.full(len(rate), np.inf), where=rate > 0.0).min())
 
 
-def _root_of_cubic(p: float, q: float) -> float:
+def _solve_cubic(p: float, q: float) -> float:
     """Return the real root of x^3 + p x = q for p, q >= 0 (Cardano's hyperbolic form)."""
     if p < SMALLEST_LINEAR_TERM:
         return math.cbrt(q)
@@ -176,21 +178,21 @@ class Trajectory:
         self.sections = sections
         self.duration = duration  # s
         self.begin = float(sections[0, 1])  # path parameter at the start, rad
-        self.end = self.at(duration).s  # path parameter at the end, rad
+        self.end = self.evaluate_at(duration).s  # path parameter at the end, rad
 
-    def at(self, time_s: float) -> PathState:
+    def evaluate_at(self, time_s: float) -> PathState:
         """Return the state at `time_s` after the start, clamped to the duration."""
         time_s = min(max(time_s, 0.0), self.duration)
         k = int(np.searchsorted(self.sections[:, 0], time_s, side="right")) - 1
         start, *state = self.sections[max(k, 0)].tolist()
-        return PathState(*_moved(time_s - start, *state))
+        return PathState(*_integrate_jerk(time_s - start, *state))
 
-    def states(self, times_s: Array) -> tuple[Array, Array, Array]:
+    def evaluate_states(self, times_s: Array) -> tuple[Array, Array, Array]:
         """Return s, ds and dds at `times_s` (n,), which must be within the duration; (n,) each."""
         row = self.sections[np.searchsorted(self.sections[:, 0], times_s, side="right") - 1]
-        return _moved(times_s - row[:, 0], *row[:, 1:].T)
+        return _integrate_jerk(times_s - row[:, 0], *row[:, 1:].T)
 
-    def stretched(self, factor: float) -> Trajectory:
+    def stretch_by(self, factor: float) -> Trajectory:
         """Return the same motion slowed by `factor`, which must be at least 1.
 
         It keeps all limits that this motion keeps.
@@ -199,7 +201,7 @@ class Trajectory:
         return Trajectory(self.sections * powers, self.duration * factor)
 
 
-def _moved(t: Any, s: Any, ds: Any, dds: Any, jerk: Any) -> tuple[Any, Any, Any]:
+def _integrate_jerk(t: Any, s: Any, ds: Any, dds: Any, jerk: Any) -> tuple[Any, Any, Any]:
     """Return s, ds and dds after time `t` under constant jerk; arguments are numbers or arrays."""
     return (
         s + t * (ds + t * (dds / 2.0 + t * jerk / 6.0)),
@@ -225,8 +227,8 @@ def make_trajectory(path: BlendedPath, limits: Limits, begin: float = 0.0) -> Tr
     rows: list[Section] = []
     for start, end in pairwise(marks):
         if end - start > COINCIDENT_RAD:
-            rows += _fastest(path, start, end, limits)
-    return _joined(rows, marks[0])
+            rows += _find_fastest(path, start, end, limits)
+    return _join_sections(rows, marks[0])
 
 
 def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory | None:
@@ -244,29 +246,29 @@ def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory
         may then follow its trajectory, which itself ends at rest, and try again a cycle later.
     """
     if state.ds < MAX_REST_RAD_S:
-        return _joined([], state.s)
-    rate = path.bounds.first[path.pieces_at(state.s)]
-    max_acceleration = least_ratio(limits.acceleration, rate)
-    max_jerk = least_ratio(limits.jerk, rate)
+        return _join_sections([], state.s)
+    rate = path.bounds.first[path.find_pieces(state.s)]
+    max_acceleration = compute_least_ratio(limits.acceleration, rate)
+    max_jerk = compute_least_ratio(limits.jerk, rate)
     # Motion must rest at a stop, because the path continues in another direction.
     end = (
         next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD
     )
     for fraction, jerk_fraction in STOP_EFFORTS:
-        stop = _ramp(
+        stop = _build_ramp(
             state, max(fraction * max_acceleration, abs(state.dds)), jerk_fraction * max_jerk
         )
-        if stop.end <= end and _keeps(stop, path, limits):
+        if stop.end <= end and _is_within_limits(stop, path, limits):
             return stop
     return None
 
 
-def _fastest(path: BlendedPath, start: float, end: float, limits: Limits) -> list[Section]:
+def _find_fastest(path: BlendedPath, start: float, end: float, limits: Limits) -> list[Section]:
     """Return the fastest of a few motions between two points of rest of a path.
 
     Only motions with few enough sections for a message are considered.
     """
-    first, last = path.pieces_at((start, end - COINCIDENT_RAD))
+    first, last = path.find_pieces((start, end - COINCIDENT_RAD))
     bounds = PathBounds(*(bound[first : last + 1] for bound in path.bounds))
     corners = int(bounds.second.any(axis=1).sum())
     candidates = [([start, *path.breaks[first + 1 : last + 1].tolist(), end], bounds)]
@@ -277,50 +279,54 @@ def _fastest(path: BlendedPath, start: float, end: float, limits: Limits) -> lis
         )
     best: list[Section] = []
     least_time_s = np.inf
-    for share in SHARES if corners else SHARES[:1]:
+    for share in SPEED_FRACTIONS if corners else SPEED_FRACTIONS[:1]:
         for marks, pieces in candidates:
             stretches = [
-                speed_limits(PathBounds(*piece), limits, share)
+                compute_speed_limits(PathBounds(*piece), limits, share)
                 for piece in zip(*pieces, strict=True)
             ]
-            sections = list(_sections(marks, stretches))
+            sections = list(_build_sections(marks, stretches))
             # `fsum` is exact, whereas `sum` rounds differently from Python 3.12 on.
             time_s = math.fsum(row[0] for row in sections)
-            if time_s < least_time_s and len(sections) <= SECTIONS_A_LINE * (1 + corners):
+            if time_s < least_time_s and len(sections) <= SECTIONS_PER_LINE * (1 + corners):
                 best = sections
                 least_time_s = time_s
     return best
 
 
-def _sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator[Section]:
+def _build_sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator[Section]:
     """Yield the sections from rest at the first mark to rest at the last.
 
     `marks` are path parameters, rad. Each stretch between two marks has an entry in `limits`.
     """
     lengths = [end - start for start, end in pairwise(marks)]
-    speeds = boundary_speeds(lengths, limits)
+    speeds = compute_boundary_speeds(lengths, limits)
     for start, length, limit, (before, after) in zip(
         marks, lengths, limits, pairwise(speeds), strict=False
     ):
         if limit.acceleration > 0.0:
-            request = _from(PathState(start, before, 0.0), limit.acceleration, limit.jerk)
+            request = _build_ruckig_input(
+                PathState(start, before, 0.0), limit.acceleration, limit.jerk
+            )
             request.target_position = [start + length]
             request.target_velocity = [after]
             request.max_velocity = [limit.speed]
-            yield from _calculated(request)
+            yield from _run_ruckig(request)
         else:
             lasts_s = length / before if before > 0.0 else np.inf
             yield (lasts_s, start, before, 0.0, 0.0)
 
 
-def _ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
+def _build_ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
     """Return the fastest ramp from `state` to rest within `acceleration` and `jerk`."""
-    request = _from(state, acceleration, jerk)
+    request = _build_ruckig_input(state, acceleration, jerk)
     request.control_interface = ruckig.ControlInterface.Velocity
-    return _joined(_calculated(request), state.s)
+    return _join_sections(_run_ruckig(request), state.s)
 
 
-def _from(state: PathState, acceleration: float, jerk: float) -> ruckig.InputParameter:
+def _build_ruckig_input(
+    state: PathState, acceleration: float, jerk: float
+) -> ruckig.InputParameter:
     """Return the input of ruckig for motion from `state`, in one dimension."""
     request = ruckig.InputParameter(1)
     request.current_position = [state.s]
@@ -331,7 +337,7 @@ def _from(state: PathState, acceleration: float, jerk: float) -> ruckig.InputPar
     return request
 
 
-def _calculated(request: ruckig.InputParameter) -> list[Section]:
+def _run_ruckig(request: ruckig.InputParameter) -> list[Section]:
     """Return the sections of ruckig's result in one dimension.
 
     Raises:
@@ -346,7 +352,7 @@ def _calculated(request: ruckig.InputParameter) -> list[Section]:
     return [row for row in rows if row[0] > MIN_SECTION_S]
 
 
-def _joined(rows: Sequence[Section], begin: float) -> Trajectory:
+def _join_sections(rows: Sequence[Section], begin: float) -> Trajectory:
     """Return the trajectory of consecutive sections, or rest at `begin` without sections."""
     if not rows:
         return Trajectory(np.array([[0.0, begin, 0.0, 0.0, 0.0]]), 0.0)
@@ -356,19 +362,19 @@ def _joined(rows: Sequence[Section], begin: float) -> Trajectory:
     return Trajectory(sections, float(ends[-1]))
 
 
-def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
+def _is_within_limits(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
     """Return True if every joint keeps its limits during a stop.
 
     The check uses bounds of motion and path over each interval of time.
     """
-    times = _checked_times(stop)
-    s, ds, dds = stop.states(times)
+    times = _find_check_times(stop)
+    s, ds, dds = stop.evaluate_states(times)
     section = np.searchsorted(stop.sections[:, 0], times[:-1], side="right") - 1
     jerk = np.abs(stop.sections[section, 4])[:, None]
     # In an interval dds is linear and keeps its sign, so values at the ends bound dds and ds.
     acceleration = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))[:, None]
     speed = np.maximum(ds[:-1], ds[1:])[:, None]
-    first, second, third = _bounds_over(path, s)
+    first, second, third = _find_bounds_over(path, s)
     # The result of ** 3 on an array differs between processors.
     cubed = speed * speed * speed
     tolerance = 1.0 + LIMIT_ROUNDING
@@ -384,7 +390,7 @@ def _keeps(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
     )
 
 
-def _checked_times(stop: Trajectory) -> Array:
+def _find_check_times(stop: Trajectory) -> Array:
     """Return the ends of the checked intervals, s.
 
     They are evenly spaced, with further ends where jerk or the sign of dds changes.
@@ -399,9 +405,9 @@ def _checked_times(stop: Trajectory) -> Array:
     )
 
 
-def _bounds_over(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
+def _find_bounds_over(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
     """Return bounds of the path derivatives between consecutive `s`, (n - 1, joints) each."""
-    piece = path.pieces_at(s)
+    piece = path.find_pieces(s)
     low = piece[:-1]
     high = piece[1:]
     bounds = [bound[low] for bound in path.bounds]

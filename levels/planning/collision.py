@@ -15,17 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from rack.levels.algebra import Array, Ints
 from rack.levels.compiled import compiled, compiled_for
-from rack.levels.planning.pose import Pose, site_pose
+from rack.levels.planning.pose import Pose, read_site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import (
-    contact_views,
+    build_contact_views,
     mj_collision,
     mj_kinematics,
     mju_mat_to_quat,
     mju_mul_quat,
     set_margins,
 )
-from rack.levels.robot.lookup import geom_name
+from rack.levels.robot.lookup import find_geom_name
 from rack.levels.tables import SceneConfig
 
 MAX_TOUCH_DEPTH_M = 0.003
@@ -77,17 +77,17 @@ class CollisionChecker:
         self.held: int | None = None
         self._touched: int | None = None
         self._margin = margin
-        self._row_geoms = [cell.parts(row) for row in range(len(cell.bodies))]
+        self._row_geoms = [cell.list_geoms(row) for row in range(len(cell.bodies))]
         # Pose of the held object in the frame of the tool: m, then w, x, y, z.
         self._offset = np.zeros(7)
-        self._model = restricted_to_arm(cell, self.clearance, margin)
+        self._model = restrict_to_arm(cell, self.clearance, margin)
         self._types = np.stack((self._model.geom_contype, self._model.geom_conaffinity))
         self._data = mujoco.MjData(self._model)
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
         # Swinging fingers may reach farther while they close. With a load, paths are checked at
         # that opening.
-        self.longest = self._longest() if margin > 0.0 else None
-        self._base = required_distances(cell, self._model, self.clearance, margin)
+        self.longest_opening = self._find_longest_opening() if margin > 0.0 else None
+        self._base = compute_required_distances(cell, self._model, self.clearance, margin)
         self._required = self._base.copy()
         self._one = np.zeros((1, len(cell.qpos)))  # buffer for a single configuration
         self._least = np.inf  # m: clearance used for the last configuration checked
@@ -96,25 +96,29 @@ class CollisionChecker:
         tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
         arrays = cell.qpos.copy(), d.qpos, *tool, self._offset, self._required
         self._first_blocked = partial(
-            first_blocked.load(), m._address, d._address, *arrays, *contact_views(m, d)
+            find_first_blocked.load_machine_code(),
+            m._address,
+            d._address,
+            *arrays,
+            *build_contact_views(m, d),
         )
 
-    def tool_at(self, q: Array) -> Pose:
+    def compute_tool_pose(self, q: Array) -> Pose:
         """Return the pose of the tool at `q`, (joints,), rad."""
         self._data.qpos[self.cell.qpos] = q
         mujoco.mj_kinematics(self._model, self._data)
-        return site_pose(self._data, self.cell.tool)
+        return read_site_pose(self._data, self.cell.tool)
 
-    def place(self, positions: Array, quaternions: Array) -> None:
+    def place_bodies(self, positions: Array, quaternions: Array) -> None:
         """Place objects and obstacles, as the function `place_bodies` does."""
         place_bodies(self.cell, self._data, positions, quaternions)
 
     def open_gripper(self, opening: float) -> None:
         """Set the gripper to `opening`, m or rad. Initially it is open."""
         if self.cell.gripper is not None:
-            self.cell.gripper.linkage.set(self._data.qpos, opening)
+            self.cell.gripper.linkage.set_opening(self._data.qpos, opening)
 
-    def hold(
+    def hold_object(
         self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)
     ) -> None:
         """Carry an object with the tool.
@@ -125,8 +129,8 @@ class CollisionChecker:
             quaternion: Orientation in that frame, as w, x, y, z.
         """
         self.held = row
-        if self.longest is not None and (gripper := self.cell.gripper) is not None:
-            opening = gripper.open if row is None else self.longest
+        if self.longest_opening is not None and (gripper := self.cell.gripper) is not None:
+            opening = gripper.open if row is None else self.longest_opening
             self.open_gripper(opening)
         self._offset[:3] = position
         self._offset[3:] = quaternion
@@ -137,9 +141,9 @@ class CollisionChecker:
             # of a check.
             m.geom_contype[self._row_geoms[row]] = LOAD
             m.geom_conaffinity[self._row_geoms[row]] &= LINK
-        self._apply()
+        self._update_required()
 
-    def permit(self, row: int | None, touch: bool = True) -> None:
+    def permit_contact(self, row: int | None, touch: bool = True) -> None:
         """Permit contact of an object with supports and gripper, or forbid it again.
 
         While it is permitted, the gripper may also come closer to supports.
@@ -149,17 +153,17 @@ class CollisionChecker:
             touch: False forbids the contact.
         """
         self._touched = row if touch else None
-        self._apply()
+        self._update_required()
 
-    def free(self, q: Array, clearance: float | None = None) -> bool:
+    def is_free(self, q: Array, clearance: float | None = None) -> bool:
         """Return True if the arm at `q`, (joints,), rad, keeps its required distances.
 
         A `clearance`, m, may lower the one of the scene.
         """
         self._one[0] = q
-        return self.first_blocked(self._one, clearance) == 1
+        return self.find_first_blocked(self._one, clearance) == 1
 
-    def first_blocked(self, path: Array, clearance: float | None = None) -> int:
+    def find_first_blocked(self, path: Array, clearance: float | None = None) -> int:
         """Find the first configuration of a path that is not free; later ones are not checked.
 
         Args:
@@ -173,13 +177,13 @@ class CollisionChecker:
         held_qpos = -1 if self.held is None else self.cell.object_qpos[self.held]
         return self._first_blocked(held_qpos, self._least, path)
 
-    def room(self, q: Array) -> float:
+    def find_clearance(self, q: Array) -> float:
         """Return the largest clearance with which `q` is free, m, at most the scene's.
 
         It is negative if `q` is not free with any clearance.
         """
-        self.free(q)
-        short = self._shortfalls()
+        self.is_free(q)
+        short = self._compute_shortfalls()
         pairs = self._data.contact.geom
         required = self._required[pairs[:, 0], pairs[:, 1]]
         close = short > 0
@@ -189,27 +193,27 @@ class CollisionChecker:
         lacking = short[close] + (self.clearance - required[close])
         return self.clearance - max(0.0, float(np.max(lacking, initial=0.0)))
 
-    def why(self, q: Array, clearance: float | None = None) -> str:
+    def describe_collision(self, q: Array, clearance: float | None = None) -> str:
         """Describe the worst violation at `q`: the pair of geoms and both distances.
 
         The text is empty if `q` is free.
         """
-        self.free(q, clearance)
-        return self.nearest()
+        self.is_free(q, clearance)
+        return self.describe_worst_pair()
 
-    def nearest(self) -> str:
+    def describe_worst_pair(self) -> str:
         """Describe the worst violation at the last configuration checked."""
-        short = self._shortfalls()
+        short = self._compute_shortfalls()
         if not np.any(short > 0):
             return ""
         worst = int(np.argmax(short))
         first, second = self._data.contact.geom[worst]
         distance = self._data.contact.dist[worst]
-        pair = f"'{geom_name(self._model, first)}' and '{geom_name(self._model, second)}'"
+        pair = f"'{find_geom_name(self._model, first)}' and '{find_geom_name(self._model, second)}'"
         required = distance + short[worst]
         return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {required * 1e3:.1f} mm"
 
-    def _shortfalls(self) -> Array:
+    def _compute_shortfalls(self) -> Array:
         """Return by how much each close pair misses its required distance, m.
 
         It refers to the last configuration checked.
@@ -220,7 +224,7 @@ class CollisionChecker:
             np.minimum(self._required[pairs[:, 0], pairs[:, 1]], self._least) - contact.dist
         )
 
-    def _longest(self) -> float | None:
+    def _find_longest_opening(self) -> float | None:
         """Return the opening at which the gripper reaches farthest along the tool, None if open."""
         gripper = self.cell.gripper
         if gripper is None:
@@ -231,38 +235,40 @@ class CollisionChecker:
             self.open_gripper(opening)
             mujoco.mj_kinematics(self._model, data)
             axis = data.site_xmat[self.cell.tool].reshape(3, 3)[:, 2]
-            extents.append((farthest(self._model, data, self.cell.geoms.gripper, axis), opening))
+            extents.append(
+                (compute_extent(self._model, data, self.cell.geoms.gripper, axis), opening)
+            )
         self.open_gripper(gripper.open)
         reached, opening = max(extents)
         return float(opening) if reached > extents[0][0] + self._margin else None
 
-    def _apply(self) -> None:
+    def _update_required(self) -> None:
         """Update the required distances for the held object and the one that may be touched."""
         self._required[:] = self._base
         arm, gripper, supports, _ = self.cell.geoms
         if self.held is not None:
             held = self._row_geoms[self.held]
-            self._require(held, np.arange(self._model.ngeom), self.clearance)
-            self._require(held, arm, 0.0)
-            self._require(held, gripper, ANY_DISTANCE)
-            self._require(held, held, ANY_DISTANCE)
+            self._set_required(held, np.arange(self._model.ngeom), self.clearance)
+            self._set_required(held, arm, 0.0)
+            self._set_required(held, gripper, ANY_DISTANCE)
+            self._set_required(held, held, ANY_DISTANCE)
         if self._touched is not None:
             touched = self._row_geoms[self._touched]
             to_gripper = to_supports = -MAX_TOUCH_DEPTH_M
             if self._touched == self.held:
                 to_gripper = ANY_DISTANCE
                 to_supports = -MAX_HELD_DEPTH_M
-            self._require(touched, gripper, to_gripper)
-            self._require(touched, supports, to_supports)
-            self._require(gripper, supports, self._margin)
+            self._set_required(touched, gripper, to_gripper)
+            self._set_required(touched, supports, to_supports)
+            self._set_required(gripper, supports, self._margin)
 
-    def _require(self, group: Ints, other_group: Ints, distance: float) -> None:
+    def _set_required(self, group: Ints, other_group: Ints, distance: float) -> None:
         """Set the required distance, m, of all pairs between two groups of geoms."""
         self._required[group[:, None], other_group] = distance
         self._required[other_group[:, None], group] = distance
 
 
-def restricted_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjModel:
+def restrict_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjModel:
     """Return a copy of the model in which MuJoCo only finds close pairs that involve the arm.
 
     This is a tenth of the work. Pairs within the gripper are left out.
@@ -286,7 +292,7 @@ def restricted_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjM
     return model
 
 
-def required_distances(
+def compute_required_distances(
     cell: Cell, restricted: mujoco.MjModel, clearance: float, margin: float
 ) -> Array:
     """Return the required distance of every pair of geoms.
@@ -336,7 +342,9 @@ def required_distances(
     return required
 
 
-def farthest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Ints, axis: ArrayLike) -> float:
+def compute_extent(
+    model: mujoco.MjModel, data: mujoco.MjData, geoms: Ints, axis: ArrayLike
+) -> float:
     """Return how far the bounding boxes of geoms reach along an axis from the origin, m.
 
     Args:
@@ -361,7 +369,7 @@ def farthest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Ints, axis: Arra
     "i8, i8, i8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:,::1], i4[::1], i4[:,:], "
     "f8[:], i8, f8, f8[:,::1]"
 )
-def first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
+def find_first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     model: int,
     data: int,
     joints: NDArray[np.int64],  # (joints,)
@@ -403,7 +411,7 @@ def first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps
             qpos[joints[j]] = path[k, j]
         mj_kinematics(model, data)
         if held >= 0:
-            carry(qpos[held : held + 7], tool, turned, offset)
+            carry_object(qpos[held : held + 7], tool, turned, offset)
             mj_kinematics(model, data)
         mj_collision(model, data)
         for pair in range(number[0]):
@@ -413,7 +421,7 @@ def first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps
 
 
 @compiled
-def carry(pose: Array, tool: Array, turned: Array, offset: Array) -> None:
+def carry_object(pose: Array, tool: Array, turned: Array, offset: Array) -> None:
     """Set the pose of the held object from the pose of the tool.
 
     Args:

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from rack.levels.algebra import Array, gram, norm, transposed_mat_vec
-from rack.levels.planning.pose import Pose, site_pose
+from rack.levels.planning.pose import Pose, read_site_pose
 from rack.levels.robot.cell import Cell
 
 MAX_RESTARTS = 60
@@ -57,15 +57,17 @@ class InverseKinematics:
         joints = len(cell.qpos)
         self._jacobian = np.zeros((6, cell.model.nv))
         self._factor = np.zeros((joints, joints + 7))  # work space of the solver
-        self._low, self._high = sampling_range(cell)
+        self._low, self._high = find_sampling_range(cell)
 
-    def tool_at(self, q: Array) -> Pose:
+    def compute_tool_pose(self, q: Array) -> Pose:
         """Return the pose of the tool at `q`, (joints,), rad."""
         self._data.qpos[self._cell.qpos] = q
         mujoco.mj_kinematics(self._cell.model, self._data)
-        return site_pose(self._data, self._cell.tool)
+        return read_site_pose(self._data, self._cell.tool)
 
-    def reach(self, target: Pose, start: Array, match_orientation: bool = True) -> Array | None:
+    def find_configuration(
+        self, target: Pose, start: Array, match_orientation: bool = True
+    ) -> Array | None:
         """Find a configuration by one descent.
 
         Args:
@@ -79,7 +81,7 @@ class InverseKinematics:
         q = np.clip(start, self._inner_low, self._inner_high)
         errors: list[float] = []
         for _ in range(MAX_ITERATIONS):
-            error = self._error(target, q)
+            error = self._compute_error(target, q)
             if not match_orientation:
                 error[3:] = 0.0
             if (np.abs(error) < TOLERANCE).all():
@@ -90,22 +92,22 @@ class InverseKinematics:
                 and errors[-1] > STALLED_PART * errors[-1 - STALLED_ITERATIONS]
             ):
                 return None
-            step = self._step(error, q, match_orientation)
+            step = self._compute_step(error, q, match_orientation)
             if step is None:
                 return None
             q = q + step
         return None
 
-    def nearby(self, target: Pose, start: Array) -> Array | None:
+    def find_nearby(self, target: Pose, start: Array) -> Array | None:
         """Return the configuration at `target` on the branch of `start`, or None."""
-        solution = self.reach(target, start)
+        solution = self.find_configuration(target, start)
         return (
             solution
             if solution is not None and bool(np.all(np.abs(solution - start) < MAX_BRANCH_STEP_RAD))
             else None
         )
 
-    def solutions(
+    def find_free_solutions(
         self,
         target: Pose,
         reference: Array,
@@ -124,9 +126,9 @@ class InverseKinematics:
             Configurations, (joints,), rad. Empty if the target is out of reach or everything
             collides.
         """
-        return [q for q in self.reachable(target, reference, restarts=restarts) if free(q)]
+        return [q for q in self.find_solutions(target, reference, restarts=restarts) if free(q)]
 
-    def reachable(
+    def find_solutions(
         self,
         target: Pose,
         reference: Array,
@@ -149,7 +151,7 @@ class InverseKinematics:
         idle = 0
         start = reference
         for _ in range(1 + restarts):
-            q = self.reach(target, start, match_orientation)
+            q = self.find_configuration(target, start, match_orientation)
             is_known = q is None or any(np.all(np.abs(q - other) < SAME_RAD) for other in solutions)
             idle = idle + 1 if is_known else 0
             if q is not None and not is_known:
@@ -157,15 +159,15 @@ class InverseKinematics:
             if len(solutions) == MAX_SOLUTIONS or (solutions and idle >= MAX_IDLE_STARTS):
                 break
             start = rng.uniform(self._low, self._high)
-        return sorted(solutions, key=lambda q: self.time_between(reference, q))
+        return sorted(solutions, key=lambda q: self.compute_travel_time(reference, q))
 
-    def time_between(self, start: Array, end: Array) -> float:
+    def compute_travel_time(self, start: Array, end: Array) -> float:
         """Return the time that the slowest joint takes at its velocity limit, s."""
         return float(np.max(np.abs(start - end) * self._pace))
 
-    def _error(self, target: Pose, q: Array) -> Array:
+    def _compute_error(self, target: Pose, q: Array) -> Array:
         """Return the error of the tool at `q`, (6,): distance, m, then rotation, rad."""
-        tool = self.tool_at(q)
+        tool = self.compute_tool_pose(q)
         turn = np.zeros(3)
         error = np.zeros(6)
         error[:3] = target.position - tool.position
@@ -173,7 +175,7 @@ class InverseKinematics:
         mujoco.mju_rotVecQuat(error[3:], turn, tool.quaternion)
         return error
 
-    def _step(self, error: Array, q: Array, match_orientation: bool) -> Array | None:
+    def _compute_step(self, error: Array, q: Array, match_orientation: bool) -> Array | None:
         """Return the bounded step that best reduces the error, (joints,), rad, or None.
 
         Args:
@@ -198,7 +200,7 @@ class InverseKinematics:
         return step if rank >= 0 else None
 
 
-def sampling_range(cell: Cell) -> tuple[Array, Array]:
+def find_sampling_range(cell: Cell) -> tuple[Array, Array]:
     """Return low and high, (joints,), rad: the limits, or one turn for a joint without limits."""
     low, high = cell.limits.position.T
     return np.where(np.isfinite(low), low, -np.pi), np.where(np.isfinite(high), high, np.pi)

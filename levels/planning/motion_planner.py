@@ -25,19 +25,19 @@ from rack.levels.planning.pose import Pose
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
 
-CLOSE_PART = 0.9
+REMAINING_CLEARANCE_PART = 0.9
 """Part of the remaining clearance that a path keeps if the arm starts too close to something."""
 LOAD_STEP_RAD = 0.25
 """Spacing of the configurations at which the motors must carry the load."""
-AHEAD_PART = 0.5
+REUSE_CLEARANCE_PART = 0.5
 """Part of the clearance that an earlier path must keep, because sensed and predicted poses differ
 slightly."""
-MAX_STRAY_M = 1e-3
+MAX_DEVIATION_M = 1e-3
 """Largest deviation of the tool from a straight line that it follows."""
 LINES = (1, 2, 3, 4, 6, 8, 12, 16, 20)
 """Numbers of joint-space lines that are tried for a straight line of the tool. The fewest that keep
 to it give the quickest path."""
-STRAY_SAMPLES = 5
+DEVIATION_SAMPLES = 5
 """Number of points on every joint-space line at which the deviation of the tool is measured."""
 
 
@@ -55,7 +55,7 @@ class MotionPlanner:
         self.cell = cell
         self.clearance = scene.clearance  # m
         self.ik = InverseKinematics(cell, seed)
-        self.checker = CollisionChecker(cell, scene, MAX_STRAY_M)
+        self.checker = CollisionChecker(cell, scene, MAX_DEVIATION_M)
         self.paths = PathPlanner(cell, scene.clearance, seed)
         self.payloads = Payloads(cell, scene.objects)
         self.fixed_jaw = find_fixed_jaw(cell, self.payloads)
@@ -85,32 +85,32 @@ class MotionPlanner:
             Refused: UNREACHABLE if no configuration serves, NO_PATH if all are blocked, OVERLOAD if
                 the motors cannot carry the load along the path.
         """
-        self.lay_out(move, situation)
-        if move.touches:
-            path = self._line(move, start, goal)
+        self.set_situation(move, situation)
+        if move.can_touch:
+            path = self._plan_line(move, start, goal)
         else:
-            goal = self.goal(move, start) if goal is None else goal
-            clearance = self._clearance_at(start)
-            first_blocked = self._with(clearance)
+            goal = self.find_goal(move, start) if goal is None else goal
+            clearance = self._find_clearance(start)
+            first_blocked = self._bind_clearance(clearance)
             free_path = self.paths.plan(
                 start, goal, first_blocked, attempt=attempt, searches=searches
             )
             if free_path is None:
-                place = in_metres(self.ik.tool_at(goal))
-                reason = self._why_no_path(start, goal, clearance)
+                place = format_position(self.ik.compute_tool_pose(goal))
+                reason = self._explain_failure(start, goal, clearance)
                 raise Refused(Error.NO_PATH, f"{VERB_NAMES[move.verb]} to {place}: {reason}")
             path = free_path
         if situation.held is not None and situation.grip is not None:
-            along = BlendedPath(*path).sample(LOAD_STEP_RAD)
+            along = BlendedPath(*path).sample_points(LOAD_STEP_RAD)
             self.payloads.check_motors(situation.held, situation.grip, along)
         return path
 
-    def lay_out(self, move: Move, situation: Situation) -> None:
+    def set_situation(self, move: Move, situation: Situation) -> None:
         """Set the collision checker to `situation`, and permit the contacts that `move` intends."""
-        touched = move.object if move.touches else None
-        situation.lay_out(self.checker, touched)
+        touched = move.object if move.can_touch else None
+        situation.apply_to(self.checker, touched)
 
-    def goal(self, move: Move, start: Array) -> Array:
+    def find_goal(self, move: Move, start: Array) -> Array:
         """Return the configuration at the end of a free motion, in the present situation.
 
         Raises:
@@ -126,67 +126,78 @@ class MotionPlanner:
                 raise Refused(Error.UNREACHABLE, f"{where}; {valid}")
             return move.joints
         if move.posture:
-            nearest = self.ik.nearby(move.tool, move.joints)
-            if nearest is not None and self.checker.free(nearest):
+            nearest = self.ik.find_nearby(move.tool, move.joints)
+            if nearest is not None and self.checker.is_free(nearest):
                 return nearest
         reference = move.joints if move.posture else start
-        reachable = self.ik.reachable(move.tool, reference)
+        reachable = self.ik.find_solutions(move.tool, reference)
         name = VERB_NAMES[move.verb]
-        place = in_metres(move.tool)
+        place = format_position(move.tool)
         if not reachable:
             raise Refused(Error.UNREACHABLE, f"{name}: the arm cannot bring the tool to {place}")
         for q in reachable:
-            if self.checker.free(q):
+            if self.checker.is_free(q):
                 return q
-        raise Refused(Error.NO_PATH, f"{name} to {place}: {self.checker.why(reachable[0])}")
+        raise Refused(
+            Error.NO_PATH, f"{name} to {place}: {self.checker.describe_collision(reachable[0])}"
+        )
 
-    def still_free(self, move: Move, path: Path, situation: Situation) -> bool:
+    def is_still_free(self, move: Move, path: Path, situation: Situation) -> bool:
         """Return True if an earlier path of `move` can still be used in `situation`."""
-        self.lay_out(move, situation)
-        first_blocked = self._with(AHEAD_PART * self.clearance)
-        return self.paths.blocked_at(path, first_blocked) is None
+        self.set_situation(move, situation)
+        first_blocked = self._bind_clearance(REUSE_CLEARANCE_PART * self.clearance)
+        return self.paths.find_blocked_configuration(path, first_blocked) is None
 
-    def _with(self, clearance: float) -> FirstBlocked:
+    def _bind_clearance(self, clearance: float) -> FirstBlocked:
         """Return the collision check for paths with a clearance, m."""
-        return partial(self.checker.first_blocked, clearance=clearance)
+        return partial(self.checker.find_first_blocked, clearance=clearance)
 
-    def _why_no_path(self, start: Array, goal: Array, clearance: float) -> str:
+    def _explain_failure(self, start: Array, goal: Array, clearance: float) -> str:
         """Explain why a free motion has no path.
 
         The reason is a blocked start or goal, or the obstacle on the straight line between them.
         """
-        collision_text = self.checker.why(start, clearance) or self.checker.why(goal, clearance)
+        collision_text = self.checker.describe_collision(
+            start, clearance
+        ) or self.checker.describe_collision(goal, clearance)
         if collision_text:
             return collision_text
         straight = Path(np.array([start, goal]), np.zeros(2))
-        blocked = self.paths.blocked_at(straight, self._with(clearance))
-        obstacle = self.checker.why(blocked, clearance) if blocked is not None else ""
+        blocked = self.paths.find_blocked_configuration(straight, self._bind_clearance(clearance))
+        obstacle = (
+            self.checker.describe_collision(blocked, clearance) if blocked is not None else ""
+        )
         return f"no path found around {obstacle}" if obstacle else "no path found"
 
-    def _line(self, move: Move, start: Array, goal: Array | None) -> Path:
+    def _plan_line(self, move: Move, start: Array, goal: Array | None) -> Path:
         """Plan a straight line of the tool, with the arguments of `plan`."""
         name = VERB_NAMES[move.verb]
-        place = in_metres(move.tool)
-        path = straight_line(self.ik, start, move.tool)
+        place = format_position(move.tool)
+        path = plan_straight_line(self.ik, start, move.tool)
         if path is None:
             raise Refused(Error.UNREACHABLE, f"{name}: no straight tool line to {place}")
         if goal is not None and np.max(np.abs(path.end - goal)) < SAME_RAD:
             path.waypoints[-1] = goal
-        clearance = self._clearance_at(start)
-        blocked = self.paths.blocked_at(path, self._with(clearance))
+        clearance = self._find_clearance(start)
+        blocked = self.paths.find_blocked_configuration(path, self._bind_clearance(clearance))
         if blocked is not None:
             raise Refused(
-                Error.NO_PATH, f"{name} to {place}: {self.checker.why(blocked, clearance)}"
+                Error.NO_PATH,
+                f"{name} to {place}: {self.checker.describe_collision(blocked, clearance)}",
             )
         return path
 
-    def _clearance_at(self, start: Array) -> float:
+    def _find_clearance(self, start: Array) -> float:
         """Return the clearance of the scene, or less if an obstacle has come closer to the arm."""
-        available = self.checker.room(start)
-        return self.clearance if available >= self.clearance else max(CLOSE_PART * available, 0.0)
+        available = self.checker.find_clearance(start)
+        return (
+            self.clearance
+            if available >= self.clearance
+            else max(REMAINING_CLEARANCE_PART * available, 0.0)
+        )
 
 
-def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | None:
+def plan_straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | None:
     """Return a path along which the tool moves straight to a target, or None.
 
     The tool turns at a constant rate and deviates at most `MAX_DEVIATION_M`. There is no such path
@@ -198,11 +209,11 @@ def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | N
         start: Configuration at the start, (joints,), rad.
         target: Pose of the tool at the end.
     """
-    begin = ik.tool_at(start)
+    begin = ik.compute_tool_pose(start)
     for lines in LINES:
         points = [start]
         for k in range(1, lines + 1):
-            q = ik.nearby(begin.towards(target, k / lines), points[-1])
+            q = ik.find_nearby(begin.interpolate_to(target, k / lines), points[-1])
             if q is None:
                 break
             points.append(q)
@@ -212,25 +223,27 @@ def straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Path | N
             blend = np.zeros(len(points))
             blend[1:-1] = 0.5 * np.minimum(lengths[:-1], lengths[1:])
             path = Path(np.array(points), blend)
-            if _stray(ik, path, begin, target) < MAX_STRAY_M:
+            if _compute_deviation(ik, path, begin, target) < MAX_DEVIATION_M:
                 return path
     return None
 
 
-def _stray(ik: InverseKinematics, path: Path, begin: Pose, target: Pose) -> float:
+def _compute_deviation(ik: InverseKinematics, path: Path, begin: Pose, target: Pose) -> float:
     """Return the largest distance of the tool from the straight line, m."""
     blended = BlendedPath(*path)
     if blended.length == 0.0:
         return 0.0
     line = target.position - begin.position
     length = norm(line)
-    samples = blended.sample(blended.length / (STRAY_SAMPLES * (len(path.waypoints) - 1)))
-    deviations = np.array([ik.tool_at(q).position - begin.position for q in samples])
+    samples = blended.sample_points(
+        blended.length / (DEVIATION_SAMPLES * (len(path.waypoints) - 1))
+    )
+    deviations = np.array([ik.compute_tool_pose(q).position - begin.position for q in samples])
     if length > 0.0:
         deviations -= np.outer(mat_vec(deviations, line) / length**2, line)
     return float(np.max(np.linalg.norm(deviations, axis=1)))
 
 
-def in_metres(tool: Pose) -> str:
+def format_position(tool: Pose) -> str:
     """Format the position of a tool, in m."""
     return "[{:.3f}, {:.3f}, {:.3f}]".format(*tool.position)

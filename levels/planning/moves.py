@@ -10,7 +10,7 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.messages import TaskCommand, TaskPlan, Verb
 from rack.levels.planning.collision import CollisionChecker
-from rack.levels.planning.pose import Pose, pose
+from rack.levels.planning.pose import Pose, make_pose
 
 VERB_NAMES = {verb: verb.name.lower() for verb in Verb}
 VERB_NAMES |= {Verb.NONE: "rest", Verb.MOVE_JOINTS: "move"}
@@ -34,7 +34,7 @@ class Move(NamedTuple):
         return self.verb not in (Verb.GRASP, Verb.RELEASE)
 
     @property
-    def touches(self) -> bool:
+    def can_touch(self) -> bool:
         """True if the object that is held or about to be grasped may touch its support."""
         return self.verb in (Verb.APPROACH, Verb.DEPART)
 
@@ -58,7 +58,7 @@ def read_move(record: Any) -> Move:
         action=int(record["action"]),
         verb=Verb(int(record["verb"])),
         object=None if row < 0 else row,
-        tool=pose(record["position"], record["quaternion"]),
+        tool=make_pose(record["position"], record["quaternion"]),
         joints=np.array(record["joints"]),
         posture=bool(record["posture"]),
         by_s=float(record["by"]),
@@ -83,15 +83,17 @@ class Situation:
         """Return the pose of object `row`."""
         return Pose(self.positions[row], self.quaternions[row])
 
-    def after(self, move: Move) -> Situation:
+    def predict_after(self, move: Move) -> Situation:
         """Return the situation after `move` has succeeded."""
         if move.verb is Verb.GRASP and move.object is not None:
-            return self.holding(move.object, move.tool.inverse() @ self.object_pose(move.object))
+            return self.with_object_held(
+                move.object, move.tool.inverse() @ self.object_pose(move.object)
+            )
         if move.verb is Verb.RELEASE and self.held is not None and self.grip is not None:
-            return self.with_body(self.held, move.tool @ self.grip).holding(None, None)
+            return self.with_body_at(self.held, move.tool @ self.grip).with_object_held(None, None)
         return self
 
-    def holding(self, row: int | None, grip: Pose | None) -> Situation:
+    def with_object_held(self, row: int | None, grip: Pose | None) -> Situation:
         """Return this situation with another object in the gripper.
 
         Args:
@@ -100,18 +102,18 @@ class Situation:
         """
         return replace(self, held=row, grip=grip)
 
-    def with_body(self, row: int, pose: Pose) -> Situation:
+    def with_body_at(self, row: int, pose: Pose) -> Situation:
         """Return this situation with body `row` at another pose."""
         positions = self.positions.copy()
         quaternions = self.quaternions.copy()
         positions[row], quaternions[row] = pose
         return replace(self, positions=positions, quaternions=quaternions)
 
-    def lay_out(self, checker: CollisionChecker, touched: int | None) -> None:
+    def apply_to(self, checker: CollisionChecker, touched: int | None) -> None:
         """Set `checker` to this situation. Object `touched` may touch supports and gripper."""
-        checker.place(self.positions, self.quaternions)
+        checker.place_bodies(self.positions, self.quaternions)
         if self.held is None or self.grip is None:
-            checker.hold(None)
+            checker.hold_object(None)
         else:
-            checker.hold(self.held, *self.grip)
-        checker.permit(touched)
+            checker.hold_object(self.held, *self.grip)
+        checker.permit_contact(touched)

@@ -18,9 +18,9 @@ from rack.levels.compiled import compiled_for
 from rack.levels.messages import WAYPOINTS
 from rack.levels.motion.path import BlendedPath, Path
 from rack.levels.motion.trajectory import make_trajectory
-from rack.levels.planning.ik import sampling_range
+from rack.levels.planning.ik import find_sampling_range
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.lookup import below, geoms_of
+from rack.levels.robot.lookup import list_geoms, mark_descendants
 
 Free = Callable[[Array], bool]
 """Returns True if all of the configurations (n, joints) are free."""
@@ -60,7 +60,7 @@ class PathPlanner:
     def __init__(self, cell: Cell, clearance: float, seed: int) -> None:
         self._limits = cell.limits
         self._seed = seed
-        self._levers = np.maximum(lever_arms(cell, seed), MIN_LEVER_M)
+        self._levers = np.maximum(compute_lever_arms(cell, seed), MIN_LEVER_M)
         # Because sum |lever_j dq_j| <= |lever| |dq|, a step of this length moves no point farther
         # than intended.
         self.step_rad = STEP_PART * clearance / norm(self._levers)
@@ -93,12 +93,12 @@ class PathPlanner:
         line = np.linspace(start, goal, max(count, 2))
         if first_blocked(line) == len(line):
             return Path(ends, np.zeros(2))
-        paths = self._sampled(ends, first_blocked, attempt, searches)
+        paths = self._search_paths(ends, first_blocked, attempt, searches)
         if len(paths) == 1:
             return paths[0]
-        return min(paths, key=self.duration, default=None)
+        return min(paths, key=self.compute_duration, default=None)
 
-    def rounded(self, waypoints: Array, first_blocked: FirstBlocked) -> Path:
+    def round_corners(self, waypoints: Array, first_blocked: FirstBlocked) -> Path:
         """Return the path along `waypoints`, with each corner rounded as far as it stays free."""
         # Blends must not overlap: they use up to half of an inner line, and most of the first and
         # the last line.
@@ -109,20 +109,20 @@ class PathPlanner:
         blend[1:-1] = np.minimum(largest_blends[:-1], largest_blends[1:])
         for corner in range(1, len(waypoints) - 1):
             largest = float(blend[corner])
-            blend[corner] = self._free_blend(waypoints, corner, largest, first_blocked)
+            blend[corner] = self._find_free_blend(waypoints, corner, largest, first_blocked)
         return Path(waypoints, blend)
 
-    def blocked_at(self, path: Path, first_blocked: FirstBlocked) -> Array | None:
+    def find_blocked_configuration(self, path: Path, first_blocked: FirstBlocked) -> Array | None:
         """Return the first configuration on `path` that is not free, or None."""
-        samples = BlendedPath(*path).sample(self.step_rad)
+        samples = BlendedPath(*path).sample_points(self.step_rad)
         index = first_blocked(samples)
         return samples[index] if index < len(samples) else None
 
-    def duration(self, path: Path) -> float:
+    def compute_duration(self, path: Path) -> float:
         """Return the duration of `path`, from rest to rest, s."""
         return make_trajectory(BlendedPath(*path), self._limits).duration
 
-    def _sampled(
+    def _search_paths(
         self, ends: Array, first_blocked: FirstBlocked, attempt: int, searches: int
     ) -> list[Path]:
         """Search paths around obstacles until enough are found, or the checks are used up.
@@ -137,15 +137,15 @@ class PathPlanner:
         checks_left = MAX_CHECKS
         for k in range(MAX_SEARCHES):
             seed = 1 + (self._seed + attempt * MAX_SEARCHES + k) % MAX_SEED
-            polyline, checks = self._search(ends, first_blocked, seed, checks_left)
+            polyline, checks = self._search_once(ends, first_blocked, seed, checks_left)
             checks_left -= checks
             if polyline is not None and len(polyline) <= WAYPOINTS:
-                paths.append(self.rounded(polyline, first_blocked))
+                paths.append(self.round_corners(polyline, first_blocked))
             if checks_left <= 0 or len(paths) == searches:
                 break
         return paths
 
-    def _free_blend(
+    def _find_free_blend(
         self, waypoints: Array, corner: int, largest: float, first_blocked: FirstBlocked
     ) -> float:
         """Return the largest free blend at a corner, rad, or 0.
@@ -161,11 +161,11 @@ class PathPlanner:
             b = part * largest
             ends = [at + b * (end - at) / max(norm(end - at), b) for end in (before, after)]
             path = Path(np.array([ends[0], at, ends[1]]), np.array([0.0, b, 0.0]))
-            if self.blocked_at(path, first_blocked) is None:
+            if self.find_blocked_configuration(path, first_blocked) is None:
                 return b
         return 0.0
 
-    def _search(
+    def _search_once(
         self, ends: Array, first_blocked: FirstBlocked, seed: int, budget: int
     ) -> tuple[Array | None, int]:
         """Search a free polyline in joint space scaled by the lever arms.
@@ -189,9 +189,9 @@ class PathPlanner:
             count += min(index + 1, len(scaled))
             return index == len(scaled)
 
-        information = self._space(ends, is_free)
+        information = self._build_space(ends, is_free)
         problem = base.ProblemDefinition(information)
-        problem.setStartAndGoalStates(*(self._state(information, end) for end in ends))
+        problem.setStartAndGoalStates(*(self._to_state(information, end) for end in ends))
         planner = geometric.RRTConnect(information)
         planner.setRange(BRANCH_PART * information.getMaximumExtent())
         planner.setProblemDefinition(problem)
@@ -205,12 +205,12 @@ class PathPlanner:
         simplifier.partialShortcutPath(path)
         simplifier.collapseCloseVertices(path)
         simplifier.reduceVertices(path)
-        polyline = self._values(*path.getStates()) / self._levers
+        polyline = self._to_values(*path.getStates()) / self._levers
         # Scaling introduces rounding errors, so restore the exact ends.
         polyline[[0, -1]] = ends
         return polyline, count
 
-    def _space(self, ends: Array, free: Free) -> base.SpaceInformation:
+    def _build_space(self, ends: Array, free: Free) -> base.SpaceInformation:
         """Build the scaled space of OMPL around `ends`, (2, joints), with its collision check."""
         least = ends.min(axis=0)
         most = ends.max(axis=0)
@@ -226,20 +226,20 @@ class PathPlanner:
             bounds.setHigh(j, value)
         space.setBounds(bounds)
         information = base.SpaceInformation(space)
-        information.setStateValidityChecker(lambda state: free(self._values(state)))
-        information.setMotionValidator(MotionCheck(information, self._values, free))
+        information.setStateValidityChecker(lambda state: free(self._to_values(state)))
+        information.setMotionValidator(MotionCheck(information, self._to_values, free))
         information.setStateValidityCheckingResolution(self._resolution / space.getMaximumExtent())
         information.setup()
         return information
 
-    def _state(self, information: base.SpaceInformation, q: Array) -> base.State:
+    def _to_state(self, information: base.SpaceInformation, q: Array) -> base.State:
         """Return the OMPL state of configuration `q`, (joints,), rad."""
         state = information.allocState()
         for j, value in enumerate(q * self._levers):
             state[j] = value
         return state
 
-    def _values(self, *states: base.State) -> Array:
+    def _to_values(self, *states: base.State) -> Array:
         """Return the scaled values of OMPL states, (states, joints)."""
         joints = range(len(self._levers))
         return np.array([[state[j] for j in joints] for state in states])
@@ -263,11 +263,13 @@ class MotionCheck(base.MotionValidator):  # type: ignore[misc]  # untyped
     def checkMotion(self, one: base.State, other: base.State) -> bool:  # noqa: N802  # OMPL's name
         """Return True if the motion from `one`, which is known to be free, to `other` is free."""
         count = max(self._space.validSegmentCount(one, other), 1)
-        return self._free(halved.load()(self._values(one, other), count))
+        return self._free(
+            list_bisection_points.load_machine_code()(self._values(one, other), count)
+        )
 
 
 @compiled_for("f8[:,::1], i8")
-def halved(ends: Array, count: int) -> Array:
+def list_bisection_points(ends: Array, count: int) -> Array:
     """Return the points at which a line is checked: its end, its middle, and so on by halves.
 
     Args:
@@ -295,7 +297,7 @@ def halved(ends: Array, count: int) -> Array:
     return places
 
 
-def lever_arms(cell: Cell, seed: int) -> Array:
+def compute_lever_arms(cell: Cell, seed: int) -> Array:
     """Return how far each joint can move any geom of the arm, per rad or per m.
 
     A joint step dq moves no point of the arm by more than sum |lever_j dq_j|.
@@ -310,7 +312,7 @@ def lever_arms(cell: Cell, seed: int) -> Array:
     m = cell.model
     data = mujoco.MjData(m)
     rng = np.random.default_rng(seed)
-    low, high = sampling_range(cell)
+    low, high = find_sampling_range(cell)
     places = np.empty((LEVER_SAMPLES, m.ngeom, 3))
     anchors, axes = np.empty((2, LEVER_SAMPLES, m.njnt, 3))
     for sample in range(LEVER_SAMPLES):
@@ -324,7 +326,7 @@ def lever_arms(cell: Cell, seed: int) -> Array:
         """Return the lever arm of one joint."""
         if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
             return 1.0
-        carried = geoms_of(m, below(m, m.jnt_bodyid[[joint]]))
+        carried = list_geoms(m, mark_descendants(m, m.jnt_bodyid[[joint]]))
         moved = np.intersect1d(carried, cell.geoms.arm)
         from_anchor = places[:, moved] - anchors[:, [joint]]
         from_axis = np.linalg.norm(np.cross(from_anchor, axes[:, [joint]]), axis=2)

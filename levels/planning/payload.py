@@ -24,7 +24,7 @@ import numpy as np
 from rack.levels.algebra import Array, Ints
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
-from rack.levels.planning.pose import Pose, pose, site_pose
+from rack.levels.planning.pose import Pose, make_pose, read_site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 
@@ -54,9 +54,9 @@ class Payloads:
         self._cell = cell
         self._names = names
         self._dynamics = Dynamics(cell)
-        self._data = cell.start()
+        self._data = cell.build_start_data()
         self._rest = np.zeros(len(cell.home))
-        self.jaws = self._closing()
+        self.jaws = self._find_jaws()
 
     def check_grip(self, row: int, grip: Pose) -> None:
         """Check that friction can hold an object at `grip`, its pose in the frame of the tool.
@@ -65,11 +65,11 @@ class Payloads:
             Refused: The grip is too weak; the text contains both forces.
         """
         gravity = float(np.sqrt(np.sum(np.square(self._cell.model.opt.gravity))))
-        needed = MIN_GRIP_FACTOR * self._mass(row) * gravity
-        holds = self._holding_force(row, grip)
+        needed = MIN_GRIP_FACTOR * self._find_mass(row) * gravity
+        holds = self._compute_holding_force(row, grip)
         if holds is not None and holds < needed:
             shortage = f"{needed:.1f} N of grip; the gripper holds {holds:.1f} N"
-            raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {shortage}")
+            raise Refused(Error.OVERLOAD, f"payload {self._format_object(row)} needs {shortage}")
 
     def check_motors(self, row: int, grip: Pose, configurations: Array) -> None:
         """Check that the motors can carry an object.
@@ -83,8 +83,8 @@ class Payloads:
             Refused: A motor is too weak; the text contains both torques.
         """
         model = self._cell.model
-        centre = grip @ pose(model.body_ipos[self._cell.bodies[row]], (1.0, 0.0, 0.0, 0.0))
-        payload = Payload(self._mass(row), centre.position)
+        centre = grip @ make_pose(model.body_ipos[self._cell.bodies[row]], (1.0, 0.0, 0.0, 0.0))
+        payload = Payload(self._find_mass(row), centre.position)
         limit = MAX_MOTOR_PART * self._cell.bounds.torque
         for q in configurations:
             load = np.abs(self._dynamics.terms(q, self._rest, payload).bias)
@@ -94,19 +94,21 @@ class Payloads:
                 shortage = (
                     f"{load[worst]:.1f} N m of '{joint}'; its motor carries {limit[worst]:.1f} N m"
                 )
-                raise Refused(Error.OVERLOAD, f"payload {self._named(row)} needs {shortage}")
+                raise Refused(
+                    Error.OVERLOAD, f"payload {self._format_object(row)} needs {shortage}"
+                )
 
-    def _mass(self, row: int) -> float:
+    def _find_mass(self, row: int) -> float:
         """Return the mass of object `row`, kg."""
         return float(self._cell.model.body_subtreemass[self._cell.bodies[row]])
 
-    def _named(self, row: int) -> str:
+    def _format_object(self, row: int) -> str:
         """Format name and mass of object `row`."""
-        return f"'{self._names[row]}' {self._mass(row):.3g} kg"
+        return f"'{self._names[row]}' {self._find_mass(row):.3g} kg"
 
-    def _holding_force(self, row: int, grip: Pose) -> float | None:
+    def _compute_holding_force(self, row: int, grip: Pose) -> float | None:
         """Return the friction force that can carry object `row`, N, or None if it is unknown."""
-        width = self._width(row, grip)
+        width = self._measure_width(row, grip)
         # Find the last jaws that are wider than the object, and the first that are not.
         pairs = (pair for pair in pairwise(self.jaws) if pair[0].gap > width >= pair[1].gap)
         wide, narrow = next(pairs, (None, None))
@@ -118,25 +120,27 @@ class Payloads:
         max_force = float(model.actuator_forcerange[gripper.actuator, 1])
         force = min(max_force, gripper.stiffness * abs(narrow.opening - gripper.closed))
         normal = force * abs(wide.length - narrow.length) / (wide.gap - narrow.gap)
-        parts = self._cell.parts(row)
+        parts = self._cell.list_geoms(row)
         return normal * sum(
-            max(_friction(model, finger, int(part)) for part in parts) for finger in narrow.geoms
+            max(_compute_friction(model, finger, int(part)) for part in parts)
+            for finger in narrow.geoms
         )
 
-    def _width(self, row: int, grip: Pose) -> float:
+    def _measure_width(self, row: int, grip: Pose) -> float:
         """Return the width of the object on the line through the tool, m, or -inf if it misses."""
         cell = self._cell
         data = self._data
         address = cell.object_qpos[row]
-        tool = pose(*site_pose(data, cell.tool))
+        tool = make_pose(*read_site_pose(data, cell.tool))
         data.qpos[address : address + 7] = np.concatenate(tool @ grip)
         mujoco.mj_kinematics(cell.model, data)
-        parts = cell.parts(row)
+        parts = cell.list_geoms(row)
         return sum(
-            RAY_RANGE_M - self._nearest(parts, RAY_RANGE_M * side, -side)[0] for side in SIDES
+            RAY_RANGE_M - self._find_nearest_geom(parts, RAY_RANGE_M * side, -side)[0]
+            for side in SIDES
         )
 
-    def _closing(self) -> list[Jaws]:
+    def _find_jaws(self) -> list[Jaws]:
         """Return the jaws from open to closed, while there is a gap and a finger on either side."""
         cell = self._cell
         gripper = cell.gripper
@@ -152,9 +156,11 @@ class Payloads:
             np.flatnonzero(cell.model.geom_bodyid == cell.model.body_parentid[hand]),
         )
         # A single finger closes on a jaw of the body that carries the finger.
-        return self._jaws_of(fingers, openings) or self._jaws_of(cell.geoms.gripper, openings)
+        return self._sample_jaws(fingers, openings) or self._sample_jaws(
+            cell.geoms.gripper, openings
+        )
 
-    def _jaws_of(self, fingers: Ints, openings: Array) -> list[Jaws]:
+    def _sample_jaws(self, fingers: Ints, openings: Array) -> list[Jaws]:
         """Return the jaws that some geoms form at these openings, as long as there is a gap."""
         cell = self._cell
         data = self._data
@@ -162,9 +168,9 @@ class Payloads:
         assert gripper is not None, "there are openings"
         jaws: list[Jaws] = []
         for opening in openings:
-            gripper.linkage.set(data.qpos, float(opening))
+            gripper.linkage.set_opening(data.qpos, float(opening))
             mujoco.mj_fwdPosition(cell.model, data)
-            sides = [self._nearest(fingers, 0.0, side) for side in SIDES]
+            sides = [self._find_nearest_geom(fingers, 0.0, side) for side in SIDES]
             gap = sides[0][0] + sides[1][0]
             # When closed, the tool's origin is inside a finger, and the line hits its far side.
             if not np.isfinite(gap) or (jaws and gap >= jaws[-1].gap):
@@ -173,7 +179,7 @@ class Payloads:
             jaws.append(Jaws(float(opening), gap, length, (sides[0][1], sides[1][1])))
         return jaws
 
-    def _nearest(self, geoms: Ints, start: float, direction: float) -> tuple[float, int]:
+    def _find_nearest_geom(self, geoms: Ints, start: float, direction: float) -> tuple[float, int]:
         """Find the first geom that a ray along the y axis of the tool hits.
 
         Args:
@@ -204,7 +210,7 @@ class Payloads:
         return nearest
 
 
-def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
+def _compute_friction(model: mujoco.MjModel, one: int, other: int) -> float:
     """Return the sliding friction of two geoms, as MuJoCo combines it. 0 if frictionless."""
     if model.geom_priority[one] == model.geom_priority[other]:
         mixed = [one, other]
@@ -219,13 +225,13 @@ def _friction(model: mujoco.MjModel, one: int, other: int) -> float:
 
 GAP_M = 0.002
 """Gap between jaw and object before the finger closes. At 0 the jaw could land on the object."""
-FARTHEST_M = 0.2
+SEARCH_RANGE_M = 0.2
 """Distance from the tool at which the search begins, and ends on the side of the jaw."""
-NEAR_M = 1e-4
+CONTACT_TOLERANCE_M = 1e-4
 """Distance from the jaw at which the search ends."""
-STEPS = 200
+MAX_SEARCH_STEPS = 200
 """Maximum number of steps of the search."""
-MOVED = 1e-6
+STILL_TOLERANCE = 1e-6
 """Change in a pose, from open to closed, up to which a geom counts as fixed."""
 
 
@@ -236,9 +242,9 @@ class FixedJaw:
         self._cell = cell
         self._geoms = geoms
         self._side = side  # side of the jaw on the y axis of the tool, 1 or -1
-        self._data = cell.start()
+        self._data = cell.build_start_data()
 
-    def beside(self, tool: Pose, row: int, object_pose: Pose) -> Pose:
+    def move_beside(self, tool: Pose, row: int, object_pose: Pose) -> Pose:
         """Move the pose of a tool along its y axis until the jaw is next to the object to grasp.
 
         Args:
@@ -249,24 +255,24 @@ class FixedJaw:
         Returns:
             The moved pose, or `tool` if the jaw does not meet the object.
         """
-        present_tool = site_pose(self._data, self._cell.tool)
+        present_tool = read_site_pose(self._data, self._cell.tool)
         relative = present_tool @ tool.inverse() @ object_pose
         along = self._side * self._data.site_xmat[self._cell.tool].reshape(3, 3)[:, 1]
-        travel = -FARTHEST_M
-        for _ in range(STEPS):
-            distance = self._distance(
+        travel = -SEARCH_RANGE_M
+        for _ in range(MAX_SEARCH_STEPS):
+            distance = self._measure_distance(
                 row, Pose(relative.position + travel * along, relative.quaternion)
             )
             travel += distance
-            if distance < NEAR_M or travel > FARTHEST_M:
+            if distance < CONTACT_TOLERANCE_M or travel > SEARCH_RANGE_M:
                 break
-        if travel > FARTHEST_M:
+        if travel > SEARCH_RANGE_M:
             return tool
         across = np.zeros(3)
         mujoco.mju_rotVecQuat(across, np.array([0.0, self._side, 0.0]), tool.quaternion)
         return Pose(tool.position - (travel - GAP_M) * across, tool.quaternion)
 
-    def _distance(self, row: int, at: Pose) -> float:
+    def _measure_distance(self, row: int, at: Pose) -> float:
         """Return the distance of object `row` from the fixed geoms, m, or 0 if they touch."""
         model = self._cell.model
         data = self._data
@@ -274,8 +280,8 @@ class FixedJaw:
         data.qpos[address : address + 7] = np.concatenate(at)
         mujoco.mj_kinematics(model, data)
         distances = [
-            mujoco.mj_geomDistance(model, data, int(part), int(geom), FARTHEST_M, None)
-            for part in self._cell.parts(row)
+            mujoco.mj_geomDistance(model, data, int(part), int(geom), SEARCH_RANGE_M, None)
+            for part in self._cell.list_geoms(row)
             for geom in self._geoms
         ]
         return max(0.0, float(min(distances)))
@@ -286,13 +292,13 @@ def find_fixed_jaw(cell: Cell, payloads: Payloads) -> FixedJaw | None:
     gripper = cell.gripper
     if gripper is None or not payloads.jaws:
         return None
-    data = cell.start()
+    data = cell.build_start_data()
     poses = []
     for opening in (gripper.open, gripper.closed):
-        gripper.linkage.set(data.qpos, opening)
+        gripper.linkage.set_opening(data.qpos, opening)
         mujoco.mj_kinematics(cell.model, data)
         poses.append(np.hstack((data.geom_xpos, data.geom_xmat)))
-    is_still = np.abs(poses[0] - poses[1]).max(axis=1) < MOVED
+    is_still = np.abs(poses[0] - poses[1]).max(axis=1) < STILL_TOLERANCE
     fixed_sides = [
         side for side, geom in zip(SIDES, payloads.jaws[0].geoms, strict=True) if is_still[geom]
     ]

@@ -37,7 +37,7 @@ class Pose(NamedTuple):
         mujoco.mju_negPose(position, quaternion, *self)
         return Pose(position, quaternion)
 
-    def raised(self, height: float) -> Pose:
+    def raise_by(self, height: float) -> Pose:
         """Return the pose moved by `height`, m, along the z axis of the world."""
         return Pose(self.position + np.array([0.0, 0.0, height]), self.quaternion)
 
@@ -45,56 +45,56 @@ class Pose(NamedTuple):
         """Return True if the two poses are equal up to rounding."""
         return (
             bool(np.all(np.abs(self.position - other.position) < MAX_DIFFERENCE))
-            and self.angle_to(other) < MAX_DIFFERENCE
+            and self.compute_angle(other) < MAX_DIFFERENCE
         )
 
-    def angle_to(self, other: Pose) -> float:
+    def compute_angle(self, other: Pose) -> float:
         """Return the angle between the two orientations, rad."""
-        return norm(self._turn_to(other))
+        return norm(self._compute_turn(other))
 
-    def towards(self, other: Pose, part: float) -> Pose:
+    def interpolate_to(self, other: Pose, part: float) -> Pose:
         """Return the pose at `part`, 0 to 1, of a straight motion to `other`.
 
         The pose turns at a constant rate.
         """
         quaternion = self.quaternion.copy()
-        mujoco.mju_quatIntegrate(quaternion, self._turn_to(other), part)
+        mujoco.mju_quatIntegrate(quaternion, self._compute_turn(other), part)
         return Pose((1.0 - part) * self.position + part * other.position, quaternion)
 
-    def _turn_to(self, other: Pose) -> Array:
+    def _compute_turn(self, other: Pose) -> Array:
         """Return the rotation vector from this orientation to `other`, (3,), rad."""
         turn = np.zeros(3)
         mujoco.mju_subQuat(turn, other.quaternion, self.quaternion)
         return turn
 
 
-def pose(position: ArrayLike, quaternion: ArrayLike) -> Pose:
+def make_pose(position: ArrayLike, quaternion: ArrayLike) -> Pose:
     """Return a pose with copies of the arrays and the quaternion normalized."""
     turned = np.array(quaternion, dtype=float)
     mujoco.mju_normalize4(turned)
     return Pose(np.array(position, dtype=float), turned)
 
 
-def site_pose(data: mujoco.MjData, site: int) -> Pose:
+def read_site_pose(data: mujoco.MjData, site: int) -> Pose:
     """Return the pose of a site in simulation data."""
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, data.site_xmat[site])
     return Pose(data.site_xpos[site].copy(), quaternion)
 
 
-def turned_about_z(yaw: float) -> Array:
+def build_yaw_quaternion(yaw: float) -> Array:
     """Return the quaternion of a rotation by `yaw`, rad, about z."""
     return np.array([math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0)])
 
 
-def yaw_of(quaternion: Array) -> float:
+def compute_yaw(quaternion: Array) -> float:
     """Return the angle about the world's z axis by which `quaternion` turns the x axis, rad."""
     turned = np.zeros(3)
     mujoco.mju_rotVecQuat(turned, np.array([1.0, 0.0, 0.0]), quaternion)
     return math.atan2(turned[1], turned[0])
 
 
-def pointing(direction: ArrayLike, yaw: float = 0.0) -> Array:
+def build_pointing_quaternion(direction: ArrayLike, yaw: float = 0.0) -> Array:
     """Return a quaternion that turns z to `direction`, (3,), and by `yaw`, rad, about it."""
     target = np.array(direction, dtype=float)
     target /= norm(target)
@@ -107,5 +107,5 @@ def pointing(direction: ArrayLike, yaw: float = 0.0) -> Array:
     turn = np.zeros(4)
     result = np.zeros(4)
     mujoco.mju_axisAngle2Quat(turn, axis, math.atan2(sine, cosine))
-    mujoco.mju_mulQuat(result, turn, turned_about_z(yaw))
+    mujoco.mju_mulQuat(result, turn, build_yaw_quaternion(yaw))
     return result

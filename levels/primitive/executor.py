@@ -20,17 +20,17 @@ from rack.levels.messages import (
     WorldState,
 )
 from rack.levels.motion import path as paths
-from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLDABLE, OperatorCommand, Orders
+from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLD_COMMANDS, OperatorCommand, Orders
 from rack.levels.planning import collision
 from rack.levels.primitive.motion_segment import (
     Memory,
     MotionSegment,
     SegmentFault,
     read_segment,
-    recall,
+    restore_memory,
     window,
 )
-from rack.levels.primitive.path_guard import Guard, Sight
+from rack.levels.primitive.path_guard import PathGuard, SceneWatch
 from rack.levels.primitive.path_motion import JointSetPoint
 from rack.levels.primitive.planner import Plans
 from rack.levels.primitive.segment_work import (
@@ -44,10 +44,10 @@ from rack.levels.primitive.tracking import (
     LEAD_CYCLES,
     MAX_UNEXPLAINED_CYCLES,
     SEEN_CYCLES,
-    Straying,
+    DeviationMonitor,
     Tracking,
 )
-from rack.levels.robot.cell import cell_of
+from rack.levels.robot.cell import build_level_cell
 
 Work = PathWork | GripperWork
 
@@ -74,7 +74,7 @@ class PrimitiveExecutor(Executor):
     operator = Input(OperatorCommand, "own.operator")
     command = Output(JointCommand, rests_on=above)
     status = Output(PrimitiveStatus, rests_on=below)
-    commands = HOLDABLE
+    commands = HOLD_COMMANDS
     preloads = (collision, paths)
     params = PrimitiveParams
     settings: PrimitiveParams
@@ -82,19 +82,21 @@ class PrimitiveExecutor(Executor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         params = self.settings
-        cell = cell_of(context)
+        cell = build_level_cell(context)
         self._rules = WorkRules(context.robot.joints, cell.limits, params, context.period_s)
-        self._guard = Guard(cell, context.scene, params.lookahead, DELAY_CYCLES * context.period_s)
+        self._guard = PathGuard(
+            cell, context.scene, params.lookahead, DELAY_CYCLES * context.period_s
+        )
         self._gripper = context.robot.gripper
         self._bring_up = context.robot.bring_up or 1.0
-        self._sight = Sight(
+        self._sight = SceneWatch(
             self._guard, round(params.blind / context.tick_s), bool(context.scene.bodies)
         )
         self._tracking = Tracking()
-        self._straying = Straying(
-            context.robot.joints, params.following, self._rules.cycles(params.straying)
+        self._straying = DeviationMonitor(
+            context.robot.joints, params.following, self._rules.count_cycles(params.straying)
         )
-        self._silent_cycles = self._rules.cycles(params.silent)
+        self._silent_cycles = self._rules.count_cycles(params.silent)
         self._plans = Plans()
         self._orders = Orders(self.commands)
         self._memory = Memory()
@@ -111,21 +113,21 @@ class PrimitiveExecutor(Executor):
         """Do one cycle: read all inputs, advance the segment, write set point and status."""
         if self._tick is None:
             self._tick = tick - self.context.every
-            self._memory = recall(self.last_status, self.last_command)
+            self._memory = restore_memory(self.last_status, self.last_command)
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
         servo = self.below.message
-        self._orders.take(self.operator)
+        self._orders.take_commands(self.operator)
         serials = window(self.above.message)
-        self._plans.accept(self.plan, serials)
+        self._plans.accept_plan(self.plan, serials)
         if servo.error == Error.DISABLED:
             # While the arm is not enabled it may be moved by hand, so plan from where it is.
             self._displaced = True
             if not self._memory.is_known:
                 self._position[:] = servo.position
-        if self._tracking.update(self.below):
-            self._resume(servo, tick)
-        self._sight.update(self.world, servo.position, tick)
+        if self._tracking.update_status(self.below):
+            self._resume_motion(servo, tick)
+        self._sight.update_scene(self.world, servo.position, tick)
         if self._tracking.in_step:
             self._do_segments(serials, tick, passed_s)
         elif self._tracking.silent_cycles > self._silent_cycles:
@@ -135,9 +137,9 @@ class PrimitiveExecutor(Executor):
             self._fault = SegmentFault(Error(servo.error), servo.reason)
         self._write_set_point(self.command, tick)
         self._write_status(self.status, serials, tick)
-        self._answer(self.above.message.operator)
+        self._answer_operator(self.above.message.operator)
 
-    def _resume(self, servo: ServoStatus, tick: int) -> None:
+    def _resume_motion(self, servo: ServoStatus, tick: int) -> None:
         """Continue from the position at which the servo holds the arm."""
         work = self._work
         self._displaced |= self._memory.is_known
@@ -145,18 +147,18 @@ class PrimitiveExecutor(Executor):
             force = self._gripper.force if self._gripper is not None else 0.0
             self._memory = Memory(is_known=True, opening=servo.opening, force=force)
         self._fault = None
-        self._straying.forget()
+        self._straying.reset_count()
         self._position[:] = servo.target
-        self._carry(self._memory.held, tick)
+        self._carry_object(self._memory.held, tick)
         if isinstance(work, PathWork):
             work.begin_near(self._position, work.progress)
             self._displaced = False
         elif work is not None:
-            work.begin()
+            work.restart_wait()
 
-    def _carry(self, row: int, tick: int) -> None:
+    def _carry_object(self, row: int, tick: int) -> None:
         """Let the guard carry object `row`, or nothing if -1, once a scene shows it."""
-        self._sight.carry(row, tick - SEEN_CYCLES * self.context.every)
+        self._sight.carry_object(row, tick - SEEN_CYCLES * self.context.every)
 
     def _do_segments(self, serials: list[int], tick: int, passed_s: float) -> None:
         """Do one cycle of the current segment: finish, withdraw, begin or advance it.
@@ -166,44 +168,46 @@ class PrimitiveExecutor(Executor):
             tick: Tick of the cycle.
             passed_s: Time since the last cycle.
         """
-        hold = self.above.message.hold or self.above.is_lost or self._orders.holds
+        hold = self.above.message.hold or self.above.is_lost or self._orders.is_holding
         if self.below.is_new:
-            self._finish(self.below.message, tick)
-            self._straying.update(self.below.message)
-        withdrawn = self._withdraw(serials)
+            self._finish_segment(self.below.message, tick)
+            self._straying.update_status(self.below.message)
+        withdrawn = self._withdraw_segment(serials)
         if self._work is None and self._fault is None:
-            self._begin(serials, hold)
+            self._begin_segment(serials, hold)
         work = self._work
         if work is None:
             return
         if self._fault is None:
-            self._fault = work.fault or self._plans.refusal(work.segment.id) or self._straying.fault
+            self._fault = (
+                work.fault or self._plans.find_refusal(work.segment.id) or self._straying.fault
+            )
         if isinstance(work, PathWork):
             hold = (
                 hold
                 or withdrawn
                 or self._fault is not None
-                or self._straying.strays
-                or bool(self._sight.lacks)
+                or self._straying.is_straying
+                or bool(self._sight.reason_to_wait)
             )
-            plan = self._plans.trajectory(work.segment.id, work.motion.s)
+            plan = self._plans.find_trajectory(work.segment.id, work.motion.s)
             due_s = (tick + (LEAD_CYCLES - 1) * self.context.every) * self.context.tick_s
             speed_scale = self._bring_up if self.below.message.slowed else 1.0
             work.step(WorkCycle(hold, plan, self.world.message, due_s, passed_s, speed_scale))
             self._position[:] = work.motion.set_point.position
 
-    def _finish(self, servo: ServoStatus, tick: int) -> None:
+    def _finish_segment(self, servo: ServoStatus, tick: int) -> None:
         """Finish the current segment if the servo shows that it is done."""
         work = self._work
-        if work is None or self._fault is not None or not work.done(servo):
+        if work is None or self._fault is not None or not work.check_done(servo):
             return
         if isinstance(work, GripperWork):
             self._memory.held = work.held_after
-            self._carry(work.held_after, tick)
+            self._carry_object(work.held_after, tick)
         self._memory.done = work.segment.id
         self._work = None
 
-    def _withdraw(self, serials: list[int]) -> bool:
+    def _withdraw_segment(self, serials: list[int]) -> bool:
         """Drop a segment and a fault that have left the window.
 
         Returns:
@@ -213,7 +217,7 @@ class PrimitiveExecutor(Executor):
         if serial in serials:
             return False
         if isinstance(self._work, PathWork):
-            if not self._work.motion.resting:
+            if not self._work.motion.is_resting:
                 return True
             # Messages may arrive out of order, so a withdrawn segment may return and continue.
             self._memory.interrupted = serial
@@ -222,7 +226,7 @@ class PrimitiveExecutor(Executor):
         self._fault = None
         return False
 
-    def _begin(self, serials: list[int], hold: bool) -> None:
+    def _begin_segment(self, serials: list[int], hold: bool) -> None:
         """Begin the oldest segment that is not done. With `hold`, a gripper segment waits."""
         memory = self._memory
         serial = next((s for s in serials if s > memory.done), 0)
@@ -248,7 +252,7 @@ class PrimitiveExecutor(Executor):
     def _begin_path(self, segment: MotionSegment, memory: Memory) -> PathWork:
         """Begin a path, from where the arm is if it may be off the start of the path."""
         path = segment.path()
-        self._guard.watch(segment, path, self.below.message.opening, self.world.message)
+        self._guard.watch_path(segment, path, self.below.message.opening, self.world.message)
         work = PathWork(segment, path, self._guard, self._rules)
         if segment.id == memory.interrupted:
             work.begin_near(self._position, memory.progress)
@@ -259,7 +263,7 @@ class PrimitiveExecutor(Executor):
         self._displaced = False
         return work
 
-    def _wanted(self, serials: list[int]) -> tuple[int, float]:
+    def _find_wanted_trajectory(self, serials: list[int]) -> tuple[int, float]:
         """Find the segment that needs a trajectory next.
 
         Returns:
@@ -271,16 +275,16 @@ class PrimitiveExecutor(Executor):
         for serial, kind in zip(serials, kinds, strict=False):
             begin = 0.0 if kind == SegmentKind.PATH else None
             if work is not None and serial == work.segment.id:
-                begin = work.begin_wanted if isinstance(work, PathWork) else None
+                begin = work.wanted_begin if isinstance(work, PathWork) else None
             if (
                 serial > self._memory.done
                 and begin is not None
-                and self._plans.lacks(serial, begin)
+                and self._plans.is_unplanned(serial, begin)
             ):
                 return serial, begin
         return 0, 0.0
 
-    def _due(self, tick: int) -> int:
+    def _compute_due_tick(self, tick: int) -> int:
         """Return the tick at which the set point of the cycle released at `tick` is due."""
         return tick + LEAD_CYCLES * self.context.every
 
@@ -291,7 +295,7 @@ class PrimitiveExecutor(Executor):
         in_step = self._tracking.in_step
         command.id = tick // self.context.every + 1 if memory.is_known else 0
         # Out of step, the position of the arm is uncertain, and a set point might be wrong.
-        command.due = self._due(tick) if in_step else 0
+        command.due = self._compute_due_tick(tick) if in_step else 0
         set_point = work.motion.set_point if in_step and isinstance(work, PathWork) else self._rest
         command.position[:] = self._position
         command.velocity[:] = set_point.velocity
@@ -306,7 +310,7 @@ class PrimitiveExecutor(Executor):
         memory = self._memory
         work = self._work
         status.echo = self.above.message.id
-        status.state = self._state(serials)
+        status.state = self._find_state(serials)
         reason = self._reason_to_wait() if status.state == State.EXECUTING else ""
         if reason:
             status.state = State.HOLDING
@@ -315,12 +319,14 @@ class PrimitiveExecutor(Executor):
         status.held = memory.held
         interrupted = memory.interrupted if memory.interrupted in serials else 0
         status.current = work.segment.id if work is not None else interrupted
-        if self.below.is_there:
+        if self.below.has_message:
             status.opening = self.below.message.opening
         status.position[:] = self._position
         status.progress = memory.progress * bool(interrupted)
         servo = self.below.message
-        status.operated = self._orders.stands or servo.standing > 0 or servo.error == Error.DISABLED
+        status.operated = (
+            self._orders.is_in_force or servo.standing > 0 or servo.error == Error.DISABLED
+        )
         status.blocked = False
         status.resting = True
         status.ends = 0.0
@@ -328,23 +334,23 @@ class PrimitiveExecutor(Executor):
             status.progress = work.progress
             # Out of step, motion does not hold because of an obstacle.
             status.blocked = work.blocked and self._tracking.in_step
-            status.resting = work.motion.resting
-            status.ends = work.ends_s(self._due(tick) * self.context.tick_s)
-        status.wants, status.begin = self._wanted(serials)
+            status.resting = work.motion.is_resting
+            status.ends = work.compute_end_s(self._compute_due_tick(tick) * self.context.tick_s)
+        status.wants, status.begin = self._find_wanted_trajectory(serials)
 
     def _reason_to_wait(self) -> str:
         """Return why the level waits and what ends the wait, or an empty text if it does not."""
         work = self._work
         command = self.above
         if not self._tracking.in_step:
-            return self._tracking.awaited(self.below.message)
+            return self._tracking.describe_wait(self.below.message)
         if isinstance(work, GripperWork):
             return ""
-        if self._orders.stands:
-            return self._orders.keeps(self.context.board)
+        if self._orders.is_in_force:
+            return self._orders.format_reason(self.context.board)
         if work is not None:
             blocked = f"blocked: {work.obstacle}" if work.blocked else ""
-            if reason := self._straying.place or blocked or self._sight.lacks:
+            if reason := self._straying.place or blocked or self._sight.reason_to_wait:
                 return reason
         if command.is_lost:
             return ABOVE_LOST
@@ -354,14 +360,14 @@ class PrimitiveExecutor(Executor):
             return f"segment {work.segment.id} waits for its trajectory from the planner"
         return ""
 
-    def _answer(self, above: int) -> None:
+    def _answer_operator(self, above: int) -> None:
         """Answer the operator, and pass down the newest command on which this cycle is based."""
         if self.status.resting:
-            self._orders.done()
-        self.command.operator = self._orders.rests_on(above)
-        self._orders.report(self.status, above)
+            self._orders.report_done()
+        self.command.operator = self._orders.find_basis(above)
+        self._orders.fill_status(self.status, above)
 
-    def _state(self, serials: list[int]) -> State:
+    def _find_state(self, serials: list[int]) -> State:
         """Return the state to report, apart from HOLDING."""
         if self._fault is not None:
             return State.ERROR

@@ -39,7 +39,7 @@ class MotionSegment(MoveSegment):
         """
         return BlendedPath(self.waypoints[: self.count], self.blend[: self.count])
 
-    def too_late(self, earliest_s: float) -> SegmentFault:
+    def build_lateness_fault(self, earliest_s: float) -> SegmentFault:
         """Return the fault of a segment that cannot be done before `earliest_s`."""
         # Rounded up, so that the printed time can be met.
         earliest_s = ceil(earliest_s * 1e3) / 1e3
@@ -87,9 +87,9 @@ class Memory:
     force: float = 0.0  # commanded, N
 
 
-def recall(status: Reading[PrimitiveStatus], command: Reading[JointCommand]) -> Memory:
+def restore_memory(status: Reading[PrimitiveStatus], command: Reading[JointCommand]) -> Memory:
     """Return the state in the level's last messages; it is not known before the first ones."""
-    if not (status.is_there and command.is_there and command.message.id):
+    if not (status.has_message and command.has_message and command.message.id):
         return Memory()
     return Memory(
         is_known=True,

@@ -29,7 +29,7 @@ MAX_REST_M_S = 0.01
 """An obstacle slower than this along every axis counts as at rest."""
 
 
-class Guard:
+class PathGuard:
     """Watches one path at a time against the world model.
 
     In every cycle it checks the path over the next `lookahead_s`, with every obstacle extrapolated
@@ -65,7 +65,7 @@ class Guard:
         self._ahead = np.zeros((self._rows, 3))
         self.obstacle = ""
 
-    def carry(self, row: int, q: Array, world: WorldState) -> None:
+    def carry_object(self, row: int, q: Array, world: WorldState) -> None:
         """Carry an object with the tool from now on.
 
         Args:
@@ -74,13 +74,15 @@ class Guard:
             world: World model that shows the object in the gripper.
         """
         object_pose = Pose(world.position[row], world.quaternion[row])
-        self._checker.hold(row, *(self._checker.tool_at(q).inverse() @ object_pose))
+        self._checker.hold_object(
+            row, *(self._checker.compute_tool_pose(q).inverse() @ object_pose)
+        )
 
     def carry_nothing(self) -> None:
         """Carry no object with the tool from now on."""
-        self._checker.hold(None)
+        self._checker.hold_object(None)
 
-    def watch(
+    def watch_path(
         self, segment: MotionSegment, path: BlendedPath, opening: float, world: WorldState
     ) -> None:
         """Begin to watch the path of a segment.
@@ -93,10 +95,10 @@ class Guard:
         """
         self._checker.open_gripper(opening)
         row = segment.object if segment.object >= 0 else None
-        self._checker.permit(row, segment.touch)
-        self._checker.place(world.position, world.quaternion)
+        self._checker.permit_contact(row, segment.touch)
+        self._checker.place_bodies(world.position, world.quaternion)
         # Motion may start close to something, but must not get much closer.
-        start_clearance = self._checker.room(path.evaluate(0.0).q)
+        start_clearance = self._checker.find_clearance(path.evaluate(0.0).q)
         self._least = min(self._clearance, max(start_clearance, 0.0) * CLEARANCE_PART)
         self._obstructed = None
         self._cursor = 0.0
@@ -116,16 +118,16 @@ class Guard:
         Returns:
             True if no checked configuration is blocked.
         """
-        begin = trajectory.at(time_s).s
+        begin = trajectory.evaluate_at(time_s).s
         obstacles = world.velocity[self._objects : self._rows]
         still = bool((np.abs(obstacles) < MAX_REST_M_S).all())
-        self._checker.place(world.position, world.quaternion)
-        far_clear = self._far_is_clear(path, begin)
+        self._checker.place_bodies(world.position, world.quaternion)
+        far_clear = self._is_far_clear(path, begin)
         moving = None if still else world
-        near_clear = self._near_is_clear(path, trajectory, time_s, moving)
+        near_clear = self._is_near_clear(path, trajectory, time_s, moving)
         return near_clear and (far_clear or not still)
 
-    def _near_is_clear(
+    def _is_near_clear(
         self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: WorldState | None
     ) -> bool:
         """Check the path within the look-ahead.
@@ -143,44 +145,44 @@ class Guard:
                 np.multiply(self._by_themselves, ahead_s + self._delay_s, out=self._ahead)
                 self._ahead *= moving.velocity[: self._rows]
                 self._ahead += moving.position[: self._rows]
-                self._checker.place(self._ahead, moving.quaternion)
-            if not self._free(path, trajectory.at(time_s + ahead_s).s):
+                self._checker.place_bodies(self._ahead, moving.quaternion)
+            if not self._is_free(path, trajectory.evaluate_at(time_s + ahead_s).s):
                 return False
             if time_s + ahead_s > trajectory.duration:
                 break
         return True
 
-    def _far_is_clear(self, path: BlendedPath, begin: float) -> bool:
+    def _is_far_clear(self, path: BlendedPath, begin: float) -> bool:
         """Check the configuration that was blocked last, then the next few after `begin`, rad."""
         if self._obstructed is not None and self._obstructed >= begin:
-            if not self._free(path, self._obstructed):
+            if not self._is_free(path, self._obstructed):
                 return False
             self._obstructed = None
         for _ in range(FAR_CHECKS):
             self._cursor += FAR_STEP_RAD
             if not begin <= self._cursor < path.length + FAR_STEP_RAD:
                 self._cursor = begin
-            if not self._free(path, min(self._cursor, path.length)):
+            if not self._is_free(path, min(self._cursor, path.length)):
                 self._obstructed = self._cursor
                 return False
         return True
 
-    def _free(self, path: BlendedPath, s: float) -> bool:
+    def _is_free(self, path: BlendedPath, s: float) -> bool:
         """Return True if the arm is free at path parameter `s`; otherwise set `obstacle`."""
-        if self._checker.free(path.evaluate(s).q, self._least):
+        if self._checker.is_free(path.evaluate(s).q, self._least):
             return True
-        self.obstacle = self._checker.nearest()
+        self.obstacle = self._checker.describe_worst_pair()
         return False
 
 
-class Sight:
+class SceneWatch:
     """Checks that the world model is fresh, and tells the guard the pose of a held object.
 
     The model may be stale because its board is lost or because it receives no scene, so the time at
     which the scene was sensed decides.
     """
 
-    def __init__(self, guard: Guard, blind_ticks: int, has_bodies: bool) -> None:
+    def __init__(self, guard: PathGuard, blind_ticks: int, has_bodies: bool) -> None:
         """Watch the world model.
 
         Args:
@@ -194,7 +196,7 @@ class Sight:
         self._blind = has_bodies
         self._waiting: tuple[int, int] | None = None
 
-    def carry(self, row: int, since: int) -> None:
+    def carry_object(self, row: int, since: int) -> None:
         """Carry object `row` from its pose in the first scene sensed at tick `since` or later.
 
         A row of -1 carries nothing.
@@ -203,7 +205,7 @@ class Sight:
         if row < 0:
             self._guard.carry_nothing()
 
-    def update(self, world: Reading[WorldState], q: Array, tick: int) -> None:
+    def update_scene(self, world: Reading[WorldState], q: Array, tick: int) -> None:
         """Process the newest world model, with the arm at rest at `q`, (joints,), rad.
 
         Args:
@@ -212,14 +214,14 @@ class Sight:
             tick: Tick of the cycle.
         """
         model = world.message
-        is_seen = world.is_there and model.revision > 0
+        is_seen = world.has_message and model.revision > 0
         self._blind = self._has_bodies and (not is_seen or tick - model.sensed > self._blind_ticks)
         if self._waiting is not None and is_seen and model.sensed >= self._waiting[1]:
-            self._guard.carry(self._waiting[0], q, model)
+            self._guard.carry_object(self._waiting[0], q, model)
             self._waiting = None
 
     @property
-    def lacks(self) -> str:
+    def reason_to_wait(self) -> str:
         """Why motion must wait for a new scene. Empty if it need not."""
         if self._blind:
             return "world model is stale: waiting for a new scene"

@@ -54,14 +54,16 @@ class PathMotion:
         self.set_point = JointSetPoint(path.evaluate(0.0).q.copy(), *moving)
 
     @property
-    def resting(self) -> bool:
+    def is_resting(self) -> bool:
         """True if the set point does not move."""
         return self.trajectory is None
 
     @property
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """True if the set point rests at the end of the path."""
-        return self.resting and self.s >= self.path.length and self._bridged_s >= self._bridging_s
+        return (
+            self.is_resting and self.s >= self.path.length and self._bridged_s >= self._bridging_s
+        )
 
     @property
     def remaining_s(self) -> float:
@@ -74,7 +76,7 @@ class PathMotion:
         Returns:
             Largest distance of a joint from the path.
         """
-        return self._rest(0.0, position)
+        return self._place_at_rest(0.0, position)
 
     def rest_near(self, position: Array, progress: float) -> float:
         """Rest at the point of the path that is nearest to the arm.
@@ -88,7 +90,7 @@ class PathMotion:
         Returns:
             Largest distance of a joint from the path.
         """
-        points = self.path.sample(NEAREST_STEP_RAD)
+        points = self.path.sample_points(NEAREST_STEP_RAD)
         distances = np.linalg.norm(points - position, axis=1)
         before = np.append(np.inf, distances[:-1])
         after = np.append(distances[1:], np.inf)
@@ -100,28 +102,28 @@ class PathMotion:
         # `linspace` ends exactly: with rounding beyond the end, no trajectory could begin.
         places = np.linspace(0.0, self.path.length, len(points))[minima]
         nearest = np.argmin(np.abs(places - progress * self.path.length))
-        return self._rest(float(places[nearest]), position)
+        return self._place_at_rest(float(places[nearest]), position)
 
-    def follow(self, trajectory: Trajectory) -> None:
+    def follow_trajectory(self, trajectory: Trajectory) -> None:
         """Start along a trajectory that begins at rest where the motion rests."""
         self.trajectory = trajectory
         self.time_s = 0.0
         self.stopping = False
 
-    def hold(self) -> None:
+    def begin_hold(self) -> None:
         """Begin a ramp to rest on the path as soon as the braking limits permit it.
 
         Call this in every cycle while motion must hold.
         """
         if self.trajectory is None or self.stopping:
             return
-        stop = make_stop(self.path, self._braking, self.trajectory.at(self.time_s))
+        stop = make_stop(self.path, self._braking, self.trajectory.evaluate_at(self.time_s))
         if stop is not None:
             self.trajectory = stop
             self.time_s = 0.0
             self.stopping = True
 
-    def advance(self, duration_s: float) -> None:
+    def advance_by(self, duration_s: float) -> None:
         """Advance the set point by `duration_s`."""
         position, velocity, acceleration = self.set_point
         if self.trajectory is None:
@@ -129,7 +131,7 @@ class PathMotion:
             acceleration.fill(0.0)
             return
         self.time_s += duration_s
-        self.s, ds, dds = self.trajectory.at(self.time_s)
+        self.s, ds, dds = self.trajectory.evaluate_at(self.time_s)
         q, dq_ds, d2q_ds2 = self.path.evaluate(self.s)
         position[:] = q
         np.multiply(dq_ds, ds, out=velocity)
@@ -148,10 +150,10 @@ class PathMotion:
         if self.time_s >= self.trajectory.duration:
             self._come_to_rest()
 
-    def _rest(self, s: float, position: Array) -> float:
+    def _place_at_rest(self, s: float, position: Array) -> float:
         """Rest at path parameter `s` with the arm at `position`; return their largest distance."""
         self.s = s
-        self._stand()
+        self._clear_trajectory()
         np.subtract(position, self.path.evaluate(s).q, out=self._offset)
         distance = float(np.abs(self._offset).max())
         self._bridged_s = 0.0 if distance > COINCIDENT_RAD else self._bridging_s
@@ -166,9 +168,9 @@ class PathMotion:
         if not self.stopping or self.s > self.path.length - COINCIDENT_RAD:
             self.s = self.path.length
             self.set_point.position[:] = self.path.evaluate(self.s).q
-        self._stand()
+        self._clear_trajectory()
 
-    def _stand(self) -> None:
+    def _clear_trajectory(self) -> None:
         """Follow no trajectory."""
         self.trajectory = None
         self.stopping = False

@@ -12,7 +12,7 @@ from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.trajectory import Trajectory, make_trajectory
 from rack.levels.primitive.motion_segment import MotionSegment, SegmentFault, read_segment, window
 from rack.levels.primitive.segment_work import PrimitiveParams, WorkRules
-from rack.levels.robot.cell import cell_of
+from rack.levels.robot.cell import build_level_cell
 
 
 class PrimitivePlanner(Planner):
@@ -29,7 +29,7 @@ class PrimitivePlanner(Planner):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        limits = cell_of(context).limits
+        limits = build_level_cell(context).limits
         self._positions = limits.position
         self._rules = WorkRules(context.robot.joints, limits, self.settings, context.period_s)
         self._made = (0, 0.0)
@@ -62,7 +62,7 @@ class PrimitivePlanner(Planner):
         fault: SegmentFault | None = None
         try:
             segment = read_segment(self.above.message, serial)
-            trajectory = make_trajectory(self._path(segment), self._rules.limits, begin)
+            trajectory = make_trajectory(self._build_path(segment), self._rules.limits, begin)
             start_s = max((published + context.every) * context.tick_s, status.ends)
             sections = trajectory.sections
             plan.duration = trajectory.duration
@@ -70,12 +70,12 @@ class PrimitivePlanner(Planner):
             plan.sections[: len(sections)] = sections
             plan.earliest = start_s + trajectory.duration + self._rules.latency_s
             if trajectory.begin == 0.0 and 0.0 < segment.by < plan.earliest:
-                fault = segment.too_late(plan.earliest)
+                fault = segment.build_lateness_fault(plan.earliest)
         except (ValueError, ArithmeticError) as error:
             fault = SegmentFault(Error.LIMIT, f"segment {serial}: {error}")
         plan.error, plan.reason, plan.earliest = fault or (Error.NONE, "", plan.earliest)
 
-    def _path(self, segment: MotionSegment) -> BlendedPath:
+    def _build_path(self, segment: MotionSegment) -> BlendedPath:
         """Return the path of a segment.
 
         Raises:
@@ -100,7 +100,7 @@ class Plans:
     def __init__(self) -> None:
         self._plans: dict[int, Trajectory | SegmentFault] = {}
 
-    def accept(self, plan: Reading[TrajectoryPlan], window: Collection[int]) -> None:
+    def accept_plan(self, plan: Reading[TrajectoryPlan], window: Collection[int]) -> None:
         """Copy a new plan, and drop plans of segments that have left the window."""
         for serial in [s for s in self._plans if s not in window]:
             del self._plans[serial]
@@ -117,16 +117,16 @@ class Plans:
                 message.sections[: message.count].copy(), message.duration
             )
 
-    def trajectory(self, serial: int, begin: float) -> Trajectory | None:
+    def find_trajectory(self, serial: int, begin: float) -> Trajectory | None:
         """Return the trajectory of a segment that starts at path parameter `begin`, or None."""
         plan = self._plans.get(serial)
         return plan if isinstance(plan, Trajectory) and plan.begin == begin else None
 
-    def lacks(self, serial: int, begin: float) -> bool:
+    def is_unplanned(self, serial: int, begin: float) -> bool:
         """Return True if a segment has neither a trajectory from `begin` nor a refusal."""
-        return self.trajectory(serial, begin) is None and self.refusal(serial) is None
+        return self.find_trajectory(serial, begin) is None and self.find_refusal(serial) is None
 
-    def refusal(self, serial: int) -> SegmentFault | None:
+    def find_refusal(self, serial: int) -> SegmentFault | None:
         """Return why the planner refuses a segment, or None if it does not."""
         plan = self._plans.get(serial)
         return plan if isinstance(plan, SegmentFault) else None

@@ -17,7 +17,7 @@ from rack.levels.messages import DrivenArm, Error, WorldState
 from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.trajectory import Trajectory
 from rack.levels.primitive.motion_segment import MotionSegment, SegmentFault
-from rack.levels.primitive.path_guard import Guard
+from rack.levels.primitive.path_guard import PathGuard
 from rack.levels.primitive.path_motion import PathMotion
 from rack.levels.primitive.tracking import HANDOVER_CYCLES
 from rack.levels.robot.limits import Limits
@@ -72,7 +72,7 @@ class WorkRules:
     period_s: float  # the level's cycle
 
     @property
-    def braking(self) -> Limits:
+    def braking_limits(self) -> Limits:
         """Limits of a hold. They exceed the planned ones, which motion on a curve may use up."""
         planned = self.limits
         factor = self.params.braking
@@ -80,7 +80,7 @@ class WorkRules:
             planned, acceleration=factor * planned.acceleration, jerk=factor * planned.jerk
         )
 
-    def cycles(self, time_s: float) -> int:
+    def count_cycles(self, time_s: float) -> int:
         """Return the number of cycles that fill `time_s`, at least 1."""
         return max(1, round(time_s / self.period_s))
 
@@ -90,7 +90,7 @@ class WorkRules:
         return (self.params.settled_cycles + ANSWER_CYCLES) * self.period_s
 
 
-class Quiet:
+class SettlingCounter:
     """Counts cycles to decide whether something has settled or takes too long.
 
     Enough consecutive quiet cycles mean that it has settled.
@@ -98,18 +98,18 @@ class Quiet:
 
     def __init__(self, rules: WorkRules) -> None:
         self._wanted_cycles = rules.params.settled_cycles
-        self._most_cycles = rules.cycles(rules.params.settling)
+        self._most_cycles = rules.count_cycles(rules.params.settling)
         self._quiet = 0
         self._cycles = 0
 
-    def settled(self, quiet: bool) -> bool:
+    def count_cycle(self, quiet: bool) -> bool:
         """Count one cycle. Return True if it has settled."""
         self._cycles += 1
         self._quiet = self._quiet + 1 if quiet else 0
         return self._quiet >= self._wanted_cycles
 
     @property
-    def overdue(self) -> bool:
+    def is_overdue(self) -> bool:
         """True if it should have settled by now."""
         return self._cycles > self._most_cycles
 
@@ -122,7 +122,7 @@ class WorkCycle(NamedTuple):
     world: WorldState
     due_s: float  # simulated time of the set point commanded last
     passed_s: float  # time since the cycle before
-    part: float = 1.0  # part of full speed for a trajectory that begins
+    speed_scale: float = 1.0  # part of full speed for a trajectory that begins
 
 
 class PathWork:
@@ -139,10 +139,10 @@ class PathWork:
     """
 
     def __init__(
-        self, segment: MotionSegment, path: BlendedPath, guard: Guard, rules: WorkRules
+        self, segment: MotionSegment, path: BlendedPath, guard: PathGuard, rules: WorkRules
     ) -> None:
         self.segment = segment
-        self.motion = PathMotion(path, rules.braking, rules.params.bridging)
+        self.motion = PathMotion(path, rules.braking_limits, rules.params.bridging)
         self.fault: SegmentFault | None = None
         self.blocked = False
         self.astray = False
@@ -150,7 +150,7 @@ class PathWork:
         self.unplanned_cycles = 0
         self._guard = guard
         self._rules = rules
-        self._quiet = Quiet(rules)
+        self._quiet = SettlingCounter(rules)
         self._clear_cycles = 0
         self._fresh = True
 
@@ -171,7 +171,7 @@ class PathWork:
         """
         self._fresh = False
         self._clear_cycles = 0
-        self._quiet = Quiet(self._rules)
+        self._quiet = SettlingCounter(self._rules)
         distance = self.motion.rest_near(position, progress)
         self.astray = self.blocked = distance > self._rules.params.astray
         self.obstacle = f"the arm is {distance:.3f} rad off its path"
@@ -179,28 +179,28 @@ class PathWork:
     def step(self, cycle: WorkCycle) -> None:
         """Do one cycle: check the path, start or hold the motion, and advance it."""
         motion = self.motion
-        waits = self.begin_wanted is not None
+        waits = self.wanted_begin is not None
         if motion.trajectory is not None and not motion.stopping:
-            self._block(
+            self._set_blocked(
                 not self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, cycle.world)
             )
             if cycle.hold or self.blocked:
-                motion.hold()
+                motion.begin_hold()
         elif waits and cycle.plan is not None:
             self._start(cycle, cycle.plan)
         self.unplanned_cycles = self.unplanned_cycles + 1 if waits and cycle.plan is None else 0
-        motion.advance(cycle.passed_s)
+        motion.advance_by(cycle.passed_s)
 
-    def done(self, status: DrivenArm) -> bool:
+    def check_done(self, status: DrivenArm) -> bool:
         """Return True if the set point and the arm rest at the end of the path.
 
         Call this once for each new status. It sets `fault` if the arm does not settle in time.
         """
-        if not self.motion.finished:
+        if not self.motion.is_finished:
             return False
         distances = np.abs(status.position - self.motion.set_point.position)
-        settled = self._quiet.settled(bool((distances < self._rules.params.settled).all()))
-        if self._quiet.overdue and not settled:
+        settled = self._quiet.count_cycle(bool((distances < self._rules.params.settled).all()))
+        if self._quiet.is_overdue and not settled:
             joint = int(distances.argmax())
             permitted = self._rules.params.settled
             name = self._rules.joints[joint]
@@ -212,10 +212,12 @@ class PathWork:
         return settled
 
     @property
-    def begin_wanted(self) -> float | None:
+    def wanted_begin(self) -> float | None:
         """Path parameter at which a trajectory must begin, rad. None if the motion needs none."""
         motion = self.motion
-        return motion.s if motion.resting and not motion.finished and not self.astray else None
+        return (
+            motion.s if motion.is_resting and not motion.is_finished and not self.astray else None
+        )
 
     @property
     def progress(self) -> float:
@@ -223,38 +225,38 @@ class PathWork:
         length = self.motion.path.length
         return self.motion.s / length if length > 0.0 else 1.0
 
-    def ends_s(self, due_s: float) -> float:
+    def compute_end_s(self, due_s: float) -> float:
         """Return the simulated time at which the segment should be done, or 0 if it is not known.
 
         The set point commanded last is due at `due_s`.
         """
-        if self.motion.stopping or (self.motion.resting and not self.motion.finished):
+        if self.motion.stopping or (self.motion.is_resting and not self.motion.is_finished):
             return 0.0
         return due_s + self.motion.remaining_s + self._rules.latency_s
 
     def _start(self, cycle: WorkCycle, plan: Trajectory) -> None:
         """Start the trajectory if the path has been clear for long enough."""
-        if cycle.part < 1.0:
-            plan = plan.stretched(1.0 / cycle.part)
+        if cycle.speed_scale < 1.0:
+            plan = plan.stretch_by(1.0 / cycle.speed_scale)
         clear = self._guard.is_clear(self.motion.path, plan, 0.0, cycle.world)
         self._clear_cycles = self._clear_cycles + 1 if clear else 0
-        wanted = self._rules.cycles(self._rules.params.clear) if self.blocked else 1
-        self._block(self._clear_cycles < wanted)
+        wanted = self._rules.count_cycles(self._rules.params.clear) if self.blocked else 1
+        self._set_blocked(self._clear_cycles < wanted)
         if cycle.hold or self.blocked:
             return
-        timed = self._timed(plan, cycle.due_s)
+        timed = self._stretch_to_deadline(plan, cycle.due_s)
         if timed is not None:
-            self.motion.follow(timed)
+            self.motion.follow_trajectory(timed)
             self._fresh = False
             self._clear_cycles = 0
 
-    def _block(self, blocked: bool) -> None:
+    def _set_blocked(self, blocked: bool) -> None:
         """Set `blocked`, and keep the obstacle that blocked the motion first."""
         if blocked and not self.blocked:
             self.obstacle = self._guard.obstacle
         self.blocked = blocked
 
-    def _timed(self, trajectory: Trajectory, due_s: float) -> Trajectory | None:
+    def _stretch_to_deadline(self, trajectory: Trajectory, due_s: float) -> Trajectory | None:
         """Stretch a trajectory so that it ends just in time.
 
         Returns:
@@ -264,9 +266,11 @@ class PathWork:
             return trajectory
         available = self.segment.by - self._rules.latency_s - due_s
         if available < trajectory.duration and self._fresh:
-            self.fault = self.segment.too_late(due_s + trajectory.duration + self._rules.latency_s)
+            self.fault = self.segment.build_lateness_fault(
+                due_s + trajectory.duration + self._rules.latency_s
+            )
             return None
-        return trajectory.stretched(max(1.0, available / trajectory.duration))
+        return trajectory.stretch_by(max(1.0, available / trajectory.duration))
 
 
 class GripperWork:
@@ -281,12 +285,12 @@ class GripperWork:
         self._closes = abs(segment.opening - gripper.closed) < abs(segment.opening - gripper.open)
         self.fault: SegmentFault | None = None  # why the segment cannot be done
         self._rules = rules
-        self.begin()
+        self.restart_wait()
 
-    def begin(self) -> None:
+    def restart_wait(self) -> None:
         """Wait for the gripper to rest: at the start, and when the servo is back in step."""
         self._cycles = 0
-        self._quiet = Quiet(self._rules)
+        self._quiet = SettlingCounter(self._rules)
 
     @property
     def held_after(self) -> int:
@@ -296,7 +300,7 @@ class GripperWork:
         """
         return self.segment.object if self._closes else -1
 
-    def done(self, status: DrivenArm) -> bool:
+    def check_done(self, status: DrivenArm) -> bool:
         """Return True if the gripper rests.
 
         Call this once for each new status. It sets `fault` if the gripper does not rest in time.
@@ -306,9 +310,9 @@ class GripperWork:
         if self._cycles <= HANDOVER_CYCLES:
             return False
         speed = abs(status.opening_velocity)
-        permitted = self._rules.params.settled_opening or self._gripper.still
-        settled = self._quiet.settled(speed < permitted)
-        if self._quiet.overdue and not settled:
+        permitted = self._rules.params.settled_opening or self._gripper.rest_threshold
+        settled = self._quiet.count_cycle(speed < permitted)
+        if self._quiet.is_overdue and not settled:
             reason = (
                 f"gripper still moves {speed / self._gripper.travel:.1%} of its way in a second; it"
                 f" must come below {permitted / self._gripper.travel:.1%}"

@@ -46,7 +46,7 @@ class Tracking:
         self._cycles_in_step = 0
         self._unexplained_cycles = 0
 
-    def update(self, status: Reading[DrivenArm]) -> bool:
+    def update_status(self, status: Reading[DrivenArm]) -> bool:
         """Process one status. Return True in the cycle in which the two get into step."""
         heard = status.is_new and not status.is_lost
         self.silent_cycles = 0 if heard else self.silent_cycles + 1
@@ -70,7 +70,7 @@ class Tracking:
         self._cycles_in_step = 0
         return True
 
-    def awaited(self, servo: DrivenArm) -> str:
+    def describe_wait(self, servo: DrivenArm) -> str:
         """Describe what a level that is out of step waits for."""
         if self.silent_cycles > MAX_MISSED_STATUSES:
             return f"waiting for servo: no status for {self.silent_cycles} cycles"
@@ -85,7 +85,7 @@ class Tracking:
         return "waiting for servo: it does not follow set points"
 
 
-class Straying:
+class DeviationMonitor:
     """Counts cycles in which a joint is too far from its set point.
 
     A few such cycles are permitted; motion holds during them.
@@ -111,21 +111,21 @@ class Straying:
         self.fault: SegmentFault | None = None
 
     @property
-    def strays(self) -> bool:
+    def is_straying(self) -> bool:
         """True while a joint is too far from its set point."""
         return self._cycles > 0
 
-    def forget(self) -> None:
+    def reset_count(self) -> None:
         """Restart the count, and clear a fault."""
         self._cycles = 0
         self.place = ""
         self.fault = None
 
-    def update(self, servo: DrivenArm) -> None:
+    def update_status(self, servo: DrivenArm) -> None:
         """Process one status. Sets `fault` when a joint has been too far away for too long."""
         errors = np.abs(servo.position - servo.target)
         if errors.max() <= self._permitted_rad:
-            self.forget()
+            self.reset_count()
             return
         self._cycles += 1
         joint = int(errors.argmax())

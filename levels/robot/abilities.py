@@ -11,13 +11,13 @@ import numpy as np
 
 from rack.levels.algebra import Array, norm
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.dynamics import OFF
+from rack.levels.robot.dynamics import DISABLED_PARTS
 
-POSES = 1000
+POSE_COUNT = 1000
 """Number of random poses that are tried, over the joints' whole ranges."""
-STEPS = 25
+JOINT_STEPS = 25
 """Number of positions of a joint that are tried in each pass of stretching out the arm."""
-TURNS = 4
+STRETCH_PASSES = 4
 """Number of passes over all joints in stretching out the arm."""
 
 
@@ -34,20 +34,20 @@ class Abilities:
 
     reach: float
     payload: float
-    left: float
+    torque_left: float
     joint: int
 
 
-def abilities(cell: Cell) -> Abilities:
+def compute_abilities(cell: Cell) -> Abilities:
     """Compute the abilities of the arm of a cell, from many random poses and stretched out."""
     statics = Statics(cell)
-    poses = statics.poses()
-    stretched = statics.stretched(max(poses, key=statics.distance))
-    limits = [statics.held(position) for position in (*poses, stretched)]
+    poses = statics.draw_poses()
+    stretched = statics.stretch_out(max(poses, key=statics.compute_reach))
+    limits = [statics.compute_load_limits(position) for position in (*poses, stretched)]
     torque_left = np.min([parts for parts, _ in limits], axis=0)
     joint = int(torque_left.argmin())
     payload = max(0.0, min(mass for _, mass in limits))
-    return Abilities(statics.distance(stretched), payload, float(torque_left[joint]), joint)
+    return Abilities(statics.compute_reach(stretched), payload, float(torque_left[joint]), joint)
 
 
 class Statics:
@@ -56,33 +56,35 @@ class Statics:
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
         self._model = copy.copy(cell.model)
-        self._model.opt.disableflags |= int(OFF)
-        self._data = cell.start()
+        self._model.opt.disableflags |= int(DISABLED_PARTS)
+        self._data = cell.build_start_data()
         self._data.qvel[:] = 0.0
         self._jacobian = np.zeros((3, self._model.nv))
         self._base = int(self._model.dof_jntid[cell.dof[0]])
         # A joint without limits is tried over one turn.
         self._low, self._high = np.clip(cell.limits.position, -math.pi, math.pi).T
 
-    def poses(self) -> list[Array]:
+    def draw_poses(self) -> list[Array]:
         """Return poses over the joints' whole ranges, rad, beginning with home."""
-        drawn = np.random.default_rng(0).uniform(self._low, self._high, (POSES - 1, len(self._low)))
+        drawn = np.random.default_rng(0).uniform(
+            self._low, self._high, (POSE_COUNT - 1, len(self._low))
+        )
         return [self._cell.home, *drawn]
 
-    def stretched(self, position: Array) -> Array:
+    def stretch_out(self, position: Array) -> Array:
         """Return a pose that reaches at least as far as `position`.
 
         Each joint in turn moves to the position with the largest reach.
         """
         best = position.copy()
-        for _ in range(TURNS):
+        for _ in range(STRETCH_PASSES):
             for joint, (low, high) in enumerate(zip(self._low, self._high, strict=True)):
-                tried = np.tile(best, (STEPS, 1))
-                tried[:, joint] = np.linspace(low, high, STEPS)
-                best = max((best, *tried), key=self.distance)
+                tried = np.tile(best, (JOINT_STEPS, 1))
+                tried[:, joint] = np.linspace(low, high, JOINT_STEPS)
+                best = max((best, *tried), key=self.compute_reach)
         return best
 
-    def distance(self, position: Array) -> float:
+    def compute_reach(self, position: Array) -> float:
         """Return the distance of the tool from the axis of the first joint, m."""
         data = self._data
         data.qpos[self._cell.qpos] = position
@@ -90,7 +92,7 @@ class Statics:
         out = data.site_xpos[self._cell.tool] - data.xanchor[self._base]
         return norm(np.cross(out, data.xaxis[self._base]))
 
-    def held(self, position: Array) -> tuple[Array, float]:
+    def compute_load_limits(self, position: Array) -> tuple[Array, float]:
         """Return the torque that gravity leaves, and the payload, in a pose.
 
         Returns:

@@ -15,19 +15,19 @@ from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.errors import RobotError
 from rack.levels.level import LevelContext
 from rack.levels.robot import lookup
-from rack.levels.robot.engine import set_margins, state_size
+from rack.levels.robot.engine import compute_state_size, set_margins
 from rack.levels.robot.hand import Hand, find_hand, fit_tendons
 from rack.levels.robot.limits import (
     Bounds,
     Encoders,
     Limits,
     MotorPatience,
-    joint_bounds,
-    patience_of,
-    planned_limits,
+    compute_patience,
+    compute_planned_limits,
+    find_joint_bounds,
 )
 from rack.levels.robot.linkage import Linkage, check_couplings, solve_linkage
-from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare
+from rack.levels.robot.model import check_joints, compile_spec, fit_motors, load_spec, prepare_spec
 from rack.levels.robot.wrist import Wrist, find_wrist
 from rack.levels.tables import GripperConfig, Interface, RobotConfig, SceneConfig, SensorConfig
 
@@ -94,7 +94,7 @@ class Cell:
     mocap: Ints  # (obstacles,), mocap ids
     geoms: CellGeoms
 
-    def start(self) -> mujoco.MjData:
+    def build_start_data(self) -> mujoco.MjData:
         """Return MuJoCo data of the start.
 
         The gripper is open, and objects are where the model places them.
@@ -104,7 +104,7 @@ class Cell:
         mujoco.mj_forward(self.model, data)
         return data
 
-    def parts(self, row: int) -> Ints:
+    def list_geoms(self, row: int) -> Ints:
         """Return the geoms of an object or obstacle, given its row in `bodies`."""
         model = self.model
         return np.flatnonzero(model.body_rootid[model.geom_bodyid] == self.bodies[row])
@@ -126,28 +126,28 @@ def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
             the wrong length, or home is outside the limits or in unintended contact. The text is
             one line.
     """
-    cell = _compiled(robot, scene, clock_ns)
+    cell = _build_cached(robot, scene, clock_ns)
     return replace(cell, model=copy(cell.model))
 
 
-def cell_of(context: LevelContext) -> Cell:
+def build_level_cell(context: LevelContext) -> Cell:
     """Build the cell of a level's rack; see `build_cell`."""
     return build_cell(context.robot, context.scene, context.clock_ns)
 
 
 @lru_cache(maxsize=4)
-def _compiled(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
+def _build_cached(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     """Build and check a cell, and cache it for later calls in this process."""
-    cell = unchecked_cell(robot, scene, clock_ns)
+    cell = build_unchecked_cell(robot, scene, clock_ns)
     for key, position in (("home", cell.home), ("start", cell.begin)):
-        cell.model.key_qpos[0] = start_qpos(cell, position)
+        cell.model.key_qpos[0] = build_start_qpos(cell, position)
         check_start(cell, robot, key, position)
     if robot.gripper is not None:
         check_fingers(cell, robot.gripper)
     return cell
 
 
-def unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
+def build_unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
     """Build the cell like `build_cell`, without checking the start and the gripper.
 
     Args:
@@ -164,23 +164,23 @@ def unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cel
         motors, torque = fit_motors(spec, robot)
     else:
         motors, torque = fit_tendons(spec, robot, robot.hand, clock_ns * 1e-9 / robot.substeps)
-    prepare(spec, robot, clock_ns)
+    prepare_spec(spec, robot, clock_ns)
     model = compile_spec(spec, robot.model)
     check_couplings(model, robot.joints)
     cell = assemble_cell(model, robot, scene, motors, torque)
-    if robot.gripper is not None and ease_gripper(cell, spec, robot.gripper, clock_ns * 1e-9):
+    if robot.gripper is not None and fix_gripper_model(cell, spec, robot.gripper, clock_ns * 1e-9):
         cell = assemble_cell(compile_spec(spec, robot.model), robot, scene, motors, torque)
-    cell.model.key_qpos[0] = start_qpos(cell, cell.begin)
+    cell.model.key_qpos[0] = build_start_qpos(cell, cell.begin)
     return cell
 
 
-def sensed_by(cell: Cell, robot: RobotConfig, sensors: SensorConfig) -> Cell:
+def replace_encoders(cell: Cell, robot: RobotConfig, sensors: SensorConfig) -> Cell:
     """Return the cell with the encoders `sensors`, unless `[robot.sensors]` states others."""
     tick_s = robot.substeps * cell.model.opt.timestep
-    return replace(cell, encoders=Encoders.of(robot, tick_s, sensors))
+    return replace(cell, encoders=Encoders.from_config(robot, tick_s, sensors))
 
 
-def sizes(cell: Cell) -> dict[str, int]:
+def compute_sizes(cell: Cell) -> dict[str, int]:
     """Return the symbolic sizes of messages in this cell.
 
     They are "joints", "bodies" (at least 1), "state", and "fingers" for a hand.
@@ -188,7 +188,7 @@ def sizes(cell: Cell) -> dict[str, int]:
     by_name = {
         "joints": len(cell.qpos),
         "bodies": max(1, len(cell.bodies)),
-        "state": state_size(cell.model),
+        "state": compute_state_size(cell.model),
     }
     return by_name if cell.hand is None else {**by_name, "fingers": len(cell.hand.names)}
 
@@ -214,17 +214,17 @@ def assemble_cell(
         RobotError: An element is missing or of the wrong kind.
     """
     joints = np.array([model.joint(name).id for name in robot.joints])
-    moved = lookup.below(model, model.jnt_bodyid[joints])
+    moved = lookup.mark_descendants(model, model.jnt_bodyid[joints])
     hand = None if robot.hand is None else find_hand(model, robot, robot.hand)
-    tool = lookup.tool_site(model, robot.tool_name, moved if hand is None else None)
+    tool = lookup.find_tool_site(model, robot.tool_name, moved if hand is None else None)
     gripper, linked = find_gripper(model, robot, moved, joints)
     if hand is not None:
         # The palm is a part of the hand, although no joint of the hand moves it.
-        linked = moved = lookup.below(model, model.site_bodyid[[tool]]) | moved
+        linked = moved = lookup.mark_descendants(model, model.site_bodyid[[tool]]) | moved
     wrist = find_wrist(model, robot.wrist, moved)
     bodies = lookup.find_all(model, mujoco.mjtObj.mjOBJ_BODY, scene.bodies, "scene")
     objects, obstacles = np.split(bodies, [len(scene.objects)])
-    bounds = joint_bounds(model, joints, robot, torque if hand is None else hand.torque)
+    bounds = find_joint_bounds(model, joints, robot, torque if hand is None else hand.torque)
     return Cell(
         model=model,
         joints=robot.joints,
@@ -235,17 +235,17 @@ def assemble_cell(
         begin=np.array(robot.start or robot.home),
         tool=tool,
         bounds=bounds,
-        limits=planned_limits(bounds, robot),
-        encoders=Encoders.of(robot, robot.substeps * model.opt.timestep),
-        patience=patience_of(robot, bounds, full_speed_energy(model, joints, robot)),
+        limits=compute_planned_limits(bounds, robot),
+        encoders=Encoders.from_config(robot, robot.substeps * model.opt.timestep),
+        patience=compute_patience(robot, bounds, compute_full_speed_energy(model, joints, robot)),
         interface=robot.interface,
         homing=robot.calibration.homing,
         gripper=gripper,
         wrist=wrist,
         hand=hand,
         bodies=bodies,
-        object_qpos=model.jnt_qposadr[lookup.free_joints(model, objects)].astype(int),
-        mocap=lookup.mocap_ids(model, obstacles),
+        object_qpos=model.jnt_qposadr[lookup.find_free_joints(model, objects)].astype(int),
+        mocap=lookup.find_mocap_ids(model, obstacles),
         geoms=find_geoms(model, scene, moved, linked, objects, wrist),
     )
 
@@ -276,17 +276,17 @@ def find_geoms(
     Raises:
         RobotError: A support is missing.
     """
-    arm = lookup.geoms_of(model, moved)
-    gripper = lookup.geoms_of(model, linked)
-    loose = lookup.geoms_of(model, lookup.below(model, objects))
+    arm = lookup.list_geoms(model, moved)
+    gripper = lookup.list_geoms(model, linked)
+    loose = lookup.list_geoms(model, lookup.mark_descendants(model, objects))
     supports = lookup.find_all(model, mujoco.mjtObj.mjOBJ_GEOM, scene.supports, "scene.supports")
     touch = np.zeros((model.ngeom, model.ngeom), dtype=bool)
     judged = np.union1d(arm, loose)
     touch[judged, :] = touch[:, judged] = True
     intended = [(loose, supports), (loose, gripper), (gripper, gripper)]
     if wrist is not None:
-        sensed = lookup.below(model, model.site_bodyid[[wrist.site]])
-        intended.append((lookup.geoms_of(model, sensed), supports))
+        sensed = lookup.mark_descendants(model, model.site_bodyid[[wrist.site]])
+        intended.append((lookup.list_geoms(model, sensed), supports))
     for first, second in intended:
         touch[np.ix_(first, second)] = touch[np.ix_(second, first)] = False
     root = model.body_rootid[model.geom_bodyid]
@@ -294,7 +294,7 @@ def find_geoms(
     return CellGeoms(arm, gripper, supports, touch)
 
 
-def full_speed_energy(model: mujoco.MjModel, joints: Ints, robot: RobotConfig) -> float:
+def compute_full_speed_energy(model: mujoco.MjModel, joints: Ints, robot: RobotConfig) -> float:
     """Return the kinetic energy of the arm at home with all joints at full speed, J."""
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[joints]] = robot.home
@@ -341,7 +341,7 @@ def find_gripper(
         and parent not in model.jnt_bodyid[arm]
     ):
         body = parent
-    linked = lookup.below(model, model.body_parentid[[body]])
+    linked = lookup.mark_descendants(model, model.body_parentid[[body]])
     gripper = Gripper(
         dof=int(model.jnt_dofadr[joint]),
         actuator=int(model.actuator(config.actuator).id),
@@ -353,7 +353,9 @@ def find_gripper(
     return gripper, linked
 
 
-def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -> NDArray[np.int32]:
+def find_unintended_contacts(
+    data: mujoco.MjData, touch: Mask, within: float = 0.0
+) -> NDArray[np.int32]:
     """Return the pairs of geoms that are in unintended contact, (n, 2).
 
     Args:
@@ -366,7 +368,9 @@ def unintended_contacts(data: mujoco.MjData, touch: Mask, within: float = 0.0) -
     return np.asarray(pairs[touch[pairs[:, 0], pairs[:, 1]] & (contact.dist < within)])
 
 
-def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s: float) -> bool:
+def fix_gripper_model(
+    cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s: float
+) -> bool:
     """Change the model where it would keep the gripper from moving.
 
     Links that overlap when the gripper is open or half open, before its fingers meet, are excluded
@@ -388,8 +392,8 @@ def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s:
     assert gripper is not None, "the config has one"
     data = mujoco.MjData(model)
     overlaps = set()
-    for opening in (gripper.open, half_open(gripper)):
-        gripper.linkage.set(data.qpos, opening)
+    for opening in (gripper.open, compute_half_opening(gripper)):
+        gripper.linkage.set_opening(data.qpos, opening)
         mujoco.mj_fwdPosition(model, data)
         contact = data.contact
         overlap = np.isin(contact.geom, cell.geoms.gripper).all(axis=1) & (contact.dist < 0.0)
@@ -405,7 +409,7 @@ def ease_gripper(cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s:
     return bool(named) or missing > 0.0
 
 
-def start_qpos(cell: Cell, position: Array) -> Array:
+def build_start_qpos(cell: Cell, position: Array) -> Array:
     """Return qpos of a start, with the arm at `position`.
 
     The gripper and its linkage are open, and all else is as in the model.
@@ -413,7 +417,7 @@ def start_qpos(cell: Cell, position: Array) -> Array:
     qpos = np.array(cell.model.qpos0)
     qpos[cell.qpos] = position
     if cell.gripper is not None:
-        cell.gripper.linkage.set(qpos, cell.gripper.open)
+        cell.gripper.linkage.set_opening(qpos, cell.gripper.open)
     return qpos
 
 
@@ -435,7 +439,7 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> No
             raise RobotError(
                 f"robot.{key}: joint '{name}' is at {q:g} rad; it must be {low:g} to {high:g}"
             )
-    data = cell.start()
+    data = cell.build_start_data()
     if not np.isfinite(data.qacc).all():
         raise RobotError(
             f"model '{robot.model}': the acceleration at {key} is not finite; check masses,"
@@ -451,9 +455,9 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> No
     # Surfaces at a distance of 0.0 mm do not touch yet, but would in the first motion.
     padded = copy(cell.model)
     set_margins(padded, padded.geom_margin + TOUCHING_M)
-    data = replace(cell, model=padded).start()
-    for pair in unintended_contacts(data, cell.geoms.touch, TOUCHING_M):
-        first, second = (lookup.geom_name(cell.model, geom) for geom in pair)
+    data = replace(cell, model=padded).build_start_data()
+    for pair in find_unintended_contacts(data, cell.geoms.touch, TOUCHING_M):
+        first, second = (lookup.find_geom_name(cell.model, geom) for geom in pair)
         raise RobotError(
             f"robot.{key}: '{first}' touches '{second}'; move {key} or the object, name a support,"
             " or exclude the pair"
@@ -474,9 +478,9 @@ def check_fingers(cell: Cell, config: GripperConfig) -> None:
         return
     model = cell.model
     stiffness, damping = config.gains
-    for goal, start in ((config.open, config.open), (config.closed, half_open(config))):
-        data = cell.start()
-        gripper.linkage.set(data.qpos, start)
+    for goal, start in ((config.open, config.open), (config.closed, compute_half_opening(config))):
+        data = cell.build_start_data()
+        gripper.linkage.set_opening(data.qpos, start)
         for _ in range(round(SETTLING_S / model.opt.timestep)):
             data.qpos[cell.qpos] = cell.home
             data.qvel[cell.dof] = 0.0
@@ -484,13 +488,13 @@ def check_fingers(cell: Cell, config: GripperConfig) -> None:
             pull = stiffness * (goal - opening) - damping * data.qvel[gripper.dof]
             data.ctrl[gripper.actuator] = np.clip(pull, -config.force, config.force)
             mujoco.mj_step(model, data)
-        if not abs(opening - goal) <= abs(start - goal) + config.still:
+        if not abs(opening - goal) <= abs(start - goal) + config.rest_threshold:
             raise RobotError(
                 f"robot.gripper.force: {config.force:g} does not move the gripper from"
                 f" {start:.4g} to {goal:.4g}: it settles at {opening:.4g}"
             )
         settled = data.geom_xpos[cell.geoms.gripper].copy()
-        gripper.linkage.set(data.qpos, float(data.qpos[gripper.linkage.driven]))
+        gripper.linkage.set_opening(data.qpos, float(data.qpos[gripper.linkage.driven]))
         mujoco.mj_kinematics(model, data)
         error_m = float(
             np.max(np.linalg.norm(data.geom_xpos[cell.geoms.gripper] - settled, axis=1))
@@ -503,6 +507,6 @@ def check_fingers(cell: Cell, config: GripperConfig) -> None:
             )
 
 
-def half_open(gripper: GripperConfig | Gripper) -> float:
+def compute_half_opening(gripper: GripperConfig | Gripper) -> float:
     """Return the opening halfway between open and closed, m or rad."""
     return 0.5 * (gripper.open + gripper.closed)

@@ -15,10 +15,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.algebra import Array, each
+from rack.levels.algebra import Array, apply_elementwise
 from rack.levels.compiled import compiled_for
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import (
+    build_common_view,
     mj_com_pos,
     mj_flex,
     mj_fwd_velocity,
@@ -28,7 +29,6 @@ from rack.levels.robot.engine import (
     mj_make_m,
     mj_tendon,
     mj_transmission,
-    one_view,
 )
 
 FRICTION_SPEED = 0.01
@@ -37,7 +37,7 @@ FRICTION_SPEED = 0.01
 A step at zero speed would excite the arm.
 """
 
-OFF = (
+DISABLED_PARTS = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT
     | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     | mujoco.mjtDisableBit.mjDSBL_SENSOR
@@ -74,7 +74,7 @@ class Dynamics:
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
         self._model = copy.copy(cell.model)
-        self._model.opt.disableflags |= int(OFF)
+        self._model.opt.disableflags |= int(DISABLED_PARTS)
         self._data = d = mujoco.MjData(self._model)
         mujoco.mj_resetDataKeyframe(self._model, d, 0)
         joints = len(cell.dof)
@@ -88,14 +88,14 @@ class Dynamics:
         self._position, self._velocity = current[:STATE_ROWS]
         self._offset = np.zeros(3)
         at = self._model._address, d._address
-        self._evaluating = *at, *addresses(self._model, d, cell), self._evaluations
+        self._evaluating = *at, *find_places(self._model, d, cell), self._evaluations
         hand = int(cell.model.site_bodyid[cell.tool])
         tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
         gravity = np.array(self._model.opt.gravity)
         jacobians = np.zeros((2, 3, cell.model.nv))
         self._carrying = self._offset, *at, cell.dof, hand, *tool, gravity, jacobians, current
-        self._evaluate = evaluate.load()
-        self._carry = carry.load()
+        self._evaluate = evaluate_terms.load_machine_code()
+        self._carry = add_payload.load_machine_code()
         self.dry = np.array(cell.model.dof_frictionloss[cell.dof])  # (joints,), N m: dry friction
 
     def terms(self, q: Array, qd: Array, payload: Payload | None = None) -> Terms:
@@ -121,10 +121,10 @@ class Dynamics:
 
     def friction(self, velocity: Array) -> Array:
         """Return the dry friction that opposes motion at `velocity`, rad/s, (joints,), N m."""
-        return np.asarray(self.dry * each(math.tanh, velocity / FRICTION_SPEED))
+        return np.asarray(self.dry * apply_elementwise(math.tanh, velocity / FRICTION_SPEED))
 
 
-def addresses(
+def find_places(
     model: mujoco.MjModel, data: mujoco.MjData, cell: Cell
 ) -> tuple[NDArray[np.int64], Array]:
     """Return the places in MuJoCo's memory that an evaluation reads and writes.
@@ -134,7 +134,7 @@ def addresses(
         position, velocity, bias, passive force, and the rows of the inertia, with -1 for elements
         that are always zero.
     """
-    memory, (qpos, qvel, bias, passive, inertia) = one_view(
+    memory, (qpos, qvel, bias, passive, inertia) = build_common_view(
         data.qpos, data.qvel, data.qfrc_bias, data.qfrc_passive, data.M
     )
     # MuJoCo stores the nonzero elements of the lower triangle, row by row.
@@ -152,7 +152,7 @@ def addresses(
 
 
 @compiled_for("i8, i8, i8[:,::1], f8[::1], f8[:,:,::1]")
-def evaluate(
+def evaluate_terms(
     model: int, data: int, places: NDArray[np.int64], memory: Array, evaluations: Array
 ) -> None:
     """Evaluate the equation of motion, unless it has been evaluated at the same state.
@@ -190,7 +190,7 @@ def evaluate(
 
 
 @compiled_for("f8, f8[::1], i8, i8, i8[::1], i8, f8[::1], f8[::1], f8[::1], f8[:,:,::1], f8[:,::1]")
-def carry(  # noqa: PLR0913  # flat, as `make_steps` in levels/arm/substeps.py
+def add_payload(  # noqa: PLR0913  # flat, as `make_steps` in levels/arm/substeps.py
     mass: float,
     offset: Array,
     model: int,

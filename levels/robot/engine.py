@@ -53,7 +53,7 @@ mj_set_state = native("mj_setState", 4)
 mj_update_sleep = native("mj_updateSleep", 2)
 
 
-def state_size(model: mujoco.MjModel) -> int:
+def compute_state_size(model: mujoco.MjModel) -> int:
     """Return the length of the state of a simulation."""
     return int(mujoco.mj_stateSize(model, INTEGRATION)) + int(model.ntree)
 
@@ -67,7 +67,7 @@ def view_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None
     mujoco.mj_setState(model, data, np.ascontiguousarray(state[:end]), INTEGRATION)
 
 
-def one_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:
+def build_common_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:
     """Return one view of memory that contains several arrays of one `MjData`.
 
     It is valid as long as the data.
@@ -80,7 +80,7 @@ def one_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:
     start = int(begins.min())
     item = np.dtype(np.float64).itemsize
     return (
-        _view(start, np.float64, ((max(ends) - start) // item,), (item,)),
+        _build_view(start, np.float64, ((max(ends) - start) // item,), (item,)),
         (begins - start) // item,
     )
 
@@ -104,7 +104,7 @@ class ContactViews(NamedTuple):
     distance: Array  # (capacity,), m; likewise
 
 
-def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
+def build_contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
     """Return views of the contacts.
 
     The bindings give a copy of their number, and views that are valid only until the contacts
@@ -119,7 +119,7 @@ def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
     warnings = data.warning.number
     timers = data.timer.number
     end = warnings.ctypes.data - warnings.itemsize + len(warnings) * warnings.strides[0]
-    number = _view(end + len(timers) * timers.strides[0], np.int32, (1,), (4,))
+    number = _build_view(end + len(timers) * timers.strides[0], np.int32, (1,), (4,))
     before = int(number[0])
     # Without any contact, the arrays of contacts have no address.
     mujoco.mj_addContact(model, data, mujoco.MjContact())
@@ -134,15 +134,15 @@ def contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
     strides = geoms.strides
     views = ContactViews(
         number,
-        _view(geoms.ctypes.data, np.int32, (capacity, 2), strides),
-        _view(distance.ctypes.data, np.float64, (capacity,), strides[:1]),
+        _build_view(geoms.ctypes.data, np.int32, (capacity, 2), strides),
+        _build_view(distance.ctypes.data, np.float64, (capacity,), strides[:1]),
     )
     mujoco.mj_forward(model, data)  # removes the added contact
     mujoco.mj_setState(model, data, state, INTEGRATION)
     return views
 
 
-def _view(
+def _build_view(
     address: int, kind: type, shape: tuple[int, ...], strides: tuple[int, ...]
 ) -> NDArray[Any]:
     """Return an array of the memory at `address`."""

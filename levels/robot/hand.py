@@ -17,10 +17,10 @@ import numpy as np
 from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.errors import RobotError
 from rack.levels.robot import lookup
-from rack.levels.robot.model import drives_arm, listed, remove
+from rack.levels.robot.model import format_names, is_arm_drive, remove_actuators
 from rack.levels.tables import FingerConfig, HandConfig, RobotConfig
 
-SAME_ARM = 1e-6
+ARM_TOLERANCE = 1e-6
 """Fraction by which a moment arm may vary, to allow for rounding."""
 ROWS = ("flexors", "extensors")
 NET_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1
@@ -99,7 +99,7 @@ def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
             )
         for joint in finger.joints:
             if joint not in robot.joints:
-                have = listed(list(robot.joints))
+                have = format_names(list(robot.joints))
                 raise RobotError(
                     f"robot.hand.finger: '{joint}' of '{finger.name}' is not in robot.joints:"
                     f" {have}"
@@ -137,8 +137,8 @@ def fit_tendons(
     """
     check_hand(robot, hand)
     tendons = hand.flexors + hand.extensors
-    remove(
-        spec, [a for a in spec.actuators if a.name not in tendons and drives_arm(spec, a, robot)]
+    remove_actuators(
+        spec, [a for a in spec.actuators if a.name not in tendons and is_arm_drive(spec, a, robot)]
     )
     for name in robot.joints:
         joint = spec.joint(name)
@@ -152,7 +152,7 @@ def fit_tendons(
         if site is not None:
             site.parent.name = site.parent.name or f"tip of {finger.name}"
             sensor = spec.add_sensor(
-                name=_force_of(finger),
+                name=_name_force_sensor(finger),
                 type=mujoco.mjtSensor.mjSENS_CONTACT,
                 reftype=mujoco.mjtObj.mjOBJ_BODY,
                 refname=site.parent.name,
@@ -161,7 +161,7 @@ def fit_tendons(
     return list(hand.flexors), np.full(len(robot.joints), np.inf)
 
 
-def _force_of(finger: FingerConfig) -> str:
+def _name_force_sensor(finger: FingerConfig) -> str:
     """Return the name of the force sensor at the tip of a finger."""
     return f"force on {finger.name}"
 
@@ -187,9 +187,9 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
     sites = tuple(finger.tip for finger in hand.finger)
     tips = lookup.find_all(model, kind.mjOBJ_SITE, sites, "robot.hand.finger.tip")
     for finger, tip in zip(hand.finger, tips, strict=True):
-        if not lookup.below(model, model.jnt_bodyid[[model.joint(finger.joints[-1]).id]])[
-            model.site_bodyid[tip]
-        ]:
+        if not lookup.mark_descendants(
+            model, model.jnt_bodyid[[model.joint(finger.joints[-1]).id]]
+        )[model.site_bodyid[tip]]:
             raise RobotError(
                 f"robot.hand.finger: joint '{finger.joints[-1]}' does not move the tip"
                 f" '{finger.tip}'"
@@ -213,10 +213,13 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
             [[joint in finger.joints for joint in robot.joints] for finger in hand.finger]
         ),
         forces=np.array(
-            [model.sensor(_force_of(finger)).adr[0] + np.arange(3) for finger in hand.finger]
+            [
+                model.sensor(_name_force_sensor(finger)).adr[0] + np.arange(3)
+                for finger in hand.finger
+            ]
         ),
         actuators=actuators,
-        arms=_arms(model, robot, actuators),
+        arms=_find_moment_arms(model, robot, actuators),
         least=hand.least,
         rest=hand.rest,
         most=np.array(most[0]),
@@ -254,7 +257,7 @@ def check_tensions(model: mujoco.MjModel, actuators: Ints, least: float) -> None
         )
 
 
-def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
+def _find_moment_arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
     """Return the moment arms, (joints,), m.
 
     Raises:
@@ -264,19 +267,19 @@ def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
     home = np.array(robot.home)
     ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], home[:, None])
     places = (home, *ranges.T)
-    moments = np.array([actuator_moments(model, joints, place)[actuators] for place in places])
+    moments = np.array([compute_moments(model, joints, place)[actuators] for place in places])
     # (places, 2, joints), m: arms of flexors and extensors, which turn joints back.
     arms = np.diagonal(moments, axis1=2, axis2=3) * np.array([[1.0], [-1.0]])
     for number, joint in enumerate(robot.joints):
         least = float(arms[:, :, number].min()) + 0.0  # avoids -0
         most = float(arms[:, :, number].max())
-        if least < SAME_ARM or most - least > SAME_ARM * most:
+        if least < ARM_TOLERANCE or most - least > ARM_TOLERANCE * most:
             raise RobotError(
                 f"robot.hand: arms of the tendons on joint '{joint}' are {least:g} to {most:g} m;"
                 " the flexor must turn it in positive direction and the extensor in negative"
                 " direction, with equal arms that do not vary"
             )
-        turned = np.abs(moments[:, :, number]).max(axis=(0, 1)) > SAME_ARM * least
+        turned = np.abs(moments[:, :, number]).max(axis=(0, 1)) > ARM_TOLERANCE * least
         for other in np.flatnonzero(turned):
             if other != number:
                 raise RobotError(
@@ -286,7 +289,7 @@ def _arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
     return np.array(arms[0, 1])
 
 
-def actuator_moments(model: mujoco.MjModel, joints: Ints, position: Array) -> Array:
+def compute_moments(model: mujoco.MjModel, joints: Ints, position: Array) -> Array:
     """Return the moment arms of all actuators on joints, (actuators, joints), m.
 
     Args:

@@ -12,12 +12,12 @@ from rack.levels.algebra import Array, Ints
 from rack.levels.errors import RobotError
 from rack.levels.tables import RobotConfig, SensorConfig
 
-VELOCITY_ROOM = 0.05
+VELOCITY_MARGIN = 0.05
 """Fraction of a velocity limit that planned motion leaves unused.
 
 It keeps motion with tracking errors clear of the limit gate.
 """
-POSITION_ROOM_RAD = 0.005
+POSITION_MARGIN_RAD = 0.005
 """Distance of planned motion from the ends of a joint's range, rad.
 
 It keeps motion with tracking errors clear of the limit gate.
@@ -28,24 +28,24 @@ EDGE_TIMING_S = 0.1
 A drive times the encoder's edges. That is much finer than the difference of two samples (for 1 mrad
 in 2.5 ms: 0.4 rad/s) and does not lag like a filter.
 """
-MAX_CONTACT_PART = 0.2
+MAX_CONTACT_FRACTION = 0.2
 """Largest fraction of a torque limit that an intended contact takes.
 
 Setting down an object is such a contact. The value is a third more than observed in tasks.
 """
-MAX_RESTING_CONTACT_PART = 0.1
+MAX_RESTING_CONTACT_FRACTION = 0.1
 """The same for an arm that holds an object and hardly moves.
 
 Dry friction may then hide the contact force in all joints except one.
 """
 MIN_TURNING_JOINTS = 2
 """Minimum number of turning joints for a contact force to be noticeable."""
-PATIENCE_PART = 0.25
+PATIENCE_FRACTION = 0.25
 """Largest fraction by which motors that keep their last torque may lengthen a stop.
 
 The stop is from full speed; see `compute_patience`.
 """
-LEAST_CYCLES = 2
+MIN_PATIENCE_CYCLES = 2
 """Minimum number of torque cycles for which motors keep their last torque by default.
 
 One late cycle must not engage the brakes.
@@ -55,7 +55,7 @@ MAX_PATIENCE_S = 0.01
 
 However slow or weak the arm is, a longer absence of torques is more than a late cycle or two.
 """
-SIGMAS = 6.0
+NOISE_SIGMAS = 6.0
 """Standard deviations of noise that a monitor tolerates.
 
 Less than one sample in a billion exceeds them.
@@ -98,12 +98,14 @@ class Encoders:
     resolution: Array  # (joints,), rad: step of a position
     noise: Array  # (joints,), rad: standard deviation of a position
     latency_ticks: int = 0  # age of a sample when it is read
-    off_late: Array | float = 0.0  # (joints,), rad: largest error due to the age
-    speed_off_late: Array | float = 0.0  # (joints,), rad/s: likewise
+    late_position_error: Array | float = 0.0  # (joints,), rad: largest error due to the age
+    late_velocity_error: Array | float = 0.0  # (joints,), rad/s: likewise
     offset: Array | None = None  # (joints,), rad: added to the drives' samples. None for 0
 
     @classmethod
-    def of(cls, robot: RobotConfig, tick_s: float, default: SensorConfig | None = None) -> Encoders:
+    def from_config(
+        cls, robot: RobotConfig, tick_s: float, default: SensorConfig | None = None
+    ) -> Encoders:
         """Return the encoders that `[robot]` describes.
 
         The arm's equation of motion extrapolates a delayed sample to the present. The assumed error
@@ -129,23 +131,23 @@ class Encoders:
         )
 
     @property
-    def exact(self) -> bool:
+    def is_exact(self) -> bool:
         """True if samples have no error."""
         return not (self.resolution.any() or self.noise.any())
 
     @property
-    def off(self) -> Array:
+    def position_error(self) -> Array:
         """Largest error of the position in a good sample, (joints,), rad."""
-        return self._off_sampled + self.off_late
+        return self._sampling_error + self.late_position_error
 
     @property
-    def speed_off(self) -> Array:
+    def velocity_error(self) -> Array:
         """Largest error of the velocity in a good sample, (joints,), rad/s."""
-        return self._off_sampled / EDGE_TIMING_S + self.speed_off_late
+        return self._sampling_error / EDGE_TIMING_S + self.late_velocity_error
 
     @property
-    def _off_sampled(self) -> Array:
-        return np.asarray(0.5 * self.resolution + SIGMAS * self.noise)
+    def _sampling_error(self) -> Array:
+        return np.asarray(0.5 * self.resolution + NOISE_SIGMAS * self.noise)
 
 
 class MotorPatience(NamedTuple):
@@ -155,7 +157,7 @@ class MotorPatience(NamedTuple):
     """
 
     seconds: float
-    least: int  # minimum, torque cycles
+    min_cycles: int  # minimum, torque cycles
 
     def ticks(self, every: int, tick_s: float) -> int:
         """Return the patience in ticks, as a multiple of the torque cycle.
@@ -163,10 +165,10 @@ class MotorPatience(NamedTuple):
         `every` is the length of a torque cycle in ticks, and `tick_s` the duration of a tick.
         """
         # Adding a millionth makes 5 ms two cycles of 2.5 ms, in spite of rounding.
-        return every * max(int(self.seconds / (every * tick_s) + 1e-6), self.least)
+        return every * max(int(self.seconds / (every * tick_s) + 1e-6), self.min_cycles)
 
 
-def patience_of(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPatience:
+def compute_patience(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPatience:
     """Compute the patience of the motors.
 
     By default, it is the longest time in which a stop from full speed grows by at most
@@ -185,11 +187,13 @@ def patience_of(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPat
     stops_s = 0.5 * np.min(bounds.velocity / robot.acceleration)
     gains_s = energy_j / np.sum(bounds.torque * bounds.velocity)
     return MotorPatience(
-        min(PATIENCE_PART * float(min(stops_s, gains_s)), MAX_PATIENCE_S), LEAST_CYCLES
+        min(PATIENCE_FRACTION * float(min(stops_s, gains_s)), MAX_PATIENCE_S), MIN_PATIENCE_CYCLES
     )
 
 
-def joint_bounds(model: mujoco.MjModel, joints: Ints, robot: RobotConfig, torque: Array) -> Bounds:
+def find_joint_bounds(
+    model: mujoco.MjModel, joints: Ints, robot: RobotConfig, torque: Array
+) -> Bounds:
     """Return the bounds of the joints.
 
     Where config and model both limit a position, the tighter limit applies.
@@ -210,18 +214,18 @@ def joint_bounds(model: mujoco.MjModel, joints: Ints, robot: RobotConfig, torque
             (np.maximum(ranges[:, 0], stated[:, 0]), np.minimum(ranges[:, 1], stated[:, 1])), axis=1
         )
     for name, (low, high) in zip(robot.joints, ranges, strict=True):
-        if not high - low > 2 * POSITION_ROOM_RAD:
+        if not high - low > 2 * POSITION_MARGIN_RAD:
             raise RobotError(
                 f"robot.position: joint '{name}' cannot move from {low:g} to {high:g} rad"
             )
     return Bounds(position=ranges, velocity=np.array(robot.velocity), torque=torque)
 
 
-def planned_limits(bounds: Bounds, robot: RobotConfig) -> Limits:
+def compute_planned_limits(bounds: Bounds, robot: RobotConfig) -> Limits:
     """Return the limits of planned motion within `bounds`."""
     return Limits(
-        position=bounds.position + np.array([POSITION_ROOM_RAD, -POSITION_ROOM_RAD]),
-        velocity=bounds.velocity * (1.0 - VELOCITY_ROOM),
+        position=bounds.position + np.array([POSITION_MARGIN_RAD, -POSITION_MARGIN_RAD]),
+        velocity=bounds.velocity * (1.0 - VELOCITY_MARGIN),
         acceleration=np.array(robot.acceleration),
         jerk=np.array(robot.jerk),
     )

@@ -22,8 +22,8 @@ import numpy as np
 
 from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.errors import RobotError
-from rack.levels.robot.lookup import below
-from rack.levels.robot.model import JOINT_DRIVES, SCALAR_JOINTS, listed
+from rack.levels.robot.lookup import mark_descendants
+from rack.levels.robot.model import JOINT_DRIVES, SCALAR_JOINTS, format_names
 from rack.levels.tables import GripperConfig
 
 OPENINGS = 33
@@ -35,21 +35,23 @@ A single step might flip a loop over to its other solution.
 """
 ITERATIONS = 60
 STEP_TOLERANCE = 1e-10
-SPRING_PART = 1e-6
+SPRING_WEIGHT = 1e-6
 """Weight of the stiffest spring relative to an equality."""
 DAMPING = 1e-9
 """Weight of staying in place, for joints that nothing determines."""
-FREE_PART = 0.01
+FREE_RATIO = 0.01
 """Ratio of `DAMPING` to everything that holds a joint, above which the joint counts as free."""
-RESIDUAL = 1e-3
+YIELD_RESIDUAL = 1e-3
 """Residual of an equality, m or rad, above which it yields.
 
 Stiffness then determines where the linkage settles.
 """
-NOT_POSED = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
-ROUNDING = 1e-9
+DISABLED_CONSTRAINTS = (
+    mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+)
+JACOBIAN_ROUNDING = 1e-9
 """Threshold for elements of the Jacobian of a tendon."""
-LOOPS = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
+LOOP_EQUALITIES = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 STIFFNESS = 0
 IMPEDANCE = 2
 """Columns of MuJoCo's `efc_KBIP`."""
@@ -65,7 +67,7 @@ class Linkage:
     positions: Array  # (n, k), m or rad
     yields: bool  # True if couplings contradict each other or a stop; positions are approximate
 
-    def set(self, qpos: Array, opening: float) -> None:
+    def set_opening(self, qpos: Array, opening: float) -> None:
         """Set the driven joint in `qpos` to `opening`, m or rad, and all joints that follow it."""
         qpos[self.driven] = opening
         for address, positions in zip(self.joints, self.positions, strict=True):
@@ -98,12 +100,12 @@ def solve_linkage(
     first = int(np.argmin(np.abs(openings - reference)))
     positions = np.zeros((len(solver.joints), OPENINGS))
     for opening in np.linspace(reference, openings[first], APPROACH_STEPS):
-        middle = solver.settle(model.qpos0, float(opening))
+        middle = solver.settle_at(model.qpos0, float(opening))
     for steps in (range(first, OPENINGS), range(first, -1, -1)):
         qpos = middle
         for k in steps:
-            qpos = solver.settle(qpos, float(openings[k]))
-            solver.check(float(openings[k]))
+            qpos = solver.settle_at(qpos, float(openings[k]))
+            solver.check_residual(float(openings[k]))
             positions[:, k] = qpos[solver.joints]
     solver.check_all_follow()
     follows = np.any(positions != model.qpos0[solver.joints][:, None], axis=1)
@@ -124,7 +126,7 @@ class _Solver:
     ) -> None:
         self._config = config
         self._model = copy.copy(model)
-        self._model.opt.disableflags |= int(NOT_POSED)
+        self._model.opt.disableflags |= int(DISABLED_CONSTRAINTS)
         self._data = mujoco.MjData(self._model)
         joint = int(model.joint(config.joint).id)
         carried = hand[model.jnt_bodyid]
@@ -143,25 +145,25 @@ class _Solver:
         self._tendons = np.flatnonzero(model.tendon_stiffness > 0.0)
         # Relative to an equality, the stiffest spring has the weight `SPRING_WEIGHT`.
         springs = (*stiffness, *model.tendon_stiffness)
-        self._stiffest = max(float(np.max(springs, initial=0.0)), 1e-12) / SPRING_PART
+        self._stiffest = max(float(np.max(springs, initial=0.0)), 1e-12) / SPRING_WEIGHT
         self._relaxed = model.qpos_spring[self.joints]
 
-    def settle(self, start: Array, opening: float) -> Array:
+    def settle_at(self, start: Array, opening: float) -> Array:
         """Return qpos with the linkage settled at `opening`, m or rad, searching from `start`."""
         data = self._data
         data.qpos[:] = start
         data.qpos[self.driven] = opening
-        matrix = self._descend(yielding=False)
-        if self.farthest()[0] > RESIDUAL:
-            matrix = self._descend(yielding=True)
+        matrix = self._minimize_residual(yielding=False)
+        if self.find_largest_residual()[0] > YIELD_RESIDUAL:
+            matrix = self._minimize_residual(yielding=True)
         step = np.zeros(len(self.joints))
         for k in np.flatnonzero(self._loose):
             # If a joint is free to move, only `DAMPING` holds it.
             mujoco.mju_cholSolve(step, matrix, DAMPING * np.eye(len(step))[k])
-            self._loose[k] = step[k] > FREE_PART
+            self._loose[k] = step[k] > FREE_RATIO
         return np.array(data.qpos)
 
-    def _descend(self, yielding: bool) -> Array:
+    def _minimize_residual(self, yielding: bool) -> Array:
         """Minimize the sum of squared residuals; return the factored matrix at the minimum.
 
         With `yielding`, every row is weighted by its stiffness in the simulation.
@@ -172,7 +174,7 @@ class _Solver:
         slope = np.zeros(count)
         step = np.zeros(count)
         for _ in range(ITERATIONS if count else 0):
-            residual, jacobian, stiffness = self._rows()
+            residual, jacobian, stiffness = self._build_rows()
             stiffest = self._stiffest
             if yielding:
                 stiffest = float(np.max(stiffness, initial=1e-12))
@@ -181,7 +183,7 @@ class _Solver:
                 jacobian *= parts[:, None]
             springs = self._stiffness / stiffest
             if self._tendons.size:
-                stretched, pulls = self._stretched(stiffest)
+                stretched, pulls = self._build_tendon_rows(stiffest)
                 residual = np.concatenate((residual, stretched))
                 jacobian = np.concatenate((jacobian, pulls))
             mujoco.mju_mulMatTMat(matrix, jacobian, jacobian)
@@ -195,10 +197,10 @@ class _Solver:
                 break
         return matrix
 
-    def farthest(self) -> tuple[float, int]:
+    def find_largest_residual(self) -> tuple[float, int]:
         """Return the largest residual of an equality in the last pose, m or rad, and its id."""
         data = self._data
-        jacobian = self._jacobian()
+        jacobian = self._compute_jacobian()
         rows = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
         rows &= data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
         if not rows.any():
@@ -206,17 +208,19 @@ class _Solver:
         worst = int(np.argmax(np.where(rows, np.abs(data.efc_pos), 0.0)))
         return abs(float(data.efc_pos[worst])), int(data.efc_id[worst])
 
-    def check(self, opening: float) -> None:
+    def check_residual(self, opening: float) -> None:
         """Record whether the last pose leaves an equality open.
 
         Raises:
             RobotError: A loop stays open.
         """
-        residual, equality = self.farthest()
-        self.yields |= residual > RESIDUAL
-        if residual > self._config.residual and self._model.eq_type[equality] in map(int, LOOPS):
+        residual, equality = self.find_largest_residual()
+        self.yields |= residual > YIELD_RESIDUAL
+        if residual > self._config.residual and self._model.eq_type[equality] in map(
+            int, LOOP_EQUALITIES
+        ):
             raise RobotError(
-                f"robot.gripper: equality {equality_name(self._model, equality)} is off by"
+                f"robot.gripper: equality {describe_equality(self._model, equality)} is off by"
                 f" {residual:.4f} m or rad with the gripper at {opening:g}; robot.gripper.residual"
                 f" permits {self._config.residual:g}"
             )
@@ -238,7 +242,7 @@ class _Solver:
                 " spring"
             )
 
-    def _rows(self) -> tuple[Array, Array, Array]:
+    def _build_rows(self) -> tuple[Array, Array, Array]:
         """Return the rows of equalities and exceeded joint stops.
 
         Returns:
@@ -246,14 +250,14 @@ class _Solver:
             simulation, (rows,).
         """
         data = self._data
-        jacobian = self._jacobian()[:, self._dof]
+        jacobian = self._compute_jacobian()[:, self._dof]
         counts = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) | (data.efc_pos < 0.0)
         rows = np.flatnonzero(counts & np.any(jacobian != 0.0, axis=1))
         law = data.efc_KBIP.reshape(-1, 4)[rows]
         stiffness = data.efc_D[rows] * law[:, STIFFNESS] * law[:, IMPEDANCE]
         return np.array(data.efc_pos[rows]), np.ascontiguousarray(jacobian[rows]), stiffness
 
-    def _stretched(self, most: float) -> tuple[Array, Array]:
+    def _build_tendon_rows(self, most: float) -> tuple[Array, Array]:
         """Return the rows of tendons that are springs.
 
         Their stiffness is divided by `most`.
@@ -262,13 +266,13 @@ class _Solver:
             Residuals, (tendons,), and their Jacobian, (tendons, joints).
         """
         model = self._model
-        jacobian = tendon_jacobian(model, self._data)[self._tendons]
+        jacobian = compute_tendon_jacobian(model, self._data)[self._tendons]
         parts = np.sqrt(model.tendon_stiffness[self._tendons] / most)
         length = self._data.ten_length[self._tendons]
         slack = np.clip(length, *model.tendon_lengthspring[self._tendons].T)
         return parts * (length - slack), parts[:, None] * jacobian[:, self._dof]
 
-    def _jacobian(self) -> Array:
+    def _compute_jacobian(self) -> Array:
         """Return the Jacobian of all constraints at the present pose, (rows, nv)."""
         mujoco.mj_fwdPosition(self._model, self._data)
         return np.asarray(self._data.efc_J).reshape(-1, self._model.nv)
@@ -296,7 +300,7 @@ def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask)
             )
 
 
-def equality_name(model: mujoco.MjModel, equality: int) -> str:
+def describe_equality(model: mujoco.MjModel, equality: int) -> str:
     """Return the name of an equality, or its kind and what it couples if it has no name."""
     if name := model.equality(equality).name:
         return f"'{name}'"
@@ -325,17 +329,18 @@ def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: boo
         RobotError: A joint of the arm is tied.
     """
     for equality in range(model.neq):
-        tied = [model.joint(joint).name for joint in sorted(tied_joints(model, equality))]
-        counts = of_bodies or model.eq_type[equality] not in map(int, LOOPS)
+        tied = [model.joint(joint).name for joint in sorted(find_tied_joints(model, equality))]
+        counts = of_bodies or model.eq_type[equality] not in map(int, LOOP_EQUALITIES)
         if counts and model.eq_active0[equality] and {*tied} & {*joints}:
             raise RobotError(
-                f"equality {equality_name(model, equality)} couples {listed(tied)}, but the joints"
+                f"equality {describe_equality(model, equality)} couples "
+                f"{format_names(tied)}, but the joints"
                 " of an arm are driven independently; remove it from the model (in a URDF:"
                 " <mimic>), or fix the joint that has no motor"
             )
 
 
-def tied_joints(model: mujoco.MjModel, equality: int) -> set[int]:
+def find_tied_joints(model: mujoco.MjModel, equality: int) -> set[int]:
     """Return the joints that an equality ties.
 
     Two bodies are tied by the joints that move only one of them.
@@ -349,15 +354,19 @@ def tied_joints(model: mujoco.MjModel, equality: int) -> set[int]:
         # Joints are tied if they change the length of a tendon.
         data = mujoco.MjData(model)
         mujoco.mj_fwdPosition(model, data)
-        moving = (np.abs(tendon_jacobian(model, data)[ends]) > ROUNDING).any(axis=0)
+        moving = (np.abs(compute_tendon_jacobian(model, data)[ends]) > JACOBIAN_ROUNDING).any(
+            axis=0
+        )
         return set(model.dof_jntid[moving].tolist())
     if model.eq_objtype[equality] == mujoco.mjtObj.mjOBJ_SITE:
         ends = model.site_bodyid[ends]
-    moving = [below(model, model.jnt_bodyid[[joint]])[ends] for joint in range(model.njnt)]
+    moving = [
+        mark_descendants(model, model.jnt_bodyid[[joint]])[ends] for joint in range(model.njnt)
+    ]
     return {joint for joint, moved in enumerate(moving) if 0 < moved.sum() < len(ends)}
 
 
-def tendon_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
+def compute_tendon_jacobian(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
     """Return the Jacobian of all tendons, (tendons, nv)."""
     jacobian = np.zeros((model.ntendon, model.nv))
     mujoco.mju_sparse2dense(

@@ -15,14 +15,20 @@ from rack.levels.algebra import Ints, Mask
 from rack.levels.errors import RobotError
 from rack.levels.robot.model import (
     JOINT_DRIVES,
-    check_number,
+    check_joint_count,
     compile_spec,
-    listed,
+    format_names,
     load_spec,
 )
 from rack.levels.tables import RobotConfig, SceneConfig
 
-COUNTS = {"site": "nsite", "body": "nbody", "geom": "ngeom", "joint": "njnt", "actuator": "nu"}
+COUNT_ATTRIBUTES = {
+    "site": "nsite",
+    "body": "nbody",
+    "geom": "ngeom",
+    "joint": "njnt",
+    "actuator": "nu",
+}
 """Attributes of a model with the numbers of its elements, by kind of element."""
 
 
@@ -42,11 +48,11 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
     if number >= 0:
         return int(number)
     noun = kind.name.removeprefix("mjOBJ_").lower()
-    count = getattr(model, COUNTS[noun])
-    have = listed([mujoco.mj_id2name(model, kind, k) or "" for k in range(count)])
+    count = getattr(model, COUNT_ATTRIBUTES[noun])
+    have = format_names([mujoco.mj_id2name(model, kind, k) or "" for k in range(count)])
     # The tool may also be a body.
     if place == "robot.tool":
-        have += "; bodies: " + listed([model.body(k).name for k in range(model.nbody)])
+        have += "; bodies: " + format_names([model.body(k).name for k in range(model.nbody)])
     raise RobotError(f"{place}: no {noun} '{name}' in the model; it has: {have}")
 
 
@@ -67,7 +73,7 @@ def find_all(
     return np.array([find(model, kind, name, place) for name in names], dtype=int)
 
 
-def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
+def find_unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     """Yield a line for every name in the config that the model lacks.
 
     Raises:
@@ -103,7 +109,7 @@ def unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
                 yield str(error)
 
 
-def tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
+def find_tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
     """Return the id of the tool's site.
 
     Args:
@@ -120,7 +126,7 @@ def tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
     return tool
 
 
-def free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:
+def find_free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:
     """Return the ids of the objects' free joints.
 
     Raises:
@@ -136,7 +142,7 @@ def free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:
     return np.asarray(joints, dtype=int)
 
 
-def mocap_ids(model: mujoco.MjModel, bodies: Ints) -> Ints:
+def find_mocap_ids(model: mujoco.MjModel, bodies: Ints) -> Ints:
     """Return the mocap ids of the obstacles.
 
     Raises:
@@ -151,7 +157,7 @@ def mocap_ids(model: mujoco.MjModel, bodies: Ints) -> Ints:
     return np.asarray(model.body_mocapid[bodies], dtype=int)
 
 
-def below(model: mujoco.MjModel, roots: Ints) -> Mask:
+def mark_descendants(model: mujoco.MjModel, roots: Ints) -> Mask:
     """Return a mask of the bodies `roots` and all their descendants, (nbody,)."""
     marked = np.zeros(model.nbody, dtype=bool)
     marked[roots] = True
@@ -160,32 +166,32 @@ def below(model: mujoco.MjModel, roots: Ints) -> Mask:
     return marked
 
 
-def geoms_of(model: mujoco.MjModel, bodies: Mask) -> Ints:
+def list_geoms(model: mujoco.MjModel, bodies: Mask) -> Ints:
     """Return the ids of the geoms on the bodies of a mask, (nbody,)."""
     return np.flatnonzero(bodies[model.geom_bodyid])
 
 
-def geom_name(model: mujoco.MjModel, geom: int) -> str:
+def find_geom_name(model: mujoco.MjModel, geom: int) -> str:
     """Return the name of a geom, or of its body if it has none."""
     return model.geom(geom).name or f"body {model.body(model.geom_bodyid[geom]).name}"
 
 
-def derived(robot: RobotConfig) -> RobotConfig:
+def derive_robot(robot: RobotConfig) -> RobotConfig:
     """Return the table with joints, tool and home added from the model.
 
     Raises:
         RobotError: The model does not determine them.
     """
     model = compile_spec(load_spec(robot.model), robot.model)
-    joints = robot.joints or _driven(model, robot)
+    joints = robot.joints or _find_driven_joints(model, robot)
     if not joints:
         raise RobotError("robot.joints: name the joints, because none in the model has an actuator")
-    check_number(joints)
+    check_joint_count(joints)
     ids = find_all(model, mujoco.mjtObj.mjOBJ_JOINT, joints, "robot.joints")
     start = model.key_qpos[0] if model.nkey else model.qpos0
     home = start[model.jnt_qposadr[ids]].tolist()
     last = int(model.jnt_bodyid[ids[-1]])
-    carried = below(model, np.array([last]))
+    carried = mark_descendants(model, np.array([last]))
     sites = [model.site(k).name for k in np.flatnonzero(carried[model.site_bodyid])]
     named = [name for name in sites if name] or [model.body(last).name]
     return robot.model_copy(
@@ -197,7 +203,7 @@ def derived(robot: RobotConfig) -> RobotConfig:
     )
 
 
-def _driven(model: mujoco.MjModel, robot: RobotConfig) -> tuple[str, ...]:
+def _find_driven_joints(model: mujoco.MjModel, robot: RobotConfig) -> tuple[str, ...]:
     """Return the names of the joints with an actuator, from base to tool, without the gripper's."""
     of_joint = np.isin(model.actuator_trntype, JOINT_DRIVES)
     driven = np.unique(model.actuator_trnid[of_joint, 0])

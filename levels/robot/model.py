@@ -13,15 +13,15 @@ from rack.levels.errors import RobotError
 from rack.levels.robot.engine import SLEEP
 from rack.levels.robot.model_file import ModelReader
 from rack.levels.tables import (
-    MOST,
-    MOST_JOINTS,
+    MAX_JOINTS,
+    MAX_VALUE,
     FollowConfig,
     GripperConfig,
     RobotConfig,
     ToolConfig,
 )
 
-LONGEST_STEP_S = 0.1
+MAX_STEP_S = 0.1
 """Maximum time step of an MJCF file. A longer one is a mistake, such as ms for s."""
 JOINT_DRIVES = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 SET_POINT_ROWS = 3
@@ -45,12 +45,12 @@ def load_spec(path: Path) -> mujoco.MjSpec:
     try:
         spec = mujoco.MjSpec.from_file(str(path.resolve().with_name(next(iter(texts)))), texts)
     except (ValueError, RuntimeError) as problem:
-        raise RobotError(f"model '{path}': {one_line(problem)}") from None
+        raise RobotError(f"model '{path}': {format_one_line(problem)}") from None
     step = float(spec.option.timestep)
-    if not 0 < step <= LONGEST_STEP_S:
+    if not 0 < step <= MAX_STEP_S:
         raise RobotError(
             f"model '{path}': timestep {step:g} s is invalid; it must be above 0 and at most"
-            f" {LONGEST_STEP_S:g} s"
+            f" {MAX_STEP_S:g} s"
         )
     return spec
 
@@ -68,7 +68,7 @@ def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     except (ValueError, RuntimeError, mujoco.FatalError) as problem:
         if drop_fixed_inertias(spec.worldbody):
             return compile_spec(spec, path)
-        raise RobotError(f"model '{path}': {one_line(problem)}") from None
+        raise RobotError(f"model '{path}': {format_one_line(problem)}") from None
 
 
 def drop_fixed_inertias(body: mujoco.MjsBody) -> bool:
@@ -90,15 +90,15 @@ def drop_fixed_inertias(body: mujoco.MjsBody) -> bool:
     return is_dropped
 
 
-def check_number(joints: Sequence[str]) -> None:
+def check_joint_count(joints: Sequence[str]) -> None:
     """Check that an arm does not have too many joints.
 
     Raises:
         RobotError: There are more than `MAX_JOINTS`.
     """
-    if len(joints) > MOST_JOINTS:
+    if len(joints) > MAX_JOINTS:
         raise RobotError(
-            f"an arm has at most {MOST_JOINTS} joints, not {len(joints)}: {listed([*joints])};"
+            f"an arm has at most {MAX_JOINTS} joints, not {len(joints)}: {format_names([*joints])};"
             " name fewer in robot.joints, or by --tip or --joints of 'rack robot new'"
         )
 
@@ -109,12 +109,12 @@ def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
     Raises:
         RobotError: A list has the wrong length, or a joint is missing, not scalar or named twice.
     """
-    for key, _, why in robot.misfits():
+    for key, _, why in robot.find_length_mismatches():
         raise RobotError(f"robot.{key}: {why}")
     for name in robot.joints:
         joint = spec.joint(name)
         if joint is None:
-            have = listed([j.name for j in spec.joints])
+            have = format_names([j.name for j in spec.joints])
             raise RobotError(f"robot.joints: no joint '{name}' in the model; it has: {have}")
         if joint.type not in SCALAR_JOINTS:
             kind = joint.type.name.removeprefix("mjJNT_").lower()
@@ -125,7 +125,7 @@ def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
             )
 
 
-def prepare(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
+def prepare_spec(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
     """Set everything that the servo level needs in any model.
 
     These are integrator, time step, drive inertia, tool, gripper and keyframe.
@@ -174,22 +174,23 @@ def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], Arra
     Raises:
         RobotError: Neither config nor model has a limit, or joints share an actuator.
     """
-    drives = [a for a in spec.actuators if drives_arm(spec, a, robot)]
+    drives = [a for a in spec.actuators if is_arm_drive(spec, a, robot)]
     tendons = [a for a in drives if a.trntype not in JOINT_DRIVES]
     shared = {*robot.joints} - {a.target for a in drives}
-    shared &= {joint for a in tendons for joint in driven_by(spec, a)}
+    shared &= {joint for a in tendons for joint in find_driven_joints(spec, a)}
     if len(shared) > len(tendons):
         raise RobotError(
-            f"joints {listed(sorted(shared))} share one actuator, but joints of an arm are driven"
+            f"joints {format_names(sorted(shared))} share one actuator, but joints of an "
+            "arm are driven"
             " independently; give each a separate actuator"
         )
-    limits = robot.torque or tuple(stated_torque(spec, name, drives) for name in robot.joints)
+    limits = robot.torque or tuple(find_torque_limit(spec, name, drives) for name in robot.joints)
     if 0.0 in limits:
         raise RobotError(
             f"joint '{robot.joints[limits.index(0.0)]}': the model has no torque limit; set"
             " robot.torque, N m, one value per joint"
         )
-    remove(spec, drives)
+    remove_actuators(spec, drives)
     names = [f"torque of {joint}" for joint in robot.joints]
     for name, joint, limit in zip(names, robot.joints, limits, strict=True):
         drive = spec.joint(joint)
@@ -211,7 +212,7 @@ def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
     """
     old = spec.actuator(gripper.actuator)
     if old is None:
-        have = listed([a.name for a in spec.actuators])
+        have = format_names([a.name for a in spec.actuators])
         raise RobotError(
             f"robot.gripper.actuator: '{gripper.actuator}' is not in the model; it has: {have}"
         )
@@ -222,13 +223,13 @@ def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
             f"robot.gripper.actuator: '{gripper.actuator}' is a {kind.name}; it must be on a joint"
             " or tendon"
         )
-    remove(spec, [old])
+    remove_actuators(spec, [old])
     add_motor(spec, gripper.actuator, kind, target, gripper.force)
     for follower in gripper.follow:
-        couple(spec, gripper, follower)
+        couple_joint(spec, gripper, follower)
 
 
-def couple(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) -> None:
+def couple_joint(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) -> None:
     """Make a joint follow the gripper's driven joint, and remove its actuators.
 
     Args:
@@ -241,7 +242,7 @@ def couple(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) 
     """
     for name in (follower.joint, gripper.joint):
         if spec.joint(name) is None:
-            have = listed([j.name for j in spec.joints])
+            have = format_names([j.name for j in spec.joints])
             raise RobotError(f"robot.gripper: no joint '{name}' in the model; it has: {have}")
     if follower.joint == gripper.joint:
         raise RobotError(f"robot.gripper.follow: '{follower.joint}' is the driven joint itself")
@@ -250,7 +251,7 @@ def couple(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) 
         raise RobotError(
             f"robot.gripper.follow: '{follower.joint}' is driven by the gripper's actuator"
         )
-    remove(spec, drives)
+    remove_actuators(spec, drives)
     equality = spec.add_equality(name=f"{follower.joint} follows {gripper.joint}")
     equality.type = mujoco.mjtEq.mjEQ_JOINT
     equality.name1 = follower.joint
@@ -261,15 +262,15 @@ def couple(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowConfig) 
     equality.solimp[:3] = [0.99, 0.999, 0.001]
 
 
-def drives_arm(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, robot: RobotConfig) -> bool:
+def is_arm_drive(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, robot: RobotConfig) -> bool:
     """Return True if an actuator drives a joint of the arm.
 
     It may do so directly or through a fixed tendon.
     """
-    return not {*robot.joints}.isdisjoint(driven_by(spec, actuator))
+    return not {*robot.joints}.isdisjoint(find_driven_joints(spec, actuator))
 
 
-def driven_by(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> list[str]:
+def find_driven_joints(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> list[str]:
     """Return the joints that an actuator drives, directly or through a fixed tendon."""
     if actuator.trntype in JOINT_DRIVES:
         return [actuator.target]
@@ -279,7 +280,9 @@ def driven_by(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> list[str]:
     return [wrap.target.name for wrap in path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT]
 
 
-def stated_torque(spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsActuator]) -> float:
+def find_torque_limit(
+    spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsActuator]
+) -> float:
     """Return the tightest torque limit that a model states for a joint, N m.
 
     0 if it states none, or only limits that a `[robot]` table must not have, such as infinity.
@@ -290,27 +293,31 @@ def stated_torque(spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsAc
         drives: Actuators of the arm.
     """
     element = spec.joint(joint)
-    limits = [reach(element.actfrclimited, element.actfrcrange)]
-    limits += [drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint]
-    return min((x for x in limits if 0 < x < MOST), default=0.0)
+    limits = [compute_symmetric_range(element.actfrclimited, element.actfrcrange)]
+    limits += [
+        compute_drive_limit(a) for a in drives if a.trntype in JOINT_DRIVES and a.target == joint
+    ]
+    return min((x for x in limits if 0 < x < MAX_VALUE), default=0.0)
 
 
-def drive_limit(actuator: mujoco.MjsActuator) -> float:
+def compute_drive_limit(actuator: mujoco.MjsActuator) -> float:
     """Return the torque limit that an actuator on a joint implies, N m. 0 if it has none."""
     gear = abs(float(actuator.gear[0]))
-    limits = [reach(actuator.forcelimited, actuator.forcerange) * gear]
+    limits = [compute_symmetric_range(actuator.forcelimited, actuator.forcerange) * gear]
     if (
         actuator.dyntype == mujoco.mjtDyn.mjDYN_NONE
         and actuator.biastype == mujoco.mjtBias.mjBIAS_NONE
         and actuator.gaintype == mujoco.mjtGain.mjGAIN_FIXED
     ):
         limits.append(
-            reach(actuator.ctrllimited, actuator.ctrlrange) * abs(float(actuator.gainprm[0])) * gear
+            compute_symmetric_range(actuator.ctrllimited, actuator.ctrlrange)
+            * abs(float(actuator.gainprm[0]))
+            * gear
         )
     return min((x for x in limits if x > 0), default=0.0)
 
 
-def reach(limited: mujoco.mjtLimited, span: Array) -> float:
+def compute_symmetric_range(limited: mujoco.mjtLimited, span: Array) -> float:
     """Return the largest symmetric range within `span`. 0 if there is none."""
     if limited == mujoco.mjtLimited.mjLIMITED_FALSE or not span[0] < span[1]:
         return 0.0
@@ -335,7 +342,7 @@ def add_motor(
     motor.ctrlrange = motor.forcerange = [-limit, limit]
 
 
-def remove(spec: mujoco.MjSpec, actuators: list[mujoco.MjsActuator]) -> None:
+def remove_actuators(spec: mujoco.MjSpec, actuators: list[mujoco.MjsActuator]) -> None:
     """Remove actuators and the sensors on them."""
     names = {a.name for a in actuators}
     for sensor in list(spec.sensors):
@@ -345,12 +352,12 @@ def remove(spec: mujoco.MjSpec, actuators: list[mujoco.MjsActuator]) -> None:
         spec.delete(actuator)
 
 
-def one_line(problem: Exception) -> str:
+def format_one_line(problem: Exception) -> str:
     """Return MuJoCo's message without line breaks."""
     return " ".join(str(problem).split()).removeprefix("Error: ")
 
 
-def listed(names: list[str], most: int = 24) -> str:
+def format_names(names: list[str], most: int = 24) -> str:
     """Format names for an error message, at most `most` of them."""
     named = [n for n in names if n]
     more = f" and {len(named) - most} more" if len(named) > most else ""

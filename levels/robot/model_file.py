@@ -18,42 +18,42 @@ from xml.parsers import expat
 from rack.backplane.regular_file import check_regular_file, read_regular_file
 from rack.levels.errors import RobotError
 
-MODEL_BYTES = 16_000_000
+MAX_MODEL_BYTES = 16_000_000
 """Maximum size of all XML files of a model."""
-ASSET_BYTES = 200_000_000
+MAX_ASSET_BYTES = 200_000_000
 """Maximum size of one mesh, texture or height field."""
-PIXELS = 70_000_000
+MAX_PIXELS = 70_000_000
 """Maximum number of pixels of an image. A small file may exceed memory when decoded."""
-MOST_DEPTH = 300
+MAX_DEPTH = 300
 """Maximum nesting depth of elements."""
-MOST_FILES = 100
+MAX_FILES = 100
 """Maximum number of XML files of a model. A file that includes itself exceeds it."""
-MOST_PARTS = 6_000
+MAX_PARTS = 6_000
 """Maximum number of parts of a model, including all replicas.
 
 The time in which MuJoCo reads them grows with the square of their number.
 """
-PARTS = ("body", "composite", "flexcomp", "geom", "joint", "link", "site")
-REPEATING = ("replicate", "composite", "flexcomp")
-GRID_CELLS = 4_000_000
+PART_TAGS = ("body", "composite", "flexcomp", "geom", "joint", "link", "site")
+REPEATING_TAGS = ("replicate", "composite", "flexcomp")
+MAX_GRID_CELLS = 4_000_000
 """Maximum number of cells of a height field or texture.
 
 MuJoCo allocates them while it parses (20000 x 20000 takes 10 s).
 """
-GRIDS = (("nrow", "ncol"), ("width", "height"))
+GRID_ATTRIBUTES = (("nrow", "ncol"), ("width", "height"))
 PNG = b"\x89PNG\r\n\x1a\n"
-EXPAND = "expand it first: xacro IN > arm.urdf"
-VECTORS = ("xyz", "rpy", "size", "scale")
+XACRO_HINT = "expand it first: xacro IN > arm.urdf"
+VECTOR_ATTRIBUTES = ("xyz", "rpy", "size", "scale")
 """Attributes of three numbers."""
-NUMBERS = (
-    *VECTORS,
+NUMBER_ATTRIBUTES = (
+    *VECTOR_ATTRIBUTES,
     *("ixx", "ixy", "ixz", "iyy", "iyz", "izz", "value", "radius", "length", "lower", "upper"),
     *("effort", "velocity", "damping", "friction", "multiplier", "offset"),
 )
 """Numeric attributes in links and joints of a URDF."""
-LIMITS = ("range", "cutoff", "effort")
+LIMIT_ENDINGS = ("range", "cutoff", "effort")
 """Endings of attribute names whose value may be infinite, which means no limit."""
-FASTEST = 1e9
+MAX_VELOCITY = 1e9
 """Velocity that no joint reaches, rad/s or m/s."""
 
 
@@ -93,8 +93,8 @@ class ModelReader:
         self._folders = {""}  # folders of assets
         self._bytes = 0
         self._parts = 0.0
-        self.root = self._read(path, path.resolve().parent)
-        self._check(self.root, _Place(path, "", 1.0, 1))
+        self.root = self._read_file(path, path.resolve().parent)
+        self._check_element(self.root, _Place(path, "", 1.0, 1))
         if self.root.tag == "mujoco":
             self._check_assets(path)
         self.texts = {
@@ -102,10 +102,10 @@ class ModelReader:
             for name, (_, root) in self._files.items()
         }
 
-    def _read(self, path: Path, folder: Path) -> ElementTree.Element:
+    def _read_file(self, path: Path, folder: Path) -> ElementTree.Element:
         """Read a file of a model in `folder`, and the files to which it refers."""
         try:
-            text = read_regular_file(path, MODEL_BYTES - self._bytes)
+            text = read_regular_file(path, MAX_MODEL_BYTES - self._bytes)
             root = parse_xml(text)
         except FileNotFoundError:
             raise RobotError(f"model '{path}': no such file") from None
@@ -117,8 +117,8 @@ class ModelReader:
             raise RobotError(f"model '{path}': {problem}") from None
         self._bytes += len(text)
         self._files[f"{len(self._files)}.xml"] = (path, root)
-        if len(self._files) > MOST_FILES:
-            why = f"more than {MOST_FILES} files are included; does one include itself?"
+        if len(self._files) > MAX_FILES:
+            why = f"more than {MAX_FILES} files are included; does one include itself?"
             raise RobotError(f"model '{path}': {why}")
         for element in root.iter():
             if element.tag not in ("include", "model"):
@@ -126,10 +126,10 @@ class ModelReader:
                 files = {value for key, value in element.items() if key.startswith("file")}
                 self._assets |= {(folder, file) for file in files if file}
             elif "file" in element.attrib:
-                self._refer(element, path, folder)
+                self._read_reference(element, path, folder)
         return root
 
-    def _refer(self, element: ElementTree.Element, path: Path, folder: Path) -> None:
+    def _read_reference(self, element: ElementTree.Element, path: Path, folder: Path) -> None:
         """Read the file to which an element refers, and point the element to the checked text.
 
         Args:
@@ -146,32 +146,32 @@ class ModelReader:
             folder = target.resolve().parent
         elif not target.resolve().is_relative_to(folder):
             raise RobotError(f"model '{path}': include '{name}' leaves the model's folder")
-        self._read(target, folder)
+        self._read_file(target, folder)
         # MuJoCo finds texts by the last part of their path.
         element.set("file", str(Path(name).with_name(text_name)))
 
-    def _check(self, element: ElementTree.Element, place: _Place) -> None:
+    def _check_element(self, element: ElementTree.Element, place: _Place) -> None:
         """Check an element and everything in it or to which it refers, and count replicas."""
         file, owner, copies, depth = place
         tag = element.tag
         if name := element.get("name"):
             owner = f"{tag} '{name}'"
-        for mistake in _mistakes(element, owner, self.root.tag == "robot"):
+        for mistake in _find_mistakes(element, owner, self.root.tag == "robot"):
             raise RobotError(f"model '{file}': {mistake}")
-        if tag in REPEATING:
-            copies *= math.prod(max(1.0, n) for n in numbers(element.get("count", "")))
-        self._parts += copies * (tag in PARTS)
-        if self._parts > MOST_PARTS:
-            why = f"more than {MOST_PARTS} bodies, joints, geoms and sites, with all replicas"
+        if tag in REPEATING_TAGS:
+            copies *= math.prod(max(1.0, n) for n in parse_numbers(element.get("count", "")))
+        self._parts += copies * (tag in PART_TAGS)
+        if self._parts > MAX_PARTS:
+            why = f"more than {MAX_PARTS} bodies, joints, geoms and sites, with all replicas"
             raise RobotError(f"model '{file}': {why}")
-        if depth > MOST_DEPTH:
-            raise RobotError(f"model '{file}': more than {MOST_DEPTH} elements within each other")
+        if depth > MAX_DEPTH:
+            raise RobotError(f"model '{file}': more than {MAX_DEPTH} elements within each other")
         for child in element:
-            self._check(child, _Place(file, owner, copies, depth + 1))
+            self._check_element(child, _Place(file, owner, copies, depth + 1))
         refers = {"include": element.get("file"), "attach": self._models.get(element.get("model"))}
         if text_name := refers.get(tag):
             inner, root = self._files[text_name.rpartition("/")[2]]
-            self._check(root, _Place(inner, owner, copies, depth + 1))
+            self._check_element(root, _Place(inner, owner, copies, depth + 1))
 
     def _check_assets(self, model: Path) -> None:
         """Check that meshes, images and height fields are regular files of bounded size."""
@@ -210,7 +210,7 @@ def parse_xml(text: bytes) -> ElementTree.Element:
         nonlocal foreign, line
         prefix, _, name = tag.rpartition(":")
         if prefix == "xacro" and name not in ("property", "arg"):
-            raise ValueError(f"line {parser.CurrentLineNumber} holds <{tag}>; {EXPAND}")
+            raise ValueError(f"line {parser.CurrentLineNumber} holds <{tag}>; {XACRO_HINT}")
         if foreign or prefix:
             foreign += 1
             return
@@ -251,16 +251,16 @@ def check_asset(file: Path, model: Path) -> None:
         RobotError: It is not.
     """
     try:
-        check_regular_file(file, ASSET_BYTES)
+        check_regular_file(file, MAX_ASSET_BYTES)
         with file.open("rb") as opened:
             head = opened.read(24)
     except OSError as problem:
         raise RobotError(f"model '{model}': '{file}': {problem.strerror}") from None
-    if head.startswith(PNG) and math.prod(struct.unpack(">II", head[16:])) > PIXELS:
-        raise RobotError(f"model '{model}': '{file}': more than {PIXELS} pixels")
+    if head.startswith(PNG) and math.prod(struct.unpack(">II", head[16:])) > MAX_PIXELS:
+        raise RobotError(f"model '{model}': '{file}': more than {MAX_PIXELS} pixels")
 
 
-def _mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> Iterator[str]:
+def _find_mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> Iterator[str]:
     """Yield descriptions of mistakes in an element, such as an invalid number or too large a grid.
 
     Args:
@@ -271,27 +271,31 @@ def _mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> Iterat
     place = owner if "name" in element.attrib else f"<{element.tag}>" + f" of {owner}" * bool(owner)
     is_part = owner.startswith(("link", "joint"))
     for key, value in element.items():
-        values = numbers(value)
+        values = parse_numbers(value)
         is_wrong = key != "name" and not all(
-            math.isfinite(x) or (math.isinf(x) and key.endswith(LIMITS)) for x in values
+            math.isfinite(x) or (math.isinf(x) and key.endswith(LIMIT_ENDINGS)) for x in values
         )
         valid = "finite numbers"
         if is_urdf:
-            is_wrong |= not len(value.split()) == len(values) == (3 if key in VECTORS else 1)
-            is_wrong |= key == "velocity" and not 0.0 <= min(values, default=0.0) < FASTEST
-            is_wrong &= is_part and key in NUMBERS
-            valid = "3 finite numbers" if key in VECTORS else "a finite number, such as 2.5"
-            valid += f", from 0 to {FASTEST:g}" * (key == "velocity")
+            is_wrong |= (
+                not len(value.split()) == len(values) == (3 if key in VECTOR_ATTRIBUTES else 1)
+            )
+            is_wrong |= key == "velocity" and not 0.0 <= min(values, default=0.0) < MAX_VELOCITY
+            is_wrong &= is_part and key in NUMBER_ATTRIBUTES
+            valid = (
+                "3 finite numbers" if key in VECTOR_ATTRIBUTES else "a finite number, such as 2.5"
+            )
+            valid += f", from 0 to {MAX_VELOCITY:g}" * (key == "velocity")
         if is_wrong:
-            hint = f"; {EXPAND}" * ("$" in value)
+            hint = f"; {XACRO_HINT}" * ("$" in value)
             yield f"{place}: {key} = '{value[:60]}'; it must be {valid}{hint}"
-    for keys in [(key,) for key in element.attrib] if element.tag == "size" else GRIDS:
-        cells = math.prod(max(numbers(element.get(key, "0")), default=0.0) for key in keys)
-        if cells > GRID_CELLS:
-            yield f"{place}: {' x '.join(keys)} = {cells:g}; at most {GRID_CELLS}"
+    for keys in [(key,) for key in element.attrib] if element.tag == "size" else GRID_ATTRIBUTES:
+        cells = math.prod(max(parse_numbers(element.get(key, "0")), default=0.0) for key in keys)
+        if cells > MAX_GRID_CELLS:
+            yield f"{place}: {' x '.join(keys)} = {cells:g}; at most {MAX_GRID_CELLS}"
 
 
-def numbers(text: str) -> list[float]:
+def parse_numbers(text: str) -> list[float]:
     """Return the words of an attribute that are numbers. In C syntax, nan(7) is a number."""
     values = []
     for word in text.split():

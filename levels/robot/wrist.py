@@ -9,10 +9,10 @@ import numpy as np
 
 from rack.levels.algebra import Ints, Mask
 from rack.levels.errors import RobotError
-from rack.levels.robot.model import listed
+from rack.levels.robot.model import format_names
 from rack.levels.tables import WristConfig
 
-KINDS = {
+SENSOR_KINDS = {
     "force": (mujoco.mjtSensor.mjSENS_FORCE, "N"),
     "torque": (mujoco.mjtSensor.mjSENS_TORQUE, "N m"),
 }
@@ -28,7 +28,7 @@ class Wrist(NamedTuple):
     site: int
     addresses: Ints  # (6,), addresses of its values in sensordata
     range: tuple[float, float]  # largest value of a component, in both directions
-    most: tuple[float, float]  # force and torque of a contact at which the arm stops
+    contact_limits: tuple[float, float]  # force and torque of a contact at which the arm stops
     noise: tuple[float, float]  # standard deviation of a component
 
 
@@ -49,7 +49,9 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
     if config is None:
         return None
     names = (config.force, config.torque)
-    sensors = [_sensor(model, key, name) for key, name in zip(KINDS, names, strict=True)]
+    sensors = [
+        _find_sensor(model, key, name) for key, name in zip(SENSOR_KINDS, names, strict=True)
+    ]
     force, torque = model.sensor_objid[sensors].tolist()
     if force != torque:
         sites = f"'{model.site(force).name}' and '{model.site(torque).name}'"
@@ -63,7 +65,7 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
     contact_limits = (config.most_force, config.most_torque)
     reaches = model.sensor_cutoff[sensors].tolist()
     for (key, (_, unit)), name, reach, limit in zip(
-        KINDS.items(), names, reaches, contact_limits, strict=True
+        SENSOR_KINDS.items(), names, reaches, contact_limits, strict=True
     ):
         if not reach > 0.0:
             raise RobotError(
@@ -78,22 +80,22 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
         site=force,
         addresses=(model.sensor_adr[sensors, None] + np.arange(3)).ravel().astype(int),
         range=(reaches[0], reaches[1]),
-        most=contact_limits,
+        contact_limits=contact_limits,
         noise=(config.noise, 0.1 * config.noise),
     )
 
 
-def _sensor(model: mujoco.MjModel, key: str, name: str) -> int:
+def _find_sensor(model: mujoco.MjModel, key: str, name: str) -> int:
     """Return the id of a sensor of kind `key`.
 
     Raises:
         RobotError: The model has no such sensor.
     """
     number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
-    is_kind = model.sensor_type == KINDS[key][0]
+    is_kind = model.sensor_type == SENSOR_KINDS[key][0]
     if number >= 0 and is_kind[number]:
         return int(number)
-    have = listed([model.sensor(int(k)).name for k in np.flatnonzero(is_kind)])
+    have = format_names([model.sensor(int(k)).name for k in np.flatnonzero(is_kind)])
     why = (
         f"sensor '{name}' is not a {key} sensor"
         if number >= 0

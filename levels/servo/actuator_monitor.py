@@ -14,7 +14,11 @@ from rack.levels.compiled import compiled_for
 from rack.levels.level import Finding
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
-from rack.levels.robot.limits import MAX_CONTACT_PART, MAX_RESTING_CONTACT_PART, MIN_TURNING_JOINTS
+from rack.levels.robot.limits import (
+    MAX_CONTACT_FRACTION,
+    MAX_RESTING_CONTACT_FRACTION,
+    MIN_TURNING_JOINTS,
+)
 
 NOISE_PART = 0.005
 """Part of a torque limit that the equation of motion may leave unexplained. Runs without faults
@@ -53,7 +57,7 @@ MOTORS = np.dtype(
 )
 """State of the monitor for one motor."""
 EXPLAINED = 0
-LEFT_OVER = 1
+UNEXPLAINED = 1
 ASTRAY = 2
 """Verdicts on a cycle: all torque is explained, some is not, or a joint has left its set point."""
 
@@ -95,10 +99,12 @@ class ActuatorMonitor:
         motors["friction_s"] = np.maximum(model.dof_solref[dof, 0], 0.0) * model.dof_solimp[dof, 1]
         motors["exact_noise"] = NOISE_PART * self._limits
         # Encoder errors may look like a change in velocity of this size.
-        motors["uncertain"] = 2.0 * cell.encoders.speed_off / period_s
-        motors["off"] = cell.encoders.off
+        motors["uncertain"] = 2.0 * cell.encoders.velocity_error / period_s
+        motors["off"] = cell.encoders.position_error
         inertia = np.zeros((joints, joints))  # kg m2: at the start of the cycle
-        self._judge = partial(left_over.load(), motors, inertia, 0.5 / period_s, following)
+        self._judge = partial(
+            compute_residuals.load_machine_code(), motors, inertia, 0.5 / period_s, following
+        )
         self._reported = is_reported
         self._begun = False
         self._pushed = False  # weak motors alone do not explain the difference
@@ -109,16 +115,16 @@ class ActuatorMonitor:
         self._commanded = self._given = self._most = 0.0
         self._alone = True  # it is the only motor that lacks torque
 
-    def begin(self) -> None:
+    def begin_cycle(self) -> None:
         """Start a cycle with `torque`, at the state passed to `judge_cycle` last."""
         self._begun = True
 
-    def drop(self) -> None:
+    def drop_cycle(self) -> None:
         """Do not judge the present cycle: brakes, missed cycles or wrong samples intervened."""
         self._begun = self._pushed = False
         self._cycles = 0
 
-    def look(self, wanted: Array, state: Array, terms: Terms, holds: bool) -> Finding | None:
+    def judge_cycle(self, wanted: Array, state: Array, terms: Terms, holds: bool) -> Finding | None:
         """Judge the cycle that ends now, and keep its final state for the next one.
 
         Args:
@@ -133,7 +139,7 @@ class ActuatorMonitor:
         verdict = self._judge(wanted, state, terms.inertia, terms.bias)
         if not self._begun:
             return None
-        if verdict == EXPLAINED or (verdict == LEFT_OVER and not self._reported):
+        if verdict == EXPLAINED or (verdict == UNEXPLAINED and not self._reported):
             self._cycles = 0
             self._pushed = False
             return None
@@ -141,9 +147,9 @@ class ActuatorMonitor:
             astray = wanted[0] - state[0]
             joint = int((np.abs(astray) - self._motors["off"]).argmax())
             return Finding(Alarm.ACTUATOR, joint, float(astray[joint]))
-        return self._lacking(state[1], holds)
+        return self._track_lacking_torque(state[1], holds)
 
-    def _lacking(self, velocity: Array, holds: bool) -> Finding | None:
+    def _track_lacking_torque(self, velocity: Array, holds: bool) -> Finding | None:
         """Observe a motor whose lack of torque explains the difference, until it is certain."""
         motors = self._motors
         residual = motors["left"]
@@ -160,9 +166,9 @@ class ActuatorMonitor:
         rests = np.count_nonzero(is_known) < MIN_TURNING_JOINTS
         permitted_share = LACKING_PART
         if self._pushed:
-            permitted_share = MAX_CONTACT_PART
+            permitted_share = MAX_CONTACT_FRACTION
         elif rests and holds:
-            permitted_share = MAX_RESTING_CONTACT_PART
+            permitted_share = MAX_RESTING_CONTACT_FRACTION
         min_share = np.maximum(permitted_share, noise / self._limits)
         joint = (
             self._joint
@@ -183,14 +189,14 @@ class ActuatorMonitor:
         self._most = max(self._most, abs(commanded[joint] - lacks[joint]))
         self._alone &= not rests and np.count_nonzero(np.abs(residual) > noise) == 1
         predicted_speed = np.abs(velocity) + 2.0 * np.abs(velocity - motors["earlier_velocity"])
-        if (predicted_speed > self._fastest).any() or self._sure(
+        if (predicted_speed > self._fastest).any() or self._is_certain(
             joint, commanded[joint], lacks[joint]
         ):
             self._cycles = 0
             return Finding(Alarm.ACTUATOR, joint, float(lacks[joint]))
         return None
 
-    def _sure(self, joint: int, commanded: float, lacks: float) -> bool:
+    def _is_certain(self, joint: int, commanded: float, lacks: float) -> bool:
         """Return True if it is certain that the motor has failed.
 
         It gives nothing, gives no more when more is commanded, or lacks more than a push can
@@ -215,7 +221,7 @@ class ActuatorMonitor:
 
 
 @compiled_for("f8[:,::1], f8, f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[::1]", MOTORS)
-def left_over(
+def compute_residuals(
     motors: NDArray[np.void],  # (joints,): MOTORS
     inertia_before: Array,  # (joints, joints), kg m2
     half_rate: float,  # 1/s
@@ -263,7 +269,7 @@ def left_over(
         motor["least_friction"] = min_friction
         motor["most_friction"] = max_friction
         if abs(residual) > noise:
-            verdict = max(verdict, LEFT_OVER)
+            verdict = max(verdict, UNEXPLAINED)
         if abs(wanted[0, j] - position[j]) - motor["off"] > following:
             verdict = ASTRAY
     for j in range(len(motors)):

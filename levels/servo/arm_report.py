@@ -44,9 +44,9 @@ class ArmReport:
     slow: str  # reason shown while the speed of the arm is reduced
 
     def __post_init__(self) -> None:
-        self._joints = numbers(self.status, "position", "target_velocity").reshape(5, -1)
-        self._gripper = numbers(self.status, "opening", "grip_force")
-        self._estimate = numbers(self.state, "position", "doubt").reshape(3, -1)
+        self._joints = view_numbers(self.status, "position", "target_velocity").reshape(5, -1)
+        self._gripper = view_numbers(self.status, "opening", "grip_force")
+        self._estimate = view_numbers(self.state, "position", "doubt").reshape(3, -1)
         self._written: tuple[object, ...] = ()  # fields in the last status that seldom change
 
     def write_numbers(self, sensed: Sensed, wanted: Array) -> None:
@@ -122,7 +122,7 @@ class ArmReport:
             status.reason = followed.reason or broken or slow or followed.note
 
 
-def numbers(message: Message, first: str, last: str) -> Array:
+def view_numbers(message: Message, first: str, last: str) -> Array:
     """Return a view of adjacent numeric fields of a message as one array.
 
     Args:

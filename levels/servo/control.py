@@ -30,7 +30,7 @@ class LoopGains(Table):
     damping: Live[Positive] = Field(1.0, le=3.0)
     """damping ratio of the error"""
 
-    def fill(self, table: Array) -> None:
+    def fill_constants(self, table: Array) -> None:
         """Write stiffness, 1/s2, and damping, 1/s, to the first two rows of a law's constants."""
         table[0] = self.bandwidth**2
         table[1] = 2.0 * self.damping * self.bandwidth
@@ -56,7 +56,7 @@ class ArmParams(Table):
 
     @field_validator("arm")
     @classmethod
-    def _is_an_arm(cls, reference: str) -> str:
+    def _check_arm(cls, reference: str) -> str:
         """Check that the class can be loaded and is an arm."""
         find_arm(reference)
         return reference
@@ -86,17 +86,17 @@ class ComputedTorque:
         """Compensate the dry friction `friction`, (joints,), N m."""
         table = np.zeros((4, len(friction)))  # in the rows of `set_torque`
         self._constants = table
-        self.tune(gains)
+        self.set_gains(gains)
         table[2] = friction
         self._torque: Array = table[3]
-        self._set = partial(set_torque.load(), table)
+        self._set = partial(set_torque.load_machine_code(), table)
         self.inertia: Array | None = None
 
-    def tune(self, gains: LoopGains) -> None:
+    def set_gains(self, gains: LoopGains) -> None:
         """Use new gains from now on."""
-        gains.fill(self._constants)
+        gains.fill_constants(self._constants)
 
-    def torque(self, wanted: Motion, sensed: SensedMotion, terms: Terms) -> Array:
+    def compute_torque(self, wanted: Motion, sensed: SensedMotion, terms: Terms) -> Array:
         """Return the torques for the wanted motion.
 
         Args:
@@ -162,13 +162,13 @@ class SetPointLaw:
     def __init__(self, cell: Cell, params: LoopGains, period_s: float) -> None:
         self._period_s = period_s
         self._is_velocity = cell.interface == "velocity"
-        self.tune(params)
+        self.set_gains(params)
 
-    def tune(self, gains: LoopGains) -> None:
+    def set_gains(self, gains: LoopGains) -> None:
         """Use new gains from now on."""
         self._gain = 0.5 * gains.bandwidth / gains.damping if self._is_velocity else 0.0  # 1/s
 
-    def target(self, wanted: Motion, position: Array, torque: Array) -> JointTarget:
+    def compute_target(self, wanted: Motion, position: Array, torque: Array) -> JointTarget:
         """Return the set points for the end of this cycle.
 
         Args:
@@ -199,21 +199,21 @@ class Grip:
         self._limit = config.force
         self._kept: float | None = None
 
-    def keep(self, force: float) -> None:
+    def keep_force(self, force: float) -> None:
         """Keep `force`, N or N m, until the first set point.
 
         A held object must not be dropped when the board restarts.
         """
         self._kept = force
 
-    def take(self, command: ArmSetPoint) -> None:
+    def take_command(self, command: ArmSetPoint) -> None:
         """Take opening and force from a new `JOINT_SET_POINT`."""
         if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
             self._opening = min(max(command.opening, self._least), self._most)
             self._limit = min(max(command.force, 0.0), self._most_force)
             self._kept = None
 
-    def force(self, opening: float, velocity: float) -> float:
+    def compute_force(self, opening: float, velocity: float) -> float:
         """Return the force, N or N m.
 
         Args:

@@ -60,10 +60,12 @@ class Curve:
         if rest is not None:
             self.table[REST] = rest
 
-    def at(self, time_s: float) -> Motion:
+    def compute_motion(self, time_s: float) -> Motion:
         """Return the motion at `time_s`, which must be at least 0."""
         motion = Motion(np.zeros((3, self.table.shape[1])))
-        set_motion.load()(self.table, self.duration_s, self.ends_s, time_s, 0.0, motion.table)
+        set_motion.load_machine_code()(
+            self.table, self.duration_s, self.ends_s, time_s, 0.0, motion.table
+        )
         return motion
 
 
@@ -120,7 +122,7 @@ class Bridge(Curve):
             end: Position, rad, and velocity, rad/s, to reach.
             duration_s: Duration of the new curve.
         """
-        motion = before.at(begin_s)
+        motion = before.compute_motion(begin_s)
         position, velocity = end
         first = motion.velocity * duration_s
         second = velocity * duration_s

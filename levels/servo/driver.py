@@ -17,7 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from rack.backplane.watch.alarms import BY_DEMAND, Alarm
+from rack.backplane.watch.alarms import BRAKED_BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
 from rack.levels.arm import DrivableArm, DriveState, Sensed, find_arm, preload
@@ -28,13 +28,13 @@ from rack.levels.level import (
     Fault,
     Finding,
     LevelContext,
-    Misfits,
+    Mismatches,
     Output,
     Reading,
 )
 from rack.levels.messages import ArmState, DrivenArm, Error, Scene
 from rack.levels.operator import Operation, OperatorCommand, Orders
-from rack.levels.robot.cell import cell_of, sensed_by
+from rack.levels.robot.cell import build_level_cell, replace_encoders
 from rack.levels.robot.dynamics import Payload, Terms
 from rack.levels.servo import actuator_monitor, sensor_monitor
 from rack.levels.servo.actuator_monitor import ActuatorMonitor
@@ -72,7 +72,7 @@ class ArmDriver(Executor):
     settings: ArmParams
     gives_set_points: ClassVar[bool] = False
     """True if it can also drive an arm by set points. Its torques are then predictions."""
-    ahead: SetPointLaw | None = None
+    set_point_law: SetPointLaw | None = None
     """Computes set points for position or velocity drives. None for torque drives."""
     orders: Orders
     """Commands of the operator."""
@@ -89,12 +89,14 @@ class ArmDriver(Executor):
         every = context.every
         robot = context.robot
         kind = find_arm(params.arm)
-        cell = sensed_by(cell_of(context), robot, kind.sensors)
+        cell = replace_encoders(build_level_cell(context), robot, kind.sensors)
         self.cell = cell
         self.arm: DrivableArm = kind(cell, context.scene, context.clock_ns, every, context.seed)
-        self.part = robot.bring_up or 1.0  # reduced until the operator's release
-        self._path = self.arm.connect(context.tick_s, self.part, self.acted, lambda: self.holds)
-        self._link: Link = self._path.sound
+        self.speed_scale = robot.bring_up or 1.0  # reduced until the operator's release
+        self._path = self.arm.connect(
+            context.tick_s, self.speed_scale, self.acted, lambda: self.holds_part
+        )
+        self._link: Link = self._path.faultless
         self.sensors = SensorMonitor(cell, params, context.tick_s, every)
         is_reported = cell.interface == "torque" or self.arm.reports_torque
         self.motors = ActuatorMonitor(cell, params.following, context.period_s, is_reported)
@@ -117,9 +119,9 @@ class ArmDriver(Executor):
         compiled.preload(sensor_monitor, actuator_monitor)
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield a robot that is a hand, and an arm that the level cannot drive or guard.
 
         A hand of tendons has a board of another kind. An arm that needs a guard must have encoders
@@ -130,8 +132,8 @@ class ArmDriver(Executor):
         reference = read_params(cls.params, context.params).arm
         kind = find_arm(reference)
         if not kind.keeps_limits:
-            cell = sensed_by(cell_of(context), robot, kind.sensors)
-            if why := kind.misfit(cell, robot.bring_up or 1.0):
+            cell = replace_encoders(build_level_cell(context), robot, kind.sensors)
+            if why := kind.find_connect_error(cell, robot.bring_up or 1.0):
                 yield "params.arm", reference, why
         if robot.hand is not None:
             yield (
@@ -142,7 +144,7 @@ class ArmDriver(Executor):
         interface = robot.interface
         if interface != "torque" and not cls.gives_set_points:
             yield "executor", cls.__name__, f'it gives torques; [robot] interface is "{interface}"'
-        elif not kind.takes(interface):
+        elif not kind.has_interface(interface):
             method = "drive" if interface == "torque" else "follow"
             text = f'no `{method}` of the class takes [robot] interface "{interface}"'
             yield "params.arm", reference, text
@@ -150,7 +152,7 @@ class ArmDriver(Executor):
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the faults injected between this level and the arm."""
         self._path.faulty.inject(faults)
-        self._link = self._path.faulty if faults else self._path.sound
+        self._link = self._path.faulty if faults else self._path.faultless
 
     @abstractmethod
     def take_messages(self) -> None:
@@ -174,7 +176,7 @@ class ArmDriver(Executor):
         return self.arm.dynamics.terms(self.sensors.position, self.sensors.velocity, self.payload)
 
     @abstractmethod
-    def efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
+    def compute_efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
         """Return torques, (joints,), N m, and grip force, N, for the wanted motion.
 
         They may use `terms`, the equation of motion of this cycle.
@@ -187,11 +189,11 @@ class ArmDriver(Executor):
 
     @property
     @abstractmethod
-    def holds(self) -> bool:
+    def holds_part(self) -> bool:
         """True if the gripper holds a part."""
 
     @abstractmethod
-    def course(self, reaction: Reaction) -> SetPointStatus:
+    def report_set_points(self, reaction: Reaction) -> SetPointStatus:
         """Return how the level follows its set points, for the status."""
 
     @cached_property
@@ -204,47 +206,47 @@ class ArmDriver(Executor):
         parts = self.arm, self.sensors, self.stopping
         return ArmReport(self.status, self.state, *parts, self.enabling.slow)
 
-    def obey(self, command: OperatorCommand) -> str:
+    def obey_drive_command(self, command: OperatorCommand) -> str:
         """Obey one of `rack.levels.operator.DRIVES`. Return why it is refused, or an empty text."""
         if command.what != Operation.RELEASE:
-            return self.enabling.obey(command)
-        self.part = 1.0
-        self.arm.permit(self.part)
+            return self.enabling.obey_command(command)
+        self.speed_scale = 1.0
+        self.arm.permit_speed(self.speed_scale)
         return ""
 
-    def feel(self, tick: int) -> None:
+    def sense_contact(self, tick: int) -> None:
         """Sense more than the joints, before the reaction is decided. The default does nothing."""
 
-    def adopted(self) -> None:
+    def on_adopted(self) -> None:
         """React to an arm that was just enabled, wherever it is. The default does nothing."""
 
-    def started(self) -> None:
+    def on_restored(self) -> None:
         """React to a restart, after the arm was restored. The default does nothing."""
 
     def process(self, tick: int) -> None:
         """Do one cycle: advance the arm to `tick`, check it, drive or brake it, and report."""
-        missed = self._advance(tick)
+        missed = self._advance_arm(tick)
         self.take_messages()
         sensed = self._link.sense()
-        reaction = self._watch(sensed, missed, tick)
+        reaction = self._check_arm(sensed, missed, tick)
         if reaction is Reaction.BRAKE:
-            self.brake()
+            self.brake_arm()
         elif self.sensors.fresh:
-            self._drive(sensed, reaction, missed, tick)
+            self._drive_arm(sensed, reaction, missed, tick)
         else:
             # Without a new sample the arm keeps its last torque.
-            self.motors.drop()
-        self.arm.brake_cause = BY_DEMAND if self.demand else self.stopping.cause
+            self.motors.drop_cycle()
+        self.arm.brake_cause = BRAKED_BY_DEMAND if self.demand else self.stopping.cause
         self.motors.torque[:] = self.arm.torque
         self._report.write_numbers(sensed, self._wanted)
-        self._report.write_fields(self.course(reaction), self.demand, self.part)
-        self.orders.report(self.status, self.rests_on)
+        self._report.write_fields(self.report_set_points(reaction), self.demand, self.speed_scale)
+        self.orders.fill_status(self.status, self.rests_on)
         self.arm.save(self.state)
-        self.stopping.remember(self.state)
+        self.stopping.save_state(self.state)
         if SCENES.is_due(tick, self.context.every, self.context.phase):
             self.arm.look(self.scene)
 
-    def _advance(self, tick: int) -> bool:
+    def _advance_arm(self, tick: int) -> bool:
         """Advance the arm to `tick`; take it over in the first cycle.
 
         Returns:
@@ -252,75 +254,80 @@ class ArmDriver(Executor):
         """
         is_first = not self.takeover.is_started
         if is_first and self.takeover.start(self.before):
-            self.started()
+            self.on_restored()
         ticks = tick - self.arm.tick
         self.arm.step(ticks)
-        self.arm.report_waiting()
+        self.arm.report_braking()
         if is_first or ticks == self.context.every:
             return False
-        self.motors.drop()
+        self.motors.drop_cycle()
         return True
 
-    def _watch(self, sensed: Sensed, missed: bool, tick: int) -> Reaction:
+    def _check_arm(self, sensed: Sensed, missed: bool, tick: int) -> Reaction:
         """Check sample, contacts, limits and drives, and return the reaction of this cycle."""
         contact = self.arm.contact
         takeover = self.takeover
         was_complete = takeover.is_complete
-        if takeover.adopt(sensed, tick):
+        if takeover.adopt_pose(sensed, tick):
             wanted = None if missed or self.abandoned else self._wanted
-            self.sensors.look(sensed, tick, wanted, contact is not None)
+            self.sensors.check_sample(sensed, tick, wanted, contact is not None)
         if takeover.is_complete and not was_complete:
-            self.adopted()
+            self.on_adopted()
         if contact is not None:
-            blow = Cause(Error.TOUCHED, f"unintended contact: {self.arm.named(contact)}")
-            self.stopping.stop_for(blow, Finding(Alarm.COLLISION, *contact), tick)
+            blow = Cause(Error.TOUCHED, f"unintended contact: {self.arm.describe_contact(contact)}")
+            self.stopping.register_blow(blow, Finding(Alarm.COLLISION, *contact), tick)
         if takeover.is_complete and self.arm.exceeded is not None:
             finding, text = self.arm.exceeded
             cause = Cause(Error.LIMIT, text, finding.subject, finding.value)
-            self.stopping.stop_for(cause, finding, tick)
-        self.feel(tick)
-        if serial := self.enabling.arrived():
-            self.orders.drives_done(serial)
+            self.stopping.register_blow(cause, finding, tick)
+        self.sense_contact(tick)
+        if serial := self.enabling.pop_finished_command():
+            self.orders.report_drives_done(serial)
         if self.enabling.is_enabled:
-            return self.stopping.decide(self.demand, self.sensors, tick)
+            return self.stopping.decide_reaction(self.demand, self.sensors, tick)
         error = Error.DRIVES if self.arm.state is DriveState.FAULT else Error.DISABLED
-        return self.stopping.wait(error, self.enabling.reason, tick)
+        return self.stopping.wait_for_enabling(error, self.enabling.reason, tick)
 
-    def brake(self) -> None:
+    def brake_arm(self) -> None:
         """Engage the brakes, and abandon the set points."""
         self.arm.brake()
-        self.motors.drop()
+        self.motors.drop_cycle()
         self._wanted = self.sensors.state
         self.abandoned = True
 
-    def _drive(self, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
+    def _drive_arm(self, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
         """Drive the arm for one cycle.
 
         It is braked instead if a motor fails, a torque is refused, or a stop is complete.
         """
         wanted = self.next_motion(reaction, missed, tick)
         if wanted is None:
-            return self.brake()
+            return self.brake_arm()
         self.terms = self.find_terms()
-        failed = self.motors.look(wanted.table, self.sensors.state, self.terms, self.holds)
+        failed = self.motors.judge_cycle(
+            wanted.table, self.sensors.state, self.terms, self.holds_part
+        )
         if failed is not None:
-            if not self.stopping.trying:
+            if not self.stopping.is_retrying:
                 self.findings.append(failed)
-            if self.stopping.motor_fails(failed.subject, failed.value, tick) is Reaction.BRAKE:
-                return self.brake()
+            if (
+                self.stopping.register_motor_failure(failed.subject, failed.value, tick)
+                is Reaction.BRAKE
+            ):
+                return self.brake_arm()
         if reaction is Reaction.STOP and (self.abandoned or not wanted.velocity.any()):
-            return self.brake()
-        torque, grip_force = self.efforts(wanted, sensed)
-        if self.ahead is None:
+            return self.brake_arm()
+        torque, grip_force = self.compute_efforts(wanted, sensed)
+        if self.set_point_law is None:
             refused = self._link.drive(torque, grip_force)
         else:
-            target = self.ahead.target(wanted, self.sensors.position, torque)
+            target = self.set_point_law.compute_target(wanted, self.sensors.position, torque)
             refused = self._link.follow(target, grip_force)
         if refused is not None:
             # The arm has engaged its brakes by itself.
-            self.stopping.refuse(refused, tick)
-            return self.brake()
+            self.stopping.register_refusal(refused, tick)
+            return self.brake_arm()
         self._wanted = wanted.table
         self.abandoned = False
         self.stopping.refused = None
-        return self.motors.begin()
+        return self.motors.begin_cycle()

@@ -42,7 +42,7 @@ class Enabling:
         if self._at_start and not (restarted or self._guessed):
             self._arm.enable()
 
-    def obey(self, command: OperatorCommand) -> str:
+    def obey_command(self, command: OperatorCommand) -> str:
         """Obey one of `rack.levels.operator.DRIVES`. Return why it is refused, or an empty text."""
         arm = self._arm
         goal: Collection[DriveState] = list(DriveState)
@@ -66,7 +66,7 @@ class Enabling:
         self._goal = goal
         return ""
 
-    def arrived(self) -> int:
+    def pop_finished_command(self) -> int:
         """Return, once, the serial of a command when the drives have carried it out, else 0."""
         self._restarted = False
         if self._disables:
@@ -115,16 +115,16 @@ class Takeover:
     def start(self, before: Reading[ArmState]) -> bool:
         """Start in the first cycle; return True if an arm was restored from its last state."""
         self.is_started = True
-        self.enabling.start(before.is_there)
-        if before.is_there:
+        self.enabling.start(before.has_message)
+        if before.has_message:
             state = before.message
             self.arm.restore(state)
-            self.sensors.recall(state)
-            self.stopping.recall(state)
+            self.sensors.restore_estimate(state)
+            self.stopping.restore_state(state)
             self.is_complete = self.enabling.is_enabled
-        return before.is_there
+        return before.has_message
 
-    def adopt(self, sensed: Sensed, tick: int) -> bool:
+    def adopt_pose(self, sensed: Sensed, tick: int) -> bool:
         """Adopt the sensed pose unless the takeover is complete.
 
         Returns:
@@ -134,6 +134,6 @@ class Takeover:
         is_enabled = self.enabling.is_enabled
         if self.is_complete and is_enabled:
             return True
-        is_adopted = self.sensors.adopt(sensed, tick)
+        is_adopted = self.sensors.adopt_pose(sensed, tick)
         self.is_complete = is_adopted and is_enabled
         return is_adopted or is_enabled

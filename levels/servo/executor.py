@@ -27,21 +27,21 @@ class ServoExecutor(ServoLaw):
         super().__init__(context)
         self._loop = ComputedTorque(self.arm.dynamics.dry, self.settings)
         if self.cell.interface != "torque":
-            self.ahead = SetPointLaw(self.cell, self.settings, context.period_s)
+            self.set_point_law = SetPointLaw(self.cell, self.settings, context.period_s)
 
     def take_plan(self, plan: ServoPlan) -> None:
         """Take over the held object and the planned inertia."""
         super().take_plan(plan)
         self._loop.inertia = plan.inertia.copy()
 
-    def _obey(self, command: OperatorCommand) -> str:
+    def _obey_command(self, command: OperatorCommand) -> str:
         """Obey a command, and pass gains that it may have changed to the loops."""
-        refusal = super()._obey(command)
-        self._loop.tune(self.settings)
-        if self.ahead is not None:
-            self.ahead.tune(self.settings)
+        refusal = super()._obey_command(command)
+        self._loop.set_gains(self.settings)
+        if self.set_point_law is not None:
+            self.set_point_law.set_gains(self.settings)
         return refusal
 
     def torques(self, set_point: Motion, sensed: SensedMotion) -> Array:
         """Return the torques, (joints,), N m. The array is valid until the next call."""
-        return self._loop.torque(set_point, sensed, self.terms)
+        return self._loop.compute_torque(set_point, sensed, self.terms)

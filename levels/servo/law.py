@@ -24,16 +24,16 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.errors import LevelError
-from rack.levels.level import Input, LevelContext, Misfits, Output, Verdict
+from rack.levels.level import Input, LevelContext, Mismatches, Output, Verdict
 from rack.levels.messages import ArmState, JointCommand, ServoPlan, ServoStatus
-from rack.levels.operator import DRIVES, Goal, Operation, OperatorCommand
+from rack.levels.operator import DRIVE_OPERATIONS, Goal, Operation, OperatorCommand
 from rack.levels.robot.dynamics import Payload
 from rack.levels.servo import control, curves, reference
 from rack.levels.servo.arm_report import SetPointStatus
 from rack.levels.servo.control import Grip, LawParams, limit_torques
 from rack.levels.servo.curves import Motion, SensedMotion
 from rack.levels.servo.driver import SCENES, ArmDriver
-from rack.levels.servo.modification import misfits_of, names_of
+from rack.levels.servo.modification import find_misfits, list_names
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
@@ -66,7 +66,7 @@ class ServoLaw(ArmDriver):
         Operation.SETPOINT: (Goal.JOINTS,),
         Operation.MODIFY: (Goal.ON, Goal.OFF),
         Operation.SET: (),
-        **dict.fromkeys(DRIVES, ()),
+        **dict.fromkeys(DRIVE_OPERATIONS, ()),
     }
     params: ClassVar[type[LawParams]] = LawParams
     settings: LawParams
@@ -76,11 +76,11 @@ class ServoLaw(ArmDriver):
         super().__init__(context)
         cell = self.cell
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
-        self.reference.part = self.part
+        self.reference.speed_scale = self.speed_scale
         self._limits = cell.bounds.torque
         # (joints,), N m: torques of the law after limiting.
         self._torque: Array = np.zeros(len(cell.home))
-        self._limit = limit_torques.load()
+        self._limit = limit_torques.load_machine_code()
         self._cut = 0  # cycles in which a limit cut a torque of the law
         self._sensed = SensedMotion(self.sensors.state)
         self._holds = False
@@ -88,25 +88,25 @@ class ServoLaw(ArmDriver):
         self._modified = ModifiedLaw(context, self.settings, self._limits, self.findings)
         joints = context.robot.joints
         self.operator_control = OperatorControl(
-            self.commands, joints, cell.limits.position, obey=self._obey
+            self.commands, joints, cell.limits.position, obey=self._obey_command
         )
         self.orders = self.operator_control.orders
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
 
     @classmethod
-    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+    def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the names of the control modifications."""
-        return names_of(params)
+        return list_names(params)
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield control modifications that do not suit the law, and what `ArmDriver` yields."""
-        yield from super().misfits(context, above, below)
-        yield from misfits_of(context)
+        yield from super().find_mismatches(context, above, below)
+        yield from find_misfits(context)
         interface = context.robot.interface
-        if interface != "torque" and (names := cls.names(context.params)):
+        if interface != "torque" and (names := cls.list_names(context.params)):
             why = f'they modify a law of torques; [robot] interface is "{interface}"'
             yield "params.modifications", ", ".join(names), why
 
@@ -127,45 +127,45 @@ class ServoLaw(ArmDriver):
     def take_messages(self) -> None:
         """Process a new operator's command, plan or set point."""
         if self.operator.verdict is Verdict.NEW:
-            self.operator_control.take(self.operator, self.sensors.position)
+            self.operator_control.take_commands(self.operator, self.sensors.position)
         if self.plan.verdict is Verdict.NEW:
             self.take_plan(self.plan.message)
         if self.above.verdict is Verdict.NEW:
             command = self.above.message
             self.followed = command.id
             self.rests_on = command.operator
-            self.reference.take(command)
+            self.reference.take_command(command)
             if self._grip is not None:
-                self._grip.take(command)
+                self._grip.take_command(command)
 
     def take_plan(self, plan: ServoPlan) -> None:
         """Take over the payload in the gripper."""
         self._holds = plan.held >= 0
         self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
 
-    def _obey(self, command: OperatorCommand) -> str:
+    def _obey_command(self, command: OperatorCommand) -> str:
         """Obey a command that leaves the one in force unchanged.
 
         Returns:
             Why it is refused, or an empty text.
         """
         if command.what == Operation.MODIFY:
-            return self._modified.switch(command.name, command.goal == Goal.ON)
+            return self._modified.switch_modification(command.name, command.goal == Goal.ON)
         if command.what == Operation.SET:
             self.settings, refusal = set_live(self.settings, command.name)
             return refusal
-        refusal = self.obey(command)
-        self.reference.part = self.part
+        refusal = self.obey_drive_command(command)
+        self.reference.speed_scale = self.speed_scale
         return refusal
 
-    def adopted(self) -> None:
+    def on_adopted(self) -> None:
         """Forget the operator's way back, because the arm may have been moved away from it."""
-        self.operator_control.forget()
+        self.operator_control.forget_return_path()
 
-    def started(self) -> None:
+    def on_restored(self) -> None:
         """Keep the grip on a held part."""
         if self._grip is not None:
-            self._grip.keep(self.arm.grip_force)
+            self._grip.keep_force(self.arm.grip_force)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion:
         """Return the wanted motion. After braking it begins where the arm is."""
@@ -173,36 +173,38 @@ class ServoLaw(ArmDriver):
         reference = self.reference
         if self.abandoned:
             reference.start(sensors.position, sensors.velocity, tick)
-        elif self.ahead is not None and self.arm.braked:
+        elif self.set_point_law is not None and self.arm.braked:
             # The first set point after braking must be exactly where the arm is.
-            reference.meet(sensors.position, sensors.velocity, tick, tolerance_rad=0.0)
+            reference.restart_if_astray(sensors.position, sensors.velocity, tick, tolerance_rad=0.0)
         elif missed:
-            reference.meet(sensors.position, sensors.velocity, tick)
+            reference.restart_if_astray(sensors.position, sensors.velocity, tick)
         if reaction:
-            return reference.rest(tick)
+            return reference.ramp_to_rest(tick)
         return (
-            self.operator_control.wanted(reference, tick)
+            self.operator_control.compute_motion(reference, tick)
             if self.operator_control.stands
-            else reference.at(tick)
+            else reference.compute_motion(tick)
         )
 
-    def efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
+    def compute_efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
         """Return the torques, N m, and the grip force, N."""
         grip = self._grip
-        grip_force = 0.0 if grip is None else grip.force(sensed.opening, sensed.opening_velocity)
+        grip_force = (
+            0.0 if grip is None else grip.compute_force(sensed.opening, sensed.opening_velocity)
+        )
         # For set points the torques are predicted, as if the arm were at its set point.
-        state = self._sensed if self.ahead is None else SensedMotion(wanted.table[:2])
+        state = self._sensed if self.set_point_law is None else SensedMotion(wanted.table[:2])
         if not self._modified.exists:
-            return self._limited(wanted, state), grip_force
+            return self._compute_limited_torque(wanted, state), grip_force
         terms = self.terms
         inputs = LawInputs(
             wanted, state.table, np.diagonal(terms.inertia), terms.bias, self.arm.tick
         )
-        return self._modified.torque(
-            lambda motion, seen: self._limited(motion, SensedMotion(seen)), inputs
+        return self._modified.compute_torque(
+            lambda motion, seen: self._compute_limited_torque(motion, SensedMotion(seen)), inputs
         ), grip_force
 
-    def _limited(self, set_point: Motion, sensed: SensedMotion) -> Array:
+    def _compute_limited_torque(self, set_point: Motion, sensed: SensedMotion) -> Array:
         """Return the torques of the law, cut at their limits. Valid until the next call.
 
         Raises:
@@ -218,10 +220,10 @@ class ServoLaw(ArmDriver):
             self._cut += 1
         return torque
 
-    def brake(self) -> None:
+    def brake_arm(self) -> None:
         """Brake, and abandon set points and torques."""
-        super().brake()
-        self._modified.interrupt()
+        super().brake_arm()
+        self._modified.forget_torque()
 
     @property
     def payload(self) -> Payload | None:
@@ -229,11 +231,11 @@ class ServoLaw(ArmDriver):
         return self._payload
 
     @property
-    def holds(self) -> bool:
+    def holds_part(self) -> bool:
         """True if the gripper holds a part according to the plan."""
         return self._holds
 
-    def course(self, reaction: Reaction) -> SetPointStatus:
+    def report_set_points(self, reaction: Reaction) -> SetPointStatus:
         """Return how the level follows its set points, for the status."""
         operator = self.operator_control
         stands = operator.stands

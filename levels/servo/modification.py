@@ -25,11 +25,11 @@ from pydantic import Field, StringConstraints, field_validator, model_validator
 
 from rack.levels.algebra import Array
 from rack.levels.errors import LevelError
-from rack.levels.level import LevelContext, Misfits
-from rack.levels.operator import NAME_BYTES
-from rack.levels.robot.cell import cell_of
+from rack.levels.level import LevelContext, Mismatches
+from rack.levels.operator import MAX_NAME_BYTES
+from rack.levels.robot.cell import build_level_cell
 from rack.levels.servo.curves import Motion
-from rack.levels.tables import Positive, Table, named_class, read_params
+from rack.levels.tables import Positive, Table, read_params, validate_class
 
 
 class Hook(StrEnum):
@@ -135,9 +135,9 @@ class ModificationConfig(Table):
 
     @field_validator("cls")
     @classmethod
-    def _has_a_hook(cls, reference: str) -> str:
+    def _check_hook(cls, reference: str) -> str:
         """Check that the class can be loaded and declares a valid hook."""
-        hook = getattr(named_class(reference, Modification), "hook", None)
+        hook = getattr(validate_class(reference, Modification), "hook", None)
         hooks = [str(hook) for hook in Hook]
         if hook not in hooks:
             name = reference.partition(":")[2]
@@ -147,7 +147,7 @@ class ModificationConfig(Table):
         return reference
 
     @model_validator(mode="after")
-    def _fits_its_class(self) -> ModificationConfig:
+    def _check_params(self) -> ModificationConfig:
         """Check the params against the table that the class declares."""
         kind = self.kind.params
         if kind is None:
@@ -163,11 +163,11 @@ class ModificationConfig(Table):
     @property
     def kind(self) -> type[Modification]:
         """The class of the modification."""
-        return named_class(self.cls, Modification)
+        return validate_class(self.cls, Modification)
 
 
 ModificationName = Annotated[
-    str, StringConstraints(pattern=rf"^[a-z][a-z0-9_-]{{0,{NAME_BYTES - 1}}}$")
+    str, StringConstraints(pattern=rf"^[a-z][a-z0-9_-]{{0,{MAX_NAME_BYTES - 1}}}$")
 ]
 
 
@@ -181,7 +181,9 @@ class ModifiableParams(Table):
 
     @field_validator("modifications")
     @classmethod
-    def _one_instead(cls, entries: dict[str, ModificationConfig]) -> dict[str, ModificationConfig]:
+    def _check_instead(
+        cls, entries: dict[str, ModificationConfig]
+    ) -> dict[str, ModificationConfig]:
         """Check that at most one modification replaces the law from the start."""
         active = [
             name for name, entry in entries.items() if entry.on and entry.kind.hook == Hook.INSTEAD
@@ -191,7 +193,7 @@ class ModifiableParams(Table):
         return entries
 
 
-def names_of(params: Mapping[str, Any]) -> Sequence[str]:
+def list_names(params: Mapping[str, Any]) -> Sequence[str]:
     """Return the names of the modifications in a board's parameters, for `Executor.names`.
 
     The parameters need not be valid.
@@ -200,14 +202,14 @@ def names_of(params: Mapping[str, Any]) -> Sequence[str]:
     return tuple(table) if isinstance(table, Mapping) else ()
 
 
-def misfits_of(context: LevelContext) -> Misfits:
+def find_misfits(context: LevelContext) -> Mismatches:
     """Yield the modifications of a board that do not suit its law, for `Executor.misfits`."""
     params = read_params(
         ModifiableParams, {"modifications": context.params.get("modifications", {})}
     )
     if not params.modifications:
         return
-    torque = cell_of(context).bounds.torque
+    torque = build_level_cell(context).bounds.torque
     for name, entry in params.modifications.items():
         try:
             entry.kind(LawContext(context.robot.joints, context.period_s, torque, entry.params))

@@ -47,7 +47,7 @@ class LawInputs(NamedTuple):
 
 
 @dataclass
-class Modified:
+class ModificationState:
     """One modification of a law, switched on or off."""
 
     number: int
@@ -56,7 +56,7 @@ class Modified:
     is_on: bool
     begins: bool = True  # the next sample is the first after it was switched on
 
-    def act(self, sample: LawSample, changed: Array) -> str:
+    def apply_to(self, sample: LawSample, changed: Array) -> str:
         """Modify a sample.
 
         Args:
@@ -111,7 +111,7 @@ class ModifiedLaw:
         period_s = context.period_s
         self.exists = bool(params.modifications)
         self._all = {
-            name: Modified(
+            name: ModificationState(
                 number,
                 name,
                 entry.kind(LawContext(joints, period_s, torque, entry.params)),
@@ -130,9 +130,9 @@ class ModifiedLaw:
         self._is_driving = False  # the last sample's torque was given to the arm
         self._switched = False  # a modification was switched after the last sample
         self._failed: dict[str, str] = {}  # reason of each failure, by name
-        self._arrange()
+        self._update_hooks()
 
-    def switch(self, name: str, is_on: bool) -> str:
+    def switch_modification(self, name: str, is_on: bool) -> str:
         """Switch a modification on or off from the next sample.
 
         Returns:
@@ -144,17 +144,17 @@ class ModifiedLaw:
         if is_on != state.is_on or state.name in self._failed:
             self._failed.pop(state.name, None)
             if is_on and state.modification.hook == Hook.INSTEAD:
-                for other in self._hooked(Hook.INSTEAD):
+                for other in self._list_hooked(Hook.INSTEAD):
                     other.is_on = False
             state.is_on = state.begins = is_on
-            self._arrange()
+            self._update_hooks()
         return ""
 
-    def interrupt(self) -> None:
+    def forget_torque(self) -> None:
         """Forget the last torque, because the arm was braked."""
         self._is_driving = False
 
-    def torque(self, law: Law, inputs: LawInputs) -> Array:
+    def compute_torque(self, law: Law, inputs: LawInputs) -> Array:
         """Return the torques of the modified law.
 
         Args:
@@ -164,19 +164,21 @@ class ModifiedLaw:
         Returns:
             Torques, (joints,), N m. The array is valid until the next call.
         """
-        torque = self._modified(law, inputs) if self._in else law(inputs.motion, inputs.state)
+        torque = (
+            self._compute_modified(law, inputs) if self._in else law(inputs.motion, inputs.state)
+        )
         tick = inputs.tick
         if self._switched:
             self._switched = False
             self._since = tick if self._is_driving else None
             self._difference[:] = self._last - torque
         if self._since is not None:
-            torque = self._go_over(torque, tick - self._since)
+            torque = self._blend_torque(torque, tick - self._since)
         np.minimum(np.maximum(torque, -self._torque), self._torque, out=self._last)  # NaN stays
         self._is_driving = True
         return self._last
 
-    def _modified(self, law: Law, inputs: LawInputs) -> Array:
+    def _compute_modified(self, law: Law, inputs: LawInputs) -> Array:
         """Run the active modifications around, or in place of, the law; return the torques."""
         sample = self._sample
         sample.tick = inputs.tick
@@ -186,24 +188,24 @@ class ModifiedLaw:
         sample.seen[3:] = inputs.state
         sample.torque[:] = np.nan
         for state in self._before:
-            self._act(state, sample.seen)
-        if not any(self._act(state, sample.torque) for state in self._instead):
+            self._apply_modification(state, sample.seen)
+        if not any(self._apply_modification(state, sample.torque) for state in self._instead):
             sample.torque = law(sample.motion, sample.seen[3:])
         for state in self._after:
-            self._act(state, sample.torque)
+            self._apply_modification(state, sample.torque)
         return sample.torque
 
-    def _act(self, state: Modified, changed: Array) -> bool:
+    def _apply_modification(self, state: ModificationState, changed: Array) -> bool:
         """Apply one modification; switch it off if it fails. Return True if it succeeded."""
-        failure = state.act(self._sample, changed)
+        failure = state.apply_to(self._sample, changed)
         if failure:
             state.is_on = False
             self._failed[state.name] = failure
             self._findings.append(Finding(Alarm.MODIFICATION, state.number))
-            self._arrange()
+            self._update_hooks()
         return not failure
 
-    def _go_over(self, torque: Array, ticks: int) -> Array:
+    def _blend_torque(self, torque: Array, ticks: int) -> Array:
         """Return the torque plus what is left of the difference, `ticks` after the switch."""
         passed = ticks / self._ticks  # part of the transfer
         if passed >= 1.0:
@@ -211,14 +213,14 @@ class ModifiedLaw:
             return torque
         return torque + (1.0 - passed) ** 2 * (1.0 + 2.0 * passed) * self._difference
 
-    def _hooked(self, hook: Hook) -> Sequence[Modified]:
+    def _list_hooked(self, hook: Hook) -> Sequence[ModificationState]:
         """Return the active modifications with a hook, in the order of the config."""
         return [state for state in self._in if state.modification.hook == hook]
 
-    def _arrange(self) -> None:
+    def _update_hooks(self) -> None:
         """Sort the active modifications by hook, and describe them in `reason`."""
         self._in = [state for state in self._all.values() if state.is_on]
-        self._before, self._instead, self._after = (self._hooked(hook) for hook in Hook)
+        self._before, self._instead, self._after = (self._list_hooked(hook) for hook in Hook)
         self._switched = True
         failed = [f"modification '{name}' taken out: {why}" for name, why in self._failed.items()]
         active = [f"modified by {', '.join(state.name for state in self._in)}"] if self._in else []

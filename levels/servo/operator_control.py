@@ -9,13 +9,13 @@ import numpy as np
 from rack.backplane.mailbox.mailbox import Reading
 from rack.levels.algebra import Array, Mask
 from rack.levels.operator import (
-    DRIVES,
+    DRIVE_OPERATIONS,
     SETTINGS,
     Commands,
     Operation,
     OperatorCommand,
     Orders,
-    joints_of,
+    read_joint_goal,
 )
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.reference import Reference
@@ -63,16 +63,16 @@ class OperatorControl:
         # (joints,), rad each: places from which the arm set out, oldest first.
         self._way: list[Array] = []
 
-    def take(self, operator: Reading[OperatorCommand], position: Array) -> None:
+    def take_commands(self, operator: Reading[OperatorCommand], position: Array) -> None:
         """Accept new commands, with the arm at `position`, (joints,), rad."""
         self._position[:] = position
-        if not self.orders.take(operator, self._judge):
+        if not self.orders.take_commands(operator, self._judge_command):
             return
-        if not self.orders.stands and self._way:
-            self.orders.under_way()
-        self.stands = self.orders.stands or bool(self._way)
+        if not self.orders.is_in_force and self._way:
+            self.orders.report_under_way()
+        self.stands = self.orders.is_in_force or bool(self._way)
 
-    def forget(self) -> None:
+    def forget_return_path(self) -> None:
         """Forget the way back, so that the level above continues from where the arm is."""
         self._way.clear()
 
@@ -81,43 +81,43 @@ class OperatorControl:
         """Why the arm does not follow the level above. Empty if it does."""
         if not self.stands:
             return ""
-        if not self.orders.stands:
+        if not self.orders.is_in_force:
             return "returning to where the operator took over, then follows the level above"
-        state = "held" if self.orders.holds else f"at the {self.orders.standing.name.lower()}"
+        state = "held" if self.orders.is_holding else f"at the {self.orders.standing.name.lower()}"
         return f"{state} by the operator; `resume` releases it"
 
-    def _judge(self, command: OperatorCommand) -> None:
+    def _judge_command(self, command: OperatorCommand) -> None:
         """Accept the goal of a set point or refuse it; obey settings and drive commands."""
-        if command.what in (*SETTINGS, *DRIVES):
+        if command.what in (*SETTINGS, *DRIVE_OPERATIONS):
             if refusal := self._obey(command):
-                self.orders.refuse(refusal)
+                self.orders.refuse_newest(refusal)
         elif self.orders.standing is Operation.SETPOINT:
             try:
-                positions = joints_of(command, self._joints, self._ranges)
+                positions = read_joint_goal(command, self._joints, self._ranges)
             except ValueError as error:
-                self.orders.refuse(str(error))
+                self.orders.refuse_newest(str(error))
             else:
                 self._goal = self._position.copy()
                 self._goal[self._driven] = positions
 
-    def wanted(self, reference: Reference, tick: int) -> Motion:
+    def compute_motion(self, reference: Reference, tick: int) -> Motion:
         """Return the motion wanted at `tick` while the level follows the operator."""
-        returns = self._way and not self.orders.stands
+        returns = self._way and not self.orders.is_in_force
         goal = self._way[-1] if returns else None
         if self.orders.standing is Operation.SETPOINT:
             goal = self._goal
         if goal is None:
-            motion = reference.rest(tick)
+            motion = reference.ramp_to_rest(tick)
         else:
             before = reference.goal
-            motion = reference.to(goal, tick)
+            motion = reference.move_to(goal, tick)
             if reference.goal is not before and self.orders.standing is Operation.SETPOINT:
                 self._way.append(motion.position.copy())
         if not motion.velocity.any() and (goal is None or np.array_equal(motion.position, goal)):
             # The motion has arrived at its goal.
             if returns:
                 self._way.pop()
-            if self.orders.stands or not self._way:
-                self.stands = self.orders.stands
-                self.orders.done()
+            if self.orders.is_in_force or not self._way:
+                self.stands = self.orders.is_in_force
+                self.orders.report_done()
         return motion

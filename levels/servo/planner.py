@@ -8,7 +8,7 @@ import numpy as np
 from rack.levels.algebra import mat_vec, transposed_mat_vec
 from rack.levels.level import Input, LevelContext, Output, Planner
 from rack.levels.messages import JointCommand, Scene, ServoPlan, ServoStatus
-from rack.levels.robot.cell import cell_of
+from rack.levels.robot.cell import build_level_cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 
 
@@ -22,7 +22,7 @@ class ServoPlanner(Planner):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        cell = cell_of(context)
+        cell = build_level_cell(context)
         self._dynamics = Dynamics(cell)
         self._home = cell.home
         self._objects = len(cell.object_qpos)
@@ -41,21 +41,21 @@ class ServoPlanner(Planner):
         command = self.above.message
         held = -1
         payload = Payload(0.0, np.zeros(3))
-        if command.due != 0 and self.scene.is_there and 0 <= command.held < self._objects:
+        if command.due != 0 and self.scene.has_message and 0 <= command.held < self._objects:
             held = command.held
-            payload = self._payload(self.scene.message, held)
+            payload = self._compute_payload(self.scene.message, held)
         # Use the next set point, else the sensed position, or home before the first status.
         position = self._home
         if command.due != 0 and np.isfinite(command.position).all():
             position = command.position
-        elif self.status.is_there:
+        elif self.status.has_message:
             position = self.status.message.position
         self.output.inertia = self._dynamics.terms(position, self._rest, payload).inertia
         self.output.held = held
         self.output.payload_mass = payload.mass
         self.output.payload_offset = payload.offset
 
-    def _payload(self, scene: Scene, held: int) -> Payload:
+    def _compute_payload(self, scene: Scene, held: int) -> Payload:
         """Return the payload that an object puts on the tool, from its pose in the scene.
 
         Args:

@@ -67,12 +67,12 @@ class Reference:
         # The wanted motion, and its difference from the curve.
         self._motions = np.zeros((2, 3, joints))
         self._wanted = Motion(self._motions[0])
-        self._interpolate = set_motion.load()
+        self._interpolate = set_motion.load_machine_code()
         self._command: ArmSetPoint | None = None  # the newest `JOINT_SET_POINT`
         self._offered = 0  # tick at which that set point is due
         self._due = 0  # tick at which the present curve ends
         self._next: SetPoint | None = None  # set point to follow after that tick
-        self.part = 1.0
+        self.speed_scale = 1.0
         self.goal: Array | None = None
         self.holding = True
         self.refused = 0
@@ -92,7 +92,7 @@ class Reference:
         self.goal = None
         self.holding = True
 
-    def meet(
+    def restart_if_astray(
         self, position: Array, velocity: Array, tick: int, tolerance_rad: float = ASTRAY_RAD
     ) -> None:
         """After missed cycles, restart from where the arm is, if it has strayed from the motion.
@@ -105,15 +105,15 @@ class Reference:
             tick: Tick of the sample.
             tolerance_rad: Distance from which the arm counts as strayed.
         """
-        now = self._motion(tick)
+        now = self._evaluate_motion(tick)
         if np.max(np.abs(now.position - position)) < tolerance_rad:
             return
         if self.holding or tick >= self._due:
             self.start(position, velocity, tick)
         else:
-            self._join(position, velocity, tick)
+            self._begin_decay(position, velocity, tick)
 
-    def take(self, command: ArmSetPoint) -> None:
+    def take_command(self, command: ArmSetPoint) -> None:
         """Accept a new `JOINT_SET_POINT`.
 
         The message must stay the newest one until the next call, because it is copied later.
@@ -121,28 +121,28 @@ class Reference:
         self._command = command
         self._offered = command.due
 
-    def at(self, tick: int) -> Motion:
+    def compute_motion(self, tick: int) -> Motion:
         """Return the motion wanted at `tick`, with the acceleration of the middle of the cycle."""
         if self._next is not None and (self.holding or tick >= self._due):
-            self._advance(self._next, tick)
+            self._begin_curve(self._next, tick)
         offered = self._offered
         waiting = self._next
         if tick < offered != self._due and (waiting is None or offered != waiting.due):
-            self._receive(offered, tick)
+            self._receive_set_point(offered, tick)
         if not self.holding and tick >= self._due:
-            last = self._motion(self._due)
+            last = self._evaluate_motion(self._due)
             self.start(last.position, last.velocity, self._due)
-        return self._motion(tick)
+        return self._evaluate_motion(tick)
 
-    def rest(self, tick: int) -> Motion:
+    def ramp_to_rest(self, tick: int) -> Motion:
         """Return the motion wanted at `tick` when ramping to rest, ignoring the level above."""
         self._next = None
         if not self.holding or self.goal is not None:
-            now = self._motion(tick)
+            now = self._evaluate_motion(tick)
             self.start(now.position, now.velocity, tick)
-        return self._motion(tick)
+        return self._evaluate_motion(tick)
 
-    def to(self, goal: Array, tick: int) -> Motion:
+    def move_to(self, goal: Array, tick: int) -> Motion:
         """Return the motion wanted at `tick` on the way to a goal, ignoring the level above.
 
         The motion ramps to rest, then goes straight to the goal within the limits of every joint.
@@ -152,20 +152,20 @@ class Reference:
             tick: Tick of the motion.
         """
         if self.goal is goal:
-            return self._motion(tick)
-        now = self.rest(tick)
+            return self._evaluate_motion(tick)
+        now = self.ramp_to_rest(tick)
         if now.velocity.any():
             return now
         limits = self._limits
-        fastest = self.part * limits.velocity
-        hardest = self.part**2 * limits.acceleration
+        fastest = self.speed_scale * limits.velocity
+        hardest = self.speed_scale**2 * limits.acceleration
         self._curve = Passage(now.position, goal, fastest, hardest)
         self._from = tick
         self._difference = None
         self.goal = goal
-        return self._motion(tick)
+        return self._evaluate_motion(tick)
 
-    def _receive(self, due: int, tick: int) -> None:
+    def _receive_set_point(self, due: int, tick: int) -> None:
         """Copy the set point that was offered.
 
         It waits until the one before it is due, because some protocols deliver early.
@@ -183,9 +183,9 @@ class Reference:
         else:
             self.refused += 1
         if self._next is not None and (self.holding or tick >= self._due):
-            self._advance(self._next, tick)
+            self._begin_curve(self._next, tick)
 
-    def _advance(self, set_point: SetPoint, tick: int) -> None:
+    def _begin_curve(self, set_point: SetPoint, tick: int) -> None:
         """Begin the curve to the waiting set point, once the one before it is due."""
         due, position, velocity = set_point
         self._next = None
@@ -204,15 +204,15 @@ class Reference:
             ):
                 self._difference = None
             return
-        now = self._motion(tick)
+        now = self._evaluate_motion(tick)
         left_s = (due - tick) * self._tick_s
         self._curve = Curve(position - velocity * left_s, velocity * left_s, duration_s=left_s)
         self._from = tick
         self._due = due
         self.holding = False
-        self._join(now.position, now.velocity, tick)
+        self._begin_decay(now.position, now.velocity, tick)
 
-    def _join(self, position: Array, velocity: Array, tick: int) -> None:
+    def _begin_decay(self, position: Array, velocity: Array, tick: int) -> None:
         """Let the difference between a motion at `tick` and the curve decay smoothly.
 
         Args:
@@ -220,14 +220,14 @@ class Reference:
             velocity: (joints,), rad/s.
             tick: Tick of that motion.
         """
-        curve = self._curve.at((tick - self._from) * self._tick_s)
-        fastest = JOINING_SPEED_PART * self.part * self._limits.velocity
+        curve = self._curve.compute_motion((tick - self._from) * self._tick_s)
+        fastest = JOINING_SPEED_PART * self.speed_scale * self._limits.velocity
         self._difference = Decay(
             position - curve.position, velocity - curve.velocity, fastest, self._limits.acceleration
         )
         self._differs_from = tick
 
-    def _motion(self, tick: int) -> Motion:
+    def _evaluate_motion(self, tick: int) -> Motion:
         """Return the motion at `tick`, with the acceleration of the middle of the cycle.
 
         The result is valid until the next call.

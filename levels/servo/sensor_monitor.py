@@ -84,14 +84,14 @@ class Tolerance(NamedTuple):
     jitter_s: float  # permitted error of the sampling time at full speed
 
 
-def tolerance(cell: Cell) -> Tolerance:
+def compute_tolerance(cell: Cell) -> Tolerance:
     """Return the errors that a `SensorMonitor` tolerates in one sample.
 
     A position is compared with the sample before, so each sample gets half of the tolerance.
     """
-    position_error = 0.5 * FIT_RAD + cell.encoders.off
+    position_error = 0.5 * FIT_RAD + cell.encoders.position_error
     jitter_s = float(np.min(position_error / cell.bounds.velocity))
-    return Tolerance(position_error, cell.encoders.speed_off, jitter_s)
+    return Tolerance(position_error, cell.encoders.velocity_error, jitter_s)
 
 
 class SensorMonitor:
@@ -138,9 +138,9 @@ class SensorMonitor:
         self._joints = np.zeros(joints, MONITORED)
         self._joints["braking"] = cell.limits.acceleration
         self._joints["fastest"] = BEYOND_SPEED * bounds.velocity
-        self._joints["tolerance"] = FIT_RAD + 2.0 * encoders.off
-        self._joints["velocity_tolerance"] = encoders.speed_off
-        self._joints["unshown"] = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.off)
+        self._joints["tolerance"] = FIT_RAD + 2.0 * encoders.position_error
+        self._joints["velocity_tolerance"] = encoders.velocity_error
+        self._joints["unshown"] = np.maximum(STILL_RAD, STUCK_STEPS * 2.0 * encoders.position_error)
         self.position[:] = self._joints["last_position"] = home
         self.fresh = True
         self.faulty = False
@@ -151,7 +151,9 @@ class SensorMonitor:
         self._suspect = np.zeros(joints, dtype=bool)
         self._everyone = np.ones(joints, dtype=bool)
         self._sent = self._everyone  # joints whose set points move, or may have moved
-        self._check = partial(check.load(), self._joints, self.estimate, not encoders.exact)
+        self._check = partial(
+            check.load_machine_code(), self._joints, self.estimate, not encoders.is_exact
+        )
         self._tick: int | None = None
         self._sampled = -sys.maxsize  # tick of the newest sample
         self._latency = encoders.latency_ticks
@@ -160,14 +162,14 @@ class SensorMonitor:
         self._streak = 0  # consecutive good samples
         self._rung: set[Alarm] = set()  # alarms raised in this episode
 
-    def recall(self, state: ArmState) -> None:
+    def restore_estimate(self, state: ArmState) -> None:
         """Continue from the estimate in an `ARM_STATE` after a restart."""
         self.position[:] = state.position
         self.velocity[:] = state.velocity
         self.doubt[:] = state.doubt
         self._tick = state.tick
 
-    def adopt(self, sensed: Sensed, tick: int) -> bool:
+    def adopt_pose(self, sensed: Sensed, tick: int) -> bool:
         """Take the sensed pose as the true one, without comparing it with earlier samples.
 
         This is for an arm that is not driven yet; it may have been moved by hand.
@@ -183,10 +185,12 @@ class SensorMonitor:
         joints["last_velocity"] = self.velocity[:] = qd
         self.doubt[:] = 0.0
         self._tick = tick - self._every
-        self._trust()
+        self._end_episode()
         return True
 
-    def look(self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool = False) -> None:
+    def check_sample(
+        self, sensed: Sensed, tick: int, wanted: Array | None, struck: bool = False
+    ) -> None:
         """Check the sample of a cycle, and add faults to `findings`, once per episode.
 
         Args:
@@ -216,7 +220,7 @@ class SensorMonitor:
             return
         joints = self._joints
         if verdict == GOOD:
-            self._take(joints["allowed"])
+            self._accept_sample(joints["allowed"])
             return
         self._sent = self._everyone if wanted is None else wanted[1] != 0.0
         fitting = joints["fits"]
@@ -224,9 +228,9 @@ class SensorMonitor:
             offset = joints["position"] - self.position - joints["way"]
             fitting = fitting | (np.abs(offset) <= joints["allowed"] + self.doubt)
         fastest = blow * joints["fastest"] if struck else joints["fastest"]
-        self._doubtful(fitting & (np.abs(joints["velocity"]) <= fastest), passed_s)
+        self._judge_doubtful_sample(fitting & (np.abs(joints["velocity"]) <= fastest), passed_s)
 
-    def _take(self, tolerance: Array) -> None:
+    def _accept_sample(self, tolerance: Array) -> None:
         """Accept the sample, and report joints that this moves by more than `tolerance`, rad."""
         joints = self._joints
         q = joints["position"]
@@ -246,7 +250,7 @@ class SensorMonitor:
         for field in ("position", "velocity"):
             self._joints[f"last_{field}"] = self._joints[field]
 
-    def _doubtful(self, fits: Mask, passed_s: float) -> None:
+    def _judge_doubtful_sample(self, fits: Mask, passed_s: float) -> None:
         """Report the faults of a sample, accept its good joints, and estimate the others.
 
         Args:
@@ -270,9 +274,9 @@ class SensorMonitor:
         allowed += passed_s * np.abs(qd - last_qd)
         steady = np.abs(q - last_q - (0.5 * passed_s) * (qd + last_qd)) <= allowed
         offset = q - self.position - travel
-        self._name(Alarm.SENSOR_RANGE, ~finite | ~inside, q)
-        self._name(Alarm.SENSOR_STUCK, frozen | still, cycles)
-        self._name(Alarm.SENSOR_MODEL, finite & ~fits & ~frozen, offset)
+        self._report_joint(Alarm.SENSOR_RANGE, ~finite | ~inside, q)
+        self._report_joint(Alarm.SENSOR_STUCK, frozen | still, cycles)
+        self._report_joint(Alarm.SENSOR_MODEL, finite & ~fits & ~frozen, offset)
         good = fits & steady & inside & ~still & ~frozen
         self.drivable = bool((np.isfinite(qd) & ~frozen & ~still).all())
         self.doubt[still] += STUCK_RAD
@@ -295,13 +299,15 @@ class SensorMonitor:
             joint = int(np.where(good, -1.0, amount).argmax())
             self.blamed = joint, float(q[joint]), float(offset[joint])
         self._suspect |= ~good
-        if self._settled(bool(good.all())):
-            self._take(joints["tolerance"])
+        if self._count_good_sample(bool(good.all())):
+            self._accept_sample(joints["tolerance"])
             return
         self._keep_sample()
-        self._estimate(q, qd, travel, np.isfinite(qd) & ~frozen, passed_s)
+        self._estimate_suspects(q, qd, travel, np.isfinite(qd) & ~frozen, passed_s)
 
-    def _estimate(self, q: Array, qd: Array, travel: Array, known: Mask, passed_s: float) -> None:
+    def _estimate_suspects(
+        self, q: Array, qd: Array, travel: Array, known: Mask, passed_s: float
+    ) -> None:
         """Estimate the suspect joints, and accept the others as sensed.
 
         A suspect joint is estimated from its velocity, or as braked where that is unknown. Its
@@ -316,7 +322,7 @@ class SensorMonitor:
         """
         coasting = self._suspect & known
         self.doubt[coasting] += 0.5 * passed_s * np.abs(qd - self.velocity)[coasting]
-        self._brake(self._suspect & ~known, passed_s)
+        self._estimate_braking(self._suspect & ~known, passed_s)
         np.copyto(self.position, q, where=~self._suspect)
         np.add(self.position, travel, out=self.position, where=coasting)
         np.copyto(self.velocity, qd, where=known)
@@ -326,22 +332,22 @@ class SensorMonitor:
         is_late = self._late >= SILENT_CYCLES
         is_silent = age >= SILENT_CYCLES * self._every
         if is_late:
-            self._ring(Finding(Alarm.SENSOR_LATE, -1, age))
+            self._report_fault(Finding(Alarm.SENSOR_LATE, -1, age))
             self.missing = (
                 f"the newest sample is {age} ticks old; permitted by robot.latency_ticks:"
                 f" {self._latency}"
             )
         elif is_silent and not self._late:
-            self._ring(Finding(Alarm.SENSOR_SILENT, -1, age))
+            self._report_fault(Finding(Alarm.SENSOR_SILENT, -1, age))
             self.missing = NO_SAMPLES
         if is_late or is_silent:
             self.drivable = False
             self._suspect[:] = True
             self.blamed = -1, float(age), 0.0
         self._streak = 0
-        self._brake(self._everyone, passed_s)
+        self._estimate_braking(self._everyone, passed_s)
 
-    def _brake(self, joints: Mask, passed_s: float) -> None:
+    def _estimate_braking(self, joints: Mask, passed_s: float) -> None:
         """Estimate how the brakes have stopped `joints`."""
         if not joints.any():
             return
@@ -357,13 +363,13 @@ class SensorMonitor:
         slower = np.copysign(np.maximum(speed - braking * time_s, 0.0), self.velocity)
         np.copyto(self.velocity, slower, where=joints)
 
-    def _name(self, alarm: Alarm, wrong: Mask, values: Array | Ints) -> None:
+    def _report_joint(self, alarm: Alarm, wrong: Mask, values: Array | Ints) -> None:
         """Report the first joint that is `wrong`, with its value."""
         if wrong.any():
             joint = int(wrong.argmax())
-            self._ring(Finding(alarm, joint, float(values[joint])))
+            self._report_fault(Finding(alarm, joint, float(values[joint])))
 
-    def _ring(self, finding: Finding) -> None:
+    def _report_fault(self, finding: Finding) -> None:
         """Report a fault, once per episode, and restart the count of good samples."""
         self.faulty = True
         self._streak = 0
@@ -371,16 +377,16 @@ class SensorMonitor:
             self._rung.add(finding.alarm)
             self.findings.append(finding)
 
-    def _settled(self, good: bool) -> bool:
+    def _count_good_sample(self, good: bool) -> bool:
         """Count consecutive good samples. Return True if they are enough to end the episode."""
         self._streak = self._streak + 1 if good else 0
         needed = self._retry_cycles if self._unproven.any() else self._good_cycles
         if self._streak < needed:
             return False
-        self._trust()
+        self._end_episode()
         return True
 
-    def _trust(self) -> None:
+    def _end_episode(self) -> None:
         """End an episode: trust all sensors again."""
         self.faulty = False
         self._streak = 0

@@ -85,7 +85,7 @@ class Stopping:
         self._struck_until: int | None = None  # tick until which a struck arm stays stopped
         self._on_blow = Reaction.BRAKE  # reaction until that tick
 
-    def recall(self, state: ArmState) -> None:
+    def restore_state(self, state: ArmState) -> None:
         """Continue from an `ARM_STATE` after a restart."""
         self._tick = state.tick
         self._kept = state.kept
@@ -93,7 +93,7 @@ class Stopping:
             self.error = Error(state.error)
             self.reason = state.reason
 
-    def remember(self, state: ArmState) -> None:
+    def save_state(self, state: ArmState) -> None:
         """Write the state that `restore_state` needs; only when it has changed."""
         error = self.error or (Error.DISABLED if self.is_disabled else Error.NONE)
         if (self._kept, error) != self._remembered:
@@ -108,11 +108,11 @@ class Stopping:
         return self.cause in (Error.DISABLED, Error.DRIVES)
 
     @property
-    def trying(self) -> bool:
+    def is_retrying(self) -> bool:
         """True while a motor is at fault, or has not yet proved to work again."""
         return self._retry_at is not None
 
-    def motor_fails(self, joint: int, lacking: float, tick: int) -> Reaction:
+    def register_motor_failure(self, joint: int, lacking: float, tick: int) -> Reaction:
         """Register a failed motor.
 
         Args:
@@ -129,15 +129,15 @@ class Stopping:
         self._motor = Cause(
             Error.MOTORS, text, joint, lacking, f"; tried again at tick {self._retry_at}"
         )
-        self._wait_for(self._motor, tick)
+        self._set_cause(self._motor, tick)
         return self._on_failure
 
-    def refuse(self, finding: Finding, tick: int) -> None:
+    def register_refusal(self, finding: Finding, tick: int) -> None:
         """Register a torque or set point that the arm refused."""
         self.refused = finding
-        self._wait_for(self._about_torque(finding), tick)
+        self._set_cause(self._describe_refusal(finding), tick)
 
-    def stop_for(
+    def register_blow(
         self, blow: Cause, finding: Finding, tick: int, reaction: Reaction = Reaction.BRAKE
     ) -> None:
         """Register a contact that is unintended or too strong, or a joint beyond its limit.
@@ -156,7 +156,7 @@ class Stopping:
         self._struck_until = tick + self._retry_ticks
         self._blow = blow
 
-    def wait(self, error: Error, why: str, tick: int) -> Reaction:
+    def wait_for_enabling(self, error: Error, why: str, tick: int) -> Reaction:
         """Return the reaction of this cycle while the arm is not enabled, without a time limit.
 
         Args:
@@ -170,7 +170,7 @@ class Stopping:
             self.reason = why
         return Reaction.BRAKE
 
-    def decide(self, demand: Demand, sensors: SensorMonitor, tick: int) -> Reaction:
+    def decide_reaction(self, demand: Demand, sensors: SensorMonitor, tick: int) -> Reaction:
         """Return the reaction of this cycle while the arm is enabled.
 
         Args:
@@ -190,7 +190,7 @@ class Stopping:
             self.cause = Error.NONE
             self.reason = ""
             return Reaction.NONE
-        reaction, cause = self._weigh(sensors, tick)
+        reaction, cause = self._weigh_faults(sensors, tick)
         if cause is None:
             self._kept = max(self._kept - passed, 0)
         elif not demand:
@@ -207,24 +207,24 @@ class Stopping:
                 " order"
             )
         elif cause is not None:
-            self._wait_for(cause, tick)
+            self._set_cause(cause, tick)
         else:
             self.cause = Error.NONE
             self.reason = ""
         return max(reaction, Reaction[demand.name]) if demand else reaction
 
-    def _wait_for(self, cause: Cause, tick: int) -> None:
+    def _set_cause(self, cause: Cause, tick: int) -> None:
         """Set `cause` and `reason`; the reason names the tick at which the fault is latched."""
         self.cause = cause.error
         self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 
-    def _weigh(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
+    def _weigh_faults(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
         """Return the strongest reaction to present faults, and the fault to report."""
         reaction = Reaction.NONE
-        cause = None if self.refused is None else self._about_torque(self.refused)
+        cause = None if self.refused is None else self._describe_refusal(self.refused)
         if sensors.faulty:
             reaction = self._on_sensors if sensors.drivable else Reaction.BRAKE
-            cause = self._about_sensors(sensors)
+            cause = self._describe_sensor_fault(sensors)
         if self._retry_at is not None:
             if tick >= self._retry_at + self._good_ticks:
                 self._retry_at = None
@@ -238,7 +238,7 @@ class Stopping:
             self._struck_until = None
         return reaction, cause
 
-    def _about_sensors(self, sensors: SensorMonitor) -> Cause:
+    def _describe_sensor_fault(self, sensors: SensorMonitor) -> Cause:
         """Describe the fault of the sensors as the cause of a stop."""
         joint, read, offset = sensors.blamed
         if joint < 0:
@@ -248,7 +248,7 @@ class Stopping:
             text = f"{text}, off by {offset:.3g}"
         return Cause(Error.SENSORS, text, joint, read)
 
-    def _about_torque(self, refused: Finding) -> Cause:
+    def _describe_refusal(self, refused: Finding) -> Cause:
         """Describe a refused torque or set point as the cause of a stop."""
         value = (
             "not finite" if refused.alarm is Alarm.COMMAND_INVALID else f"{refused.value:.3g} N m"

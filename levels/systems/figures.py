@@ -81,7 +81,7 @@ class FigureExecutor(FigureLoop):
 
     def process(self, tick: int) -> None:
         """Note the newest plan, then write the status and consume X."""
-        if self.plan.is_there:
+        if self.plan.has_message:
             self.plan_in_use = self.plan.message.made_at
         super().process(tick)
 
@@ -106,5 +106,5 @@ class FigurePlanner(Planner):
         """Write the plan, then consume P. Time while preempted does not count."""
         end_ns = process_time_ns() + self._time_ns
         self.output.made_at = tick
-        self.output.cycle = self.status.message.cycle if self.status.is_there else -1
+        self.output.cycle = self.status.message.cycle if self.status.has_message else -1
         compute_until(end_ns)

@@ -12,17 +12,17 @@ from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.messages import Error, Verb
 from rack.levels.planning.ik import MAX_RESTARTS
-from rack.levels.planning.motion_planner import MAX_STRAY_M, MotionPlanner, in_metres
+from rack.levels.planning.motion_planner import MAX_DEVIATION_M, MotionPlanner, format_position
 from rack.levels.planning.moves import Situation
-from rack.levels.planning.pose import Pose, pointing, pose
+from rack.levels.planning.pose import Pose, build_pointing_quaternion, make_pose
 from rack.levels.tables import SceneConfig
-from rack.levels.task.grasps import SLIP_M, goals, grasps, leans, standing
+from rack.levels.task.grasps import SLIP_M, find_goals, find_grasps, find_standing_pose, is_leaning
 from rack.levels.task.program import DOWN, Goto, Home, TaskConfig, Transfer
 from rack.levels.task.rehearsal import Rehearsal
 
 Option = TypeVar("Option")
 
-TURNS = 8
+TURN_COUNT = 8
 """Number of turns about the tool's z axis that are tried if only its direction is given."""
 MAX_WAYS = 16
 """Maximum number of ways to do an action for which all motions are planned."""
@@ -64,18 +64,20 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
     rehearsal = start
     for k, action in enumerate(program.action):
         if isinstance(action, Transfer):
-            rehearsal = transfer(rehearsal, k, action, scene)
+            rehearsal = rehearse_transfer(rehearsal, k, action, scene)
             continue
-        with _naming(k, str(action)):
+        with _refusals_named(k, str(action)):
             if isinstance(action, Goto):
-                rehearsal = goto(rehearsal, k, action)
+                rehearsal = rehearse_goto(rehearsal, k, action)
             elif isinstance(action, Home):
-                rehearsal = rehearsal.then(k, Verb.MOVE_JOINTS, joints=rehearsal.motion.cell.home)
+                rehearsal = rehearsal.add_move(
+                    k, Verb.MOVE_JOINTS, joints=rehearsal.motion.cell.home
+                )
     return rehearsal
 
 
 @contextmanager
-def _naming(k: int, step: str) -> Iterator[None]:
+def _refusals_named(k: int, step: str) -> Iterator[None]:
     """Add the number of the action and the step to a refusal."""
     try:
         yield
@@ -83,7 +85,7 @@ def _naming(k: int, step: str) -> Iterator[None]:
         raise Refused(refused.code, f"{step}: {refused}", k) from refused
 
 
-def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
+def rehearse_goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
     """Return the rehearsal after a goto.
 
     Args:
@@ -95,33 +97,38 @@ def goto(rehearsal: Rehearsal, k: int, action: Goto) -> Rehearsal:
         Refused: The goal cannot be reached.
     """
     if action.joints is not None:
-        return rehearsal.then(k, Verb.MOVE_JOINTS, joints=np.array(action.joints))
+        return rehearsal.add_move(k, Verb.MOVE_JOINTS, joints=np.array(action.joints))
     assert action.position is not None, "a goto has joints or a position"
     motion = rehearsal.motion
-    rehearsal.situation.lay_out(motion.checker, None)
+    rehearsal.situation.apply_to(motion.checker, None)
     if action.direction == "any":
-        place = pose(action.position, pointing(DOWN))
-        reachable = motion.ik.reachable(place, rehearsal.q, match_orientation=False)
-        tools = [motion.ik.tool_at(q) for q in reachable] or [place]
+        place = make_pose(action.position, build_pointing_quaternion(DOWN))
+        reachable = motion.ik.find_solutions(place, rehearsal.q, match_orientation=False)
+        tools = [motion.ik.compute_tool_pose(q) for q in reachable] or [place]
     elif action.quaternion is not None:
-        tools = [pose(action.position, action.quaternion)]
+        tools = [make_pose(action.position, action.quaternion)]
     else:
-        turns = np.arange(TURNS) * 2.0 * np.pi / TURNS
-        tools = [pose(action.position, pointing(action.direction or DOWN, turn)) for turn in turns]
+        turns = np.arange(TURN_COUNT) * 2.0 * np.pi / TURN_COUNT
+        tools = [
+            make_pose(action.position, build_pointing_quaternion(action.direction or DOWN, turn))
+            for turn in turns
+        ]
     ends = [
         (tool, q)
         for tool in tools
-        for q in motion.ik.solutions(tool, rehearsal.q, motion.checker.free)
+        for q in motion.ik.find_free_solutions(tool, rehearsal.q, motion.checker.is_free)
     ]
     if not ends:
-        raise _nothing_at(motion, tools, rehearsal.q)
-    ends.sort(key=lambda end: motion.ik.time_between(rehearsal.q, end[1]))
-    return _first(
-        ends[:MAX_WAYS], lambda end: rehearsal.then(k, Verb.MOVE, tool=end[0], joints=end[1])
+        raise _explain_unreachable(motion, tools, rehearsal.q)
+    ends.sort(key=lambda end: motion.ik.compute_travel_time(rehearsal.q, end[1]))
+    return _rehearse_first(
+        ends[:MAX_WAYS], lambda end: rehearsal.add_move(k, Verb.MOVE, tool=end[0], joints=end[1])
     )
 
 
-def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig) -> Rehearsal:
+def rehearse_transfer(
+    rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig
+) -> Rehearsal:
     """Return the rehearsal after a transfer.
 
     Args:
@@ -136,33 +143,36 @@ def transfer(rehearsal: Rehearsal, k: int, action: Transfer, scene: SceneConfig)
     handling = Handling(rehearsal, scene.objects.index(action.object), action.lift)
     pick = f"pick {action.object}"
     place = f"place {action.object} at [{', '.join(f'{value:.4g}' for value in action.to)}]"
-    with _naming(k, place):
+    with _refusals_named(k, place):
         situation = rehearsal.situation
         row = handling.row
         cell = rehearsal.motion.cell
-        data = cell.start()
+        data = cell.build_start_data()
         standing_goals = [
-            [standing(cell, data, row, situation.with_body(row, goal)) for goal in group]
-            for group in goals(action, situation.object_pose(row), cell)
+            [
+                find_standing_pose(cell, data, row, situation.with_body_at(row, goal))
+                for goal in group
+            ]
+            for group in find_goals(action, situation.object_pose(row), cell)
         ]
 
     def choices() -> Iterator[tuple[list[Spot], list[Pose]]]:
-        with _naming(k, pick):
-            for takes in handling.takes():
+        with _refusals_named(k, pick):
+            for takes in handling.find_takes():
                 yield from ((takes, group) for group in standing_goals)
 
     def chosen(choice: tuple[list[Spot], list[Pose]]) -> Rehearsal:
-        with _naming(k, place):
-            ways = handling.ways(*choice)
-        return _first(ways[:MAX_WAYS], transferred)
+        with _refusals_named(k, place):
+            ways = handling.find_ways(*choice)
+        return _rehearse_first(ways[:MAX_WAYS], transferred)
 
     def transferred(way: Way) -> Rehearsal:
-        with _naming(k, pick):
-            taken = handling.moved(rehearsal, k, way.take, Verb.GRASP)
-        with _naming(k, place):
-            return handling.moved(taken, k, way.put, Verb.RELEASE)
+        with _refusals_named(k, pick):
+            taken = handling.rehearse_moves(rehearsal, k, way.take, Verb.GRASP)
+        with _refusals_named(k, place):
+            return handling.rehearse_moves(taken, k, way.put, Verb.RELEASE)
 
-    return _first(choices(), chosen)
+    return _rehearse_first(choices(), chosen)
 
 
 class Handling(NamedTuple):
@@ -175,7 +185,7 @@ class Handling(NamedTuple):
     row: int  # row of the object
     lift: float  # height of the straight motions, m
 
-    def takes(self) -> Iterator[list[Spot]]:
+    def find_takes(self) -> Iterator[list[Spot]]:
         """Yield spots at which the object can be taken and held, lowest height first.
 
         Raises:
@@ -186,25 +196,27 @@ class Handling(NamedTuple):
         is_taken = False
         jaw = start.motion.fixed_jaw
         seen = start.situation.object_pose(self.row)
-        for tools in grasps(start.motion.cell, start.situation, self.row):
+        for tools in find_grasps(start.motion.cell, start.situation, self.row):
             if jaw is not None:
-                tools = [jaw.beside(tool, self.row, seen) for tool in tools]
+                tools = [jaw.move_beside(tool, self.row, seen) for tool in tools]
             takes = [
-                spot for tool in tools for spot in self._spots(tool, start.situation, grasps=True)
+                spot
+                for tool in tools
+                for spot in self._find_spots(tool, start.situation, grasps=True)
             ]
             try:
                 if takes:
-                    yield self._held(takes)
+                    yield self._select_holdable(takes)
                     is_taken = True
                 elif refusal is None:
-                    refusal = self._nothing_at(tools)
+                    refusal = self._explain_unreachable(tools)
             except Refused as refused:
                 refusal = refusal or refused
         if not is_taken:
             assert refusal is not None, "there is at least one height"
             raise refusal
 
-    def ways(self, takes: list[Spot], standing_goals: list[Pose]) -> list[Way]:
+    def find_ways(self, takes: list[Spot], standing_goals: list[Pose]) -> list[Way]:
         """Return ways to do the transfer, those with the shortest motion first.
 
         `standing_goals` are poses in which the object may be put down.
@@ -218,23 +230,23 @@ class Handling(NamedTuple):
         puts: list[tuple[Pose, list[Spot]]] = []
         for take in takes:
             grip = take.tool.inverse() @ situation.object_pose(self.row)
-            slip_m = SLIP_M if leans(take.tool) else 0.0
+            slip_m = SLIP_M if is_leaning(take.tool) else 0.0
             for goal in standing_goals:
-                tool = goal.raised(slip_m) @ grip.inverse()
+                tool = goal.raise_by(slip_m) @ grip.inverse()
                 spots = next((spots for known, spots in puts if known.is_near(tool)), None)
                 if spots is None:
-                    spots = self._spots(tool, situation.holding(self.row, grip))
+                    spots = self._find_spots(tool, situation.with_object_held(self.row, grip))
                     puts.append((tool, spots))
                 ways += [Way(take, put) for put in spots]
         if not ways:
-            raise self._nothing_at([tool for tool, _ in puts])
-        time_s = self.start.motion.ik.time_between
+            raise self._explain_unreachable([tool for tool, _ in puts])
+        time_s = self.start.motion.ik.compute_travel_time
         return sorted(
             ways,
             key=lambda way: time_s(start_q, way.take.above) + time_s(way.take.above, way.put.above),
         )
 
-    def moved(self, rehearsal: Rehearsal, k: int, spot: Spot, verb: Verb) -> Rehearsal:
+    def rehearse_moves(self, rehearsal: Rehearsal, k: int, spot: Spot, verb: Verb) -> Rehearsal:
         """Return the rehearsal after the four moves of a grasp or a release.
 
         Args:
@@ -246,34 +258,36 @@ class Handling(NamedTuple):
         Raises:
             Refused: A move cannot be done.
         """
-        above = spot.tool.raised(self.lift)
+        above = spot.tool.raise_by(self.lift)
         row = self.row
         over = None if verb is Verb.GRASP else row
-        rehearsal = rehearsal.then(k, Verb.MOVE, tool=above, row=over, joints=spot.above)
-        rehearsal = rehearsal.then(k, Verb.APPROACH, tool=spot.tool, row=row)
-        rehearsal = rehearsal.then(k, verb, tool=spot.tool, row=row)
-        return rehearsal.then(k, Verb.DEPART, tool=above, row=row)
+        rehearsal = rehearsal.add_move(k, Verb.MOVE, tool=above, row=over, joints=spot.above)
+        rehearsal = rehearsal.add_move(k, Verb.APPROACH, tool=spot.tool, row=row)
+        rehearsal = rehearsal.add_move(k, verb, tool=spot.tool, row=row)
+        return rehearsal.add_move(k, Verb.DEPART, tool=above, row=row)
 
-    def _spots(self, tool: Pose, situation: Situation, grasps: bool = False) -> list[Spot]:
+    def _find_spots(self, tool: Pose, situation: Situation, grasps: bool = False) -> list[Spot]:
         """Return spots at `tool` from which the arm can come down to it without collision.
 
         If it `grasps` an object there, the gripper can also close.
         """
         motion = self.start.motion
-        situation.lay_out(motion.checker, None)
-        restarts = LEANING_RESTARTS if leans(tool) else MAX_RESTARTS
-        over = tool.raised(self.lift)
-        above = motion.ik.solutions(over, self.start.q, motion.checker.free, restarts)
-        situation.lay_out(motion.checker, self.row)
-        ends = [(q, motion.ik.reach(tool, q)) for q in above]
-        free = [(q, end) for q, end in ends if end is not None and motion.checker.free(end)]
-        if grasps and motion.checker.longest is not None:
-            closed = situation.holding(self.row, tool.inverse() @ situation.object_pose(self.row))
-            closed.lay_out(motion.checker, self.row)
-            free = [(q, end) for q, end in free if motion.checker.free(end, MAX_STRAY_M)]
+        situation.apply_to(motion.checker, None)
+        restarts = LEANING_RESTARTS if is_leaning(tool) else MAX_RESTARTS
+        over = tool.raise_by(self.lift)
+        above = motion.ik.find_free_solutions(over, self.start.q, motion.checker.is_free, restarts)
+        situation.apply_to(motion.checker, self.row)
+        ends = [(q, motion.ik.find_configuration(tool, q)) for q in above]
+        free = [(q, end) for q, end in ends if end is not None and motion.checker.is_free(end)]
+        if grasps and motion.checker.longest_opening is not None:
+            closed = situation.with_object_held(
+                self.row, tool.inverse() @ situation.object_pose(self.row)
+            )
+            closed.apply_to(motion.checker, self.row)
+            free = [(q, end) for q, end in free if motion.checker.is_free(end, MAX_DEVIATION_M)]
         return [Spot(tool, q) for q, _ in free]
 
-    def _held(self, takes: list[Spot]) -> list[Spot]:
+    def _select_holdable(self, takes: list[Spot]) -> list[Spot]:
         """Return the spots at which gripper and motors can hold the object.
 
         Raises:
@@ -295,13 +309,13 @@ class Handling(NamedTuple):
             raise refusals[0]
         return held
 
-    def _nothing_at(self, tools: list[Pose]) -> Refused:
+    def _explain_unreachable(self, tools: list[Pose]) -> Refused:
         """Return the refusal for tool poses that cannot be reached from above without collision."""
-        places = [place for tool in tools for place in (tool, tool.raised(self.lift))]
-        return _nothing_at(self.start.motion, places, self.start.q)
+        places = [place for tool in tools for place in (tool, tool.raise_by(self.lift))]
+        return _explain_unreachable(self.start.motion, places, self.start.q)
 
 
-def _first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehearsal:
+def _rehearse_first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehearsal:
     """Return the first rehearsal that succeeds.
 
     `do` rehearses an option.
@@ -318,27 +332,29 @@ def _first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehe
     raise refusals[0]
 
 
-def _nothing_at(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refused:
+def _explain_unreachable(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refused:
     """Return the refusal for tool poses that cannot be reached without collision."""
     beyond: Pose | None = None
     for tool in tools:
-        reachable = motion.ik.reachable(tool, here)
-        if why := next(filter(None, map(motion.checker.why, reachable)), ""):
+        reachable = motion.ik.find_solutions(tool, here)
+        if why := next(filter(None, map(motion.checker.describe_collision, reachable)), ""):
             return Refused(Error.NO_PATH, why)
         if beyond is None and not reachable:
             beyond = tool
     end = beyond or tools[0]
-    out_of_reach = f"out of reach: {in_metres(end)}; in reach"
-    if motion.ik.reachable(end, here, match_orientation=False):
+    out_of_reach = f"out of reach: {format_position(end)}; in reach"
+    if motion.ik.find_solutions(end, here, match_orientation=False):
         return Refused(Error.UNREACHABLE, f"{out_of_reach} in another orientation")
-    begin = motion.ik.tool_at(here)
+    begin = motion.ik.compute_tool_pose(here)
     low = 0.0
     high = 1.0
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         reached = bool(
-            motion.ik.reachable(Pose(begin.towards(end, middle).position, end.quaternion), here)
+            motion.ik.find_solutions(
+                Pose(begin.interpolate_to(end, middle).position, end.quaternion), here
+            )
         )
         low, high = (middle, high) if reached else (low, middle)
-    in_reach = begin.towards(end, low)
-    return Refused(Error.UNREACHABLE, f"{out_of_reach}: {in_metres(in_reach)}")
+    in_reach = begin.interpolate_to(end, low)
+    return Refused(Error.UNREACHABLE, f"{out_of_reach}: {format_position(in_reach)}")

@@ -10,12 +10,12 @@ from rack.levels.messages import Error, MoveStatus, TaskCommand, TaskPlan, TaskS
 from rack.levels.operator import (
     BELOW_LOST,
     HELD_FROM_ABOVE,
-    HOLDABLE,
+    HOLD_COMMANDS,
     Goal,
     Operation,
     OperatorCommand,
     Orders,
-    answered,
+    find_answered_serial,
 )
 from rack.levels.tables import read_params
 from rack.levels.task.program import ROUNDING_S, AnyAction, TaskConfig, TaskParams, read_program
@@ -37,7 +37,7 @@ class TaskExecutor(Executor):
     command = Output(TaskCommand)
     status = Output(TaskStatus, rests_on=below)
     commands = {
-        **HOLDABLE,
+        **HOLD_COMMANDS,
         Operation.GOTO: (Goal.JOINTS, Goal.POSE, Goal.DIRECTION, Goal.HOME),
     }
     params: ClassVar[type[TaskParams]] = TaskParams
@@ -45,7 +45,7 @@ class TaskExecutor(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._actions = self._first_actions()
+        self._actions = self._read_first_actions()
         self._ahead_s = 0.0  # clock of the program's `by` minus simulated time
         self._stalled_s = read_params(self.params, context.params).stalled_s
         self._orders = Orders(self.commands)
@@ -61,90 +61,93 @@ class TaskExecutor(Executor):
     def process(self, tick: int) -> None:
         """Read progress and operator's commands, and hand down the next moves."""
         if not self._started:
-            self._recall()
-        self._orders.take(
-            self.operator, lambda command: self._judge(command, answered(self.last_status.message))
+            self._restore_state()
+        self._orders.take_commands(
+            self.operator,
+            lambda command: self._judge_command(
+                command, find_answered_serial(self.last_status.message)
+            ),
         )
-        plan = self._plan_to_follow(tick)
+        plan = self._find_plan(tick)
         below = self.below.message
         if not self._error:
-            self._follow(plan, below)
+            self._track_progress(plan, below)
             # Fail when an action is not done by its time.
             now_s = tick * self.context.tick_s + self._ahead_s
-            done = self._actions_done(plan)
+            done = self._count_done_actions(plan)
             for k in range(done, len(self._actions)):
                 by_s = self._actions[k].by
                 if by_s is not None and now_s > by_s + ROUNDING_S and not self._error:
                     why = f", {self._actions[k]}, was not done by {by_s:g} s"
                     self._error = Error.TOO_LATE
-                    self._reason = self._about(k, why)
-        self._done = self._step_aside(plan, below)
-        waits = self._reason_to_wait(self.below)
-        if self._state(plan) == State.EXECUTING:
+                    self._reason = self._format_reason(k, why)
+        self._done = self._interrupt_program(plan, below)
+        waits = self._find_reason_to_wait(self.below)
+        if self._compute_state(plan) == State.EXECUTING:
             self._check_progress(plan, waits, tick)
-        self._hand_down(plan, self.command)
-        self._report(plan, waits)
-        self._answer(below)
+        self._hand_down_moves(plan, self.command)
+        self._write_status(plan, waits)
+        self._answer_operator(below)
 
-    def _first_actions(self) -> tuple[AnyAction, ...]:
+    def _read_first_actions(self) -> tuple[AnyAction, ...]:
         """Return the initial actions, which are the whole program."""
         return read_program(self.context.task, self.context.robot, self.context.scene).action
 
-    def _plan_to_follow(self, tick: int) -> TaskPlan:
+    def _find_plan(self, tick: int) -> TaskPlan:
         """Return the plan of the present actions, with all fields 0 if there is none yet."""
         return self.plan.message
 
-    def _recall(self) -> None:
+    def _restore_state(self) -> None:
         """Restore the state from the last command and status, after a restart of the board."""
         self._started = True
         last = self.last_status.message
         self._done = last.moves_done
         self._error = Error(last.error)
         self._reason = last.reason
-        if self.last_status.is_there and self.last_command.is_there:
+        if self.last_status.has_message and self.last_command.has_message:
             before = (last.detour or last.first + self._done) - 1
             self._window = ShownWindow(last.first, self.last_command.message.id, before)
             self._detour = Detour(self.context.robot, self._orders, self._window, last.detour)
 
-    def _judge(self, command: OperatorCommand, answered: int) -> None:
+    def _judge_command(self, command: OperatorCommand, answered: int) -> None:
         """Accept or refuse a goto.
 
         A goto that was answered before a restart of this board is not new.
         """
         if self._orders.standing is Operation.GOTO:
-            self._detour.begin(command, command.id > answered)
+            self._detour.accept_command(command, command.id > answered)
 
-    def _follow(self, plan: TaskPlan, below: MoveStatus) -> None:
+    def _track_progress(self, plan: TaskPlan, below: MoveStatus) -> None:
         """Count completed moves, and detect errors of the plan and the level below."""
         if plan.error:
             self._error = Error(plan.error)
             self._reason = plan.reason
         elif plan.count and not self._detour.move:
-            self._done = min(max(self._done, self._window.done(below)), plan.count)
+            self._done = min(max(self._done, self._window.count_done(below)), plan.count)
         failed = below.state == State.ERROR and below.done >= self._window.before
         if failed and not self._detour.move and self._done < plan.count:
             action = int(plan.moves["action"][self._done])
             self._error = Error(below.error)
-            self._reason = self._about(action, f": {below.reason}")
+            self._reason = self._format_reason(action, f": {below.reason}")
 
-    def _about(self, action: int, why: str) -> str:
+    def _format_reason(self, action: int, why: str) -> str:
         """Return a reason with the number of its action. `why` begins with the separator."""
         return f"action {action}{why}"
 
-    def _step_aside(self, plan: TaskPlan, below: MoveStatus) -> int:
+    def _interrupt_program(self, plan: TaskPlan, below: MoveStatus) -> int:
         """Interrupt the program for an operator; return how many moves of the plan are done."""
         return self._detour.step(plan, self._done, below)
 
-    def _reason_to_wait(self, below: Reading[MoveStatus]) -> str:
+    def _find_reason_to_wait(self, below: Reading[MoveStatus]) -> str:
         """Return why the level waits, and the condition that ends the wait.
 
         Empty if it does not wait.
         """
         orders = self._orders
         if orders.standing is Operation.GOTO:
-            return self._detour.reason()
-        if orders.stands:
-            return orders.keeps(self.context.board)
+            return self._detour.format_reason()
+        if orders.is_in_force:
+            return orders.format_reason(self.context.board)
         if below.is_lost:
             return BELOW_LOST
         is_held = below.message.state == State.HOLDING and below.message.reason != HELD_FROM_ABOVE
@@ -154,22 +157,29 @@ class TaskExecutor(Executor):
         """Fail if nothing has moved for too long, unless an operator prevents motion."""
         below = self.below.message
         reported = below.done, below.planned, below.current, below.progress
-        progress = (plan.id, self._done, *reported, self._detour.move, *self._stage())
-        operated = below.operated or self._orders.stands
+        progress = (
+            plan.id,
+            self._done,
+            *reported,
+            self._detour.move,
+            *self._list_progress_values(),
+        )
+        operated = below.operated or self._orders.is_in_force
         if operated or progress != self._progress:
             self._progress = progress
             self._moved_at = tick
         elif (tick - self._moved_at) * self.context.tick_s > self._stalled_s:
             self._error = Error.STALLED
             self._reason = (
-                f"nothing has moved for {self._stalled_s:g} s: {waits or _awaited(plan, below)}"
+                f"nothing has moved for {self._stalled_s:g} s: "
+                f"{waits or _format_awaited(plan, below)}"
             )
 
-    def _stage(self) -> tuple[int, ...]:
+    def _list_progress_values(self) -> tuple[int, ...]:
         """Return further values whose change counts as progress."""
         return ()
 
-    def _actions_done(self, plan: TaskPlan) -> int:
+    def _count_done_actions(self, plan: TaskPlan) -> int:
         """Return how many actions of the program are done."""
         if not plan.count:
             return 0
@@ -177,50 +187,50 @@ class TaskExecutor(Executor):
             return len(self._actions)
         return int(plan.moves["action"][self._done])
 
-    def _hand_down(self, plan: TaskPlan, command: TaskCommand) -> None:
+    def _hand_down_moves(self, plan: TaskPlan, command: TaskCommand) -> None:
         """Show the program's next moves, or the operator's goto, to the level below."""
         detour = self._detour
         if detour.move and detour.is_known and not self._error:
-            self._window.show_one(detour.as_move(self._actions_done(plan)), command)
+            self._window.show_one(detour.to_move(self._count_done_actions(plan)), command)
         else:
             is_kept = self._error or detour.move
-            until = 0 if is_kept else self._shown_until(plan)
-            self._window.show(plan, self._done, command, until)
+            until = 0 if is_kept else self._find_last_move(plan)
+            self._window.show_moves(plan, self._done, command, until)
 
-    def _shown_until(self, plan: TaskPlan) -> int:
+    def _find_last_move(self, plan: TaskPlan) -> int:
         """Return the first move of the plan that must not begin."""
         return plan.count if self._detour.until is None else self._detour.until
 
-    def _report(self, plan: TaskPlan, waits: str) -> None:
+    def _write_status(self, plan: TaskPlan, waits: str) -> None:
         """Fill the status. `waits` is the reason to wait, or empty."""
         status = self.status
         status.echo = plan.id
-        status.state = self._state(plan)
+        status.state = self._compute_state(plan)
         holds = waits and status.state == State.EXECUTING
         if holds:
             status.state = State.HOLDING
         status.error = self._error
         status.reason = self._reason if self._error else waits if holds else ""
-        status.action = self._actions_done(plan)
+        status.action = self._count_done_actions(plan)
         status.actions = len(self._actions)
         status.moves_done = self._done
         status.moves = plan.count
         status.first = self._window.first
         status.detour = self._detour.move
 
-    def _answer(self, below: MoveStatus) -> None:
+    def _answer_operator(self, below: MoveStatus) -> None:
         """Obey and answer the operator.
 
         The newest operator's command on which this cycle is based is passed down.
         """
         orders = self._orders
-        self.command.hold = orders.holds or self._detour.holds
-        self.command.operator = orders.rests_on(0)
-        if orders.holds and below.resting and below.operator >= orders.basis:
-            orders.done()
-        orders.report(self.status)
+        self.command.hold = orders.is_holding or self._detour.holds
+        self.command.operator = orders.find_basis(0)
+        if orders.is_holding and below.resting and below.operator >= orders.basis:
+            orders.report_done()
+        orders.fill_status(self.status)
 
-    def _state(self, plan: TaskPlan) -> State:
+    def _compute_state(self, plan: TaskPlan) -> State:
         """Return the state of the level, without holds."""
         if self._error:
             return State.ERROR
@@ -229,7 +239,7 @@ class TaskExecutor(Executor):
         return State.DONE if plan.count and self._done == plan.count else State.EXECUTING
 
 
-def _awaited(plan: TaskPlan, below: MoveStatus) -> str:
+def _format_awaited(plan: TaskPlan, below: MoveStatus) -> str:
     """Return the event for which a task waits while nothing holds it."""
     if not plan.id:
         return "no plan yet: the objects must be at rest and the position of the arm known"

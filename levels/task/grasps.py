@@ -11,15 +11,21 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
 from rack.levels.messages import Error
-from rack.levels.planning.collision import farthest, place_bodies
+from rack.levels.planning.collision import compute_extent, place_bodies
 from rack.levels.planning.moves import Situation
-from rack.levels.planning.pose import Pose, pointing, pose, turned_about_z, yaw_of
+from rack.levels.planning.pose import (
+    Pose,
+    build_pointing_quaternion,
+    build_yaw_quaternion,
+    compute_yaw,
+    make_pose,
+)
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.lookup import geom_name
+from rack.levels.robot.lookup import find_geom_name
 from rack.levels.task.program import DOWN, Transfer
 
 UP = np.array([0.0, 0.0, 1.0])
-QUARTERS = (0, 1, -1, 2)
+QUARTER_TURNS = (0, 1, -1, 2)
 """Quarter turns between object and gripper, in the order of trying."""
 TILTS_DEG = (*range(10, 91, 10), *range(15, 90, 10))
 """Angles between the tool and straight down, in the order of trying.
@@ -44,7 +50,7 @@ SLIP_M = 0.006
 An object that is swung around slips in the fingers by some millimetres, and would otherwise be
 pressed onto its support.
 """
-LEAST_LEAN = 0.01
+MIN_LEAN = 0.01
 """1 - cosine of the angle from straight down above which a tool counts as leaning."""
 MAX_DISTANCE_M = 10.0
 """Maximum distance between geoms that is measured."""
@@ -54,50 +60,58 @@ MAX_STANDING_GAP_M = 0.02
 """Distance of a goal from a standing height above which the program is refused."""
 
 
-def grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
+def find_grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
     """Yield groups of tool poses that take object `row`, from the lowest height up.
 
     The poses straight down come first, then poses that lean over each side of the object. The
     fingers close along the tool's y axis, across the object's x or y axis.
     """
     seen = situation.object_pose(row)
-    yaws = [yaw_of(seen.quaternion) + quarter * np.pi / 2.0 for quarter in QUARTERS]
+    yaws = [compute_yaw(seen.quaternion) + quarter * np.pi / 2.0 for quarter in QUARTER_TURNS]
     height = 0.0
     heights = []
-    while height == 0.0 or seen.position[2] + height < _top(cell, situation, row):
+    while height == 0.0 or seen.position[2] + height < _find_top(cell, situation, row):
         heights.append(height)
-        yield [Pose(seen.raised(height).position, pointing(DOWN, -yaw)) for yaw in yaws]
+        yield [
+            Pose(seen.raise_by(height).position, build_pointing_quaternion(DOWN, -yaw))
+            for yaw in yaws
+        ]
         height += HEIGHT_STEP_M
     if len(cell.qpos) < FULL_ORIENTATION:
-        yaws = [bearing(cell, seen.position)]
+        yaws = [compute_bearing(cell, seen.position)]
     for tilt in map(math.radians, TILTS_DEG):
         for height in heights[::2]:
-            yield [Pose(seen.raised(height).position, leaning(yaw, tilt)) for yaw in yaws]
+            yield [
+                Pose(seen.raise_by(height).position, build_leaning_quaternion(yaw, tilt))
+                for yaw in yaws
+            ]
 
 
-def leaning(yaw: float, tilt: float) -> Array:
+def build_leaning_quaternion(yaw: float, tilt: float) -> Array:
     """Return the quaternion of a tool that points down, tilted by `tilt`, rad, towards `yaw`.
 
     Its y axis is level.
     """
     across = math.sin(tilt)
-    return pointing((across * math.cos(yaw), across * math.sin(yaw), -math.cos(tilt)), yaw)
+    return build_pointing_quaternion(
+        (across * math.cos(yaw), across * math.sin(yaw), -math.cos(tilt)), yaw
+    )
 
 
-def leans(tool: Pose) -> bool:
+def is_leaning(tool: Pose) -> bool:
     """Return True if a tool does not point straight down."""
     axis = np.zeros(3)
     mujoco.mju_rotVecQuat(axis, UP, tool.quaternion)
-    return bool(1.0 + axis[2] > LEAST_LEAN)
+    return bool(1.0 + axis[2] > MIN_LEAN)
 
 
-def bearing(cell: Cell, position: Array) -> float:
+def compute_bearing(cell: Cell, position: Array) -> float:
     """Return the direction of a position as seen from the arm's first joint, rad."""
-    base = cell.start().xanchor[cell.model.dof_jntid[cell.dof[0]]]
+    base = cell.build_start_data().xanchor[cell.model.dof_jntid[cell.dof[0]]]
     return math.atan2(position[1] - base[1], position[0] - base[0])
 
 
-def goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[list[Pose]]:
+def find_goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[list[Pose]]:
     """Yield groups of poses in which the object may be put down, in the order of trying.
 
     The object stays upright. It is turned about the vertical by quarter turns, then by angles in
@@ -108,26 +122,28 @@ def goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[list[Pose]]:
         at: Pose of the object before the transfer.
         cell: The cell.
     """
-    yaw = yaw_of(at.quaternion)
+    yaw = compute_yaw(at.quaternion)
     if action.yaw is not None:
-        yield [_turned(action, at, action.yaw - yaw)]
+        yield [_build_turned_pose(action, at, action.yaw - yaw)]
         return
-    turns = [quarter * np.pi / 2.0 for quarter in QUARTERS]
+    turns = [quarter * np.pi / 2.0 for quarter in QUARTER_TURNS]
     between = [turn + eighths * np.pi / 8.0 for eighths in (2, 1, 3) for turn in turns]
     if len(cell.qpos) < FULL_ORIENTATION:
-        turns.append(bearing(cell, np.array(action.to)) - bearing(cell, at.position))
+        turns.append(
+            compute_bearing(cell, np.array(action.to)) - compute_bearing(cell, at.position)
+        )
     for group in (turns, between):
-        yield [_turned(action, at, turn) for turn in group]
+        yield [_build_turned_pose(action, at, turn) for turn in group]
 
 
-def _turned(action: Transfer, at: Pose, turn: float) -> Pose:
+def _build_turned_pose(action: Transfer, at: Pose, turn: float) -> Pose:
     """Return the pose of an object at its goal, turned by `turn`, rad, from its present pose."""
     quaternion = np.zeros(4)
-    mujoco.mju_mulQuat(quaternion, turned_about_z(turn), at.quaternion)
-    return pose(action.to, quaternion)
+    mujoco.mju_mulQuat(quaternion, build_yaw_quaternion(turn), at.quaternion)
+    return make_pose(action.to, quaternion)
 
 
-def standing(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) -> Pose:
+def find_standing_pose(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) -> Pose:
     """Return the pose of an object at the height at which it stands on the support below it.
 
     Args:
@@ -140,32 +156,32 @@ def standing(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) ->
         Refused: The goal is not over a support, or far above or below it.
     """
     model = cell.model
-    _lay_out(cell, data, situation)
+    _place_bodies(cell, data, situation)
     goal = situation.object_pose(row)
     name = model.body(cell.bodies[row]).name
     x, y, z = goal.position
-    support = _geom_below(cell, data, row, goal.position)
+    support = _find_geom_below(cell, data, row, goal.position)
     if support not in cell.geoms.supports:
-        supports = ", ".join(f"'{geom_name(model, g)}'" for g in cell.geoms.supports) or "none"
-        place = f"over '{geom_name(model, support)}'" if support >= 0 else "over nothing"
+        supports = ", ".join(f"'{find_geom_name(model, g)}'" for g in cell.geoms.supports) or "none"
+        place = f"over '{find_geom_name(model, support)}'" if support >= 0 else "over nothing"
         raise Refused(
             Error.UNREACHABLE,
             f"at [{x:.3f}, {y:.3f}] '{name}' would be {place}; supports: {supports}",
         )
     gap = min(
         mujoco.mj_geomDistance(model, data, int(geom), support, MAX_DISTANCE_M, None)
-        for geom in cell.parts(row)
+        for geom in cell.list_geoms(row)
     )
     if abs(gap) > MAX_STANDING_GAP_M:
         side = "above" if gap > 0 else "deep in"
-        place = f"{abs(gap) * 1e3:.0f} mm {side} '{geom_name(model, support)}'"
+        place = f"{abs(gap) * 1e3:.0f} mm {side} '{find_geom_name(model, support)}'"
         raise Refused(
             Error.UNREACHABLE, f"at z = {z:.3f} '{name}' would be {place}; valid z: {z - gap:.3f}"
         )
-    return goal.raised(SET_DOWN_M - gap)
+    return goal.raise_by(SET_DOWN_M - gap)
 
 
-def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
+def _find_geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
     """Return the first geom below a point that is neither object `row` nor part of the arm.
 
     -1 if there is none.
@@ -180,14 +196,14 @@ def _geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
         begin[2] -= distance + SKIN_M
 
 
-def _lay_out(cell: Cell, data: mujoco.MjData, situation: Situation) -> None:
+def _place_bodies(cell: Cell, data: mujoco.MjData, situation: Situation) -> None:
     """Place the bodies in `data` as in `situation`."""
     place_bodies(cell, data, situation.positions, situation.quaternions)
     mujoco.mj_kinematics(cell.model, data)
 
 
-def _top(cell: Cell, situation: Situation, row: int) -> float:
+def _find_top(cell: Cell, situation: Situation, row: int) -> float:
     """Return the height of the highest point of object `row`, from its bounding boxes, m."""
-    data = cell.start()
-    _lay_out(cell, data, situation)
-    return farthest(cell.model, data, cell.parts(row), UP)
+    data = cell.build_start_data()
+    _place_bodies(cell, data, situation)
+    return compute_extent(cell.model, data, cell.list_geoms(row), UP)

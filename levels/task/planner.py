@@ -7,17 +7,17 @@ from typing import ClassVar
 
 import numpy as np
 
-from rack.backplane.message import copied
+from rack.backplane.message import copy_message
 from rack.levels.errors import Refused
 from rack.levels.level import Input, LevelContext, Output, Planner, Program
 from rack.levels.messages import MOVES, Error, ServoStatus, TaskPlan, TaskStatus, WorldState
 from rack.levels.planning.moves import Situation
-from rack.levels.robot.cell import cell_of
+from rack.levels.robot.cell import build_level_cell
 from rack.levels.tables import read_params
 from rack.levels.task.program import ROUNDING_S, TaskConfig, TaskParams, read_program
-from rack.levels.task.rehearsal import Rehearsal, Rehearsed, finish_times
+from rack.levels.task.rehearsal import Rehearsal, Rehearsed, compute_finish_times
 
-FIRST_PLAN = 1
+FIRST_PLAN_ID = 1
 """Serial of the first plan."""
 MAX_REST_M_S = 0.01
 """Speed below which an object is at rest, so that motions to it can be planned."""
@@ -49,17 +49,17 @@ class TaskPlanner(Planner):
         # OMPL takes time and memory to import, so only racks that plan motions import it.
         from rack.levels.planning.motion_planner import MotionPlanner
 
-        self._program = self._first_program()
-        self._id = FIRST_PLAN
+        self._program = self._read_first_program()
+        self._id = FIRST_PLAN_ID
         self._ahead_s = 0.0  # clock of the program's `by` minus simulated time
         self._needs = read_params(self.params, context.params)
-        cell = cell_of(context)
+        cell = build_level_cell(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
         self._plan: TaskPlan | None = None  # made by this process
         self._visible_at = 0  # tick from which that plan is visible
         self._since: int | None = None  # tick of the first cycle
 
-    def _first_program(self) -> TaskConfig:
+    def _read_first_program(self) -> TaskConfig:
         """Return the program to plan first."""
         return read_program(self.context.task, self.context.robot, self.context.scene)
 
@@ -67,11 +67,11 @@ class TaskPlanner(Planner):
         """Return True if the program has no plan yet, and the world is known and at rest."""
         self._since = tick if self._since is None else self._since
         followed = self.status.message.echo == self._id
-        if not self._program.action or followed or self._is_on_its_way(tick, self._since):
+        if not self._program.action or followed or self._may_be_reported(tick, self._since):
             return False
         if self._plan is not None:
             return True
-        if not (self.servo.is_there and self.world.is_there and self.world.message.revision):
+        if not (self.servo.has_message and self.world.has_message and self.world.message.revision):
             return False
         objects = len(self.context.scene.objects)
         speeds = np.linalg.norm(self.world.message.velocity[:objects], axis=1)
@@ -82,30 +82,30 @@ class TaskPlanner(Planner):
 
         A plan that was lost is published again.
         """
-        self._visible_at = tick + self._slice
+        self._visible_at = tick + self._planning_ticks
         if self._plan is not None:
             self.output.copy_from(self._plan)
             return
         self.output.clear()
         self.output.id = self._id
         try:
-            self._decompose(tick)
+            self._decompose_program(tick)
         except Refused as refused:
             self.output.error = Error(refused.code)
-            self.output.reason = self._reason(refused)
+            self.output.reason = self._format_reason(refused)
             self.output.count = 0
-        self._plan = copied(self.output)
+        self._plan = copy_message(self.output)
 
-    def _reason(self, refused: Refused) -> str:
+    def _format_reason(self, refused: Refused) -> str:
         """Return why the program is refused, with the number of the action."""
         return str(refused) if refused.action is None else f"action {refused.action}, {refused}"
 
     @property
-    def _slice(self) -> int:
+    def _planning_ticks(self) -> int:
         """Ticks that the computation of a plan may take."""
         return self.context.within_cycles * self.context.every
 
-    def _is_on_its_way(self, tick: int, since: int) -> bool:
+    def _may_be_reported(self, tick: int, since: int) -> bool:
         """Return True if the executor may still report a published plan.
 
         The plan may be from this process or an earlier one. `since` is the tick of the first cycle.
@@ -114,33 +114,33 @@ class TaskPlanner(Planner):
             # The status acknowledges a plan one cycle after it becomes visible.
             return tick <= self._visible_at + self.context.every
         # A plan published just before a restart of this planner becomes visible later.
-        return self.made.message.id == self._id or 0 < since <= tick < since + self._slice
+        return self.made.message.id == self._id or 0 < since <= tick < since + self._planning_ticks
 
-    def _decompose(self, tick: int) -> None:
+    def _decompose_program(self, tick: int) -> None:
         """Rehearse the program and write its moves into `output`. Raises `Refused`."""
         from rack.levels.task.actions import rehearse
 
         world = self.world.message
         situation = Situation(np.array(world.position), np.array(world.quaternion))
         start = Rehearsal(self._motion, np.array(self.servo.message.target), situation)
-        moves = self._with_times(rehearse(self._program, self.context.scene, start).moves)
+        moves = self._add_times(rehearse(self._program, self.context.scene, start).moves)
         if len(moves) > MOVES:
             raise Refused(
                 Error.LIMIT,
                 f"the program has {len(moves)} elemental moves; at most {MOVES} are valid",
             )
-        self._promise(moves, self._visible_s(tick))
+        self._check_times(moves, self._compute_visible_s(tick))
         for k, (move, _) in enumerate(moves):
             move.write_to(self.output.moves[k])
         self.output.count = len(moves)
 
-    def _visible_s(self, tick: int) -> float:
+    def _compute_visible_s(self, tick: int) -> float:
         """Return when the first moves of a plan begun at `tick` become visible below, s."""
         # The plan is ready within its cycles, is read and handed down at once, and is visible below
         # a cycle later.
         return (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
 
-    def _with_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
+    def _add_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
         """Set the time by which the last move of each action must be done.
 
         It leaves this level time to report.
@@ -156,13 +156,13 @@ class TaskPlanner(Planner):
                 )
         return timed
 
-    def _promise(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
+    def _check_times(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
         """Check that every action can be done by its time.
 
         Raises:
             Refused: An action cannot. The text has the earliest possible time.
         """
-        finish_s = finish_times(moves, visible_s, self.context, self._needs)
+        finish_s = compute_finish_times(moves, visible_s, self.context, self._needs)
         for (move, _), finished_s in zip(moves, finish_s, strict=True):
             action = self._program.action[move.action]
             earliest_s = finished_s + self._ahead_s

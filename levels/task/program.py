@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from rack.levels.level import Misfits, Program
+from rack.levels.level import Mismatches, Program
 from rack.levels.tables import Finite, GoalConfig, Positive, RobotConfig, SceneConfig, Table, Vector
 
 ROUNDING_S = 1e-9
@@ -57,7 +57,7 @@ class Goto(Action):
     """joint positions [rad]"""
 
     @model_validator(mode="after")
-    def _one_goal(self) -> Goto:
+    def _check_goal(self) -> Goto:
         if (self.position is None) == (self.joints is None):
             raise ValueError("a goto has either position or joints")
         if self.quaternion is not None and self.direction is not None:
@@ -94,18 +94,18 @@ class TaskConfig(Program):
     action: tuple[AnyAction, ...] = ()
     """actions, done in their order"""
 
-    def goals(self) -> Iterator[GoalConfig]:
+    def list_goals(self) -> Iterator[GoalConfig]:
         """Yield the final positions of all transferred objects."""
         for action in self.action:
             if isinstance(action, Transfer):
                 yield GoalConfig(object=action.object, position=action.to)
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
+    def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
         """Yield key, value and reason of every entry that does not suit arm or scene."""
         if robot is None:
             return
         for k, action in enumerate(self.action):
-            for key, value, why in misfits(action, robot, scene):
+            for key, value, why in find_mismatches(action, robot, scene):
                 yield f"action[{k}].{key}", value, why
 
 
@@ -130,7 +130,7 @@ class TaskParams(Table):
 read_program = TaskConfig.read
 
 
-def misfits(action: Action, robot: RobotConfig, scene: SceneConfig) -> Misfits:
+def find_mismatches(action: Action, robot: RobotConfig, scene: SceneConfig) -> Mismatches:
     """Yield key, value and reason of every entry of an action that does not suit arm or scene.
 
     Args:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rack.levels.algebra import Array
 from rack.levels.level import LevelContext
-from rack.levels.messages import SEGMENTS, WINDOW, Verb
+from rack.levels.messages import SEGMENTS, WINDOW_MOVES, Verb
 from rack.levels.planning.moves import Move, Situation
 from rack.levels.planning.pose import Pose
 from rack.levels.task.program import TaskParams
@@ -40,7 +40,7 @@ class Rehearsal:
     situation: Situation
     moves: tuple[Rehearsed, ...] = ()
 
-    def then(
+    def add_move(
         self,
         action: int,
         verb: Verb,
@@ -64,7 +64,7 @@ class Rehearsal:
         """
         ends_at = self.q if joints is None else joints
         if tool is None:
-            tool = self.motion.ik.tool_at(ends_at)
+            tool = self.motion.ik.compute_tool_pose(ends_at)
         move = Move(
             id=len(self.moves) + 1,
             action=action,
@@ -78,17 +78,17 @@ class Rehearsal:
         if not move.is_motion:
             return replace(
                 self,
-                situation=self.situation.after(move),
+                situation=self.situation.predict_after(move),
                 moves=(*self.moves, Rehearsed(move, 0.0)),
             )
         # One search is enough. The level below takes the quickest path of several searches, which
         # include this one.
         path = self.motion.plan(move, self.q, self.situation, searches=1)
-        rehearsed = Rehearsed(move, self.motion.paths.duration(path))
+        rehearsed = Rehearsed(move, self.motion.paths.compute_duration(path))
         return replace(self, q=path.end, moves=(*self.moves, rehearsed))
 
 
-def finish_times(
+def compute_finish_times(
     moves: Sequence[Rehearsed], visible_s: float, context: LevelContext, needs: TaskParams
 ) -> list[float]:
     """Return the latest times at which the task level reads that a move is done, s.
@@ -109,8 +109,10 @@ def finish_times(
     planned_s = visible_s
     for k, (move, duration_s) in enumerate(moves):
         shown_s = visible_s
-        if k >= WINDOW:
-            shown_s = max(visible_s, done_s[k - WINDOW] + 2.0 * below_s + 2.0 * context.period_s)
+        if k >= WINDOW_MOVES:
+            shown_s = max(
+                visible_s, done_s[k - WINDOW_MOVES] + 2.0 * below_s + 2.0 * context.period_s
+            )
         if move.is_motion:
             # The planner computes one plan after the other. Only a move for which it has waited
             # takes another cycle.

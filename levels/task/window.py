@@ -11,25 +11,25 @@ import numpy as np
 
 from rack.backplane.message import State
 from rack.levels.algebra import Array
-from rack.levels.messages import WINDOW, MoveStatus, TaskCommand, TaskPlan, Verb
+from rack.levels.messages import WINDOW_MOVES, MoveStatus, TaskCommand, TaskPlan, Verb
 from rack.levels.operator import (
     Answer,
     Goal,
     Operation,
     OperatorCommand,
     Orders,
-    described,
-    joints_of,
+    describe_command,
+    read_joint_goal,
 )
 from rack.levels.planning.moves import Move
-from rack.levels.planning.pose import Pose, pointing, pose
+from rack.levels.planning.pose import Pose, build_pointing_quaternion, make_pose
 from rack.levels.tables import RobotConfig
 
-JUMP = 2
+ID_JUMP = 2
 """Step from the newest id shown to the next; a gap makes the level below start over."""
 FIRST_ID = 1
 """Id of the plan's first move, unless an operator has intervened."""
-FREE = (Verb.MOVE, Verb.MOVE_JOINTS)
+FREE_VERBS = (Verb.MOVE, Verb.MOVE_JOINTS)
 """Kinds of moves that may be interrupted, and repeated later from another position."""
 MAX_JOINT_RAD = 1e3
 """Joint goals beyond this are refused. The level below has narrower limits."""
@@ -46,22 +46,22 @@ class ShownWindow:
         self.newest = newest  # newest id shown
         self.before = before  # the level below has started over once it has done this id
 
-    def jump(self) -> int:
+    def reserve_id(self) -> int:
         """Return an id that makes the level below start over."""
-        self.newest += JUMP
+        self.newest += ID_JUMP
         self.before = self.newest - 1
         return self.newest
 
-    def renumber(self, done: int) -> None:
+    def renumber_plan(self, done: int) -> None:
         """Show the plan under new ids, from its move `done` on."""
-        self.first = self.newest + JUMP - done
+        self.first = self.newest + ID_JUMP - done
         self.before = self.first + done - 1
 
-    def done(self, below: MoveStatus) -> int:
+    def count_done(self, below: MoveStatus) -> int:
         """Return how many of the plan's moves the level below reports as done."""
         return below.done - self.first + 1
 
-    def breaking_off(self, plan: TaskPlan, done: int, below: MoveStatus) -> tuple[int, bool]:
+    def find_interruption(self, plan: TaskPlan, done: int, below: MoveStatus) -> tuple[int, bool]:
         """Return the first move that must not begin so that the program can be interrupted.
 
         Args:
@@ -75,11 +75,11 @@ class ShownWindow:
             first.
         """
         is_begun = below.current == self.first + done
-        if not is_free(plan, done) and (is_begun or not is_free(plan, done - 1)):
-            return next(k for k in range(done, plan.count + 1) if is_free(plan, k)), False
+        if not is_free_motion(plan, done) and (is_begun or not is_free_motion(plan, done - 1)):
+            return next(k for k in range(done, plan.count + 1) if is_free_motion(plan, k)), False
         return done, True
 
-    def show(self, plan: TaskPlan, done: int, command: TaskCommand, until: int) -> None:
+    def show_moves(self, plan: TaskPlan, done: int, command: TaskCommand, until: int) -> None:
         """Show the moves from the first one that is not done up to `until`.
 
         After the last move the window stays. Moves that were done under other ids are not shown
@@ -91,18 +91,18 @@ class ShownWindow:
             command: Receives the window.
             until: First move that is not shown.
         """
-        first = min(done, max(plan.count - WINDOW, 0)) if self.first == FIRST_ID else done
-        count = max(0, min(WINDOW, until - first))
+        first = min(done, max(plan.count - WINDOW_MOVES, 0)) if self.first == FIRST_ID else done
+        count = max(0, min(WINDOW_MOVES, until - first))
         command.moves[:count] = plan.moves[first : first + count]
         command.moves["id"][:count] = np.arange(count) + (self.first + first)
-        self._end(command, count)
+        self._finish_window(command, count)
 
     def show_one(self, move: Move, command: TaskCommand) -> None:
         """Show a single move."""
         move.write_to(command.moves[0])
-        self._end(command, 1)
+        self._finish_window(command, 1)
 
-    def _end(self, command: TaskCommand, count: int) -> None:
+    def _finish_window(self, command: TaskCommand, count: int) -> None:
         """Set the count and id of a window, and clear its unused moves."""
         command.count = count
         # Unused moves are cleared, so that equal windows have equal bytes.
@@ -112,12 +112,12 @@ class ShownWindow:
         command.id = self.newest
 
 
-def is_free(plan: TaskPlan, k: int) -> bool:
+def is_free_motion(plan: TaskPlan, k: int) -> bool:
     """Return True if move `k` of the plan is a free motion.
 
     Also True before the first move and after the last.
     """
-    return not 0 <= k < plan.count or plan.moves["verb"][k] in FREE
+    return not 0 <= k < plan.count or plan.moves["verb"][k] in FREE_VERBS
 
 
 class Detour:
@@ -144,18 +144,18 @@ class Detour:
         """
         return self._target is not None
 
-    def reason(self) -> str:
+    def format_reason(self) -> str:
         """Describe the state of the goto, and the command that ends it."""
-        goal = described(Operation.GOTO, self._goal)
+        goal = describe_command(Operation.GOTO, self._goal)
         stage = "done" if self._orders.answer is Answer.DONE else "under way"
         return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
 
-    def begin(self, message: OperatorCommand, is_new: bool) -> None:
+    def accept_command(self, message: OperatorCommand, is_new: bool) -> None:
         """Accept or refuse a goto. One that is not new continues under its id."""
         try:
-            self._target = self._read(message)
+            self._target = self._read_goal(message)
         except ValueError as error:
-            self._orders.refuse(str(error))
+            self._orders.refuse_newest(str(error))
             return
         self._goal = Goal(message.goal)
         self._is_new = is_new
@@ -175,34 +175,34 @@ class Detour:
         self.until = None
         standing = self._orders.standing
         if standing is Operation.NONE and self.move:
-            self._window.renumber(done)
+            self._window.renumber_plan(done)
             self.move = 0
         elif standing is Operation.GOTO and self.move:
             if self._is_new:
-                self.move = self._window.jump()
-            self._follow(below)
+                self.move = self._window.reserve_id()
+            self._track_progress(below)
         elif standing is Operation.GOTO:
-            done = self._leave(plan, done, below)
+            done = self._interrupt_program(plan, done, below)
         self._is_new = False
         return done
 
-    def _leave(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
+    def _interrupt_program(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
         """Interrupt the program if possible; until then show only moves that must be done first.
 
         Returns how many of the plan's moves are done.
         """
-        self.until, self.holds = self._window.breaking_off(plan, done, below)
+        self.until, self.holds = self._window.find_interruption(plan, done, below)
         if not self.holds:
             return done
         # The program can be interrupted once the arm rests and the level below has received the
         # window without further moves.
         if below.resting and below.operator >= self._orders.basis:
-            self.move = self._window.jump()
+            self.move = self._window.reserve_id()
             self.holds = False
-            return done if is_free(plan, done) else done - 1
+            return done if is_free_motion(plan, done) else done - 1
         return done
 
-    def as_move(self, action: int) -> Move:
+    def to_move(self, action: int) -> Move:
         """Return the goto as a move.
 
         `action` is the program's next action, although the move does not belong to it.
@@ -211,31 +211,33 @@ class Detour:
         verb, tool, joints = self._target
         return Move(self.move, action, verb, None, tool, joints, False, 0.0)
 
-    def _follow(self, below: MoveStatus) -> None:
+    def _track_progress(self, below: MoveStatus) -> None:
         """Report that the goto is done or has failed, when the level below reports it."""
         if below.done >= self.move:
-            self._orders.done()
+            self._orders.report_done()
         elif below.state == State.ERROR and below.done >= self._window.before:
-            self._orders.fail(below.reason)
+            self._orders.abandon_command(below.reason)
 
-    def _read(self, message: OperatorCommand) -> tuple[Verb, Pose, Array]:
+    def _read_goal(self, message: OperatorCommand) -> tuple[Verb, Pose, Array]:
         """Return the kind of move to the goal, and its tool pose and joint positions.
 
         Raises:
             ValueError: The goal is invalid.
         """
         joints = np.array(self._robot.home)
-        tool = pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0))
+        tool = make_pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0))
         goal = message.goal
         if goal == Goal.JOINTS:
             names = self._robot.joints
             ranges = np.tile((-MAX_JOINT_RAD, MAX_JOINT_RAD), (len(names), 1))
-            joints = joints_of(message, names, ranges)
+            joints = read_joint_goal(message, names, ranges)
         if goal in (Goal.JOINTS, Goal.HOME):
             return Verb.MOVE_JOINTS, tool, joints
         turned = np.array(message.quaternion if goal == Goal.POSE else message.direction)
         position = np.array(message.position)
         if not (np.isfinite(position).all() and np.isfinite(turned).all() and turned.any()):
             raise ValueError("position, quaternion or direction is not finite, or all zero")
-        tool = pose(position, turned if goal == Goal.POSE else pointing(turned))
+        tool = make_pose(
+            position, turned if goal == Goal.POSE else build_pointing_quaternion(turned)
+        )
         return Verb.MOVE, tool, joints

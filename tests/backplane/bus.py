@@ -6,12 +6,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
+from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, compute_slot_stride
 from rack.backplane.layout import InterruptSpec, Layout, MailboxSpec, Protocol, Role, TaskSpec, Wake
-from rack.backplane.mailbox.queue import QueueTaken, taken_name
+from rack.backplane.mailbox.queue import QueueTaken, get_position_mailbox
 from rack.backplane.message import Message, field
 from rack.backplane.segment import Segment
-from rack.boards.config.layout import field_specs
+from rack.boards.config.layout import build_field_specs
 
 CLOCK_NS = 2_500_000
 SERVICE_NS, SPARE_NS = 60_000, 1_000_000
@@ -51,8 +51,8 @@ def mailbox(
         depth=depth,
         message=Point.message_type.name,
         version=Point.message_type.version,
-        size=Point.message_type.dtype(SIZES).itemsize,
-        fields=field_specs(Point.message_type, SIZES),
+        size=Point.message_type.build_dtype(SIZES).itemsize,
+        fields=build_field_specs(Point.message_type, SIZES),
         capacity=capacity,
         interrupt=interrupt if protocol == "interrupt" else None,
     )
@@ -66,7 +66,7 @@ def queue(
     written, read = rates
     box = mailbox("queue", every=written, delay=written, depth=slots, capacity=capacity)
     position = MailboxSpec(
-        name=taken_name(NAME),
+        name=get_position_mailbox(NAME),
         writer="reader",
         readers=("writer",),
         protocol="time-slice",
@@ -75,8 +75,8 @@ def queue(
         depth=64,
         message=QueueTaken.message_type.name,
         version=QueueTaken.message_type.version,
-        size=QueueTaken.message_type.dtype({}).itemsize,
-        fields=field_specs(QueueTaken.message_type, {}),
+        size=QueueTaken.message_type.build_dtype({}).itemsize,
+        fields=build_field_specs(QueueTaken.message_type, {}),
     )
     return box, position
 
@@ -105,6 +105,6 @@ def layout(
 
 def message_address(segment: Segment, serial: int, name: str = NAME) -> int:
     """Return the bus address of the message in that serial's slot."""
-    spec = segment.layout.mailbox(name)
-    slot = (serial % spec.depth) * slot_stride(spec)
+    spec = segment.layout.find_mailbox(name)
+    slot = (serial % spec.depth) * compute_slot_stride(spec)
     return segment.map.mailboxes[name] + MAILBOX_HEAD_SIZE + slot + SLOT_HEAD_SIZE

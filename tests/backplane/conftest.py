@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from rack.backplane.layout import MailboxSpec, TaskSpec
-from rack.backplane.segment import SHM_FOLDER, Segment, unlink
+from rack.backplane.segment import SHM_FOLDER, Segment, unlink_segment
 from tests.backplane.bus import layout
 
 MakeBus = Callable[..., Segment]
@@ -29,5 +29,5 @@ def make_bus(rack_name: str) -> Iterator[MakeBus]:
     yield make
     for segment in made:
         segment.close()
-    unlink(rack_name)
+    unlink_segment(rack_name)
     assert not [path.name for path in SHM_FOLDER.iterdir() if rack_name in path.name]

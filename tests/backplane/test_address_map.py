@@ -9,18 +9,18 @@ import pytest
 from rack.backplane.address_map import (
     ALARM_SIZE,
     BLOCK_SIZE,
+    CACHE_LINE,
     FAULT_ENTRIES,
     FAULT_ENTRY_SIZE,
     HEAD_SIZE,
-    LINE,
     OPERATOR_ENTRIES,
     PAGE,
     AddressMap,
-    mailbox_size,
-    operator_entry_size,
-    trace_size,
+    compute_mailbox_size,
+    compute_operator_entry_size,
+    compute_trace_size,
 )
-from rack.backplane.layout import Layout, TaskSpec, depth_for
+from rack.backplane.layout import Layout, TaskSpec, compute_depth
 from rack.backplane.words import Block, Head, System
 from tests.backplane.bus import layout, mailbox, task
 
@@ -50,13 +50,13 @@ def test_windows_follow_each_other_on_pages(full: Layout) -> None:
 
 def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
     places = AddressMap(full)
-    areas = [(places.blocks[t.name], BLOCK_SIZE + trace_size(t)) for t in full.tasks]
-    areas += [(places.mailboxes[m.name], mailbox_size(m)) for m in full.mailboxes]
+    areas = [(places.blocks[t.name], BLOCK_SIZE + compute_trace_size(t)) for t in full.tasks]
+    areas += [(places.mailboxes[m.name], compute_mailbox_size(m)) for m in full.mailboxes]
     areas += [(address, ALARM_SIZE) for address in places.alarms.values()]
     areas += [(places.faults, FAULT_ENTRIES * FAULT_ENTRY_SIZE)]
-    areas += [(places.operator, OPERATOR_ENTRIES * operator_entry_size(full))]
+    areas += [(places.operator, OPERATOR_ENTRIES * compute_operator_entry_size(full))]
     areas.sort()
-    assert all(address % LINE == 0 for address, _ in areas)
+    assert all(address % CACHE_LINE == 0 for address, _ in areas)
     assert all(address + size <= following for (address, size), (following, _) in pairwise(areas))
 
 
@@ -68,7 +68,7 @@ def test_everything_that_a_board_writes_is_in_its_window(full: Layout) -> None:
     for window, addresses in zip(places.windows, (of_clock, of_writer), strict=False):
         for address in addresses:
             assert window.address <= address < window.address + window.size
-    assert operator_entry_size(full) >= full.mailbox("reader.operator").size
+    assert compute_operator_entry_size(full) >= full.find_mailbox("reader.operator").size
 
 
 def words_of(kind: type) -> list[int]:
@@ -87,4 +87,4 @@ def test_shared_words_fit_their_places() -> None:
     [(0, 1, 4), (1, 1, 4), (2, 1, 8), (800, 1, 1024), (800, 8, 128)],
 )
 def test_depth_keeps_the_span_in_a_power_of_two(span_ticks: int, every: int, slots: int) -> None:
-    assert depth_for(span_ticks, every) == slots
+    assert compute_depth(span_ticks, every) == slots

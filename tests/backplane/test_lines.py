@@ -46,12 +46,12 @@ def test_the_emergency_stop_latches_until_every_input_is_good(bus: Segment) -> N
     lines.latch_emergency_stop()
     lines.release_sysfail(2)
     bus.words[System.ACFAIL] = 1
-    bus.block("high")[Block.LOST] = 1
+    bus.get_block("high")[Block.LOST] = 1
     message = "stays latched: SYSFAIL of slot 21, ACFAIL, board 'high' is lost$"
     with pytest.raises(EmergencyStopError, match=message):
         lines.reset_emergency_stop()
     assert lines.emergency_stop
     lines.release_sysfail(21)
-    bus.words[System.ACFAIL] = bus.block("high")[Block.LOST] = 0
+    bus.words[System.ACFAIL] = bus.get_block("high")[Block.LOST] = 0
     lines.reset_emergency_stop()
     assert not lines.emergency_stop

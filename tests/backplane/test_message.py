@@ -16,10 +16,10 @@ from rack.backplane.message import (
     Message,
     State,
     Status,
+    decode_text,
     field,
     fill_counts,
     make_message,
-    text_of,
 )
 from rack.backplane.message_type import Field, MessageType
 
@@ -45,7 +45,7 @@ def track() -> Track:
 
 
 def test_symbolic_sizes_are_filled_in() -> None:
-    dtype = Track.message_type.dtype(SIZES)
+    dtype = Track.message_type.build_dtype(SIZES)
     assert dtype["angle"].shape == (6, 2)
     assert dtype["poses"].shape == (5,)
     assert dtype["poses"].base["position"].shape == (3,)
@@ -57,7 +57,7 @@ def test_an_unknown_size_is_refused_with_the_known_ones() -> None:
     with pytest.raises(
         MailboxError, match=r"'track' field 'poses': size 'poses' is unknown; known sizes: joints"
     ):
-        Track.message_type.dtype({"joints": 6})
+        Track.message_type.build_dtype({"joints": 6})
 
 
 class Colour(IntEnum):
@@ -158,7 +158,8 @@ def test_arrays_are_views_of_the_bytes(track: Track) -> None:
     angle[0, 1] = -1.0
     assert track.record["angle"][0].tolist() == [0.0, -1.0]
     assert (
-        track.raw[Track.message_type.dtype(SIZES).fields["angle"][1] :][8:16].cast("d")[0] == -1.0
+        track.raw[Track.message_type.build_dtype(SIZES).fields["angle"][1] :][8:16].cast("d")[0]
+        == -1.0
     )
 
 
@@ -181,10 +182,10 @@ def test_text_reads_as_text_cut_to_its_field(track: Track) -> None:
 def test_text_reads_with_escapes_in_place_of_control_characters(track: Track) -> None:
     for content, shown in ((b"\x1b[2J", r"\x1b[2J"), (b"a\n\x7f", r"a\n\x7f"), (b"a\\b", r"a\b")):
         track.word = content
-        assert track.word == text_of(content) == shown
+        assert track.word == decode_text(content) == shown
         # As often as it is passed on.
-        assert text_of(shown.encode()) == shown
-    assert text_of(b"\xe9t") == "\N{REPLACEMENT CHARACTER}t"
+        assert decode_text(shown.encode()) == shown
+    assert decode_text(b"\xe9t") == "\N{REPLACEMENT CHARACTER}t"
 
 
 def test_clear_and_copy_take_every_byte(track: Track) -> None:
@@ -216,7 +217,7 @@ def test_counts_stay_at_the_greatest_number_of_their_fields() -> None:
         Field("tick", "i8", "tick", ""),
     )
     message = AnyMessage(
-        MessageType("counts", 1, (*fields, Field("age_s", "f8", "s", ""))).dtype({})
+        MessageType("counts", 1, (*fields, Field("age_s", "f8", "s", ""))).build_dtype({})
     )
     fill_counts(message.record, (1 << 70, 1 << 32, 1 << 63, 1e30))
     assert message.record.tolist() == ((1 << 16) - 1, (1 << 32) - 1, (1 << 63) - 1, 1e30)

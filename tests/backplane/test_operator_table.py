@@ -37,8 +37,8 @@ def give(entry: RequestEntry, serial: int) -> None:
 
 
 def test_an_entry_contains_the_request(segment: Segment) -> None:
-    message = bytes(range(1, 1 + segment.layout.mailbox(BOX).size % 256))
-    entry = OperatorTable(segment).add(Request(0, message, tick=40))
+    message = bytes(range(1, 1 + segment.layout.find_mailbox(BOX).size % 256))
+    entry = OperatorTable(segment).add_request(Request(0, message, tick=40))
     read = OperatorTable(segment).entries[entry.index]
     assert bytes(read.message[: len(message)]) == message
     assert (read.mailbox, read.tick) == (0, 40)
@@ -47,11 +47,11 @@ def test_an_entry_contains_the_request(segment: Segment) -> None:
 
 def test_requests_wait_in_the_order_of_their_arrival(segment: Segment) -> None:
     table = OperatorTable(segment)
-    added = [table.add(Request(0, b"", tick)) for tick in (9, 3, 5)]
+    added = [table.add_request(Request(0, b"", tick)) for tick in (9, 3, 5)]
     give(added[0], 1)
-    added.append(table.add(Request(0, b"", 7)))
-    assert [entry.tick for entry in OperatorTable(segment).waiting()] == [3, 5, 7]
-    assert [entry.ticket for entry in OperatorTable(segment).waiting()] == [2, 3, 4]
+    added.append(table.add_request(Request(0, b"", 7)))
+    assert [entry.tick for entry in OperatorTable(segment).list_waiting()] == [3, 5, 7]
+    assert [entry.ticket for entry in OperatorTable(segment).list_waiting()] == [2, 3, 4]
     assert segment.words[System.REQUESTED] == 4
 
 
@@ -64,44 +64,44 @@ def test_issued_commands_without_a_waiting_request_by_their_tick_are_missing(
         Request(0, message, tick)
         for message, tick in ((hold, 100), (resume, 150), (hold, 200), (hold, 300))
     ]
-    assert table.lacking(issued) == issued
+    assert table.find_missing(issued) == issued
     # Added late, at once, and one that the run did not live to see.
     for message, tick in ((hold, 300), (hold, -1), (resume, 400)):
-        table.add(Request(0, message, tick))
-    assert table.lacking(issued) == issued[1:3]
-    with table.claim(Request(0, resume, 150)):
-        assert table.lacking(issued) == issued[2:3]
+        table.add_request(Request(0, message, tick))
+    assert table.find_missing(issued) == issued[1:3]
+    with table.claim_request(Request(0, resume, 150)):
+        assert table.find_missing(issued) == issued[2:3]
     # Its client is gone.
-    assert table.lacking(issued) == issued[1:3]
+    assert table.find_missing(issued) == issued[1:3]
 
 
 def test_a_request_in_a_reused_entry_is_not_withdrawn_by_an_earlier_client(
     segment: Segment,
 ) -> None:
     table = OperatorTable(segment)
-    entry = table.add(Request(0, b"", 9))
+    entry = table.add_request(Request(0, b"", 9))
     ticket = entry.ticket
-    assert table.withdraw(entry, ticket)
-    assert table.waiting() == []
-    again = table.add(Request(0, b"", 11))
+    assert table.withdraw_request(entry, ticket)
+    assert table.list_waiting() == []
+    again = table.add_request(Request(0, b"", 11))
     assert again.index == entry.index
-    assert not table.withdraw(entry, ticket)
+    assert not table.withdraw_request(entry, ticket)
     assert again.stage == RequestStage.WAITING
     give(again, 1)
-    assert not table.withdraw(again, again.ticket)
+    assert not table.withdraw_request(again, again.ticket)
     assert again.stage == RequestStage.GIVEN
 
 
 def test_a_claimed_request_waits_as_long_as_its_client_holds_it(segment: Segment) -> None:
     table, before = OperatorTable(segment), descriptors()
-    with table.claim(Request(0, b"", 9)) as first:
-        assert OperatorTable(segment).waiting()[0].index == first.index
-    assert table.waiting() == []
+    with table.claim_request(Request(0, b"", 9)) as first:
+        assert OperatorTable(segment).list_waiting()[0].index == first.index
+    assert table.list_waiting() == []
     # One without a client waits in an entry that a client had.
-    assert table.add(Request(0, b"", 9)).index == first.index
-    with table.claim(Request(0, b"", 9)) as second:
-        assert [entry.index for entry in table.waiting()] == [first.index, second.index]
-    assert [entry.index for entry in table.waiting()] == [first.index]
+    assert table.add_request(Request(0, b"", 9)).index == first.index
+    with table.claim_request(Request(0, b"", 9)) as second:
+        assert [entry.index for entry in table.list_waiting()] == [first.index, second.index]
+    assert [entry.index for entry in table.list_waiting()] == [first.index]
     assert descriptors() == before
 
 
@@ -112,24 +112,24 @@ def test_the_entry_of_a_dead_client_is_reused(segment: Segment) -> None:
     def die() -> None:
         with ExitStack() as claims:
             for _ in range(OPERATOR_ENTRIES):
-                claims.enter_context(table.claim(Request(0, b"", 9)))
-            assert len(table.waiting()) == OPERATOR_ENTRIES
+                claims.enter_context(table.claim_request(Request(0, b"", 9)))
+            assert len(table.list_waiting()) == OPERATOR_ENTRIES
             os.kill(os.getpid(), signal.SIGKILL)
 
     assert exit_status(fork(die)) == -signal.SIGKILL
-    assert table.waiting() == []
-    entries = {table.add(Request(0, b"", 9)).index for _ in range(OPERATOR_ENTRIES)}
-    assert len(entries) == len(table.waiting()) == OPERATOR_ENTRIES
+    assert table.list_waiting() == []
+    entries = {table.add_request(Request(0, b"", 9)).index for _ in range(OPERATOR_ENTRIES)}
+    assert len(entries) == len(table.list_waiting()) == OPERATOR_ENTRIES
 
 
 def test_a_full_table_reuses_the_entry_of_the_command_issued_longest_ago(segment: Segment) -> None:
     table = OperatorTable(segment)
-    entries = [table.add(Request(0, b"", 9)) for _ in range(OPERATOR_ENTRIES)]
+    entries = [table.add_request(Request(0, b"", 9)) for _ in range(OPERATOR_ENTRIES)]
     with pytest.raises(OperatorTableError, match=f"full: {OPERATOR_ENTRIES} commands wait"):
-        table.add(Request(0, b"", 9))
+        table.add_request(Request(0, b"", 9))
     for serial, entry in enumerate(reversed(entries), 1):
         give(entry, serial)
-    assert table.add(Request(0, b"", 9)).index == entries[-1].index
+    assert table.add_request(Request(0, b"", 9)).index == entries[-1].index
 
 
 @pytest.mark.parametrize(("tick", "was_withdrawn"), [(-1, True), (0, False), (1, False)])
@@ -137,7 +137,7 @@ def test_a_request_that_the_clock_is_issuing_is_not_withdrawn(
     segment: Segment, tick: int, was_withdrawn: bool
 ) -> None:
     table = OperatorTable(segment)
-    entry = table.add(Request(0, b""))
+    entry = table.add_request(Request(0, b""))
     assert entry.tick == -1
     entry.given_tick = tick
-    assert table.withdraw(entry, entry.ticket) is was_withdrawn
+    assert table.withdraw_request(entry, entry.ticket) is was_withdrawn

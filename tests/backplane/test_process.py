@@ -15,26 +15,26 @@ import pytest
 from rack.backplane.memory import hold_memory
 from rack.backplane.process import (
     DEADLINE,
-    GONE,
-    STOPPED,
-    WAITING,
+    ENDED_STATES,
+    STOPPED_STATES,
+    WAITING_STATES,
     Reservation,
-    children_of,
     compute_until,
-    cores_kept_awake,
+    describe_end,
+    describe_refusal,
     die_with_parent,
-    how_ended,
+    disable_timer_slack,
     is_alive,
-    mapped_and_locked,
+    keep_cores_awake,
+    list_children,
     name_process,
-    processor_ns,
-    readable,
-    refusal,
+    read_memory_sizes,
+    read_processor_ns,
+    read_start_time,
+    read_state,
     set_priority,
-    start_time,
-    state_of,
     take_core,
-    wake_up_exactly,
+    wait_readable,
 )
 from tests.machine import needs_deadlines, needs_fifo
 from tests.processes import FORKS, descriptors, exit_status, fork, forked, wait_until
@@ -43,7 +43,7 @@ pytestmark = pytest.mark.filterwarnings(FORKS)
 
 
 def test_a_running_process_is_alive_only_with_its_start_time() -> None:
-    started = start_time(os.getpid())
+    started = read_start_time(os.getpid())
     assert started > 0
     assert is_alive(os.getpid())
     assert is_alive(os.getpid(), started)
@@ -58,9 +58,9 @@ def test_a_process_name_may_contain_parentheses_and_spaces() -> None:
         time.sleep(60)
 
     with forked(rename) as pid:
-        before = start_time(pid)
+        before = read_start_time(pid)
         wait_until(lambda: ") S 1" in Path(f"/proc/{pid}/comm").read_text())
-        assert start_time(pid) == before > 0
+        assert read_start_time(pid) == before > 0
 
 
 def test_cores_are_kept_awake_by_a_request_that_is_held(
@@ -68,14 +68,14 @@ def test_cores_are_kept_awake_by_a_request_that_is_held(
 ) -> None:
     device = tmp_path / "cpu_dma_latency"
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)
-    with cores_kept_awake() as refusal:
+    with keep_cores_awake() as refusal:
         assert refusal == (
             f"idle cores sleep, because {device} cannot be opened: No such file or directory"
         )
     assert not device.exists()
     device.touch()
     before = descriptors()
-    with cores_kept_awake() as refusal:
+    with keep_cores_awake() as refusal:
         assert refusal == ""
         assert device.read_bytes() == bytes(4)
         assert descriptors() == before + 1
@@ -83,17 +83,17 @@ def test_cores_are_kept_awake_by_a_request_that_is_held(
 
 
 def test_the_kernel_says_in_which_state_a_process_is() -> None:
-    assert state_of(os.getpid()) == "R"
+    assert read_state(os.getpid()) == "R"
     with forked(signal.pause) as pid:
-        wait_until(lambda: state_of(pid) in WAITING)
+        wait_until(lambda: read_state(pid) in WAITING_STATES)
         os.kill(pid, signal.SIGSTOP)
-        wait_until(lambda: state_of(pid) in STOPPED)
+        wait_until(lambda: read_state(pid) in STOPPED_STATES)
         os.kill(pid, signal.SIGKILL)
-        wait_until(lambda: state_of(pid) in GONE)
-        assert state_of(pid) == "Z"
+        wait_until(lambda: read_state(pid) in ENDED_STATES)
+        assert read_state(pid) == "Z"
         assert not is_alive(pid)
-        assert start_time(pid) == 0
-    assert (state_of(pid), processor_ns(pid), mapped_and_locked(pid)) == ("X", 0, (0, 0))
+        assert read_start_time(pid) == 0
+    assert (read_state(pid), read_processor_ns(pid), read_memory_sizes(pid)) == ("X", 0, (0, 0))
 
 
 def test_processor_time_excludes_other_processes() -> None:
@@ -102,18 +102,18 @@ def test_processor_time_excludes_other_processes() -> None:
     used = time.process_time_ns()
     assert used >= target
     # The kernel counts in steps of 10 ms.
-    assert abs(processor_ns(os.getpid()) - used) < 25_000_000
+    assert abs(read_processor_ns(os.getpid()) - used) < 25_000_000
 
 
 def test_a_descriptor_is_waited_for_within_a_bound() -> None:
     reading, writing = os.pipe()
     try:
         began = time.monotonic()
-        assert not readable(reading, 0.02)
+        assert not wait_readable(reading, 0.02)
         assert time.monotonic() - began >= 0.02
-        assert not readable(reading, -1.0)
+        assert not wait_readable(reading, -1.0)
         os.write(writing, b"x")
-        assert readable(reading, 0.0)
+        assert wait_readable(reading, 0.0)
     finally:
         os.close(reading)
         os.close(writing)
@@ -122,15 +122,15 @@ def test_a_descriptor_is_waited_for_within_a_bound() -> None:
 def test_a_refusal_names_the_limit_that_is_reached() -> None:
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     processes = resource.getrlimit(resource.RLIMIT_NPROC)[0]
-    text = refusal(OSError(errno.EMFILE, "Too many"))
+    text = describe_refusal(OSError(errno.EMFILE, "Too many"))
     assert text == f"Too many: the limit is {files} open files (ulimit -n)"
-    text = refusal(OSError(errno.EAGAIN, "Not now"))
+    text = describe_refusal(OSError(errno.EAGAIN, "Not now"))
     assert text == f"Not now: the limit is {processes} processes (ulimit -u)"
-    assert refusal(OSError(errno.EACCES, "No")) == f"[Errno {errno.EACCES}] No"
+    assert describe_refusal(OSError(errno.EACCES, "No")) == f"[Errno {errno.EACCES}] No"
 
 
 def test_a_status_says_how_a_process_ended() -> None:
-    assert [how_ended(status) for status in (0, 3, -9)] == [
+    assert [describe_end(status) for status in (0, 3, -9)] == [
         "exit status 0",
         "exit status 3",
         "signal SIGKILL",
@@ -145,17 +145,17 @@ def test_a_task_takes_its_core_its_priority_and_its_memory() -> None:
         assert take_core(core, 5) == 5
         hold_memory()
         assert os.sched_getaffinity(0) == {core}
-        mapped, locked = mapped_and_locked(os.getpid())
+        mapped, locked = read_memory_sizes(os.getpid())
         assert mapped >= locked > 0
         return os.sched_getparam(0).sched_priority == 5
 
     def take_for_lockstep() -> bool:
         hold_memory(lockstep=True)
-        return not gc.isenabled() and mapped_and_locked(os.getpid())[1] == 0
+        return not gc.isenabled() and read_memory_sizes(os.getpid())[1] == 0
 
     def be_ordinary() -> bool:
         assert take_core(core, 0) == 0
-        wake_up_exactly()
+        disable_timer_slack()
         return Path("/proc/self/timerslack_ns").read_text().strip() == "1"
 
     assert exit_status(fork(take)) == 0
@@ -210,7 +210,7 @@ def test_a_child_dies_with_its_parent() -> None:
 
     with forked(parent) as pid:
         child = int(os.read(reading, 20))
-        assert child in children_of(pid)
+        assert child in list_children(pid)
         assert is_alive(child)
     wait_until(lambda: not is_alive(child))
     # One that is started too late ends at once.

@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.mailbox import Writer
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.mailbox.slots import claim
+from rack.backplane.mailbox.slots import build_signature
 from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
 from tests.backplane.bus import NAME, mailbox
@@ -36,7 +36,7 @@ def write(writer: Writer, count: int) -> None:
 
 def serials(ring: Ring) -> tuple[list[int], int]:
     """Return the serials of the rows drained, and how many were lost."""
-    rows, lost = ring.drain()
+    rows, lost = ring.read_new_rows()
     assert (rows["message"]["id"] == rows["serial"]).all()
     return rows["serial"].tolist(), lost
 
@@ -46,26 +46,26 @@ def test_each_reader_gets_every_row_once_and_in_order(bus: Segment) -> None:
     assert serials(ring) == ([], 0)
     for first in range(1, 100, 11):
         write(writer, 11)
-        assert ring.waiting == 11
+        assert ring.waiting_count == 11
         assert serials(ring) == serials(second) == (list(range(first, first + 11)), 0)
-        assert ring.waiting == 0
+        assert ring.waiting_count == 0
     assert serials(ring) == ([], 0)
 
 
 def test_a_row_is_a_copy_with_the_head_of_its_message(bus: Segment) -> None:
     writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
     writer.write(7, basis=3)
-    row = ring.drain().rows[0]
+    row = ring.read_new_rows().rows[0]
     write(writer, 3 * DEPTH)
     assert [row[word] for word in ("serial", "tick", "visible_at", "basis")] == [1, 7, 8, 3]
-    assert row["epoch"] == claim(1, os.getpid())
+    assert row["epoch"] == build_signature(1, os.getpid())
 
 
 @pytest.mark.parametrize("written", [DEPTH - 1, DEPTH, DEPTH + 1, 3 * DEPTH + 5])
 def test_lost_rows_are_counted_exactly(bus: Segment, written: int) -> None:
     writer, ring = open_writer(bus, NAME), MailboxRing(bus, NAME)
     write(writer, 3)
-    ring.drain()
+    ring.read_new_rows()
     write(writer, written)
     found, lost = serials(ring)
     # One slot is the writer's: it may hold half a message.
@@ -86,13 +86,13 @@ def test_every_row_is_whole_or_counted_while_a_writer_hammers(bus: Segment) -> N
     writer = fork(lambda: hammer(bus))
     try:
         while taken < 8_000:
-            wait_until(lambda: ring.waiting)
-            rows, missing = ring.drain()
+            wait_until(lambda: ring.waiting_count)
+            rows, missing = ring.read_new_rows()
             whole = rows["message"]["row"] == rows["serial"][:, np.newaxis]
             assert whole.all()
             assert (np.diff(rows["serial"]) == 1).all()
             taken, lost = taken + len(rows), lost + missing
     finally:
         kill(writer)
-    rows, missing = ring.drain()
-    assert taken + len(rows) + lost + missing == MailboxRing(bus, NAME).waiting
+    rows, missing = ring.read_new_rows()
+    assert taken + len(rows) + lost + missing == MailboxRing(bus, NAME).waiting_count

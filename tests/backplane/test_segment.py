@@ -14,7 +14,7 @@ from types import SimpleNamespace
 import pytest
 
 from rack.backplane.errors import SegmentError
-from rack.backplane.segment import VERSION, Segment, racks, shm_path, unlink
+from rack.backplane.segment import VERSION, Segment, get_shm_path, list_racks, unlink_segment
 from rack.backplane.words import Block, Head, System
 from tests.backplane.bus import layout, mailbox
 from tests.backplane.conftest import MakeBus
@@ -45,7 +45,7 @@ def refusal(attach: Callable[[], object]) -> str:
 
 def test_a_segment_is_private_to_its_user_and_fully_allocated(make_bus: MakeBus) -> None:
     segment = make_bus(mailbox())
-    found = shm_path(segment.rack).stat()
+    found = get_shm_path(segment.rack).stat()
     assert stat.S_IMODE(found.st_mode) == 0o600
     assert found.st_size == len(segment.bytes)
     assert found.st_blocks * 512 >= found.st_size
@@ -59,15 +59,15 @@ def test_attached_processes_find_layout_config_and_the_same_memory(make_bus: Mak
     assert found.map.mailboxes == made.map.mailboxes
     assert (found.launcher, found.launcher_is_alive) == (os.getpid(), True)
     made.words[System.TICK] = 2**62 + 1
-    found.block("reader")[Block.DONE] = -7
+    found.get_block("reader")[Block.DONE] = -7
     assert found.words[System.TICK] == 2**62 + 1
-    assert made.block("reader")[Block.DONE] == -7
+    assert made.get_block("reader")[Block.DONE] == -7
 
 
 def test_tasks_begin_without_a_release_and_boards_hold_sysfail(make_bus: MakeBus) -> None:
     segment = make_bus()
     assert [
-        segment.block(t)[w] for t in ("writer", "reader") for w in (Block.RELEASED, Block.DONE)
+        segment.get_block(t)[w] for t in ("writer", "reader") for w in (Block.RELEASED, Block.DONE)
     ] == [-1] * 4
     assert [segment.words[System.SYSFAIL + slot] for slot in (1, 2, 3, 4)] == [0, 1, 1, 0]
 
@@ -108,7 +108,7 @@ def rename_field(segment: Segment) -> str:
 
 def lengthen(segment: Segment) -> str:
     size = len(segment.bytes)
-    os.truncate(shm_path(segment.rack), size + 4096)
+    os.truncate(get_shm_path(segment.rack), size + 4096)
     return f"the segment has {size + 4096} bytes, but its head says {size}"
 
 
@@ -124,11 +124,11 @@ def test_a_segment_that_this_program_does_not_understand_is_refused(
 
 
 def test_a_segment_without_room_for_a_head_is_refused(rack_name: str) -> None:
-    shm_path(rack_name).touch()
+    get_shm_path(rack_name).touch()
     try:
         assert "0 bytes" in refusal(lambda: Segment.attach(rack_name))
     finally:
-        unlink(rack_name)
+        unlink_segment(rack_name)
 
 
 @as_root
@@ -141,8 +141,8 @@ def test_another_users_segment_is_refused(make_bus: MakeBus) -> None:
 
     assert exit_status(fork(lambda: attach("belongs to another user"))) == 0
     # World-writable and another user's: its contents must not be trusted.
-    shm_path(segment.rack).chmod(0o666)
-    os.chown(shm_path(segment.rack), ANOTHER, ANOTHER)
+    get_shm_path(segment.rack).chmod(0o666)
+    os.chown(get_shm_path(segment.rack), ANOTHER, ANOTHER)
     assert exit_status(fork(lambda: attach(f"owner {ANOTHER}"))) == 0
 
 
@@ -156,7 +156,7 @@ def test_a_processor_that_reorders_stores_is_refused_before_anything_is_made(
         " for x86_64 alone; set RACK_TRY_PROCESSOR=1 to try it"
     )
     assert descriptors() == before
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
 
 
 def test_another_processor_is_tried_on_demand_if_its_words_have_64_bits(
@@ -165,7 +165,7 @@ def test_another_processor_is_tried_on_demand_if_its_words_have_64_bits(
     monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine="aarch64"))
     monkeypatch.setenv("RACK_TRY_PROCESSOR", "1")
     Segment.create(layout(rack_name, []), "").close()
-    unlink(rack_name)
+    unlink_segment(rack_name)
     assert capsys.readouterr().err == (
         f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is proved"
         " for x86_64 alone, and this one is untested\n"
@@ -183,7 +183,7 @@ def test_a_lack_of_shared_memory_is_reported_at_creation(rack_name: str) -> None
         assert f"rack '{rack_name}'" in message
         assert "bytes of shared memory" in message
     assert descriptors() == before
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
 
 
 @pytest.mark.slow
@@ -193,11 +193,11 @@ def test_a_creator_killed_anywhere_leaves_a_whole_segment_or_none(rack_name: str
         creator = fork(lambda: Segment.create(spec, "x = 1"))
         time.sleep(rng.uniform(0.0, 0.006))
         kill(creator)
-        if rack_name in racks():
+        if rack_name in list_racks():
             found = Segment.attach(rack_name)
             assert (found.layout, found.config, found.launcher_is_alive) == (spec, "x = 1", False)
             found.close()
-            unlink(rack_name)
+            unlink_segment(rack_name)
             complete += 1
     assert complete
 
@@ -210,7 +210,7 @@ def test_a_launcher_counts_as_alive_until_it_releases_its_lock(make_bus: MakeBus
     assert (segment.launcher_is_alive, other.launcher_is_alive) == (True, True)
     assert not other.await_launcher(0.01)
     with in_thread(lambda: other.await_launcher(BOUND_S)):
-        segment.release()
+        segment.release_launcher_lock()
     assert (segment.launcher_is_alive, other.launcher_is_alive) == (False, False)
     other.close()
 
@@ -236,7 +236,7 @@ def test_a_killed_launcher_is_dead_though_a_process_that_it_forked_lives_on(rack
             assert not found.launcher_is_alive
         finally:
             os.kill(orphan, signal.SIGKILL)
-            unlink(rack_name)
+            unlink_segment(rack_name)
             found.close()
 
 
@@ -249,8 +249,8 @@ def test_a_launcher_of_another_pid_namespace_has_no_process_id_here(make_bus: Ma
 
 def test_a_segment_detects_that_its_name_leads_to_another(make_bus: MakeBus) -> None:
     first = make_bus()
-    assert first.has_its_name
-    unlink(first.rack)
-    assert not first.has_its_name
+    assert first.is_named
+    unlink_segment(first.rack)
+    assert not first.is_named
     second = make_bus()
-    assert (first.has_its_name, second.has_its_name) == (False, True)
+    assert (first.is_named, second.has_its_name) == (False, True)

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.address_map import LINE
+from rack.backplane.address_map import CACHE_LINE
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import done_semaphore, lock_semaphore, wake_semaphore
+from rack.backplane.semaphores import get_done_semaphore, get_lock_semaphore, get_wake_semaphore
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME, mailbox, task
 from tests.backplane.conftest import MakeBus
@@ -38,25 +38,25 @@ def test_tasks_have_two_semaphores_and_locked_mailboxes_one_in_separate_cache_li
 ) -> None:
     places = bus.map
     found = [*places.wake.values(), *places.done.values(), *places.locks.values()]
-    assert len(found) == len({address // LINE for address in found}) == 5
+    assert len(found) == len({address // CACHE_LINE for address in found}) == 5
     assert all(places.windows[-1].address + places.windows[-1].size <= at for at in found)
 
 
 def test_locks_start_free_and_wake_ups_start_unposted(bus: Segment) -> None:
-    assert lock_semaphore(bus, NAME).value == 1
-    assert wake_semaphore(bus, "writer").value == 0
-    assert done_semaphore(bus, "writer").value == 0
+    assert get_lock_semaphore(bus, NAME).value == 1
+    assert get_wake_semaphore(bus, "writer").value == 0
+    assert get_done_semaphore(bus, "writer").value == 0
 
 
 def test_processes_that_attach_share_the_semaphores(bus: Segment) -> None:
-    wake_semaphore(bus, "writer").release()
+    get_wake_semaphore(bus, "writer").release()
     with closing(Segment.attach(bus.rack)) as other:
-        assert wake_semaphore(other, "writer").take()
-    assert not wake_semaphore(bus, "writer").take()
+        assert get_wake_semaphore(other, "writer").try_acquire()
+    assert not get_wake_semaphore(bus, "writer").try_acquire()
 
 
 def test_a_wait_lasts_until_its_deadline(bus: Segment) -> None:
-    semaphore = wake_semaphore(bus, "writer")
+    semaphore = get_wake_semaphore(bus, "writer")
     start = time.monotonic()
     assert not semaphore.acquire(0.02)
     assert time.monotonic() - start >= 0.02
@@ -66,7 +66,7 @@ def test_a_wait_lasts_until_its_deadline(bus: Segment) -> None:
 
 @pytest.mark.filterwarnings(FORKS)
 def test_a_release_ends_a_wait(bus: Segment) -> None:
-    semaphore = wake_semaphore(bus, "writer")
+    semaphore = get_wake_semaphore(bus, "writer")
     parent = os.getpid()
 
     def release_once_it_waits() -> None:
@@ -78,7 +78,7 @@ def test_a_release_ends_a_wait(bus: Segment) -> None:
     with forked(release_once_it_waits) as releaser:
         assert semaphore.acquire(BOUND_S)
         assert exit_status(releaser) == 0
-    assert not semaphore.take()
+    assert not semaphore.try_acquire()
 
 
 def wait_for_release(segment: Segment) -> None:
@@ -91,7 +91,7 @@ def wait_for_lock(segment: Segment) -> None:
 
 
 def wait_for_tasks(segment: Segment) -> None:
-    segment.block("writer")[Block.RELEASED] = 0
+    segment.get_block("writer")[Block.RELEASED] = 0
     LockstepDriver(segment, lambda tick: None, False, 8).run()
 
 

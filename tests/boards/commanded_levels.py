@@ -34,17 +34,17 @@ class Upper(Executor):
 
     def process(self, tick: int) -> None:
         orders = self.orders
-        orders.take(self.operator, self._judge)
+        orders.take_commands(self.operator, self._judge)
         self.command.hold = orders.standing is Operation.HOLD
-        self.command.operator = orders.rests_on(0)
+        self.command.operator = orders.find_basis(0)
         if self.below.message.operator >= orders.basis:
-            orders.done()
-        orders.report(self.status)
+            orders.report_done()
+        orders.fill_status(self.status)
         self.status.state = State.EXECUTING
 
     def _judge(self, command: Message) -> None:
         if self.orders.standing is Operation.GOTO:
-            self.orders.refuse("the way home is closed")
+            self.orders.refuse_newest("the way home is closed")
 
     def self_test(self) -> None:
         self.orders = Orders(self.commands)
@@ -73,17 +73,17 @@ class Lower(Executor):
     step = 1
 
     @classmethod
-    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+    def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the one name."""
         return ("twice",)
 
     def process(self, tick: int) -> None:
-        self.orders.take(self.operator, self._set)
+        self.orders.take_commands(self.operator, self._set_parameter)
         held = bool(self.above.message.hold) or self.orders.standing is Operation.HOLD
         self.status.count += 0 if held else self.step * self.given.by
         if self.is_there:
-            self.orders.done()
-        self.orders.report(self.status, self.above.message.operator)
+            self.orders.report_done()
+        self.orders.fill_status(self.status, self.above.message.operator)
         self.status.state = State.EXECUTING
 
     @property
@@ -91,7 +91,7 @@ class Lower(Executor):
         """Whether the command in force is done: at once."""
         return True
 
-    def _set(self, command: Message) -> None:
+    def _set_parameter(self, command: Message) -> None:
         if command.what == Operation.MODIFY:
             self.step = 2 if command.goal == Goal.ON else 1
         elif command.what == Operation.SET:

@@ -14,7 +14,7 @@ class Place(Status, version=1):
     mode: int = field("i2", unit="1", doc="how it moves")
 
 
-class Driven(Executor):
+class AppliedTorque(Executor):
     """Reports that it stands still."""
 
     status = Output(Place)

@@ -10,7 +10,7 @@ from rack.backplane.message import State, Status, field
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS, Kind, Parameter
 from rack.boards.faults import drawing as draw
-from rack.boards.faults.bounds import DELIVERY, writes
+from rack.boards.faults.bounds import DELIVERY, write_bound
 from rack.boards.faults.message_steps import MessageStep, Outgoing
 from rack.levels.level import Executor, Input, Output
 
@@ -27,10 +27,10 @@ class Valve(IntEnum):
 class LoseEvery(MessageStep):
     """Loses every n-th message."""
 
-    def send(self, message: Outgoing) -> None:
+    def send_message(self, message: Outgoing) -> None:
         if message.released // self.writer.spec.every % round(self.entry.parameters[0]) == 0:
-            self.acts(message)
-            self.writer.lose()
+            self.count_action(message)
+            self.writer.lose_message()
         else:
             self.onward(message)
 
@@ -42,11 +42,13 @@ KINDS.add(
         means="every n-th message is lost",
         step=LoseEvery,
         parameters=(
-            Parameter("n", "messages", "the n", 4, 2, 8, is_whole=True, drawn=draw.whole(2, 4)),
+            Parameter(
+                "n", "messages", "the n", 4, 2, 8, is_whole=True, drawn=draw.uniform_integer(2, 4)
+            ),
         ),
         detected_as=(Alarm.GAP,),
-        bound=writes(1) + DELIVERY,
-        lasts=draw.messages(8, 12),
+        bound=write_bound(1) + DELIVERY,
+        lasts=draw.uniform_messages(8, 12),
     )
 )
 

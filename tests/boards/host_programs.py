@@ -12,7 +12,7 @@ from rack.backplane.message import Command, State, Status, field
 from rack.backplane.segment import Segment
 from rack.boards.host import bus_adapter
 from rack.boards.host.bus_adapter import BusAdapter
-from rack.boards.wiring import Entries
+from rack.boards.wiring import ExchangedEntries
 from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
 from rack.levels.level import Executor, Input, Output
 
@@ -143,16 +143,16 @@ class Lingering(Host):
 
     def run(self, bus: Bus) -> None:
         """Declare the work done; end with the rack."""
-        bus.finish()
+        bus.declare_done()
         time.sleep(3600)
 
 
 class HastyAdapter(BusAdapter):
     """A bus adapter that waits for a program for a second at most."""
 
-    def attach(self, segment: Segment, entries: Entries | None) -> None:
+    def attach_segment(self, segment: Segment, entries: ExchangedEntries | None) -> None:
         bus_adapter.LONGEST_S = 1.0
-        super().attach(segment, entries)
+        super().attach_segment(segment, entries)
 
 
 class Ending(Host):
@@ -172,7 +172,7 @@ class Failing(Host):
 class Console(Host):
     """A board for prompts."""
 
-    def names(self, bus: Bus) -> dict[str, object]:
+    def list_prompt_names(self, bus: Bus) -> dict[str, object]:
         """Offer a function that sends a number."""
         return {"number": self.send_number}
 

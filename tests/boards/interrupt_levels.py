@@ -35,6 +35,6 @@ class Hub(Executor):
     def process(self, tick: int) -> None:
         self.status.state = State.EXECUTING
         for at, reading in enumerate(self.below.values()):
-            self.status.cycle[at] = reading.message.cycle if reading.is_there else -1
+            self.status.cycle[at] = reading.message.cycle if reading.has_message else -1
             self.status.lost[at] = reading.is_lost
         self.command.number = tick // self.context.every

@@ -42,7 +42,7 @@ class Swing(Executor):
         """Write the set point due two cycles later."""
         command, due = self.command, tick + 2 * self.context.every
         readings = self.statuses.values()
-        held = any(not one.is_there or one.is_lost or one.message.stopped for one in readings)
+        held = any(not one.has_message or one.is_lost or one.message.stopped for one in readings)
         self.status.state = State.HOLDING if held else State.EXECUTING
         self.status.reason = "a board below is stopped" if held else ""
         command.opening, command.force = self.opening, 20.0

@@ -9,7 +9,7 @@ import numpy as np
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
-from rack.backplane.trace import Flag, trace_ring
+from rack.backplane.trace import Flag, open_trace_ring
 from rack.backplane.words import Block
 from tests.processes import wait_until
 
@@ -17,7 +17,7 @@ WHAT = ("serial", "tick", "visible_at", "basis", "chain")
 
 
 @dataclass(frozen=True)
-class Written:
+class WrittenMessages:
     """The messages of a run by mailbox, and its cycles by task; complete if the run is shorter than
     the rings."""
 
@@ -25,10 +25,10 @@ class Written:
     cycles: dict[str, np.ndarray]
 
     @classmethod
-    def on(cls, segment: Segment) -> Written:
+    def on(cls, segment: Segment) -> WrittenMessages:
         """Read everything from a segment, once the cycles that were under way at the end of the run
         have ended."""
-        blocks = [segment.block(task.name) for task in segment.layout.tasks]
+        blocks = [segment.get_block(task.name) for task in segment.layout.tasks]
         wait_until(
             lambda: all(
                 b[Block.DONE] >= b[Block.RELEASED] or not is_alive(b[Block.PID]) for b in blocks
@@ -36,10 +36,10 @@ class Written:
         )
         messages, cycles = {}, {}
         for mailbox in segment.layout.mailboxes:
-            messages[mailbox.name], lost = MailboxRing(segment, mailbox.name).drain()
+            messages[mailbox.name], lost = MailboxRing(segment, mailbox.name).read_new_rows()
             assert not lost
         for task in segment.layout.tasks:
-            cycles[task.name], lost = trace_ring(segment, task.name).drain()
+            cycles[task.name], lost = open_trace_ring(segment, task.name).read_new_rows()
             assert not lost
         return cls(messages, cycles)
 

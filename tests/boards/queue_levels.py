@@ -19,7 +19,7 @@ class Sent(Status, version=1):
     refused: int = field(unit="1", doc="refused: queue full")
 
 
-class Taken(Status, version=1):
+class MonitoredPort(Status, version=1):
     taken: int = field(unit="1", doc="requests taken")
     newest: int = field("u4", unit="1", doc="id of the newest request taken")
     repeated: int = field(unit="1", doc="requests not newer than the one before")
@@ -64,20 +64,20 @@ class Answering(Executor):
     """Takes at most `most` requests a cycle, and counts what is repeated or missing."""
 
     requests = Input(Request, "above.requests")
-    own = Input(Taken, "own.status")
-    status = Output(Taken)
+    own = Input(MonitoredPort, "own.status")
+    status = Output(MonitoredPort)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._has_begun = False
 
-    def room(self, port: str) -> int:
+    def max_messages(self, port: str) -> int:
         return int(self.context.params.get("most", 1 << 30))
 
     def process(self, tick: int) -> None:
         if not self._has_begun:
             self._has_begun = True
-            if self.own.is_there:
+            if self.own.has_message:
                 self.status.copy_from(self.own.message)
         count(self.requests, self.status)
 
@@ -86,7 +86,7 @@ class Steady(Executor):
     """Follows the plan of its planner, a queue, as a level that reads requests does."""
 
     plan = Input(Request, "own.plan")
-    status = Output(Taken)
+    status = Output(MonitoredPort)
 
     def process(self, tick: int) -> None:
         if self.plan.is_new:
@@ -114,7 +114,7 @@ class Filing(Planner):
     """Plans what it has taken: its slice is several cycles, in which requests wait."""
 
     requests = Input(Request, "above.requests")
-    output = Output(Taken)
+    output = Output(MonitoredPort)
 
     def wanted(self, tick: int) -> bool:
         return bool(self.requests.is_new)
@@ -126,8 +126,8 @@ class Filing(Planner):
 class Filed(Executor):
     """Shows its planner's counts."""
 
-    plan = Input(Taken, "own.plan")
-    status = Output(Taken)
+    plan = Input(MonitoredPort, "own.plan")
+    status = Output(MonitoredPort)
 
     def process(self, tick: int) -> None:
         self.status.copy_from(self.plan.message)

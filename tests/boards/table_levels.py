@@ -9,7 +9,7 @@ from rack.levels.systems.state_table.level import (
     StateTableExecutor,
     TableCommand,
     TableStatus,
-    vocabulary,
+    build_vocabulary,
 )
 
 
@@ -26,7 +26,7 @@ class Counter(StateTableExecutor):
     last_status = Input(CounterStatus, "own.status")
     operator = Input(OperatorCommand, "own.operator")
     status = Output(CounterStatus)
-    vocabulary = vocabulary(
+    vocabulary = build_vocabulary(
         conditions={"count": ("low", "between", "high")},
         commands={"reset": (("low", "high"),)},
         actions={
@@ -36,11 +36,11 @@ class Counter(StateTableExecutor):
     )
     count = 0
 
-    def recall(self) -> None:
-        super().recall()
+    def restore_state(self) -> None:
+        super().restore_state()
         self.count = self.last_status.message.count
 
-    def look(self, tick: int) -> dict[str, str]:
+    def evaluate_conditions(self, tick: int) -> dict[str, str]:
         return {"count": "low" if self.count <= 0 else "high" if self.count >= 10 else "between"}
 
     def do_count(self, way: str) -> None:
@@ -51,5 +51,5 @@ class Counter(StateTableExecutor):
         """Go to an end."""
         self.count = 0 if self.words[1] == "low" else 10
 
-    def give(self, tick: int) -> None:
+    def write_outputs(self, tick: int) -> None:
         self.status.count = self.count

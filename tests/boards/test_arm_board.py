@@ -10,7 +10,7 @@ import pytest
 
 from rack.backplane.mailbox.protocols import open_observer
 from rack.boards import Rack
-from rack.boards.config import wire
+from rack.boards.config import resolve_layout
 from rack.boards.errors import ConfigError
 from tests.boards.arm_racks import APART, TOGETHER, arm_rack, named, without
 from tests.boards.conftest import MakeConfig
@@ -53,7 +53,7 @@ WRONG: dict[str, tuple[Mapping[str, Mapping[str, Any]], str, str]] = {
 def test_joints_without_one_board_are_refused_in_one_line(config: MakeConfig, case: str) -> None:
     servos, place, reason = WRONG[case]
     with pytest.raises(ConfigError) as refused:
-        wire(config(text=arm_rack(servos)))
+        resolve_layout(config(text=arm_rack(servos)))
     assert [(mistake.place, mistake.why) for mistake in refused.value.mistakes] == [(place, reason)]
 
 

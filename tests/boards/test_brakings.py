@@ -35,7 +35,7 @@ def test_a_stall_longer_than_the_patience_is_one_braking_with_its_time(
 ) -> None:
     with Rack(config(text=stalling(stall=stall))) as rack:
         outcome = rack.run(1.1)
-    assert (outcome.faults, outcome.worked) == ((), True)
+    assert (outcome.faults, outcome.is_success) == ((), True)
     assert [braking.why for braking in outcome.brakings] == [NO_TORQUE] * count
     for number, braking in enumerate(outcome.brakings, 1):
         # The last torque was given in the last cycle before the stall, and the motors kept it for 5
@@ -52,7 +52,7 @@ HELD = "held without a known cause"
 def test_a_run_held_by_brakes_has_failed_and_says_so(config: MakeConfig) -> None:
     with Rack(config(text=stalling(stall=400, period=600))) as rack:
         outcome = rack.run(0.65)
-    assert (outcome.cause, outcome.worked) == ("time over", False)
+    assert (outcome.cause, outcome.is_success) == ("time over", False)
     (fault,) = outcome.faults
     assert fault.startswith(f"{HELD}, in 650 ms: brakes engaged 1 time, ")
     assert fault.endswith(" ms at tick 204: no torque (1)")

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pytest
 
 from rack.boards import Rack
-from rack.tools.faults.ending import ArmEnd, arm_of
+from rack.tools.faults.ending import ArmEnd, read_arm
 from tests.boards.conftest import MakeConfig
 from tests.levels.arms import ROBOTS
 from tests.tools.command_line import rack as rack_command
@@ -97,11 +97,11 @@ def test_an_arm_reports_by_itself_what_its_level_leaves_out(config: MakeConfig, 
     with Rack(config(text=careless(case.params))) as rack:
         outcome = rack.run(0.4)
         events = rack.events
-        arm = arm_of(rack.segment)
+        arm = read_arm(rack.segment)
     found = [(e.tick, e.code, e.subject) for e in events if e.kind == "detection"]
     assert found == [*case.found]
     assert [braking.why for braking in outcome.brakings] == ["limit"] * case.brakings
-    assert outcome.worked == (not case.fault)
+    assert outcome.is_success == (not case.fault)
     assert [fault.startswith(case.fault) for fault in outcome.faults] == [True] * bool(case.fault)
     assert (arm.violations > 0) == ("limit_exceeded" in str(case.found))
 
@@ -111,7 +111,7 @@ def test_an_arm_reports_a_blow_by_itself(config: MakeConfig) -> None:
     with Rack(config(text=careless("", POST))) as rack:
         outcome = rack.run(0.6)
         found = [event for event in rack.events if event.kind == "detection"]
-        arm = arm_of(rack.segment)
+        arm = read_arm(rack.segment)
     assert {event.code for event in found} >= {"collision"}
     assert "'post'" in found[0].text
     assert arm.touches > 0

@@ -5,16 +5,16 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.errors import (
-    LONGEST_REASON,
-    LONGEST_VALUE,
+    MAX_REASON_LENGTH,
+    MAX_VALUE_LENGTH,
     BoardError,
     ConfigError,
     Failure,
     LaunchError,
     Mistake,
     SnapshotError,
-    one_line,
-    shown,
+    format_value,
+    to_one_line,
 )
 
 
@@ -31,12 +31,12 @@ from rack.boards.errors import (
     ],
 )
 def test_a_value_is_shown_as_in_a_config(value: object, text: str) -> None:
-    assert shown(value) == text
+    assert format_value(value) == text
 
 
 @pytest.mark.parametrize("length", [9, 10, 11, 40])
 def test_a_long_text_is_cut_to_its_length(length: int) -> None:
-    text = one_line("x" * length, 10)
+    text = to_one_line("x" * length, 10)
     assert text == ("x" * length if length <= 10 else "xxxxxxx...")
 
 
@@ -46,7 +46,7 @@ def test_a_mistake_names_place_value_and_reason() -> None:
     )
     assert str(Mistake("robot", None, "missing")) == "robot: missing"
     long = str(Mistake("p" * 500, "v" * 500, "w" * 5000))
-    assert len(long) == 120 + 3 + LONGEST_VALUE + 2 + LONGEST_REASON
+    assert len(long) == 120 + 3 + MAX_VALUE_LENGTH + 2 + MAX_REASON_LENGTH
 
 
 def test_an_error_has_each_mistake_once() -> None:

@@ -12,17 +12,17 @@ from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import Message, State, Status, field
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
-from rack.boards.config.layout import field_specs
+from rack.boards.config.layout import build_field_specs
 from rack.boards.events import (
-    HELD_MS,
+    MAX_HOLD_MS,
     NO_TORQUE,
     Braking,
     Ending,
     Event,
     Journal,
-    braked_text,
-    brakings,
-    statuses,
+    format_brakings,
+    iterate_statuses,
+    list_brakings,
 )
 from rack.levels.tables import GoalConfig
 from tests.backplane.bus import CLOCK_NS, task
@@ -52,7 +52,7 @@ class Order(Message, version=1):
 TICK_MS = CLOCK_NS * 1e-6
 
 
-class Told(Message, version=1, message="command"):
+class EventClue(Message, version=1, message="command"):
     """A command."""
 
     id: int = field("u4", unit="1", doc="serial")
@@ -70,8 +70,8 @@ def box(name: str, kind: type[Message], writer: str) -> MailboxSpec:
         depth=8,
         message=kind.message_type.name,
         version=kind.message_type.version,
-        size=kind.message_type.dtype({}).itemsize,
-        fields=field_specs(kind.message_type, {}),
+        size=kind.message_type.build_dtype({}).itemsize,
+        fields=build_field_specs(kind.message_type, {}),
     )
 
 
@@ -83,7 +83,7 @@ def bus(make_bus: MakeBus) -> Segment:
         box("upper.status", LevelStatus, "upper"),
         box("lower.status", Braked, "lower"),
         box("lower.scene", Scene, "lower"),
-        box("lower.command", Told, "lower"),
+        box("lower.command", EventClue, "lower"),
     )
 
 
@@ -113,8 +113,8 @@ def test_the_last_status_of_the_level_that_ends_a_run_is_its_cause(
     bus: Segment, state: State, moves: int, cause: str
 ) -> None:
     write(bus, "upper.status", 5, state=state, moves=moves, reason="so it is")
-    assert ending(bus).cause() == cause
-    assert ending(bus).final_state() == (state.name.lower(), "so it is")
+    assert ending(bus).find_cause() == cause
+    assert ending(bus).find_final_state() == (state.name.lower(), "so it is")
 
 
 @pytest.mark.parametrize(("written", "at", "is_silent"), [(5, 45, False), (5, 46, True)])
@@ -126,32 +126,35 @@ def test_a_level_that_is_silent_for_too_long_has_failed_unless_it_is_done(
     bus.words[System.TICK] = at
     causes = {State.EXECUTING: "time over", State.DONE: "task done", State.ERROR: "task failed"}
     is_failed = is_silent and state == State.EXECUTING
-    assert ending(bus).cause() == ("task failed" if is_failed else causes[state])
+    assert ending(bus).find_cause() == ("task failed" if is_failed else causes[state])
     reason = "'upper.status' has not been written for 0.1025 s" if is_failed else ""
-    assert ending(bus).final_state() == (state.name.lower(), reason)
+    assert ending(bus).find_final_state() == (state.name.lower(), reason)
 
 
 def test_a_level_that_never_wrote_is_silent_from_the_start(bus: Segment) -> None:
     bus.words[System.TICK] = SILENT
-    assert ending(bus).cause() == "time over"
+    assert ending(bus).find_cause() == "time over"
     bus.words[System.TICK] = SILENT + 1
-    assert ending(bus).cause() == "task refused"
+    assert ending(bus).find_cause() == "task refused"
 
 
 def test_errors_of_other_levels_are_latched(bus: Segment) -> None:
-    assert list(statuses(bus, "error")) == []
+    assert list(iterate_statuses(bus, "error")) == []
     write(bus, "upper.status", error=4, reason="mine")
     write(bus, "lower.status", error=0, reason="none")
-    assert [board for board, _ in statuses(bus, "error")] == ["upper", "lower"]
-    assert [board for board, _ in statuses(bus, "braked")] == ["lower"]
-    assert (ending(bus).latched(), ending(bus, None).latched()) == ([], ["level 'upper': mine"])
+    assert [board for board, _ in iterate_statuses(bus, "error")] == ["upper", "lower"]
+    assert [board for board, _ in iterate_statuses(bus, "braked")] == ["lower"]
+    assert (ending(bus).list_latched_faults(), ending(bus, None).list_latched_faults()) == (
+        [],
+        ["level 'upper': mine"],
+    )
     write(bus, "lower.status", 1, error=2, reason="no arm")
-    assert ending(bus).latched() == ["level 'lower': no arm"]
+    assert ending(bus).list_latched_faults() == ["level 'lower': no arm"]
 
 
 RAN_MS = 40_000.0
-LONG = Braking("sensors", 400, HELD_MS + 0.1)
-SHORT = Braking("no torque", 800, HELD_MS)
+LONG = Braking("sensors", 400, MAX_HOLD_MS + 0.1)
+SHORT = Braking("no torque", 800, MAX_HOLD_MS)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +163,7 @@ SHORT = Braking("no torque", 800, HELD_MS)
         ((), False),
         ((SHORT,), False),
         ((LONG,), True),
-        ((Braking("a stop is demanded", 400, 9 * HELD_MS),), False),
+        ((Braking("a stop is demanded", 400, 9 * MAX_HOLD_MS),), False),
         # Together more than half of the run.
         ((SHORT,) * 4, False),
         ((SHORT,) * 5, True),
@@ -169,50 +172,52 @@ SHORT = Braking("no torque", 800, HELD_MS)
 def test_brakes_hold_a_run_if_they_are_long_or_often_engaged(
     bus: Segment, found: tuple[Braking, ...], is_held: bool
 ) -> None:
-    lines = list(ending(bus).held([], found, RAN_MS))
-    text = f"held without a known cause, in {RAN_MS:g} ms: {braked_text(found)}" if found else ""
+    lines = list(ending(bus).find_long_holds([], found, RAN_MS))
+    text = (
+        f"held without a known cause, in {RAN_MS:g} ms: {format_brakings(found)}" if found else ""
+    )
     assert lines == ([text] if is_held else [])
 
 
 @pytest.mark.parametrize("kind", ["fault", "command"])
 def test_holds_with_a_known_cause_are_not_reported(bus: Segment, kind: Any) -> None:
-    assert list(ending(bus).held([Event(0, 0, "miss", "", "")], [LONG], RAN_MS))
-    assert not list(ending(bus).held([Event(0, 0, kind, "", "")], [LONG], RAN_MS))
+    assert list(ending(bus).find_long_holds([Event(0, 0, "miss", "", "")], [LONG], RAN_MS))
+    assert not list(ending(bus).find_long_holds([Event(0, 0, kind, "", "")], [LONG], RAN_MS))
     bus.words[System.DEMAND] = 1
-    assert not list(ending(bus).held([], [LONG], RAN_MS))
+    assert not list(ending(bus).find_long_holds([], [LONG], RAN_MS))
 
 
 def test_brakes_that_were_never_opened_count_from_when_the_level_has_its_state(
     bus: Segment,
 ) -> None:
     write(bus, "lower.status", braked=1)
-    bus.block("lower")[Block.LEVEL_SINCE] = round((RAN_MS - HELD_MS) / TICK_MS)
-    (line,) = ending(bus).held([], [], RAN_MS + 1.0)
+    bus.get_block("lower")[Block.LEVEL_SINCE] = round((RAN_MS - MAX_HOLD_MS) / TICK_MS)
+    (line,) = ending(bus).find_long_holds([], [], RAN_MS + 1.0)
     assert line.endswith("1 time, 5001 ms in all, longest 5001 ms at tick 14000: no torque (1)")
-    assert list(ending(bus).held([], [], RAN_MS)) == []
+    assert list(ending(bus).find_long_holds([], [], RAN_MS)) == []
     write(bus, "lower.status", 1, braked=1, reason="no sensor")
-    (line,) = ending(bus).held([], [], RAN_MS + 1.0)
+    (line,) = ending(bus).find_long_holds([], [], RAN_MS + 1.0)
     assert line.endswith("no sensor (1)")
 
 
 def test_a_level_that_holds_for_long_is_named(bus: Segment) -> None:
     write(bus, "upper.status", state=State.HOLDING, reason="waits for a part")
-    block = bus.block("upper")
+    block = bus.get_block("upper")
     block[Block.LEVEL_STATE] = State.HOLDING
     block[Block.LEVEL_SINCE] = 400
-    assert list(ending(bus).held([], [], 1000.0 + HELD_MS)) == []
-    assert list(ending(bus).held([], [], 1000.0 + HELD_MS + 1.0)) == [
+    assert list(ending(bus).find_long_holds([], [], 1000.0 + MAX_HOLD_MS)) == []
+    assert list(ending(bus).find_long_holds([], [], 1000.0 + MAX_HOLD_MS + 1.0)) == [
         "level 'upper' held for 5001 ms without a known cause: waits for a part"
     ]
     block[Block.LEVEL_STATE] = State.EXECUTING
-    assert list(ending(bus).held([], [], 1000.0 + HELD_MS + 1.0)) == []
+    assert list(ending(bus).find_long_holds([], [], 1000.0 + MAX_HOLD_MS + 1.0)) == []
 
 
 def test_objects_end_where_they_were_sensed_last(bus: Segment) -> None:
     goal = GoalConfig(object="block", position=(0.1, 0.2, 0.3), tolerance_mm=5.0)
-    assert ending(bus).ends({1: goal}) == ()
+    assert ending(bus).find_object_ends({1: goal}) == ()
     write(bus, "lower.scene", position=[[0.0, 0.0, 0.0], [0.1, 0.2, 0.304]])
-    (end,) = ending(bus).ends({1: goal})
+    (end,) = ending(bus).find_object_ends({1: goal})
     assert (end.object, end.off_mm, end.tolerance_mm) == ("block", 4.0, 5.0)
     assert str(end) == "object 'block' ended 4 mm from its goal (tolerance 5 mm)"
 
@@ -220,20 +225,20 @@ def test_objects_end_where_they_were_sensed_last(bus: Segment) -> None:
 def test_a_journal_stamps_events_and_passes_them_on(bus: Segment) -> None:
     heard: list[Event] = []
     journal = Journal(heard.append)
-    journal.add("launch", "rack", "first")
+    journal.add_event("launch", "rack", "first")
     journal.segment = bus
     bus.words[System.TICK] = 7
     bus.words[System.STATE] = Run.STARTING
-    journal.add("ready", "rack", "second")
+    journal.add_event("ready", "rack", "second")
     bus.words[System.STATE] = Run.RUNNING
-    journal.add("died", "upper", "third", "loss", at_ns=0, subject="a")
-    journal.add("died", "upper", "fourth", tick=3)
+    journal.add_event("died", "upper", "third", "loss", at_ns=0, subject="a")
+    journal.add_event("died", "upper", "fourth", tick=3)
     assert heard == journal.events
     assert [event.tick for event in heard] == [-1, -1, 7, 3]
     assert (heard[2].code, heard[2].subject, heard[2].board) == ("loss", "a", "upper")
     # At the machine's start, by CLOCK_MONOTONIC.
     assert heard[2].time_ns < heard[0].time_ns <= heard[1].time_ns <= heard[3].time_ns
-    Journal(None).add("launch", "rack", "nobody listens")
+    Journal(None).add_event("launch", "rack", "nobody listens")
 
 
 def test_brakings_include_finished_ones_and_the_one_at_the_end() -> None:
@@ -248,7 +253,7 @@ def test_brakings_include_finished_ones_and_the_one_at_the_end() -> None:
         change(90, "brakes_opened", "sensors", 10),
         change(150, "brakes_closed", NO_TORQUE, 4),
     ]
-    found = brakings(events, 200, 2.0)
+    found = list_brakings(events, 200, 2.0)
     assert found == (
         Braking(NO_TORQUE, 47, 6.0),
         Braking("sensors", 80, 20.0),
@@ -258,5 +263,5 @@ def test_brakings_include_finished_ones_and_the_one_at_the_end() -> None:
         "brakes engaged 3 times, 126 ms in all, longest 100 ms at tick 150: no torque (2),"
         " sensors (1)"
     )
-    assert braked_text(found) == told
-    assert brakings(events[:1], 200, 2.0) == brakings([], 200, 2.0) == ()
+    assert format_brakings(found) == told
+    assert list_brakings(events[:1], 200, 2.0) == list_brakings([], 200, 2.0) == ()

@@ -12,7 +12,7 @@ import pytest
 
 from rack.backplane.mailbox.history import MailboxRing
 from rack.boards import Rack
-from rack.boards.config import load, wire
+from rack.boards.config import load, resolve_layout
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event
@@ -78,7 +78,7 @@ SWITCHED = commands(
 )
 
 
-class Ran(NamedTuple):
+class RunContext(NamedTuple):
     """A run: its digest, its events, and the statuses of the board of the shoulder by tick."""
 
     digest: str
@@ -102,32 +102,32 @@ def rack_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RackConfi
 
 
 @pytest.fixture(scope="module")
-def run(rack_of: Callable[..., RackConfig]) -> Callable[..., Ran]:
-    def run(*settings: str) -> Ran:
+def run(rack_of: Callable[..., RackConfig]) -> Callable[..., RunContext]:
+    def run(*settings: str) -> RunContext:
         with Rack(rack_of(*settings)) as rack:
             outcome = rack.run(SECONDS)
-            return Ran(
+            return RunContext(
                 outcome.digest,
                 rack.events,
-                MailboxRing(rack.segment, "shoulder.status").drain().rows,
+                MailboxRing(rack.segment, "shoulder.status").read_new_rows().rows,
             )
 
     return run
 
 
 @pytest.fixture(scope="module")
-def switched(run: Callable[..., Ran]) -> Ran:
+def switched(run: Callable[..., RunContext]) -> RunContext:
     return run(SWITCHED)
 
 
 @pytest.fixture(scope="module")
-def without(run: Callable[..., Ran]) -> Ran:
+def without(run: Callable[..., RunContext]) -> RunContext:
     return run("board.shoulder.params.modifications={}")
 
 
 @pytest.mark.slow
 def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step(
-    switched: Ran, without: Ran
+    switched: RunContext, without: RunContext
 ) -> None:
     for tick, reason in (
         (300, ""),
@@ -147,7 +147,7 @@ def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step
 
 @pytest.mark.slow
 def test_a_run_with_switches_repeats_and_equals_an_unmodified_run_up_to_the_first_switch(
-    switched: Ran, without: Ran, run: Callable[..., Ran]
+    switched: RunContext, without: RunContext, run: Callable[..., RunContext]
 ) -> None:
     again = run(SWITCHED)
     assert again.digest == switched.digest != without.digest
@@ -160,7 +160,7 @@ def test_a_run_with_switches_repeats_and_equals_an_unmodified_run_up_to_the_firs
 
 @pytest.mark.slow
 def test_a_failed_modification_is_removed_with_its_reason_and_the_arm_continues(
-    switched: Ran,
+    switched: RunContext,
 ) -> None:
     assert switched.reason(649) == "modified by pd, breaks"
     assert (
@@ -198,7 +198,7 @@ def test_a_mistake_in_a_modification_is_one_line(
     rack_of: Callable[..., RackConfig], setting: str, place: str, why: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
-        wire(rack_of(f"board.shoulder.params.{setting}"))
+        resolve_layout(rack_of(f"board.shoulder.params.{setting}"))
     assert len(caught.value.mistakes) == 1
     assert str(caught.value).startswith(place)
     assert why in str(caught.value)

@@ -20,11 +20,11 @@ from rack.backplane.operator_table import (
 )
 from rack.backplane.words import Run, System
 from rack.boards import Rack
-from rack.boards.config import wire
+from rack.boards.config import resolve_layout
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
 from rack.boards.events import Event, Outcome
-from rack.boards.operator import message_of
+from rack.boards.operator import copy_request_message
 from rack.levels.operator import Answer, Goal, Operation
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.conftest import MakeConfig
@@ -52,7 +52,7 @@ def run(
         return (
             outcome,
             rack.events,
-            {name: MailboxRing(rack.segment, name).drain().rows for name in boxes},
+            {name: MailboxRing(rack.segment, name).read_new_rows().rows for name in boxes},
         )
 
 
@@ -128,7 +128,7 @@ def test_a_restarted_board_has_its_live_params_as_they_were_set(
 ) -> None:
     lower = f"board.lower.executor=commanded_levels:{level}"
     outcome, events, boxes = run(faulty(commanded(SET, lower), kill_at("lower", 250)), 2.0)
-    assert outcome.worked
+    assert outcome.is_success
     assert [event.board for event in events if event.code == "rejoined"] == ["lower"]
     assert np.diff(boxes["lower.status"]["message"]["count"])[-50:].tolist() == [2] * 50
 
@@ -150,7 +150,7 @@ def test_an_impossible_setting_is_refused_in_one_line(
     commanded: Callable[..., RackConfig], table: str, line: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
-        wire(commanded(commands(table)))
+        resolve_layout(commanded(commands(table)))
     assert str(caught.value) == line
 
 
@@ -175,11 +175,11 @@ def test_a_restarted_board_keeps_the_command_before_a_refused_one(
     config = commanded(commands(f"level='{board}', what='hold', tick=50"))
     with Rack(faulty(config, kill_at(board, 100))) as rack:
         hold = OperatorTable(rack.segment).entries[0]
-        message = message_of(hold, rack.segment.layout)
+        message = copy_request_message(hold, rack.segment.layout)
         message.what, message.goal = Operation.GOTO, Goal.HOME
-        OperatorTable(rack.segment).add(Request(hold.mailbox, bytes(message.raw), 60))
-        assert rack.run(1.0).worked
-        last = MailboxRing(rack.segment, f"{board}.status").drain().rows["message"][-1]
+        OperatorTable(rack.segment).add_request(Request(hold.mailbox, bytes(message.raw), 60))
+        assert rack.run(1.0).is_success
+        last = MailboxRing(rack.segment, f"{board}.status").read_new_rows().rows["message"][-1]
     assert [event.board for event in rack.events if event.code == "rejoined"] == [board]
     assert (last["order"], last["answer"], last["standing"], last["operator"]) == (
         2,
@@ -216,16 +216,16 @@ def test_a_command_is_issued_only_while_its_client_lives(
         wanted = Request(table.entries[0].mailbox, bytes(table.entries[0].message), 100)
 
         def wait() -> None:
-            with OperatorTable(rack.segment).claim(wanted):
+            with OperatorTable(rack.segment).claim_request(wanted):
                 time.sleep(60)
 
         with forked(wait) as pid:
-            wait_until(lambda: len(table.waiting()) == 2)
+            wait_until(lambda: len(table.list_waiting()) == 2)
             if is_killed:
                 kill(pid)
-            assert rack.run(1.0).worked
+            assert rack.run(1.0).is_success
         assert (
-            MailboxRing(rack.segment, "upper.operator").drain().rows["tick"].tolist()
+            MailboxRing(rack.segment, "upper.operator").read_new_rows().rows["tick"].tolist()
             == [50, 100][: 2 - is_killed]
         )
 
@@ -235,7 +235,7 @@ def await_giving(rack: Rack, entry: RequestEntry) -> None:
 
 
 def answered(reading: Reading, serial: int) -> bool:
-    return reading.is_there and reading.message.order == serial
+    return reading.has_message and reading.message.order == serial
 
 
 def watch(rack: Rack, condition: Callable[[], bool]) -> None:
@@ -244,8 +244,8 @@ def watch(rack: Rack, condition: Callable[[], bool]) -> None:
 
 def test_the_clock_takes_no_lock_for_an_operator(config: MakeConfig) -> None:
     with pytest.raises(ConfigError, match="the clock writes it and must not wait"):
-        wire(config("protocol.mailbox={'upper.operator' = 'lock'}", text=COMMANDED))
+        resolve_layout(config("protocol.mailbox={'upper.operator' = 'lock'}", text=COMMANDED))
     with pytest.raises(
         ConfigError, match="the clock writes it, not a board; must be time-slice or double-buffer"
     ):
-        wire(config("protocol.mailbox={'upper.operator' = 'interrupt'}", text=COMMANDED))
+        resolve_layout(config("protocol.mailbox={'upper.operator' = 'interrupt'}", text=COMMANDED))

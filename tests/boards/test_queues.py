@@ -14,7 +14,7 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.words import Block
 from rack.boards import Rack
-from rack.boards.config import wire
+from rack.boards.config import resolve_layout
 from rack.boards.errors import ConfigError
 from tests.boards.conftest import CLOCK, MakeConfig
 from tests.boards.runs import faulty, kill, stop
@@ -61,7 +61,7 @@ def counts(rack: Rack, board: str) -> dict[str, int]:
 
 def mistakes(config: MakeConfig, *settings: str, text: str = QUEUES) -> list[str]:
     with pytest.raises(ConfigError) as caught:
-        wire(config(*settings, text=text))
+        resolve_layout(config(*settings, text=text))
     return str(caught.value).splitlines()
 
 
@@ -81,7 +81,7 @@ def test_runs_with_a_full_queue_and_killed_boards_repeat(config: MakeConfig) -> 
 
 def kill_often(rack: Rack, board: str, times: int, rng: random.Random) -> None:
     """Kill a board's process that often, at random instants, and wait until it cycles again."""
-    block = rack.segment.block(board)
+    block = rack.segment.get_block(board)
     for _ in range(times):
         cycles = block[Block.CYCLES]
         while block[Block.LOST] or block[Block.CYCLES] < cycles + 3:
@@ -103,7 +103,7 @@ def test_a_killed_reader_repeats_nothing_and_loses_at_most_the_cycle_it_died_in(
         rack.start(60.0)
         kill_often(rack, "lower", 2, random.Random(1))
         found = settle(rack, "lower")
-        rows, lost = MailboxRing(rack.segment, "upper.requests").drain()
+        rows, lost = MailboxRing(rack.segment, "upper.requests").read_new_rows()
         assert not lost
         # A cycle that the writer misses on a busy machine sends nothing.
         sent = int(np.count_nonzero(rows["message"]["id"] <= found["newest"]))
@@ -117,7 +117,7 @@ def test_a_killed_writer_sends_all_requests_of_a_cycle_or_none(config: MakeConfi
         rack.start(60.0)
         kill_often(rack, "upper", 2, random.Random(2))
         found = settle(rack, "lower")
-        rows, lost = MailboxRing(rack.segment, "upper.requests").drain()
+        rows, lost = MailboxRing(rack.segment, "upper.requests").read_new_rows()
     assert not lost
     ids, ticks = rows["message"]["id"].tolist(), rows["tick"].tolist()
     assert ids == sorted(set(ids))
@@ -133,7 +133,7 @@ def test_a_killed_writer_sends_all_requests_of_a_cycle_or_none(config: MakeConfi
 def settle(rack: Rack, board: str) -> dict[str, int]:
     """Let a rack run on until the board has cycled again, then stop it; return the board's
     counts."""
-    block = rack.segment.block(board)
+    block = rack.segment.get_block(board)
     while block[Block.LOST]:
         assert rack.watch(0.01)
     assert rack.watch(0.3)

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from rack.boards import Rack
-from rack.boards.config import rack_timing, wire
+from rack.boards.config import build_rack_timing, resolve_layout
 from rack.boards.config.schema import RackConfig
-from rack.boards.crate.recovery import Supervision
+from rack.boards.crate.recovery import RestartPolicy
 from rack.boards.errors import ConfigError
-from rack.boards.timing.command_path import command_paths
-from rack.boards.timing.system_response import mailboxes_along
+from rack.boards.timing.command_path import find_command_paths
+from rack.boards.timing.system_response import find_path_mailboxes
 from tests.boards.conftest import MakeConfig
-from tests.boards.messages import Written
+from tests.boards.messages import WrittenMessages
 from tests.boards.runs import faulty, kill
 from tests.boards.vector_racks import JOINTED
 
@@ -29,11 +29,11 @@ def jointed(config: MakeConfig) -> MakeConfig:
     return lambda *settings: config(*settings, text=JOINTED)
 
 
-def run(config: RackConfig, *faults: dict[str, Any]) -> tuple[str, Written]:
+def run(config: RackConfig, *faults: dict[str, Any]) -> tuple[str, WrittenMessages]:
     """Run the rack; return its digest and everything that it wrote."""
     with Rack(faulty(config, *faults)) as rack:
         digest = rack.run(SECONDS).digest
-        return digest, Written.on(rack.segment)
+        return digest, WrittenMessages.on(rack.segment)
 
 
 def at(rows: np.ndarray, tick: int) -> np.void:
@@ -76,10 +76,10 @@ def test_boards_restart_after_all_that_are_below_them_and_wait_for_no_other(
     jointed: MakeConfig,
 ) -> None:
     config = jointed("board.watch={ slot = 10, rate_hz = 400, executor = 'vector_levels:Lone' }")
-    supervision = Supervision(config, wire(config))
+    supervision = RestartPolicy(config, resolve_layout(config))
     lost = ["path", "watch", "joint2", "arm", "clock"]
-    assert supervision.in_order(lost)[0] == "clock"
-    assert [name for name in supervision.in_order(lost) if name != "watch"] == [
+    assert supervision.sort_by_dependency(lost)[0] == "clock"
+    assert [name for name in supervision.sort_by_dependency(lost) if name != "watch"] == [
         "clock",
         "arm",
         "joint2",
@@ -97,17 +97,17 @@ def test_boards_restart_after_all_that_are_below_them_and_wait_for_no_other(
 
 def test_information_is_traced_through_the_sources_of_each_message(jointed: MakeConfig) -> None:
     config = jointed()
-    layout = wire(config)
-    down = mailboxes_along(layout, ("path", "joint2", "arm"))
+    layout = resolve_layout(config)
+    down = find_path_mailboxes(layout, ("path", "joint2", "arm"))
     assert [box.name for box in down] == ["path.command", "joint2.part"]
-    assert [box.name for box in mailboxes_along(layout, ("arm", "joint2", "path"))] == [
+    assert [box.name for box in find_path_mailboxes(layout, ("arm", "joint2", "path"))] == [
         "arm.status",
         "joint2.status",
     ]
     # Of two boards it is the one between them, of one board none.
-    assert [box.name for box in mailboxes_along(layout, ("joint2", "arm"))] == ["joint2.part"]
-    assert mailboxes_along(layout, ("arm",)) == ()
-    assert command_paths(rack_timing(config, layout), layout)["path"].cycles == (8, 1, 1)
+    assert [box.name for box in find_path_mailboxes(layout, ("joint2", "arm"))] == ["joint2.part"]
+    assert find_path_mailboxes(layout, ("arm",)) == ()
+    assert find_command_paths(build_rack_timing(config, layout), layout)["path"].cycles == (8, 1, 1)
 
 
 CIRCLES = {
@@ -121,7 +121,7 @@ def test_a_circle_is_one_mistake_with_its_members(
     jointed: MakeConfig, setting: str, place: str, circle: str
 ) -> None:
     with pytest.raises(ConfigError) as found:
-        wire(jointed(setting))
+        resolve_layout(jointed(setting))
     (mistake,) = [mistake for mistake in found.value.mistakes if "circle" in str(mistake)]
     assert mistake.place == place
     assert f"the levels form a circle, {circle};" in str(mistake)
@@ -154,6 +154,6 @@ WRONG = {
 @pytest.mark.parametrize(("setting", "expected"), WRONG.values(), ids=WRONG)
 def test_a_wrong_list_is_one_mistake(jointed: MakeConfig, setting: str, expected: str) -> None:
     with pytest.raises(ConfigError) as found:
-        wire(jointed(setting))
+        resolve_layout(jointed(setting))
     (mistake,) = found.value.mistakes
     assert expected in str(mistake)

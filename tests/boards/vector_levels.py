@@ -47,15 +47,15 @@ class PathLevel(Executor):
 
     def process(self, tick: int) -> None:
         """Move on, unless held; show what the joints report, and which of them are lost."""
-        self.orders.take(self.operator)
+        self.orders.take_commands(self.operator)
         if self.orders.standing is not Operation.HOLD:
             self.command.position[:] = [tick, 2 * tick, 3 * tick]
-        self.command.operator = self.orders.rests_on(0)
+        self.command.operator = self.orders.find_basis(0)
         for at, joint in enumerate(self.joints.values()):
             self.status.position[at] = joint.message.position[at]
             self.status.lost[at] = joint.is_lost
-        self.orders.done()
-        self.orders.report(self.status)
+        self.orders.report_done()
+        self.orders.fill_status(self.status)
         self.status.state = State.EXECUTING
 
 

@@ -93,7 +93,7 @@ class PlannedWave(Wave):
 
     def gain(self) -> float:
         """Return the planned factor; 1 before the first plan."""
-        return float(self.plan.message.gain) if self.plan.is_there else 1.0
+        return float(self.plan.message.gain) if self.plan.has_message else 1.0
 
 
 class Steady(PlannedWave):

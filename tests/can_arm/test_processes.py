@@ -65,7 +65,7 @@ def test_killed_drive_board_and_launcher_leave_an_arm_that_is_braked(
         assert rack("command", rack_name, "servo", "reset", "--wait").returncode == 0
         assert rack("command", rack_name, "servo", "enable", "--wait").returncode == 0
         wait_until(lambda: not servo().braked)
-        board = Segment.attach(rack_name).block("servo")
+        board = Segment.attach(rack_name).get_block("servo")
         before = board[Block.PID]
         os.kill(before, signal.SIGKILL)
         wait_until(lambda: board[Block.PID] not in (0, before), 60.0)

@@ -27,7 +27,7 @@ class Box:
     def __init__(
         self, kind: type[Message], sizes_: Mapping[str, int], every: int | None = None
     ) -> None:
-        self.kind, self.dtype = kind, kind.message_type.dtype(sizes_)
+        self.kind, self.dtype = kind, kind.message_type.build_dtype(sizes_)
         self.lost = False
         self.disturbance: Disturbance | None = None
         self._every = every

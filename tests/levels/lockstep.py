@@ -15,17 +15,17 @@ from typing import Any
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import AnyMessage, Message
 from rack.levels.level import (
+    ConfiguredPorts,
     Demand,
     Executor,
     InputPort,
     LevelContext,
-    MadePorts,
     Output,
     Pace,
     Planner,
 )
 from rack.levels.operator import Goal, Operation, OperatorCommand
-from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.robot.cell import build_cell, compute_sizes
 from rack.levels.tables import RobotConfig, SceneConfig
 from tests.levels.box import Box, Disturbance
 
@@ -61,7 +61,7 @@ class Task:
         self._inputs: dict[str | tuple[str, str], Box] = {}
         ports = {**level.inputs, **made_ports(spec, level).inputs}
         self._many = [port for port, input_ in ports.items() if input_.many]
-        self._tables = {port: level.input_table(port) for port in ports}
+        self._tables = {port: level.find_input_table(port) for port in ports}
         for port, input_ in ports.items():
             names = sources(input_, spec)
             self._inputs |= {
@@ -155,7 +155,7 @@ class Lockstep:
         self.tick, self._clock_ns = 0, clock_ns
         self.demand = Demand.NONE
         self._coming: dict[int, list[Callable[[], None]]] = {}
-        self.sizes = sizes(build_cell(robot, scene, clock_ns))
+        self.sizes = compute_sizes(build_cell(robot, scene, clock_ns))
         self.boxes = {name: Box(kind, self.sizes) for name, kind in (outside or {}).items()}
         paces = {board.name: Pace(board.every, board.within_cycles) for board in boards}
         for board in boards:
@@ -264,15 +264,17 @@ def listed(boards: str | tuple[str, ...]) -> tuple[str, ...]:
     return boards if isinstance(boards, tuple) else (boards,) if boards else ()
 
 
-def made_ports(board: BoardSpec, level: Executor | Planner) -> MadePorts:
+def made_ports(board: BoardSpec, level: Executor | Planner) -> ConfiguredPorts:
     """Return the ports that the parameters of a board make; a planner has none."""
     return (
-        board.executor.made_ports(board.params, {}) if isinstance(level, Executor) else MadePorts()
+        board.executor.build_ports(board.params, {})
+        if isinstance(level, Executor)
+        else ConfiguredPorts()
     )
 
 
 def outputs_of(board: BoardSpec) -> dict[str, Output[Any]]:
-    return {**board.executor.outputs, **board.executor.made_ports(board.params, {}).outputs}
+    return {**board.executor.outputs, **board.executor.build_ports(board.params, {}).outputs}
 
 
 def sources(port: InputPort[Any], board: BoardSpec) -> list[str]:

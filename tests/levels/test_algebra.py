@@ -39,7 +39,8 @@ def test_results_are_those_of_linear_algebra(joints: int) -> None:
     assert np.array_equal(x, before[1])
     assert algebra.norm(x) == pytest.approx(np.linalg.norm(x))
     assert np.array_equal(
-        algebra.each(math.tanh, tall), [[math.tanh(value) for value in row] for row in tall]
+        algebra.apply_elementwise(math.tanh, tall),
+        [[math.tanh(value) for value in row] for row in tall],
     )
 
 

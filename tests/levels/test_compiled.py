@@ -32,16 +32,16 @@ def compiled_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[
     names: list[str] = []
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(module, "on_compile", names.append)
-    module._folder.cache_clear()
-    module._say.cache_clear()
+    module._find_cache_folder.cache_clear()
+    module._print_once.cache_clear()
     yield names
-    module._folder.cache_clear()
-    module._say.cache_clear()
+    module._find_cache_folder.cache_clear()
+    module._print_once.cache_clear()
 
 
 def call_fresh(function: Callable[[float], float] = twice, value: float = 1.5) -> float:
     """Call a compiled function as a process does that has not used it yet."""
-    return compiled(function).load()(value)
+    return compiled(function).load_machine_code()(value)
 
 
 def list_files(tmp_path: Path) -> list[Path]:
@@ -91,15 +91,15 @@ def build_outer(**changes: str) -> compiled[[float], float]:
 def test_code_is_recompiled_only_if_its_source_or_constants_change(
     compiled_names: list[str], tmp_path: Path
 ) -> None:
-    assert build_outer().load()(1.0) == 4.0
+    assert build_outer().load_machine_code()(1.0) == 4.0
     assert compiled_names == ["theirs.outer", "theirs.inner"]
     before = list_files(tmp_path)
     for same in ({"docstring": "Sum."}, {"comment": "Twice.\n\n"}):
-        assert build_outer(**same).load()(1.0) == 4.0
+        assert build_outer(**same).load_machine_code()(1.0) == 4.0
     assert (len(compiled_names), list_files(tmp_path)) == (2, before)
-    assert build_outer(inner="value + 2.0").load()(1.0) == 6.0
+    assert build_outer(inner="value + 2.0").load_machine_code()(1.0) == 6.0
     assert compiled_names[2:] == ["theirs.outer", "theirs.inner"]
-    assert build_outer(inner="value + 2.0", factor="3.0").load()(1.0) == 9.0
+    assert build_outer(inner="value + 2.0", factor="3.0").load_machine_code()(1.0) == 9.0
     # The called one is the same.
     assert compiled_names[4:] == ["theirs.outer"]
     # And none of an earlier state stays.
@@ -109,7 +109,7 @@ def test_code_is_recompiled_only_if_its_source_or_constants_change(
 @pytest.mark.parametrize("value", ["object()", "[1.0]", "__import__('random')"])
 def test_a_global_that_may_change_unnoticed_is_refused(value: str) -> None:
     with pytest.raises(TypeError, match="cannot be a constant in compiled code"):
-        build_outer(factor=value).load()
+        build_outer(factor=value).load_machine_code()
 
 
 def truncate_file(path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 import rack.levels
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.levels.errors import LevelError
-from rack.levels.level import OPERATOR, Executor, Input, LevelContext, Output
+from rack.levels.level import OPERATOR_PORT, Executor, Input, LevelContext, Output
 from rack.levels.operator import Answer, AnsweringStatus, Operation, OperatorCommand
 from rack.levels.tables import Finite, Live, Positive, Table
 
@@ -91,7 +91,7 @@ def operator_reading(serial: int, setting: str) -> Reading[OperatorCommand]:
 def test_a_board_sets_a_live_parameter_only_within_its_range(
     level: Answering, setting: str, why: str
 ) -> None:
-    level.input_table("operator")["operator"] = operator_reading(1, setting)
+    level.find_input_table("operator")["operator"] = operator_reading(1, setting)
     level.take_settings(0)
     assert (level.settings.gain, level.settings.offset) == (2.0 if why else 3.5, 0.5)
     status = level.status
@@ -100,7 +100,7 @@ def test_a_board_sets_a_live_parameter_only_within_its_range(
 
 
 def test_a_level_that_reads_its_operators_commands_itself_is_not_set_by_its_board() -> None:
-    assert Tuned.inputs["operator"] is Answering.inputs["operator"] is OPERATOR
+    assert Tuned.inputs["operator"] is Answering.inputs["operator"] is OPERATOR_PORT
     assert Answering.commands == {Operation.SET: ()}
     assert Commanding.inputs["operator"] is Commanding.operator
 

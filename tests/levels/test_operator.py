@@ -17,8 +17,8 @@ from rack.levels.operator import (
     Operation,
     OperatorCommand,
     Orders,
-    answered,
-    joints_of,
+    find_answered_serial,
+    read_joint_goal,
 )
 from tests.levels.lockstep import Operator
 from tests.levels.whole_rack import WholeRack
@@ -46,19 +46,19 @@ def operator_reading(
 def report(orders: Orders, above: int = 0, message: Message | None = None) -> Message:
     """Return the status; `message` is that of the last cycle, whose values stay."""
     message = Answering.zeros({}) if message is None else message
-    orders.report(message, above)
+    orders.fill_status(message, above)
     return message
 
 
 def test_a_command_stays_in_force_until_resume() -> None:
     orders = Orders(TAKES)
-    assert orders.take(operator_reading(3, Operation.HOLD))
-    assert not orders.take(operator_reading(3, Operation.HOLD, verdict=Verdict.OLD))
+    assert orders.take_commands(operator_reading(3, Operation.HOLD))
+    assert not orders.take_commands(operator_reading(3, Operation.HOLD, verdict=Verdict.OLD))
     assert orders.standing is Operation.HOLD
-    assert orders.take(operator_reading(5, Operation.RESUME))
+    assert orders.take_commands(operator_reading(5, Operation.RESUME))
     assert (orders.standing, orders.answer) == (Operation.NONE, Answer.DONE)
     # A command given twice is taken up once.
-    assert not orders.take(operator_reading(3, Operation.HOLD))
+    assert not orders.take_commands(operator_reading(3, Operation.HOLD))
     assert orders.standing is Operation.NONE
 
 
@@ -70,9 +70,9 @@ def test_a_command_that_the_level_does_not_accept_is_refused_and_changes_nothing
     what: Operation, goal: Goal
 ) -> None:
     orders = Orders(TAKES)
-    orders.take(operator_reading(1, Operation.HOLD))
+    orders.take_commands(operator_reading(1, Operation.HOLD))
     report(orders)
-    assert not orders.take(operator_reading(2, what, goal))
+    assert not orders.take_commands(operator_reading(2, what, goal))
     shown = report(orders)
     assert (shown.order, shown.answer, shown.standing) == (2, Answer.REFUSED, Operation.HOLD)
     name = f"{what.name} {goal.name}".lower()
@@ -84,14 +84,14 @@ def test_a_command_that_the_level_does_not_accept_is_refused_and_changes_nothing
     assert shown.operator == 1
     unknown = operator_reading(3, Operation.NONE)
     unknown.message.what = 99
-    assert not orders.take(unknown)
+    assert not orders.take_commands(unknown)
     assert report(orders).objection.startswith("99 is not a command of this level")
 
 
 def test_the_level_holds_after_an_abandoned_command() -> None:
     orders = Orders(TAKES)
-    orders.take(operator_reading(5, Operation.GOTO, Goal.HOME))
-    orders.fail("out of reach")
+    orders.take_commands(operator_reading(5, Operation.GOTO, Goal.HOME))
+    orders.abandon_command("out of reach")
     shown = report(orders)
     assert (shown.standing, shown.answer, shown.objection) == (
         Operation.HOLD,
@@ -99,7 +99,7 @@ def test_the_level_holds_after_an_abandoned_command() -> None:
         "out of reach",
     )
     assert shown.operator == 5
-    orders.done()
+    orders.report_done()
     assert report(orders, message=shown).answer == Answer.REFUSED
 
 
@@ -113,47 +113,48 @@ def read_answer(orders: Orders) -> tuple[int, Answer, str]:
 
 def test_a_setting_does_not_replace_the_answer_to_the_command_in_force() -> None:
     orders = Orders(SETTING)
-    orders.take(operator_reading(5, Operation.GOTO, Goal.HOME))
+    orders.take_commands(operator_reading(5, Operation.GOTO, Goal.HOME))
     assert read_answer(orders) == (5, Answer.TAKEN, "")
-    orders.take(operator_reading(6, Operation.SET))
+    orders.take_commands(operator_reading(6, Operation.SET))
     assert read_answer(orders) == (6, Answer.DONE, "")
     # Nor does it make the goto a command that is done.
     assert orders.answer is Answer.TAKEN
     # Nor does one that is refused.
-    orders.take(
-        operator_reading(7, Operation.GOTO, Goal.JOINTS), lambda message: orders.refuse("too far")
+    orders.take_commands(
+        operator_reading(7, Operation.GOTO, Goal.JOINTS),
+        lambda message: orders.refuse_newest("too far"),
     )
-    orders.done()
+    orders.report_done()
     assert {read_answer(orders), read_answer(orders)} == {
         (5, Answer.DONE, ""),
         (7, Answer.REFUSED, "too far"),
     }
     # A restarted board does none of them twice.
-    assert answered(report(orders)) == 6
+    assert find_answered_serial(report(orders)) == 6
 
 
 def test_a_goto_that_fails_after_a_setting_is_answered_under_its_serial() -> None:
     orders = Orders(SETTING)
-    orders.take(operator_reading(5, Operation.GOTO, Goal.HOME))
-    orders.take(operator_reading(6, Operation.SET))
-    orders.fail("out of reach")
+    orders.take_commands(operator_reading(5, Operation.GOTO, Goal.HOME))
+    orders.take_commands(operator_reading(6, Operation.SET))
+    orders.abandon_command("out of reach")
     # Both in one cycle: shown one after the other, the newest answer to each.
     assert read_answer(orders) == (5, Answer.REFUSED, "out of reach")
     assert read_answer(orders) == (6, Answer.DONE, "")
-    assert orders.keeps("task") == "task held, `resume` releases it: out of reach"
+    assert orders.format_reason("task") == "task held, `resume` releases it: out of reach"
 
 
 def test_drives_that_finish_late_answer_the_command_that_started_them() -> None:
     orders = Orders(SETTING)
-    orders.take(operator_reading(5, Operation.HOLD))
-    orders.take(operator_reading(6, Operation.ENABLE))
+    orders.take_commands(operator_reading(5, Operation.HOLD))
+    orders.take_commands(operator_reading(6, Operation.ENABLE))
     assert [read_answer(orders), read_answer(orders)] == [
         (5, Answer.TAKEN, ""),
         (6, Answer.TAKEN, ""),
     ]
-    orders.done()
+    orders.report_done()
     assert read_answer(orders) == (5, Answer.DONE, "")
-    orders.drives_done(6)
+    orders.report_drives_done(6)
     assert read_answer(orders) == (6, Answer.DONE, "")
 
 
@@ -174,9 +175,9 @@ def test_an_invalid_joint_goal_names_the_joint_and_its_range(
     message.joints[: len(joints)] = joints
     if why:
         with pytest.raises(ValueError, match=why):
-            joints_of(message, ("base", "elbow"), RANGES)
+            read_joint_goal(message, ("base", "elbow"), RANGES)
     else:
-        assert joints_of(message, ("base", "elbow"), RANGES).tolist() == list(joints)
+        assert read_joint_goal(message, ("base", "elbow"), RANGES).tolist() == list(joints)
 
 
 LEVELS = ("task", "elemental_move", "primitive", "servo")

@@ -51,7 +51,7 @@ def test_a_level_without_a_board_has_empty_readings_and_messages() -> None:
     assert (level.above.verdict, level.above.message.value, level.below) == (Verdict.NONE, 0, {})
     number = Number.zeros({})
     number.value = 5
-    level.input_table("above")["above"] = Reading(number, Verdict.NEW)
+    level.find_input_table("above")["above"] = Reading(number, Verdict.NEW)
     level.process(0)
     assert level.number.value == 5
     assert Base(CONTEXT).number.value == 0
@@ -83,7 +83,7 @@ def test_a_port_with_the_name_of_another_attribute_is_an_error_of_the_class(
 
 def test_ports_from_a_config_are_separate_from_attributes() -> None:
     level = Base(CONTEXT)
-    level.input_table("context")["context"] = 1
+    level.find_input_table("context")["context"] = 1
     level.place_output("process", 2)
     assert level.ports == {"context": 1, "process": 2}
     assert level.context is CONTEXT

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from rack.levels.tables import Table, keys_of
+from rack.levels.tables import Table, describe_keys
 
 
 class Base(Table):
@@ -29,11 +29,11 @@ class Own(Base):
 
 
 def test_the_text_below_a_field_is_its_description_unless_it_has_one() -> None:
-    described = {key: field.description for key, field in keys_of(Own).items()}
+    described = {key: field.description for key, field in describe_keys(Own).items()}
     assert described == {
         "count": "counts of a cycle, at most",
         "by": "what each of them adds",
         "start": "where counting begins",
         "bare": "not bare any more",
     }
-    assert keys_of(Base)["bare"].description is None
+    assert describe_keys(Base)["bare"].description is None

@@ -58,7 +58,7 @@ def board(config: RackConfig, name: str, params: Mapping[str, Any]) -> BoardSpec
     table = config.board[name]
     return BoardSpec(
         name=name,
-        every=config.every(name),
+        every=config.find_period(name),
         executor=named(table.executor),
         planner=named(table.planner) if table.planner is not None else None,
         within_cycles=table.within_cycles,

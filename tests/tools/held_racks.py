@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from rack.backplane.segment import Segment, racks
+from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import System
 from tests.boards.table_racks import counting
 from tests.processes import RACK, wait_until
@@ -23,7 +23,7 @@ def held_rack(
     path.write_text(counting(folder))
     words = ("--lockstep", "--step", "--set", f"name={name}", *(options or ("--no-record",)))
     with subprocess.Popen([*RACK, "run", path, *words], cwd=ROOT) as process:
-        wait_until(lambda: name in racks(), BOUND_S)
+        wait_until(lambda: name in list_racks(), BOUND_S)
         segment = Segment.attach(name)
         try:
             wait_until(lambda: segment.words[System.HELD], BOUND_S)

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
-from rack.backplane.mailbox.history import row_dtype
+from rack.backplane.mailbox.history import build_row_dtype
 from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD
-from rack.boards.config import RackConfig, load, wire
-from rack.levels.peer import DRIFT_PPM, Presence, peer_port
+from rack.boards.config import RackConfig, load, resolve_layout
+from rack.levels.peer import DRIFT_PPM, Presence, format_peer_port
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED
-from rack.tools.recording.parquet import CyclesFile, signal_tables
+from rack.tools.recording.parquet import CyclesFile, create_signal_tables
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import TABLES
+from rack.tools.recording.run_files import TABLE_PATTERNS
 from tests.boards.lan.racks import rack_text
 
 S, MS, US = 1_000_000_000, 1_000_000, 1_000
@@ -29,7 +29,7 @@ ERROR_NS = 200 * US
 
 
 @dataclass(frozen=True)
-class Machine:
+class MachineComparison:
     """A machine, and the rack on it: its CLOCK_MONOTONIC at true time 0, its drift, and when the
     rack's tick 0 was."""
 
@@ -64,7 +64,7 @@ class Machine:
         return max(0, (self.shows(true_ns) - self.epoch_ns) * self.speed)
 
 
-def config_of(machine: Machine, others: Sequence[str], folder: Path) -> RackConfig:
+def config_of(machine: MachineComparison, others: Sequence[str], folder: Path) -> RackConfig:
     folder.mkdir(parents=True)
     path = folder / "rack.toml"
     heard = others[0] if others and machine.mode == "lockstep" else ""
@@ -73,7 +73,11 @@ def config_of(machine: Machine, others: Sequence[str], folder: Path) -> RackConf
 
 
 def recorded(
-    machine: Machine, others: Sequence[Machine], folder: Path, seed: int = 1, counts_from: int = 0
+    machine: MachineComparison,
+    others: Sequence[MachineComparison],
+    folder: Path,
+    seed: int = 1,
+    counts_from: int = 0,
 ) -> Recording:
     """Write the recording of a rack that compared its clock with those of others, each time with an
     error.
@@ -82,39 +86,41 @@ def recorded(
     late.
     """
     config = config_of(machine, [other.rack for other in others], folder)
-    (folder / "config.toml").write_text(config.text())
-    layout = wire(config)
+    (folder / "config.toml").write_text(config.to_toml_text())
+    layout = resolve_layout(config)
     launch = Launch(machine.epoch_ns + 7 * S, machine.epoch_ns - S)
     cycles = CyclesFile(folder / "cycles.parquet", layout, launch)
     rows = np.zeros(TICKS, RECORD)
     rows["tick"] = np.arange(TICKS)
     for name in ("release_ns", "start_ns", "read_ns", "process_ns", "end_ns"):
         rows[name] = machine.epoch_ns + rows["tick"] * machine.period_ns
-    cycles.add("pulse", rows)
+    cycles.add_records("pulse", rows)
     cycles.close({}, UNMEASURED, (), ())
-    signals = signal_tables(folder / "signals", layout)
+    signals = create_signal_tables(folder / "signals", layout)
     for other in others:
-        box = layout.mailbox(f"lan.{peer_port(other.rack)}")
-        signals[box.name].add(sightings(machine, other, box, seed))
+        box = layout.find_mailbox(f"lan.{format_peer_port(other.rack)}")
+        signals[box.name].add_rows(sightings(machine, other, box, seed))
     if machine.mode == "lockstep":
         for name, ticks in (
             ("pulse.status", TICKS),
             *([("lan.other", TICKS - 4)] if others else []),
         ):
-            rows = np.zeros(ticks // 4, row_dtype(layout.mailbox(name)))
+            rows = np.zeros(ticks // 4, build_row_dtype(layout.find_mailbox(name)))
             rows["basis"] = np.arange(0, ticks, 4)
             rows["tick"] = rows["basis"] + TICKS - ticks
             rows["message"]["count"] = counts_from + rows["basis"]
-            signals[name].add(rows)
+            signals[name].add_rows(rows)
     for table in signals.values():
         table.close()
-    Checksums(folder).store("config.toml", *TABLES)
+    Checksums(folder).store("config.toml", *TABLE_PATTERNS)
     return Recording(folder)
 
 
-def sightings(machine: Machine, other: Machine, box: MailboxSpec, seed: int) -> np.ndarray:
+def sightings(
+    machine: MachineComparison, other: MachineComparison, box: MailboxSpec, seed: int
+) -> np.ndarray:
     random = np.random.default_rng(seed)
-    rows = np.zeros(TICKS // EVERY, row_dtype(box))
+    rows = np.zeros(TICKS // EVERY, build_row_dtype(box))
     rows["tick"] = rows["basis"] = np.arange(0, TICKS, EVERY)
     message = rows["message"]
     message["presence"] = Presence.THERE
@@ -135,6 +141,6 @@ def sightings(machine: Machine, other: Machine, box: MailboxSpec, seed: int) -> 
     return rows
 
 
-A = Machine("a", 5000 * S, begins_ns=1 * S)
-B = Machine("b", 777_000 * S + 123, drift_ppm=DRIFT_PPM // 2, begins_ns=2 * S + 345_678)
-C = Machine("c", 12 * S, drift_ppm=-DRIFT_PPM // 2, begins_ns=500 * MS, speed=2)
+A = MachineComparison("a", 5000 * S, begins_ns=1 * S)
+B = MachineComparison("b", 777_000 * S + 123, drift_ppm=DRIFT_PPM // 2, begins_ns=2 * S + 345_678)
+C = MachineComparison("c", 12 * S, drift_ppm=-DRIFT_PPM // 2, begins_ns=500 * MS, speed=2)

@@ -10,12 +10,12 @@ import numpy as np
 
 from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
-from rack.boards.config import RackConfig, wire
-from rack.tools.recording.checksums import Checksums, checked_line
+from rack.boards.config import RackConfig, resolve_layout
+from rack.tools.recording.checksums import Checksums, format_checked_line
 from rack.tools.recording.cores import UNMEASURED
-from rack.tools.recording.parquet import CyclesFile, signal_tables
+from rack.tools.recording.parquet import CyclesFile, create_signal_tables
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import TABLES
+from rack.tools.recording.run_files import TABLE_PATTERNS
 
 MS, US = 1_000_000, 1_000
 EPOCH_NS = 5_000_000_123
@@ -67,18 +67,20 @@ def recorded(
 ) -> Recording:
     """Write the recording of a rack with these traces and messages into `folder`, and return it."""
     folder.mkdir(exist_ok=True)
-    (folder / "config.toml").write_text(config.text())
-    (folder / "events.jsonl").write_text("".join(checked_line({**event}) for event in events))
-    layout = wire(config)
+    (folder / "config.toml").write_text(config.to_toml_text())
+    (folder / "events.jsonl").write_text(
+        "".join(format_checked_line({**event}) for event in events)
+    )
+    layout = resolve_layout(config)
     cycles = CyclesFile(folder / "cycles.parquet", layout, Launch(EPOCH_NS, EPOCH_NS))
-    signals = signal_tables(folder / "signals", layout)
+    signals = create_signal_tables(folder / "signals", layout)
     for task, trace in traces.items():
         rows = [cycle.row(config.tick_ns) if isinstance(cycle, Cycle) else cycle for cycle in trace]
-        cycles.add(task, np.array(rows, RECORD))
+        cycles.add_records(task, np.array(rows, RECORD))
     for mailbox, rows in (messages or {}).items():
-        signals[mailbox].add(rows)
+        signals[mailbox].add_rows(rows)
     cycles.close({}, UNMEASURED, (), ())
     for table in signals.values():
         table.close()
-    Checksums(folder).store("config.toml", *TABLES)
+    Checksums(folder).store("config.toml", *TABLE_PATTERNS)
     return Recording(folder)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import pytest
 
 import rack as api
-from rack.backplane.segment import Segment, racks
+from rack.backplane.segment import Segment, list_racks
 from rack.boards.faults import KINDS
 from rack.tools.cli import COMMANDS
 from tests.boards.commanded_racks import COMMANDED, commands
@@ -271,7 +271,7 @@ def test_commands_that_last_as_long_as_the_rack_import_nothing(guarded: Spied) -
         for process in started.values():
             process.kill()
             process.communicate()
-    assert guarded.rack not in racks()
+    assert guarded.rack not in list_racks()
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rack.tools.recording.recording import Recording
-from rack.tools.viewer.reading import read
+from rack.tools.viewer.reading import read_component
 from tests.boards.commanded_racks import commands
 from tests.boards.table_racks import counting
 from tests.tools.command_line import rack
@@ -47,8 +47,8 @@ def test_the_report_counts_the_rows_that_fired(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_the_viewer_has_a_lane_of_rows_and_a_line_a_change(folder: Path) -> None:
-    states = read(folder / "run.rrd", "/levels/counter/row", "StateChange:state")
-    lines = read(folder / "run.rrd", "/log/rows", "TextLog:text")
+    states = read_component(folder / "run.rrd", "/levels/counter/row", "StateChange:state")
+    lines = read_component(folder / "run.rrd", "/log/rows", "TextLog:text")
     assert states.ticks.tolist() == [0, 40, 44, 60, 64]
     rows = ["3 count up", "4 turn", "5 count down", "3 settle", "4 rest"]
     assert [str(value) for value in states.values.ravel()] == rows

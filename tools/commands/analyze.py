@@ -7,12 +7,12 @@ from pathlib import Path
 
 from rack.tools.console.answer import print_json, write_json
 from rack.tools.console.parameters import Json, RunFolder, option
-from rack.tools.console.progress import reading_progress
+from rack.tools.console.progress import create_reading_progress
 from rack.tools.console.tables import print_blocks
 from rack.tools.recording.recording import Recording
 from rack.tools.report.analysis import Analysis
-from rack.tools.report.tables import analysis_blocks, document
-from rack.tools.timing.operator_response import show
+from rack.tools.report.tables import build_document, format_analysis
+from rack.tools.timing.operator_response import show_response
 
 
 def analyze(
@@ -51,18 +51,18 @@ def analyze(
     """
     folder = run if out is None else out
     if response:
-        if not show(Recording(run), folder, as_json):
+        if not show_response(Recording(run), folder, as_json):
             sys.exit(1)
         return
-    progress = reading_progress(silent=as_json)
-    analysis = Analysis.of(Recording(run), percentile, progress)
-    analysis_document = document(analysis)
+    progress = create_reading_progress(silent=as_json)
+    analysis = Analysis.from_recording(Recording(run), percentile, progress)
+    analysis_document = build_document(analysis)
     progress(0.9)
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "analysis.json", analysis_document)
     if as_json:
         print_json(analysis_document)
     else:
-        print_blocks((*analysis_blocks(analysis, verbose), "", f"{folder}/analysis.json"))
-    if not analysis.holds:
+        print_blocks((*format_analysis(analysis, verbose), "", f"{folder}/analysis.json"))
+    if not analysis.is_fulfilled:
         sys.exit(1)

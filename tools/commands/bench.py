@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, config_names, option
-from rack.tools.lab.benches.harness import show
+from rack.tools.console.parameters import Json, complete_config_name, option
+from rack.tools.lab.benches.harness import measure_and_show
 
 Config = Annotated[
     str,
@@ -17,7 +17,7 @@ Config = Annotated[
         "--config",
         metavar="CONFIG",
         help="config by name, or path to a .toml file",
-        autocompletion=config_names,
+        autocompletion=complete_config_name,
     ),
 ]
 Against = Annotated[
@@ -26,7 +26,7 @@ Against = Annotated[
         metavar="TREE", help="another checkout of rack, measured alternately with this one"
     ),
 ]
-Share = Annotated[
+TrialShare = Annotated[
     bool,
     typer.Option(
         "--share",
@@ -41,10 +41,10 @@ bench = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode
 
 
 @bench.callback()
-def interruptible(context: typer.Context) -> None:
+def bench_group(context: typer.Context) -> None:
     """Measure costs on this machine."""
     # Raise an exception on a signal, so that temporary folders are removed.
-    context.with_resource(INTERRUPT.raising())
+    context.with_resource(INTERRUPT.raise_interrupted())
 
 
 @bench.command()
@@ -55,7 +55,7 @@ def machine(
     ),
     seconds: float = option("--seconds S", "time of one run", 5.0, min=0.1),
     rounds: Rounds = 2,
-    share: Share = False,
+    share: TrialShare = False,
     as_json: Json = False,
 ) -> None:
     r"""Is this machine fit for real time, and up to which rate?
@@ -77,11 +77,11 @@ def machine(
       rack bench machine
       rack bench machine --rate 1000 --seconds 60 --rounds 1
     """
-    from rack.tools.lab.benches.machine import RATES_HZ, measure
+    from rack.tools.lab.benches.machine import RATES_HZ, measure_machine
 
     rates = rate or RATES_HZ
-    verdict = show(
-        lambda progress: measure(config, rates, seconds, rounds, share, progress), as_json
+    verdict = measure_and_show(
+        lambda progress: measure_machine(config, rates, seconds, rounds, share, progress), as_json
     )
     if not verdict.is_fit:
         raise typer.Exit(1)
@@ -97,9 +97,9 @@ def mailbox(
     Messages of 64 B to 16 kB are sent to one reader and to four, by every protocol, alternately
     with iceoryx2, HORUS and pipes of multiprocessing. The ratio is to the best of these peers.
     """
-    from rack.tools.lab.benches.mailbox import CASES, measure
+    from rack.tools.lab.benches.mailbox import CASES, measure_mailboxes
 
-    show(lambda progress: measure(CASES, rounds, progress), as_json)
+    measure_and_show(lambda progress: measure_mailboxes(CASES, rounds, progress), as_json)
 
 
 @bench.command()
@@ -107,7 +107,7 @@ def cycle(
     against: Against = None,
     seconds: float = option("--seconds S", "simulated seconds of one run", 6.0, min=2.0, max=1e9),
     rounds: Rounds = 3,
-    share: Share = False,
+    share: TrialShare = False,
     as_json: Json = False,
 ) -> None:
     """Measure the cost of a board's cycle, part by part.
@@ -117,9 +117,11 @@ def cycle(
     compared with bare mj_step calls that replay the physics of its recorded run. TREE runs in its
     environment TREE/.venv.
     """
-    from rack.tools.lab.benches.cycle import measure
+    from rack.tools.lab.benches.cycle import measure_cycles
 
-    show(lambda progress: measure(against, seconds, rounds, progress, share), as_json)
+    measure_and_show(
+        lambda progress: measure_cycles(against, seconds, rounds, progress, share), as_json
+    )
 
 
 @bench.command()
@@ -137,13 +139,13 @@ def lockstep(
     process without a rack, whose messages must equal the rack's bit for bit. Ratios are to TREE if
     it is given, and to this bound otherwise. TREE runs in its environment TREE/.venv.
     """
-    from rack.tools.lab.benches.lockstep import RACKS, measure
+    from rack.tools.lab.benches.lockstep import RACKS, measure_lockstep
 
     racks = {
         name: min(filter(None, (default_s, seconds)), default=None)
         for name, default_s in RACKS.items()
     }
-    show(lambda progress: measure(against, racks, rounds, progress), as_json)
+    measure_and_show(lambda progress: measure_lockstep(against, racks, rounds, progress), as_json)
 
 
 @bench.command()
@@ -152,7 +154,7 @@ def launch(
     rounds: Rounds = 10,
     kills: int = option("--kills N", "kills of the board", 10, min=1),
     against: Against = None,
-    share: Share = False,
+    share: TrialShare = False,
     as_json: Json = False,
 ) -> None:
     """Measure the duration of launches, commands and reactions.
@@ -163,6 +165,8 @@ def launch(
     a running rack is killed repeatedly: the output shows the time to detection, and the time until
     the brakes of the arm are engaged.
     """
-    from rack.tools.lab.benches.launch import measure
+    from rack.tools.lab.benches.launch import measure_launches
 
-    show(lambda progress: measure(config, rounds, kills, against, share, progress), as_json)
+    measure_and_show(
+        lambda progress: measure_launches(config, rounds, kills, against, share, progress), as_json
+    )

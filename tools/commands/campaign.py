@@ -19,20 +19,26 @@ INJECTIONS = 3
 SIZES = 10
 FAULTLESS_S = 60.0
 NO_TIME = "no time for the report: 'rack campaign' with --out {} continues from here"
-MOST = 100_000
+MAX_COUNT = 100_000
 """Upper bound for injections of a kind, kills and sizes of one campaign."""
 
 
 def campaign(
     config: ConfigName,
     injections: int = option(
-        "--injections N", "minimum number of injections of each kind", INJECTIONS, min=0, max=MOST
+        "--injections N",
+        "minimum number of injections of each kind",
+        INJECTIONS,
+        min=0,
+        max=MAX_COUNT,
     ),
     seed: int = option("--seed S", "seed; the same seed draws the same plans", 0, min=0),
     kinds: str | None = option(
         "--kinds A,B", "only these kinds; default: all kinds that apply to the rack"
     ),
-    kills: int | None = option("--kills N", "instead: only N kills from outside", min=1, max=MOST),
+    kills: int | None = option(
+        "--kills N", "instead: only N kills from outside", min=1, max=MAX_COUNT
+    ),
     lockstep: bool = option("--lockstep", "trials in lockstep only; default: both", False),
     realtime: bool = option("--realtime", "trials in real time only; default: both", False),
     faultless: float | None = option(
@@ -45,7 +51,10 @@ def campaign(
         "--load", "run without faults only under load, made by stress-ng if installed", False
     ),
     sizes: int | None = option(
-        "--sizes N", f"points on each curve of size against delay; default {SIZES}", min=0, max=MOST
+        "--sizes N",
+        f"points on each curve of size against delay; default {SIZES}",
+        min=0,
+        max=MAX_COUNT,
     ),
     seconds: float | None = option(
         "--seconds S", "simulated seconds of a run, for a rack without a task", min=1.0, max=1e9
@@ -82,9 +91,9 @@ def campaign(
     """
     from rack.boards.config import load as load_config
     from rack.tools.console.interrupt import INTERRUPT
-    from rack.tools.console.progress import progress_for
+    from rack.tools.console.progress import open_progress
     from rack.tools.faults.campaigns.campaign import ORDER, Campaign, Order
-    from rack.tools.launch.folder import folder_of
+    from rack.tools.launch.folder import choose_run_folder
 
     if lockstep and realtime:
         raise Failure(
@@ -123,19 +132,21 @@ def campaign(
     )
     started = time.monotonic()
     # An existing campaign is continued in its folder.
-    folder = out if out is not None and (out / ORDER).is_file() else folder_of(out, "campaign")
-    with INTERRUPT.orderly(unfinished=NO_TIME.format(folder)):
-        with progress_for(silent=as_json) as progress:
+    folder = (
+        out if out is not None and (out / ORDER).is_file() else choose_run_folder(out, "campaign")
+    )
+    with INTERRUPT.stop_orderly(unfinished=NO_TIME.format(folder)):
+        with open_progress(silent=as_json) as progress:
             work = Campaign(order, folder, progress, whole)
             results = work.run()
-        report, text = _write(work, results, time.monotonic() - started)
+        report, text = _write_report(work, results, time.monotonic() - started)
     picture_note = "" if can_draw() else f"; {NO_PICTURES}"
     print_json(report) if as_json else print(f"{text}\n{folder}/{picture_note}")
     if report["shortfalls"] or report["interrupted"]:
         sys.exit(1)
 
 
-def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
+def _write_report(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
     """Write campaign.json, campaign.md and campaign.png, and return the first two.
 
     The picture needs matplotlib, and is left out of an interrupted campaign.
@@ -144,13 +155,13 @@ def _write(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, o
 
     work.folder.mkdir(parents=True, exist_ok=True)
     report = CampaignReport(work, results, wall_s)
-    document = report.document()
-    text = report.markdown()
+    document = report.to_document()
+    text = report.to_markdown()
     write_json(work.folder / "campaign.json", document)
     (work.folder / "campaign.md").write_text(text)
     # Drawing takes too long for an interrupted campaign.
     if not results.is_interrupted and can_draw():
-        from rack.tools.faults.campaigns.plot import plot
+        from rack.tools.faults.campaigns.plot import plot_campaign
 
-        plot(report, work.folder / "campaign.png")
+        plot_campaign(report, work.folder / "campaign.png")
     return document, text

@@ -8,20 +8,20 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rack.boards.config import load, shared_out
-from rack.boards.config.cell import built_cell
+from rack.boards.config import list_replaced_cores, load
+from rack.boards.config.cell import build_rack_cell
 from rack.boards.config.schema import RackConfig
-from rack.boards.config.timing import rack_timing, with_budgets, without_interrupts
+from rack.boards.config.timing import build_rack_timing, replace_budgets, subtract_interrupts
 from rack.boards.timing.forecast import Forecast
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.parameters import ConfigName, Faults, Json, Settings, option
 from rack.tools.console.tables import TextTable, print_blocks
-from rack.tools.launch.folder import folder_of
-from rack.tools.timing.inventory import arm_lines, inventory, inventory_blocks
+from rack.tools.launch.folder import choose_run_folder
+from rack.tools.timing.inventory import build_inventory, format_arm_lines, format_inventory
 from rack.tools.timing.judged_config import JudgedConfig
-from rack.tools.timing.repair import Repair, repair
-from rack.tools.timing.summary import summary_blocks
-from rack.tools.timing.tables import forecast_blocks
+from rack.tools.timing.repair import Repair, find_repair
+from rack.tools.timing.summary import format_summary
+from rack.tools.timing.tables import format_forecast
 
 if TYPE_CHECKING:
     from rack.levels.robot.abilities import Abilities
@@ -88,48 +88,48 @@ def check(
     """
     rack_config = load(config, settings, faults)
     if run is not None:
-        rack_config = _measured(rack_config, run, percentile)
-    judged = JudgedConfig.of(rack_config)
-    if judged.failing and sys.stderr.isatty():
+        rack_config = _use_measured_budgets(rack_config, run, percentile)
+    judged = JudgedConfig.judge(rack_config)
+    if judged.failures and sys.stderr.isatty():
         print("the timing does not fit; looking for changes that help", file=sys.stderr)
-    fitting = repair(judged)
+    fitting = find_repair(judged)
     if fix:
         _print_fixed(fitting, as_json)
-        if fitting.left:
+        if fitting.remaining_failures:
             sys.exit(1)
         return
-    core_warnings = shared_out(rack_config)
-    inventory_document = inventory(rack_config, judged.layout, core_warnings)
-    forecast = Forecast.of(judged.timing, not core_warnings, rack_config.host)
-    arm = _abilities(rack_config)
+    core_warnings = list_replaced_cores(rack_config)
+    inventory_document = build_inventory(rack_config, judged.layout, core_warnings)
+    forecast = Forecast.from_rack(judged.timing, not core_warnings, rack_config.host)
+    arm = _compute_abilities(rack_config)
     if as_json:
         fits = (None if forecast.uncounted else True) if forecast.holds else False
-        verdict = {"fits": fits, "uncounted": forecast.uncounted, "repair": fitting.document()}
-        timing = forecast.document() | verdict
+        verdict = {"fits": fits, "uncounted": forecast.uncounted, "repair": fitting.to_document()}
+        timing = forecast.to_document() | verdict
         arm_document = None if arm is None else asdict(arm)
-        extra = {"changed": rack_config.changed, "arm": arm_document}
+        extra = {"changed": rack_config.format_notes, "arm": arm_document}
         print_json(inventory_document | extra | {"timing": timing})
     else:
         arguments_text = shlex.join([config, *(f"--set={setting}" for setting in settings)])
-        measured = folder_of(None, rack_config.name)
+        measured = choose_run_folder(None, rack_config.name)
         measure_hint = (
             f"rack run {arguments_text} --seconds 10 --out {measured};"
             f" rack check {arguments_text} --from {measured}"
         )
-        head, *rest = inventory_blocks(inventory_document)
+        head, *rest = format_inventory(inventory_document)
         lines: list[str | TextTable] = [
             head,
-            *rack_config.changed,
+            *rack_config.format_notes,
             *core_warnings,
-            *summary_blocks(
+            *format_summary(
                 forecast, fitting, arm, rack_config.joints, "" if run else measure_hint
             ),
         ]
         if verbose:
             lines += [
                 *rest[len(core_warnings) :],
-                *arm_lines(inventory_document),
-                *forecast_blocks(forecast),
+                *format_arm_lines(inventory_document),
+                *format_forecast(forecast),
             ]
         else:
             lines.append("--verbose shows every task, mailbox and equation")
@@ -138,13 +138,13 @@ def check(
         sys.exit(1)
 
 
-def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
+def _use_measured_budgets(config: RackConfig, run: Path, percentile: float) -> RackConfig:
     """Replace the budgets of a config by those measured in a run.
 
     Raises `Failure` for a run of another rack.
     """
     # Import these only for --from, because they take long to load.
-    from rack.tools.recording.cycles import measured_budgets
+    from rack.tools.recording.cycles import measure_budgets
     from rack.tools.recording.recording import Recording
 
     recording = Recording(run)
@@ -156,29 +156,29 @@ def _measured(config: RackConfig, run: Path, percentile: float) -> RackConfig:
             f" {', '.join(config_boards)}",
             2,
         )
-    run_timing = rack_timing(recording.rack_config, recording.layout)
-    return with_budgets(
-        config, without_interrupts(run_timing, measured_budgets(recording, percentile))
+    run_timing = build_rack_timing(recording.rack_config, recording.layout)
+    return replace_budgets(
+        config, subtract_interrupts(run_timing, measure_budgets(recording, percentile))
     )
 
 
-def _abilities(config: RackConfig) -> Abilities | None:
+def _compute_abilities(config: RackConfig) -> Abilities | None:
     """Compute what the arm of a rack can do at rest. None for a hand, or without an arm."""
     robot = config.robot
     if robot is None or robot.hand is not None:
         return None
     # Importing MuJoCo takes 0.5 s: only racks with an arm pay for it.
-    from rack.levels.robot.abilities import abilities
+    from rack.levels.robot.abilities import compute_abilities
 
-    return abilities(built_cell(config))
+    return compute_abilities(build_rack_cell(config))
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:
     """Print the config that fits on stdout, and its changes on stderr."""
-    config = None if fitting.left else fitting.end.config.text()
+    config = None if fitting.remaining_failures else fitting.end.config.to_toml_text()
     if as_json:
-        print_json(fitting.document() | {"config": config})
+        print_json(fitting.to_document() | {"config": config})
         return
-    print(*(fitting.lines() or ["nothing to change"]), sep="\n", file=sys.stderr)
+    print(*(fitting.format_lines() or ["nothing to change"]), sep="\n", file=sys.stderr)
     if config is not None:
         print(config, end="")

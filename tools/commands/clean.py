@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rack.boards.crate.clean import clean as remove_leftovers
+from rack.boards.crate.clean import remove_dead_racks
 from rack.tools.console.answer import print_answer
 from rack.tools.console.parameters import Json
 
@@ -16,7 +16,7 @@ def clean(as_json: Json = False) -> None:
     Examples:
       rack clean
     """
-    removed, in_use, strange = remove_leftovers()
+    removed, in_use, strange = remove_dead_racks()
     lines = [f"removed: {', '.join(removed) or 'nothing'}"]
     if in_use:
         lines.append(f"in use: {', '.join(in_use)}")

@@ -100,17 +100,17 @@ def command(
     """
     from rack.backplane.segment import Segment
     from rack.levels.operator import EFFECTS, Operation
-    from rack.tools.monitor.desk import LiveDesk, goal_of
-    from rack.tools.monitor.holds import resume_command
+    from rack.tools.monitor.desk import LevelCommander, parse_goal
+    from rack.tools.monitor.holds import format_resume_command
 
     check_timeout(timeout, wait)
     if lease and wait:
         raise Failure("--lease and --wait: a lease waits anyway; leave out --wait", 2)
     # Raise an exception on a signal, so that a command that has not been given yet is withdrawn.
-    with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
-        desk = LiveDesk(segment)
+    with INTERRUPT.raise_interrupted(), closing(Segment.attach(rack)) as segment:
+        desk = LevelCommander(segment)
         if is_list:
-            print_answer(desk.levels(), desk.text(), as_json)
+            print_answer(desk.list_levels(), desk.format_levels(), as_json)
             return
         if level is None or what is None:
             raise Failure(
@@ -121,15 +121,15 @@ def command(
             "what": what,
             "tick": tick,
             "at": at,
-            **goal_of(what, goal or []),
+            **parse_goal(what, goal or []),
         }
         if lease:
-            desk.attend(request, partial(print_reply, as_json=as_json))
+            desk.lease_command(request, partial(print_reply, as_json=as_json))
             return
-        reply = desk.give(request, wait, timeout)
+        reply = desk.give_command(request, wait, timeout)
     print_reply(reply, as_json)
     if reply.is_standing and Operation[what.upper()] in EFFECTS and not as_json:
-        print(f"in force until: {resume_command(rack, level)}")
+        print(f"in force until: {format_resume_command(rack, level)}")
 
 
 def print_reply(reply: Reply, as_json: bool) -> None:

@@ -6,15 +6,21 @@ import sys
 import time
 
 from rack.backplane.lines import UtilityLines
-from rack.backplane.process import readable
+from rack.backplane.process import wait_readable
 from rack.backplane.segment import Segment
 from rack.backplane.words import Demand, Run, System
 from rack.tools.console.address import OPERATOR, Operator, RackAddress
 from rack.tools.console.answer import Failure, print_answer
-from rack.tools.console.held import waits
-from rack.tools.console.parameters import Json, argument, named, option, rack_names
+from rack.tools.console.held import describe_wait
+from rack.tools.console.parameters import (
+    Json,
+    argument,
+    check_rack_name,
+    complete_rack_name,
+    option,
+)
 
-OBEY_S = 2.0
+MAX_RESPONSE_S = 2.0
 """Longest wait until the clock, which reads the latch every tick, has obeyed."""
 
 
@@ -22,8 +28,8 @@ def estop(
     rack: str = argument(
         "RACK",
         "running rack by name, as 'rack list' shows it; on another machine: HOST[:PORT]/RACK",
-        autocompletion=rack_names,
-        callback=named,
+        autocompletion=complete_rack_name,
+        callback=check_rack_name,
     ),
     reset: bool = option("--reset", "clear the latch, so that the arm may move again", False),
     ready: bool = option(
@@ -67,11 +73,13 @@ def estop(
             f"--ready, {other}: --ready only stops a rack on another machine, HOST/RACK", 2
         )
     if "/" in rack:
-        tick = _stop_from_afar(RackAddress.of(rack), reset, ready, Operator.of(name, certificates))
+        tick = _stop_remote_rack(
+            RackAddress.parse_address(rack), reset, ready, Operator.from_options(name, certificates)
+        )
         rack_name = rack.partition("/")[2]
         wait_reason = ""
     else:
-        tick, wait_reason = _latch(rack, reset)
+        tick, wait_reason = _set_latch(rack, reset)
         rack_name = rack
     where = ", on its own machine" if rack_name != rack else ""
     state = f"reset at tick {tick}" if reset else f"latched at tick {tick}"
@@ -83,7 +91,7 @@ def estop(
     print_answer(document, f"rack '{rack}': emergency stop {state}", as_json)
 
 
-def _stop_from_afar(address: RackAddress, reset: bool, ready: bool, operator: Operator) -> int:
+def _stop_remote_rack(address: RackAddress, reset: bool, ready: bool, operator: Operator) -> int:
     """Set the latch of a rack on another machine, at once or when Enter is pressed.
 
     Args:
@@ -103,17 +111,21 @@ def _stop_from_afar(address: RackAddress, reset: bool, ready: bool, operator: Op
         why = f"can only be reset on its own machine: rack estop {rack} --reset"
         raise Failure(f"rack '{rack}' {why}")
     try:
-        from rack.tools.network.estop import stop, stop_when
+        from rack.tools.network.estop import stop_rack, stop_when
     except ImportError as error:
         if error.name not in ("zenoh", "cryptography"):
             raise
         raise Failure(
             "racks on other machines need zenoh and cryptography: pip install nasrem-rack[lan]"
         ) from None
-    return stop_when(_pressed, address, operator, _Teller()) if ready else stop(address, operator)
+    return (
+        stop_when(_wait_for_enter, address, operator, _ChangePrinter())
+        if ready
+        else stop_rack(address, operator)
+    )
 
 
-class _Teller:
+class _ChangePrinter:
     """Prints a line on stderr if it differs from the previous line."""
 
     def __init__(self) -> None:
@@ -125,19 +137,19 @@ class _Teller:
         self._last = line
 
 
-def _pressed(wait_s: float) -> bool:
+def _wait_for_enter(wait_s: float) -> bool:
     """Wait for a line on stdin, up to a time, and return whether one has come.
 
     Raises `Failure` at the end of the input.
     """
-    if not readable(sys.stdin.fileno(), wait_s):
+    if not wait_readable(sys.stdin.fileno(), wait_s):
         return False
     if not sys.stdin.readline():
         raise Failure("stdin has ended before a stop was set")
     return True
 
 
-def _latch(rack: str, reset: bool) -> tuple[int, str]:
+def _set_latch(rack: str, reset: bool) -> tuple[int, str]:
     """Set or clear the latch of a rack on this machine, and wait until the clock has obeyed.
 
     Returns:
@@ -152,16 +164,16 @@ def _latch(rack: str, reset: bool) -> tuple[int, str]:
         lines.reset_emergency_stop()
     else:
         lines.latch_emergency_stop()
-    deadline = time.monotonic() + OBEY_S
+    deadline = time.monotonic() + MAX_RESPONSE_S
     # The demand on the arm follows at the next tick. A lost board may also cause a demand.
     wait_reason = ""
     while (words[System.DEMAND] == Demand.BRAKE) == reset and words[System.STATE] == Run.RUNNING:
-        if wait_reason := waits(segment):
+        if wait_reason := describe_wait(segment):
             break
         if time.monotonic() > deadline:
             raise Failure(
                 f"rack '{rack}': the latch is {'clear' if reset else 'set'}, but the clock has not"
-                f" obeyed within {OBEY_S:g} s"
+                f" obeyed within {MAX_RESPONSE_S:g} s"
             )
         time.sleep(0.001)
     return words[System.TICK], wait_reason

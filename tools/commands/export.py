@@ -8,7 +8,7 @@ from typing import Literal
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RunFolder, option
-from rack.tools.console.progress import reading_progress
+from rack.tools.console.progress import create_reading_progress
 from rack.tools.recording.recording import Recording
 
 
@@ -45,9 +45,9 @@ def export(
     # Write to a temporary file, so that no incomplete file is left after Ctrl-C.
     partial_file = path.with_name(f"{path.name}.part")
     try:
-        with INTERRUPT.raising():
-            count = exchange_file.export(
-                recording, partial_file, reading_progress(as_json, "exported")
+        with INTERRUPT.raise_interrupted():
+            count = exchange_file.export_recording(
+                recording, partial_file, create_reading_progress(as_json, "exported")
             )
         partial_file.rename(path)
     except OSError as error:

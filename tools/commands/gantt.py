@@ -8,11 +8,11 @@ from pathlib import Path
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json, Settings, argument, option
 from rack.tools.console.pictures import NO_PICTURES, can_draw
-from rack.tools.console.progress import reading_progress
+from rack.tools.console.progress import create_reading_progress
 from rack.tools.timing.charts import figure5
-from rack.tools.timing.charts.gantt import Subject, gantt_of, subject_of
+from rack.tools.timing.charts.gantt import Subject, build_gantt, find_subject
 from rack.tools.timing.charts.panel import NS_PER_MS
-from rack.tools.timing.charts.window import WindowOptions, times_of
+from rack.tools.timing.charts.window import WindowOptions, parse_process_times
 
 LATEST_MS = 1e10
 MANY_SPANS = 10_000
@@ -56,31 +56,37 @@ def gantt(
       rack gantt fig4-overload --from-ms 60 --to-ms 78
       rack gantt runs/nasrem-20250101-120000 --from-ms 500 --to-ms 540
     """
-    drawn_subject = subject_of(subject, settings, out)
+    drawn_subject = find_subject(subject, settings, out)
     if figure is not None:
-        _figure_5(drawn_subject, figure, as_json)
+        _draw_figure_5(drawn_subject, figure, as_json)
         return
     from_ns, to_ns = (None if ms is None else round(ms * NS_PER_MS) for ms in (from_ms, to_ms))
     window = WindowOptions(from_ns, to_ns)
-    chart = gantt_of(drawn_subject, window, times_of(process), reading_progress(silent=as_json))
-    if chart.spans > MANY_SPANS and not as_json:
-        print(f"drawing {chart.spans} spans", file=sys.stderr, flush=True)
-    pictures = chart.save(_made(drawn_subject.folder)) if can_draw() else []
-    _answer(chart.text(), chart.document(), pictures, as_json)
+    chart = build_gantt(
+        drawn_subject, window, parse_process_times(process), create_reading_progress(silent=as_json)
+    )
+    if chart.span_count > MANY_SPANS and not as_json:
+        print(f"drawing {chart.span_count} spans", file=sys.stderr, flush=True)
+    pictures = chart.save_pictures(_create_folder(drawn_subject.folder)) if can_draw() else []
+    _print_chart(chart.format_text(), chart.to_document(), pictures, as_json)
 
 
-def _figure_5(subject: Subject, figure: int, as_json: bool) -> None:
+def _draw_figure_5(subject: Subject, figure: int, as_json: bool) -> None:
     """Draw the paper's figure 5. Raises `Failure` for another number."""
     if figure != 5:
         raise Failure(
             f"--figure {figure}: must be 5; figures 2 to 4 are racks, as in: rack gantt fig2", 2
         )
-    pictures = figure5.save(subject.config, _made(subject.folder) / "figure5") if can_draw() else []
-    text = "\n".join(figure5.lines(subject.config))
-    _answer(text, figure5.document(subject.config), pictures, as_json)
+    pictures = (
+        figure5.save_picture(subject.config, _create_folder(subject.folder) / "figure5")
+        if can_draw()
+        else []
+    )
+    text = "\n".join(figure5.format_figure(subject.config))
+    _print_chart(text, figure5.build_document(subject.config), pictures, as_json)
 
 
-def _made(folder: Path) -> Path:
+def _create_folder(folder: Path) -> Path:
     """Create the folder for the pictures if it is missing, and return it. Raises `Failure`."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -89,7 +95,7 @@ def _made(folder: Path) -> Path:
     return folder
 
 
-def _answer(text: str, document: Document, pictures: list[Path], as_json: bool) -> None:
+def _print_chart(text: str, document: Document, pictures: list[Path], as_json: bool) -> None:
     """Print the chart, with the paths of its pictures."""
     paths = [str(path) for path in pictures]
     files = f"pictures: {', '.join(paths)}" if paths else NO_PICTURES

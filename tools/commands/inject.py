@@ -9,13 +9,20 @@ import typer
 from typer.core import TyperCommand
 
 from rack.tools.console.answer import Document, Failure, print_answer
-from rack.tools.console.parameters import Json, Timeout, argument, check_timeout, named, option
-from rack.tools.console.tables import fitted
+from rack.tools.console.parameters import (
+    Json,
+    Timeout,
+    argument,
+    check_rack_name,
+    check_timeout,
+    option,
+)
+from rack.tools.console.tables import format_fitted_table
 
 
 def inject(
     rack: str | None = argument(
-        "RACK", "running rack by name, as 'rack list' shows it", None, callback=named
+        "RACK", "running rack by name, as 'rack list' shows it", None, callback=check_rack_name
     ),
     board: str | None = argument(
         "BOARD", "task to strike: servo, servo.planner, ..., or clock", None
@@ -64,7 +71,7 @@ def inject(
       rack inject nasrem --withdraw 0
     """
     if is_list and rack is None:
-        print_answer(kinds_document(), kinds_text(), as_json)
+        print_answer(build_kinds_document(), format_kinds(), as_json)
         return
     needs_fault = not is_list and withdraw is None
     if rack is None or (needs_fault and (board is None or kind is None)):
@@ -77,10 +84,10 @@ def inject(
 
     live = LiveRack(Segment.attach(rack))
     if is_list:
-        print_answer(live.faults(), live.text(), as_json)
+        print_answer(live.list_faults(), live.format_table(), as_json)
         return
     if withdraw is not None:
-        answer = live.withdraw(withdraw)
+        answer = live.withdraw_fault(withdraw)
     else:
         request: Document = {
             "board": board,
@@ -92,13 +99,13 @@ def inject(
             "when": when,
             "phase": phase,
             "seed": seed,
-            **_values(parameters or []),
+            **_parse_parameters(parameters or []),
         }
-        answer = live.inject(request, wait, timeout)
+        answer = live.inject_fault(request, wait, timeout)
     print_answer(answer, answer["message"], as_json)
 
 
-def _values(parameters: list[str]) -> dict[str, str]:
+def _parse_parameters(parameters: list[str]) -> dict[str, str]:
     """Parse parameters given as KEY=VALUE. Raises `Failure`."""
     values = {}
     for text in parameters:
@@ -117,10 +124,10 @@ class KindsCommand(TyperCommand):
 
     def get_help(self, ctx: Any) -> str:
         """Return the help, with the kinds of faults at the end."""
-        return "\n".join([super().get_help(ctx), "", "Kinds:", *kinds_text()])
+        return "\n".join([super().get_help(ctx), "", "Kinds:", *format_kinds()])
 
 
-def kinds_text() -> Iterator[str]:
+def format_kinds() -> Iterator[str]:
     """Yield the lines of a table of fault kinds, and of a table of their parameters."""
     from rack.boards.faults import KINDS
 
@@ -134,7 +141,7 @@ def kinds_text() -> Iterator[str]:
         ]
         for kind in KINDS
     ]
-    yield from fitted(["kind", "effect", "found within", ""], rows)
+    yield from format_fitted_table(["kind", "effect", "found within", ""], rows)
     yield ""
     yield "A cycle is one of the task that is struck; for a planner it is its time slice."
     yield "A delivery is the time until a message is visible and its reader has read it."
@@ -151,10 +158,12 @@ def kinds_text() -> Iterator[str]:
         for kind in KINDS
         for p in kind.parameters
     ]
-    yield from fitted(["kind", "parameter", "unit", "default", "range", "meaning"], numbers)
+    yield from format_fitted_table(
+        ["kind", "parameter", "unit", "default", "range", "meaning"], numbers
+    )
 
 
-def kinds_document() -> list[Document]:
+def build_kinds_document() -> list[Document]:
     """Build the description of the fault kinds as plain data."""
     from rack.boards.faults import KINDS
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from contextlib import closing
 
-from rack.backplane.checked import as_named
+from rack.backplane.checked import to_enum
 from rack.backplane.errors import SegmentError
-from rack.backplane.segment import Segment, racks
+from rack.backplane.segment import Segment
+from rack.backplane.segment import list_racks as list_rack_names
 from rack.backplane.words import Head, Run, System
 from rack.tools.console.answer import Document, print_answer
 from rack.tools.console.parameters import Json
-from rack.tools.console.tables import fitted
+from rack.tools.console.tables import format_fitted_table
 
 
 def list_racks(as_json: Json = False) -> None:
@@ -28,13 +29,13 @@ def list_racks(as_json: Json = False) -> None:
       rack list
       rack list --json
     """
-    descriptions = [describe(name) for name in racks()]
+    descriptions = [describe_rack(name) for name in list_rack_names()]
     rows = [[rack["rack"], rack["state"], rack["detail"]] for rack in descriptions]
-    text = fitted(("rack", "state", ""), rows) if rows else "no racks"
+    text = format_fitted_table(("rack", "state", ""), rows) if rows else "no racks"
     print_answer(descriptions, text, as_json)
 
 
-def describe(name: str) -> Document:
+def describe_rack(name: str) -> Document:
     """Build the answer for one rack: its name as "rack", its state and details.
 
     The age is in seconds. The launcher is None in another PID namespace.
@@ -49,7 +50,7 @@ def describe(name: str) -> Document:
         state = "dead"
         launcher_text = "its launcher is gone: 'rack clean' removes it"
         if segment.launcher_is_alive:
-            state = as_named(Run, words[System.STATE]).name.lower()
+            state = to_enum(Run, words[System.STATE]).name.lower()
             launcher_text = f"launched {age_s:.0f} s ago by {segment.launcher_text}"
         boards = len({task.board for task in segment.layout.tasks})
         hosts = len(segment.layout.hosts)

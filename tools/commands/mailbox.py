@@ -10,13 +10,13 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json, RackName, argument, option
-from rack.tools.console.tables import console, fitted_records
-from rack.tools.monitor.message_text import DROPPED, MessageText, list_mailboxes
-from rack.tools.monitor.polling import looks
-from rack.tools.recording.signal import mailbox_of
+from rack.tools.console.tables import create_console, format_fitted_records
+from rack.tools.monitor.message_text import DROPPED, MessageFormatter, list_mailboxes
+from rack.tools.monitor.polling import poll_run
+from rack.tools.recording.signal import find_mailbox
 
-LOOK_S = 0.1
-PLAIN_S = 1.0
+READ_INTERVAL_S = 0.1
+PLAIN_INTERVAL_S = 1.0
 """Wall-clock time between two readings: on a terminal or as JSON, and as plain text."""
 
 
@@ -44,22 +44,24 @@ def mailbox(
         if watch:
             raise Failure("--watch needs the NAME of a mailbox", 2)
         rows = list_mailboxes(segment)
-        print_answer(rows, fitted_records(rows, DROPPED), as_json)
+        print_answer(rows, format_fitted_records(rows, DROPPED), as_json)
         return
-    box = mailbox_of(name, segment.layout.mailboxes)
+    box = find_mailbox(name, segment.layout.mailboxes)
     ring = MailboxRing(segment, box.name)
-    formatter = MessageText(box, segment.layout.clock_ns)
+    formatter = MessageFormatter(box, segment.layout.clock_ns)
     if watch:
-        _watch(segment, ring, formatter, as_json)
+        _watch_mailbox(segment, ring, formatter, as_json)
         return
-    messages = ring.drain().rows
+    messages = ring.read_new_rows().rows
     if not len(messages):
         raise Failure(f"mailbox '{name}' has no message yet")
-    newest = formatter.document(messages[-1], segment.words[System.TICK])
-    print_answer(newest, formatter.lines(newest), as_json)
+    newest = formatter.to_document(messages[-1], segment.words[System.TICK])
+    print_answer(newest, formatter.format_lines(newest), as_json)
 
 
-def _watch(segment: Segment, ring: MailboxRing, formatter: MessageText, as_json: bool) -> None:
+def _watch_mailbox(
+    segment: Segment, ring: MailboxRing, formatter: MessageFormatter, as_json: bool
+) -> None:
     """Show the newest message, and each new one until the run is over.
 
     With JSON all messages are printed. For people the newest one of each reading is shown.
@@ -67,20 +69,22 @@ def _watch(segment: Segment, ring: MailboxRing, formatter: MessageText, as_json:
     from rich.live import Live
     from rich.text import Text
 
-    terminal = console()
+    terminal = create_console()
     is_drawn = terminal.is_terminal and not as_json
     live = Live(console=terminal, auto_refresh=False) if is_drawn else None
-    look_s = LOOK_S if is_drawn or as_json else PLAIN_S
-    rows = ring.drain().rows[-1:]
+    look_s = READ_INTERVAL_S if is_drawn or as_json else PLAIN_INTERVAL_S
+    rows = ring.read_new_rows().rows[-1:]
     with live or nullcontext():
-        for _ in looks(segment, look_s):
+        for _ in poll_run(segment, look_s):
             tick = segment.words[System.TICK]
-            documents = [formatter.document(row, tick) for row in (*rows, *ring.drain().rows)]
+            documents = [
+                formatter.to_document(row, tick) for row in (*rows, *ring.read_new_rows().rows)
+            ]
             rows = rows[:0]
             if as_json:
                 for document in documents:
                     print(encode_json(document), flush=True)
             elif live is not None and documents:
-                live.update(Text("\n".join(formatter.lines(documents[-1]))), refresh=True)
+                live.update(Text("\n".join(formatter.format_lines(documents[-1]))), refresh=True)
             elif documents:
-                print(*formatter.lines(documents[-1]), "", sep="\n", flush=True)
+                print(*formatter.format_lines(documents[-1]), "", sep="\n", flush=True)

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import typer
 
 from rack.backplane.rack_name import RACK_NAME
-from rack.boards.config import CONFIGS, load, names
+from rack.boards.config import CONFIGS, list_names, load
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.parameters import Json
 
@@ -46,11 +46,11 @@ def new(
       rack new servo my_law && pytest my_law
       rack new planner my_planner --json
     """
-    if why := _flaw(kind, name):
+    if why := _find_name_problem(kind, name):
         raise Failure(f'NAME = "{name}": {why}', 2)
     folder = out or Path(name)
     written = {
-        folder / path.name.replace(f"my_{kind}", name): _filled(path.read_text(), kind, name)
+        folder / path.name.replace(f"my_{kind}", name): _fill_template(path.read_text(), kind, name)
         for path in sorted((TEMPLATES / kind).glob("*my_*"))
     }
     try:
@@ -69,17 +69,17 @@ def new(
     print_answer(document, lines, as_json)
 
 
-def _flaw(kind: str, name: str) -> str:
+def _find_name_problem(kind: str, name: str) -> str:
     """Return why a name cannot be used for the module, its rack and its board, or an empty text."""
     if not re.fullmatch(RACK_NAME, name) or not name.isidentifier() or keyword.iskeyword(name):
         return "must be at most 40 of a-z, 0-9 and '_', begin with a letter, and not be a keyword"
-    if name in names() or name in load("nasrem").board:
+    if name in list_names() or name in load("nasrem").board:
         return "a bundled config, or a board of nasrem, has that name"
     if find_spec(name) is not None:
         return "an installed module has that name"
     source = (TEMPLATES / kind / f"my_{kind}.py").read_text()
     used_names = re.findall(rf"\b(?!{_class_name(f'my_{kind}')})\w+", source)
-    class_names = re.findall(r"^class (\w+)", _filled(source, kind, name), re.MULTILINE)
+    class_names = re.findall(r"^class (\w+)", _fill_template(source, kind, name), re.MULTILINE)
     for clash in sorted({*class_names} & {*used_names}):
         return f"its class would be named {clash}, as a class that it uses"
     return ""
@@ -89,7 +89,7 @@ def _class_name(name: str) -> str:
     return "".join(part.capitalize() for part in name.split("_"))
 
 
-def _filled(text: str, kind: str, name: str) -> str:
+def _fill_template(text: str, kind: str, name: str) -> str:
     """Replace the names in a file of a template by the user's name."""
     template_name = f"my_{kind}"
     return text.replace(template_name, name).replace(_class_name(template_name), _class_name(name))

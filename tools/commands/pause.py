@@ -30,8 +30,8 @@ def pause(rack: RackName, as_json: Json = False) -> None:
       rack pause nasrem
       rack resume nasrem
     """
-    with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
-        tick, levels = pausing.pause(segment)
+    with INTERRUPT.raise_interrupted(), closing(Segment.attach(rack)) as segment:
+        tick, levels = pausing.pause_rack(segment)
     state = f"held before tick {tick}"
     if levels:
         state = f"'{levels[0]}' held by the operator, at rest since tick {tick}"
@@ -50,7 +50,7 @@ def resume(rack: RackName, as_json: Json = False) -> None:
     Examples:
       rack resume nasrem
     """
-    with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
-        levels = pausing.resume(segment)
+    with INTERRUPT.raise_interrupted(), closing(Segment.attach(rack)) as segment:
+        levels = pausing.resume_rack(segment)
     document = {"rack": rack, "paused": False, "levels": levels}
     print_answer(document, f"rack '{rack}' continues", as_json)

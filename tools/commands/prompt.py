@@ -14,7 +14,7 @@ from typing import Any
 
 from rack.backplane.segment import Segment
 from rack.boards.classes import find_class
-from rack.boards.config.loader import loads
+from rack.boards.config.loader import load_text
 from rack.boards.config.resolved import resolve
 from rack.boards.host.bus import HostBus
 from rack.boards.wiring import HostWiring
@@ -55,28 +55,28 @@ def prompt(
     if (owner := os.fstat(segment.fd).st_uid) != os.getuid():
         why = "only that user may run the program that its config names"
         raise Failure(f"rack '{rack}' belongs to user {owner}: {why}")
-    wiring = _wiring(segment, board)
+    wiring = _find_wiring(segment, board)
     program = find_class(wiring.target, HostProgram)(wiring.context)
     bus = HostBus(segment, wiring)
-    bus.connect(program)
-    names = {"bus": bus, "program": program, **program.names(bus)}
+    bus.connect_ports(program)
+    names = {"bus": bus, "program": program, **program.list_prompt_names(bus)}
     try:
-        with _python_signals():
+        with _use_python_signals():
             if script is None:
-                _interact(rack, wiring.board, names)
+                _open_prompt(rack, wiring.board, names)
             else:
-                _run(script, names)
+                _run_script(script, names)
     finally:
         bus.close()
 
 
-def _wiring(segment: Segment, board: str | None) -> HostWiring:
+def _find_wiring(segment: Segment, board: str | None) -> HostWiring:
     """Return the wiring of the external host board.
 
     Raises `Failure` if none fits, or several do.
     """
     wirings = {
-        host.board: host for host in resolve(loads(segment.config)).hosts if host.is_external
+        host.board: host for host in resolve(load_text(segment.config)).hosts if host.is_external
     }
     names = ", ".join(wirings) or "none"
     if board is None and len(wirings) != 1:
@@ -90,7 +90,7 @@ def _wiring(segment: Segment, board: str | None) -> HostWiring:
 
 
 @contextlib.contextmanager
-def _python_signals() -> Iterator[None]:
+def _use_python_signals() -> Iterator[None]:
     """Handle signals as Python's prompt and scripts expect: Ctrl-C raises `KeyboardInterrupt`."""
     previous = {number: signal.getsignal(number) for number in SIGNALS}
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -101,7 +101,7 @@ def _python_signals() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def _interact(rack: str, board: str, names: dict[str, Any]) -> None:
+def _open_prompt(rack: str, board: str, names: dict[str, Any]) -> None:
     """Open a prompt in which `names` are defined."""
     with contextlib.suppress(ImportError):
         import readline  # noqa: F401  line editing and history
@@ -110,7 +110,7 @@ def _interact(rack: str, board: str, names: dict[str, Any]) -> None:
     code.interact(f"rack {rack}, host board '{board}': {names_text}", local=names, exitmsg="")
 
 
-def _run(script: Path, names: dict[str, Any]) -> None:
+def _run_script(script: Path, names: dict[str, Any]) -> None:
     """Run a script. Raises `Failure` with the exception that ended it, in one line."""
     if not script.is_file():
         raise Failure(f"{script}: no such file", 2)

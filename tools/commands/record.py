@@ -11,24 +11,29 @@ from threading import Event
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.config.layout import KEPT_S
-from rack.tools.commands.replay import merge
-from rack.tools.commands.status import recorded_by
+from rack.boards.config.layout import RETAINED_S
+from rack.tools.commands.replay import merge_runs
+from rack.tools.commands.status import find_run_folder
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, RackName, View, named_here, option
-from rack.tools.launch.folder import folder_of
+from rack.tools.console.parameters import Json, RackName, View, check_local_rack_name, option
+from rack.tools.launch.folder import choose_run_folder
 from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.file_names import CODE, CONFIG, ORIGIN, PUBLISHED, SPOOL
-from rack.tools.recording.folder_size import recorded_line, size_of, size_text, sizes
+from rack.tools.recording.folder_size import (
+    format_recorded_line,
+    format_size,
+    measure_size,
+    measure_sizes,
+)
 from rack.tools.recording.recorder.process import RecorderProcess
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import EVENTS, mend
-from rack.tools.recording.spool import STRETCHES, stretch_files
+from rack.tools.recording.run_files import EVENTS, rebuild_files
+from rack.tools.recording.spool import STRETCHES, list_stretch_files
 from rack.tools.viewer.parts import FILE
-from rack.tools.viewer.window import ViewerWindow, free_port, url
+from rack.tools.viewer.window import ViewerWindow, find_free_port, format_url
 
-LOOK_S = 0.1
+CHECK_INTERVAL_S = 0.1
 """Time between two checks of the racks and their recorders."""
 
 
@@ -70,40 +75,45 @@ def record(
     if save and (others or view):
         raise Failure(f"--save, {'--with' if others else '--view'}: give one of them", 2)
     with ExitStack() as stack:
-        attached = (closing(Segment.attach(str(named_here(name)))) for name in racks)
+        attached = (closing(Segment.attach(str(check_local_rack_name(name)))) for name in racks)
         segments = [stack.enter_context(attached_segment) for attached_segment in attached]
         segment = segments[0]
-        folder = folder_of(out, rack)
+        folder = choose_run_folder(out, rack)
         if save:
-            print_answer(*_saved(segment, folder), as_json)
+            print_answer(*_save_recording(segment, folder), as_json)
             return
         clock_ns = segment.layout.clock_ns
-        first_tick = max(0, segment.words[System.TICK] - round(KEPT_S * 1e9 / clock_ns))
-        notes = _record(segments, folder, view)
+        first_tick = max(0, segment.words[System.TICK] - round(RETAINED_S * 1e9 / clock_ns))
+        notes = _record_racks(segments, folder, view)
         lasted_s = (segment.words[System.TICK] - first_tick) * clock_ns * 1e-9
     for text in notes:
         print(text, file=sys.stderr)
-    answer = {"rack": rack, "folder": str(folder), "notes": notes, **sizes(folder, lasted_s)}
-    print_answer(answer, recorded_line(folder, lasted_s), as_json)
+    answer = {
+        "rack": rack,
+        "folder": str(folder),
+        "notes": notes,
+        **measure_sizes(folder, lasted_s),
+    }
+    print_answer(answer, format_recorded_line(folder, lasted_s), as_json)
 
 
-def _saved(segment: Segment, folder: Path) -> tuple[Document, str]:
+def _save_recording(segment: Segment, folder: Path) -> tuple[Document, str]:
     """Save the recording of a running rack so far. Returns the answer as data and as a line."""
     name = segment.layout.rack
-    run = recorded_by(segment)
+    run = find_run_folder(segment)
     if run is None:
         raise Failure(f"--save {name}: the rack is not recorded; 'rack record {name}' records it")
-    with INTERRUPT.raising():
+    with INTERRUPT.raise_interrupted():
         save_run(run, folder)
         traces = [rows["tick"] for rows in Recording(folder).cycles.values()]
         if not traces:
             raise Failure(f"--save {name}: nothing is recorded yet")
-        merge([folder], folder / FILE)
+        merge_runs([folder], folder / FILE)
     first, last = min(ticks[0] for ticks in traces), max(ticks[-1] for ticks in traces)
     tick_s = segment.layout.clock_ns * 1e-9
     since_s, until_s = float(first * tick_s), float(last * tick_s)
-    size = size_of(folder)
-    size_note = size_text(size, until_s - since_s)
+    size = measure_size(folder)
+    size_note = format_size(size, until_s - since_s)
     summary = f"saved into {folder}: {since_s:.2f} s to {until_s:.2f} s, {size_note}"
     times = {"since_s": since_s, "until_s": until_s}
     return {"rack": name, "folder": str(folder), **times, "bytes": size}, summary
@@ -111,16 +121,16 @@ def _saved(segment: Segment, folder: Path) -> tuple[Document, str]:
 
 def save_run(folder: Path, into: Path) -> None:
     """Copy the recording in `folder` so far to the run folder `into`. The recorder continues."""
-    stretches = (f"{STRETCHES}/{path.name}" for path in stretch_files(folder))
+    stretches = (f"{STRETCHES}/{path.name}" for path in list_stretch_files(folder))
     for name in (CONFIG, PUBLISHED, ORIGIN, CODE, EVENTS, CHECKSUMS, SPOOL, *stretches):
         (into / name).parent.mkdir(parents=True, exist_ok=True)
         # The flight recorder may have removed a file since, and few runs have an origin.
         with suppress(FileNotFoundError):
             copyfile(folder / name, into / name)
-    mend(into)
+    rebuild_files(into)
 
 
-def _begin(segment: Segment, folder: Path, port: int | None) -> RecorderProcess:
+def _start_recorder(segment: Segment, folder: Path, port: int | None) -> RecorderProcess:
     """Start to record a rack into a folder.
 
     Args:
@@ -145,7 +155,7 @@ def _begin(segment: Segment, folder: Path, port: int | None) -> RecorderProcess:
     return recorder
 
 
-def _record(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
+def _record_racks(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
     """Record racks until their runs are over.
 
     Args:
@@ -163,39 +173,39 @@ def _record(racks: Sequence[Segment], folder: Path, view: bool) -> list[str]:
     unfinished = ""
     if len(racks) > 1:
         unfinished = f"{folder / FILE} is missing; 'rack replay {folder}' creates it"
-    port = free_port() if view else None
+    port = find_free_port() if view else None
     # Ctrl-C ends the recording, not the run.
-    with INTERRUPT.orderly(unfinished=unfinished):
+    with INTERRUPT.stop_orderly(unfinished=unfinished):
         recorders = []
         with ExitStack() as stack:
             for rack, into in zip(racks, folders, strict=True):
-                recorders.append(_begin(rack, into, port))
+                recorders.append(_start_recorder(rack, into, port))
                 stack.callback(recorders[-1].finish)
             if port is not None:
-                ViewerWindow(url(port))
-            notes = _follow(racks, recorders, unfinished)
+                ViewerWindow(format_url(port))
+            notes = _await_runs(racks, recorders, unfinished)
         if len(racks) == 1:
             return notes
         if INTERRUPT.number:
             return [*notes, unfinished]
         try:
-            return [*notes, *merge(folders, folder / FILE)]
+            return [*notes, *merge_runs(folders, folder / FILE)]
         except Failure as failure:
             raise Failure(
                 f"recorded into {', '.join(map(str, folders))}, but not joined: {failure}"
             ) from None
 
 
-def _follow(
+def _await_runs(
     racks: Sequence[Segment], recorders: Sequence[RecorderProcess], unfinished: str
 ) -> list[str]:
     """Record until all runs are over, or until Ctrl-C. Returns notes of the recorders."""
     notes: list[str] = []
     ended = Event()
-    with INTERRUPT.orderly(ended.set, unfinished):
-        while not all(rack.run_is_over for rack in racks) and not ended.wait(LOOK_S):
-            notes += [text for recorder in recorders for text in recorder.news()]
+    with INTERRUPT.stop_orderly(ended.set, unfinished):
+        while not all(rack.run_is_over for rack in racks) and not ended.wait(CHECK_INTERVAL_S):
+            notes += [text for recorder in recorders for text in recorder.read_news()]
     for recorder in recorders:
         recorder.finish(in_a_hurry=INTERRUPT.number != 0)
-        notes += recorder.news()
+        notes += recorder.read_news()
     return notes

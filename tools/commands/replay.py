@@ -10,13 +10,13 @@ from tempfile import TemporaryDirectory
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import argument, option
-from rack.tools.console.progress import reading_progress
+from rack.tools.console.progress import create_reading_progress
 from rack.tools.recording.checksums import Checksums
-from rack.tools.recording.divergence import other_run
+from rack.tools.recording.divergence import find_other_run
 from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.time_line import RackPlace, on_one_time_line, side_by_side
-from rack.tools.viewer.parts import FILE, parts_of
+from rack.tools.recording.time_line import RackPlace, place_on_time_line, place_side_by_side
+from rack.tools.viewer.parts import FILE, list_parts
 from rack.tools.viewer.window import ViewerWindow, has_screen
 
 Places = Callable[[Sequence[Recording]], list[RackPlace]]
@@ -59,44 +59,44 @@ def replay(
       rack replay runs/slower --against runs/whole
       rack replay runs/slower --against origin
     """
-    place: Places = on_one_time_line
+    place: Places = place_on_time_line
     if against is not None:
         if len(runs) > 1:
             raise Failure("--against: give exactly one RUN", 2)
-        place = side_by_side
-        runs = [other_run(runs[0], against), *runs]
-    if out is None and len(runs) == 1 and (recordings := _own(runs[0])):
-        _show(*recordings)
+        place = place_side_by_side
+        runs = [find_other_run(runs[0], against), *runs]
+    if out is None and len(runs) == 1 and (recordings := _find_viewer_files(runs[0])):
+        _open_viewer(*recordings)
         return
-    parts = [part for run in runs for part in _parts(run)]
+    parts = [part for run in runs for part in _list_runs(run)]
     if out is not None:
-        _make(parts, out, place)
+        _write_file(parts, out, place)
     elif len(parts) == 1 and not (parts[0] / CONFIG).exists():
         raise Failure(f"{parts[0]}: nothing to replay: it has no run.rrd", 2)
     elif has_screen():
-        with INTERRUPT.raising(), TemporaryDirectory(prefix="rack-replay-") as folder:
-            _make(parts, Path(folder, "run.rrd"), place)
-            _show(Path(folder, "run.rrd"))
+        with INTERRUPT.raise_interrupted(), TemporaryDirectory(prefix="rack-replay-") as folder:
+            _write_file(parts, Path(folder, "run.rrd"), place)
+            _open_viewer(Path(folder, "run.rrd"))
     else:
         raise Failure(
             "no screen: DISPLAY and WAYLAND_DISPLAY are not set; --out FILE.rrd writes a file"
         )
 
 
-def _own(run: Path) -> list[Path]:
+def _find_viewer_files(run: Path) -> list[Path]:
     """Return the viewer's files of a run. A long run and a restarted recorder have several.
 
     Raises `Failure` for a damaged file.
     """
     is_file = run.suffix == ".rrd"
     checksums = Checksums(run.parent if is_file else run)
-    files = [run] if is_file and run.is_file() else parts_of(run / FILE)
+    files = [run] if is_file and run.is_file() else list_parts(run / FILE)
     # A killed recorder leaves a file without a checksum.
     checksums.verify(*{part.name for part in files} & {*checksums.stored})
     return files
 
 
-def _parts(run: Path) -> list[Path]:
+def _list_runs(run: Path) -> list[Path]:
     """Return the runs in a folder made by `rack record --with`, or the folder if it is a run."""
     parts = (
         [] if (run / CONFIG).exists() else sorted(path.parent for path in run.glob(f"*/{CONFIG}"))
@@ -104,13 +104,15 @@ def _parts(run: Path) -> list[Path]:
     return parts or [run]
 
 
-def _show(*recordings: Path) -> None:
+def _open_viewer(*recordings: Path) -> None:
     """Open the viewer and wait until it is closed. Raises `Failure` if it fails."""
-    if problem := ViewerWindow(*(str(recording.resolve()) for recording in recordings)).wait():
+    if problem := ViewerWindow(
+        *(str(recording.resolve()) for recording in recordings)
+    ).wait_until_closed():
         raise Failure(problem)
 
 
-def _make(runs: Sequence[Path], out: Path, place: Places) -> None:
+def _write_file(runs: Sequence[Path], out: Path, place: Places) -> None:
     """Write the file of `merge_runs`, printing its notes.
 
     Raises `Failure` for an unusable `out`.
@@ -119,11 +121,11 @@ def _make(runs: Sequence[Path], out: Path, place: Places) -> None:
         raise Failure(f"--out {out}: the name of a file for the viewer must end in .rrd", 2)
     if out.exists():
         raise Failure(f"--out {out}: exists already", 2)
-    for note in merge(runs, out, place):
+    for note in merge_runs(runs, out, place):
         print(note, file=sys.stderr)
 
 
-def merge(runs: Sequence[Path], out: Path, place: Places = on_one_time_line) -> list[str]:
+def merge_runs(runs: Sequence[Path], out: Path, place: Places = place_on_time_line) -> list[str]:
     """Write runs to one file for the viewer.
 
     Args:
@@ -149,7 +151,7 @@ def merge(runs: Sequence[Path], out: Path, place: Places = on_one_time_line) -> 
     from rack.tools.viewer.merged import write_merged
 
     try:
-        write_merged(placed, out, reading_progress(False, "merging the recordings"))
+        write_merged(placed, out, create_reading_progress(False, "merging the recordings"))
     except RuntimeError as error:
         raise Failure(f"{out}: {' '.join(str(error).split())}") from None
     return notes

@@ -57,10 +57,10 @@ def report(
             raise Failure("--of and --repeat need --against", 2)
         show_report(run, as_json)
         return
-    from rack.tools.recording.divergence import other_run
+    from rack.tools.recording.divergence import find_other_run
     from rack.tools.report.report import OtherRun, write_report
 
-    other = other_run(run, against)
+    other = find_other_run(run, against)
     data, text = write_report(run, OtherRun(other, of, repeat))
     print_report(data, text, as_json)
     if not data["against"]["explained"]:

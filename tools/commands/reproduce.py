@@ -11,14 +11,16 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, option
 from rack.tools.launch.folder import RUNS
 
-PAGE = RUNS / "paper"
+DEFAULT_FOLDER = RUNS / "paper"
 """Default folder of the page. It is always the same, so that the command continues."""
-NO_LAB = "the page needs jinja2: pip install 'nasrem-rack[lab]'"
-STAYS = "{}: finished experiments are kept; the same command continues from there"
+MISSING_JINJA2 = "the page needs jinja2: pip install 'nasrem-rack[lab]'"
+CONTINUE_HINT = "{}: finished experiments are kept; the same command continues from there"
 
 
 def reproduce(
-    out: Path = option("--out DIR", "folder of the page; an existing one is continued", PAGE),
+    out: Path = option(
+        "--out DIR", "folder of the page; an existing one is continued", DEFAULT_FOLDER
+    ),
     only: list[str] = option(
         "--only SECTION", 'only this section, as in 3.4 or "abstract"; repeatable', []
     ),
@@ -61,8 +63,8 @@ def reproduce(
       rack reproduce --json | jq .rulings
     """
     if not find_spec("jinja2"):
-        raise Failure(NO_LAB, 2)
-    from rack.tools.console.progress import progress_for
+        raise Failure(MISSING_JINJA2, 2)
+    from rack.tools.console.progress import open_progress
     from rack.tools.lab.reproduction import reproduction
     from rack.tools.lab.reproduction.experiments.experiment import Workshop
 
@@ -70,11 +72,11 @@ def reproduce(
     if out.exists() and not out.is_dir():
         raise Failure(f"--out {out}: exists, and is not a folder", 2)
     with (
-        INTERRUPT.orderly(INTERRUPT.end, unfinished=STAYS.format(out)),
-        progress_for(as_json) as progress,
+        INTERRUPT.stop_orderly(INTERRUPT.end_process, unfinished=CONTINUE_HINT.format(out)),
+        open_progress(as_json) as progress,
     ):
-        page = reproduction.reproduce(wanted, Workshop(out, share), progress, again)
-    is_good = reproduction.has_worked(page, wanted)
-    document = {"folder": str(out), "worked": is_good, **page.document()}
-    print_answer(document, reproduction.summarize(page, out), as_json)
+        page = reproduction.reproduce_paper(wanted, Workshop(out, share), progress, again)
+    is_good = reproduction.has_succeeded(page, wanted)
+    document = {"folder": str(out), "worked": is_good, **page.to_document()}
+    print_answer(document, reproduction.summarize_page(page, out), as_json)
     sys.exit(0 if is_good else 1)

@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from rack.backplane.json_text import encode_json
-from rack.boards.errors import one_line
+from rack.boards.errors import to_one_line
 from rack.levels.tables import LAST_TICK
-from rack.tools.console.answer import MAX_LINE, Failure, as_failure
+from rack.tools.console.answer import MAX_LINE, Failure, convert_errors
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Anyway, Json, RunFolder
-from rack.tools.monitor.display import display_for
-from rack.tools.scripting.rewound import Glance, RewoundRun
+from rack.tools.monitor.display import open_display
+from rack.tools.scripting.rewound import RewindAnswer, RewoundRun
 
 USAGE = {
     "goto": 'goto TIME, as in 12.5; or goto --when "servo.status.position[2] > 1.2"',
@@ -32,7 +32,7 @@ USAGE = {
     "help": "help [COMMAND]",
     "quit": "quit",
 }
-MOST_S = 1e9
+MAX_SECONDS = 1e9
 
 
 def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> None:
@@ -62,7 +62,7 @@ def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> Non
       rack rewind runs/whole
       printf 'goto 12.5\\nshow servo.status\\n' | rack rewind runs/whole --json
     """
-    with INTERRUPT.raising(), RewoundRun(run, anyway) as rewound:
+    with INTERRUPT.raise_interrupted(), RewoundRun(run, anyway) as rewound:
         prompt = RewindPrompt(rewound, as_json)
         if sys.stdin.isatty() and not as_json:
             with suppress(ImportError):
@@ -72,11 +72,11 @@ def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> Non
         for line in sys.stdin:
             if prompt.onecmd(line):
                 break
-    if prompt.failed:
+    if prompt.failed_count:
         sys.exit(2)
 
 
-class _Arguments(argparse.ArgumentParser):
+class _ArgumentParser(argparse.ArgumentParser):
     """Parser for the arguments of a command at the prompt. A mistake raises `Failure`."""
 
     def error(self, message: str) -> NoReturn:
@@ -95,32 +95,32 @@ class RewindPrompt(cmd.Cmd):
         super().__init__()
         self._run = run
         self._as_json = as_json
-        self.failed = 0
+        self.failed_count = 0
 
     @property
     def prompt(self) -> str:  # type: ignore[override]
         """Text of the prompt: the current simulated time."""
-        return f"{self._run.time_s(self._run.tick):g} s> "
+        return f"{self._run.to_time_s(self._run.tick):g} s> "
 
     def onecmd(self, line: str) -> bool:
         """Execute one command. Returns True if it was the last."""
         try:
-            with as_failure():
+            with convert_errors():
                 # A signal that ended a branch also ends the prompt.
                 return bool(super().onecmd(line)) or INTERRUPT.number != 0
         except Failure as failure:
-            self._fail(str(failure))
+            self._report_failure(str(failure))
         except OSError as error:
-            self._fail(f"{error.filename}: {error.strerror}")
+            self._report_failure(f"{error.filename}: {error.strerror}")
         return False
 
-    def _fail(self, why: str) -> None:
+    def _report_failure(self, why: str) -> None:
         """Count and print a failure."""
-        self.failed += 1
-        text = one_line(why, MAX_LINE)
+        self.failed_count += 1
+        text = to_one_line(why, MAX_LINE)
         print(encode_json({"error": text}) if self._as_json else text, flush=True)
 
-    def _answer(self, answer: Glance) -> None:
+    def _print_answer(self, answer: RewindAnswer) -> None:
         """Print an answer, as JSON or as lines."""
         if self._as_json:
             print(encode_json(answer.document), flush=True)
@@ -147,28 +147,28 @@ class RewindPrompt(cmd.Cmd):
         Comparisons: == != <= >= < >; a state may be named, as in "primitive.status.state ==
         holding".
         """
-        arguments = _given("goto", line)
+        arguments = _parse_arguments("goto", line)
         if (arguments.time is None) == (arguments.when is None):
             raise Failure(f"goto: usage: {USAGE['goto']}", 2)
         if arguments.when is not None:
-            self._answer(self._run.goto_when(" ".join(arguments.when)))
+            self._print_answer(self._run.go_to_condition(" ".join(arguments.when)))
         else:
-            self._answer(self._run.goto(arguments.time))
+            self._print_answer(self._run.go_to_time(arguments.time))
 
     def do_step(self, line: str) -> None:
         """Go forward by one tick, or by TICKS."""
-        self._answer(self._run.step(_given("step", line).ticks))
+        self._print_answer(self._run.step(_parse_arguments("step", line).ticks))
 
     def do_back(self, line: str) -> None:
         """Go back by one tick or by TICKS, or to the tick at which a condition last began to hold.
 
         Conditions are written as for goto.
         """
-        arguments = _given("back", line)
+        arguments = _parse_arguments("back", line)
         if arguments.when is not None:
-            self._answer(self._run.goto_when(" ".join(arguments.when), back=True))
+            self._print_answer(self._run.go_to_condition(" ".join(arguments.when), back=True))
         else:
-            self._answer(self._run.step(-arguments.ticks))
+            self._print_answer(self._run.step(-arguments.ticks))
 
     def do_show(self, line: str) -> None:
         """Show a message, one of its signals, or the object of a level at this tick.
@@ -179,7 +179,7 @@ class RewindPrompt(cmd.Cmd):
         attributes of the
         level's object.
         """
-        self._answer(self._run.show(_given("show", line).name))
+        self._print_answer(self._run.show_name(_parse_arguments("show", line).name))
 
     def complete_show(self, text: str, line: str, begin: int, end: int) -> Sequence[str]:
         """List the names that complete a text."""
@@ -187,7 +187,7 @@ class RewindPrompt(cmd.Cmd):
 
     def do_events(self, line: str) -> None:
         """Show the events within SECONDS before and after this tick, by default 1 s."""
-        self._answer(self._run.events(_given("events", line).seconds))
+        self._print_answer(self._run.list_events(_parse_arguments("events", line).seconds))
 
     def do_branch(self, line: str) -> None:
         """Run the rack from this tick with other settings or faults, and record that as a new run.
@@ -196,12 +196,12 @@ class RewindPrompt(cmd.Cmd):
         run. By
         default the branch ends with its task, or after as long a time as the run.
         """
-        arguments = _given("branch", line)
-        with display_for(silent=self._as_json) as display:
-            answer = self._run.branch(
+        arguments = _parse_arguments("branch", line)
+        with open_display(silent=self._as_json) as display:
+            answer = self._run.run_branch(
                 arguments.set, arguments.faults, arguments.out, arguments.seconds, display
             )
-        self._answer(answer)
+        self._print_answer(answer)
 
     def do_help(self, arg: str) -> None:
         """List the commands, or explain one."""
@@ -210,7 +210,7 @@ class RewindPrompt(cmd.Cmd):
         lines = list(USAGE.values())
         if arg:
             lines = [USAGE[arg], cleandoc(getattr(self, f"do_{arg}").__doc__)]
-        self._answer(Glance({"help": "\n".join(lines)}, lines))
+        self._print_answer(RewindAnswer({"help": "\n".join(lines)}, lines))
 
     def do_quit(self, line: str) -> bool:
         """Leave the prompt. The end of the input does the same."""
@@ -222,15 +222,15 @@ class RewindPrompt(cmd.Cmd):
         return True
 
 
-def _seconds(text: str) -> float:
+def _parse_seconds(text: str) -> float:
     """Parse a time, s. Raises `ArgumentTypeError`."""
     with suppress(ValueError):
-        if 0.0 <= (seconds := float(text)) <= MOST_S:
+        if 0.0 <= (seconds := float(text)) <= MAX_SECONDS:
             return seconds
-    raise argparse.ArgumentTypeError(f"{text}: must be 0 to {MOST_S:g} s")
+    raise argparse.ArgumentTypeError(f"{text}: must be 0 to {MAX_SECONDS:g} s")
 
 
-def _ticks(text: str) -> int:
+def _parse_ticks(text: str) -> int:
     """Parse a number of ticks. Raises `ArgumentTypeError`."""
     with suppress(ValueError):
         if abs(ticks := int(text)) <= LAST_TICK:
@@ -239,26 +239,26 @@ def _ticks(text: str) -> int:
 
 
 _WHEN = {"nargs": "+"}
-_TICKS = {"nargs": "?", "type": _ticks, "default": 1}
+_TICKS = {"nargs": "?", "type": _parse_ticks, "default": 1}
 ARGUMENTS: Mapping[str, Mapping[str, Mapping[str, Any]]] = {
     "goto": {"time": {"nargs": "?"}, "--when": _WHEN},
     "step": {"ticks": _TICKS},
     "back": {"ticks": _TICKS, "--when": _WHEN},
     "show": {"name": {}},
-    "events": {"seconds": {"nargs": "?", "type": _seconds, "default": 1.0}},
+    "events": {"seconds": {"nargs": "?", "type": _parse_seconds, "default": 1.0}},
     "branch": {
         "--set": {"action": "append", "default": []},
         "--faults": {},
-        "--seconds": {"type": _seconds},
+        "--seconds": {"type": _parse_seconds},
         "--out": {"type": Path},
     },
 }
 """Arguments of each command, in the form that `argparse` takes."""
 
 
-def _given(command: str, line: str) -> argparse.Namespace:
+def _parse_arguments(command: str, line: str) -> argparse.Namespace:
     """Parse the arguments of a command. Raises `Failure`."""
-    parser = _Arguments(command, add_help=False, allow_abbrev=False)
+    parser = _ArgumentParser(command, add_help=False, allow_abbrev=False)
     for name, settings in ARGUMENTS[command].items():
         parser.add_argument(name, **settings)
     try:

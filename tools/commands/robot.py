@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from rack.boards.config import load, names
+from rack.boards.config import list_names, load
 from rack.levels.errors import RobotError
 from rack.tools.console.answer import Document, Failure, print_answer
 from rack.tools.console.parameters import Json, argument, option
-from rack.tools.console.tables import fitted_records
+from rack.tools.console.tables import format_fitted_records
 from rack.tools.robot.rack_name import derive_name, is_free_name
 
 if TYPE_CHECKING:
-    from rack.tools.robot.draft import Wishes
-    from rack.tools.robot.findings import Examined
+    from rack.tools.robot.draft import ArmOptions
+    from rack.tools.robot.findings import ArmExamination
     from rack.tools.robot.source import Source
 
 app = typer.Typer(
@@ -64,12 +64,12 @@ def new(
       rack robot new cell.xml --tip left_hand --name left --home ready
       rack robot new arm.xml --joints j1,j2,j3,j4,j5,j6 --gripper none --json
     """
-    from rack.tools.robot.draft import Wishes
+    from rack.tools.robot.draft import ArmOptions
 
     asks = sys.stdin.isatty() and sys.stdout.isatty() and not as_json
-    taken = names()
+    taken = list_names()
     derived = derive_name(model.stem, taken)
-    name = name or (_asked("name", derived) if asks else derived)
+    name = name or (_ask("name", derived) if asks else derived)
     if not is_free_name(name, taken):
         why = "must be at most 40 of a-z, 0-9, '-' and '_', and not the name of a bundled config"
         raise Failure(f"--name = {name}: {why}; for example {derive_name(name, taken)}", 2)
@@ -77,11 +77,13 @@ def new(
     if folder.exists():
         raise Failure(f"--out: '{folder}' exists already; name a new folder", 2)
     chain = tuple(filter(None, joints.split(",")))
-    wanted = Wishes(tip, chain, tool, gripper, home, _numbers(torque))
-    with drafting(model) as draft:
-        document = _made(model, wanted, draft / name, name, asks)
+    wanted = ArmOptions(tip, chain, tool, gripper, home, _parse_torques(torque))
+    with draft_folder(model) as draft:
+        document = _write_draft(model, wanted, draft / name, name, asks)
         shutil.copytree(draft / name, folder)
-    print_answer(document | {"folder": str(folder)}, _lines(document, folder, name), as_json)
+    print_answer(
+        document | {"folder": str(folder)}, _format_answer(document, folder, name), as_json
+    )
 
 
 @app.command("check")
@@ -104,11 +106,11 @@ def check(
       rack robot check nasrem
       rack robot check arm.urdf --out arm.png
     """
-    with drafting(Path(model)) as folder:
-        examined, name = _examined(model, folder)
-        from rack.tools.robot.picture import draw
+    with draft_folder(Path(model)) as folder:
+        examined, name = _examine_robot(model, folder)
+        from rack.tools.robot.picture import draw_arm
 
-        picture = draw(examined.cell, out or Path(f"{name}.png"))
+        picture = draw_arm(examined.cell, out or Path(f"{name}.png"))
     able = examined.able
     document = {
         "robot": name,
@@ -118,29 +120,29 @@ def check(
         "findings": [asdict(finding) for finding in examined.findings],
         "picture": picture,
     }
-    print_answer(document, _report(document), as_json)
+    print_answer(document, _format_examination(document), as_json)
     if any(finding.fails for finding in examined.findings):
         sys.exit(1)
 
 
-def _examined(model: str, folder: Path) -> tuple[Examined, str]:
+def _examine_robot(model: str, folder: Path) -> tuple[ArmExamination, str]:
     """Examine the arm of a config or a model. Returns also its name. Raises `RobotError`."""
-    from rack.tools.robot.draft import CLOCK_NS, NOTHING, Wishes, draft
-    from rack.tools.robot.findings import examine
+    from rack.tools.robot.draft import CLOCK_NS, EMPTY_SCENE, ArmOptions, draft_arm
+    from rack.tools.robot.findings import examine_arm
     from rack.tools.robot.source import read_source
 
     if Path(model).suffix not in ("", ".toml"):
-        drafted = draft(read_source(Path(model)), Wishes(), folder, "arm")
-        return examine(drafted.robot, NOTHING, CLOCK_NS), derive_name(Path(model).stem, ())
+        drafted = draft_arm(read_source(Path(model)), ArmOptions(), folder, "arm")
+        return examine_arm(drafted.robot, EMPTY_SCENE, CLOCK_NS), derive_name(Path(model).stem, ())
     config = load(model)
     if config.robot is None:
         raise RobotError(f"config '{model}' has no [robot]")
-    return examine(config.robot, config.scene, config.clock_ns), config.name
+    return examine_arm(config.robot, config.scene, config.clock_ns), config.name
 
 
-def _report(document: Document) -> Iterator[str]:
+def _format_examination(document: Document) -> Iterator[str]:
     """Yield the lines of the answer for people."""
-    yield from fitted_records(document["joints"])
+    yield from format_fitted_records(document["joints"])
     yield f"reach {document['reach_m']} m, payload {document['payload_kg']} kg at any pose in reach"
     for finding in document["findings"]:
         verdict = "FAILS" if finding["fails"] else "ok"
@@ -148,34 +150,36 @@ def _report(document: Document) -> Iterator[str]:
     yield f"picture: {document['picture']}"
 
 
-def _asked(text: str, default: str = "") -> str:
+def _ask(text: str, default: str = "") -> str:
     """Ask the user for a value. An empty answer means the default, or what the draft will find."""
     question = text if default else f"{text} [found]"
     return str(typer.prompt(question, default, show_default=bool(default))).strip()
 
 
-def _completed(source: Source, wanted: Wishes) -> Wishes:
+def _ask_for_options(source: Source, wanted: ArmOptions) -> ArmOptions:
     """Ask on the terminal for each value that no option gives. Raises `RobotError`."""
-    from rack.levels.robot.model import listed
+    from rack.levels.robot.model import format_names
     from rack.tools.robot.arm import find_arm
 
-    arm = find_arm(source.compiled(), wanted.tip, wanted.joints)
+    arm = find_arm(source.compile_model(), wanted.tip, wanted.joints)
     if arm.others and not (wanted.tip or wanted.joints):
-        others = listed(list(arm.others))
-        tip = _asked(f"body at the end of the arm; others begin at {others}", arm.tip)
+        others = format_names(list(arm.others))
+        tip = _ask(f"body at the end of the arm; others begin at {others}", arm.tip)
         if tip != arm.tip:
             wanted = replace(wanted, tip=tip)
-            arm = find_arm(source.compiled(), tip, ())
-    tool = wanted.tool or _asked(f"tool: a site or body beyond {arm.tip}, z outward")
+            arm = find_arm(source.compile_model(), tip, ())
+    tool = wanted.tool or _ask(f"tool: a site or body beyond {arm.tip}, z outward")
     gripper = wanted.gripper
     if arm.fingers and not gripper:
-        gripper = _asked(f"gripper: none, or the joint that drives it: {listed(list(arm.fingers))}")
-    home = wanted.home or _asked("home: a keyframe, or positions q1,q2,...")
+        gripper = _ask(
+            f"gripper: none, or the joint that drives it: {format_names(list(arm.fingers))}"
+        )
+    home = wanted.home or _ask("home: a keyframe, or positions q1,q2,...")
     return replace(wanted, tool=tool, gripper=gripper, home=home)
 
 
 @contextmanager
-def drafting(model: Path) -> Iterator[Path]:
+def draft_folder(model: Path) -> Iterator[Path]:
     """Provide a temporary folder for a draft.
 
     Raises:
@@ -186,15 +190,15 @@ def drafting(model: Path) -> Iterator[Path]:
         try:
             yield Path(folder)
         except RobotError as error:
-            raise Failure(_without(Path(folder), str(error), model), 2) from None
+            raise Failure(_hide_folder(Path(folder), str(error), model), 2) from None
 
 
-def _without(folder: Path, text: str, model: Path) -> str:
+def _hide_folder(folder: Path, text: str, model: Path) -> str:
     """Replace paths of the temporary folder in a text by the path of the model."""
     return re.sub(f"{re.escape(str(folder))}[^']*", lambda _: str(model), text)
 
 
-def _numbers(text: str) -> tuple[float, ...]:
+def _parse_torques(text: str) -> tuple[float, ...]:
     """Parse torque limits. Raises `Failure`."""
     try:
         return tuple(float(number) for number in text.split(",") if text)
@@ -202,31 +206,31 @@ def _numbers(text: str) -> tuple[float, ...]:
         raise Failure(f"--torque = {text}: must be numbers, as in 80,80,12", 2) from None
 
 
-def _made(model: Path, wanted: Wishes, folder: Path, name: str, asks: bool) -> Document:
+def _write_draft(model: Path, wanted: ArmOptions, folder: Path, name: str, asks: bool) -> Document:
     """Write the folder of an arm, and return the answer to `--json`. Raises `RobotError`."""
-    from rack.tools.robot.assignment import lay_out
-    from rack.tools.robot.draft import draft
-    from rack.tools.robot.folder import config_text, document
-    from rack.tools.robot.picture import NO_PICTURE, draw
+    from rack.tools.robot.assignment import find_assignment
+    from rack.tools.robot.draft import draft_arm
+    from rack.tools.robot.folder import build_document, format_config
+    from rack.tools.robot.picture import NO_PICTURE, draw_arm
     from rack.tools.robot.source import read_source
 
     folder.mkdir()
     source = read_source(model)
     if asks:
-        wanted = _completed(source, wanted)
-    drafted = draft(source, wanted, folder, name)
-    layout = lay_out(drafted)
+        wanted = _ask_for_options(source, wanted)
+    drafted = draft_arm(source, wanted, folder, name)
+    layout = find_assignment(drafted)
     (folder / f"{name}.toml").write_text(
-        config_text(drafted, layout, name, model), encoding="utf-8"
+        format_config(drafted, layout, name, model), encoding="utf-8"
     )
-    picture = draw(drafted.cell(layout.scene), folder / f"{name}.png")
+    picture = draw_arm(drafted.cell(layout.scene), folder / f"{name}.png")
     if picture == NO_PICTURE:
         drafted.notes.append(picture)
-    drafted.notes = [_without(folder, note, model) for note in drafted.notes]
-    return document(drafted, layout, folder, name)
+    drafted.notes = [_hide_folder(folder, note, model) for note in drafted.notes]
+    return build_document(drafted, layout, folder, name)
 
 
-def _lines(document: Document, folder: Path, name: str) -> Iterator[str]:
+def _format_answer(document: Document, folder: Path, name: str) -> Iterator[str]:
     joints = document["joints"]
     yield f"{folder}: {len(joints)} joints, {', '.join(joints)}; {document['task']}"
     yield from document["notes"]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from rack.boards.config.files import assembled, named_classes
+from rack.boards.config.files import assemble, list_level_classes
 from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.requests import Preload
 from rack.tools.console.answer import Document, Failure
@@ -22,7 +22,7 @@ from rack.tools.console.parameters import (
     Settings,
     View,
     argument,
-    config_names,
+    complete_config_name,
     option,
 )
 
@@ -36,7 +36,10 @@ if TYPE_CHECKING:
 def run(
     context: typer.Context,
     config: str | None = argument(
-        "CONFIG", "config by name, or path to a .toml file", None, autocompletion=config_names
+        "CONFIG",
+        "config by name, or path to a .toml file",
+        None,
+        autocompletion=complete_config_name,
     ),
     lockstep: bool = option(
         "--lockstep",
@@ -116,37 +119,37 @@ def run(
     if origin is not None and entries is not None:
         raise Failure("--entries and --from: --from replays the entries anyway; leave one out", 2)
     if origin is not None:
-        from rack.tools.launch.continued import beginning, run_of
+        from rack.tools.launch.continued import find_run_config, open_beginning
 
-        config = str(run_of(origin))
+        config = str(find_run_config(origin))
     assert config is not None
-    tables_read = assembled(config, overrides, faults)
-    crate = _informed(context.obj, tables_read.tables)
-    from rack.boards.config.loader import validated
-    from rack.tools.launch.folder import folder_of
-    from rack.tools.launch.launch import NO_TIME, Beginning, run_rack
-    from rack.tools.launch.verdict import headline
-    from rack.tools.monitor.display import display_for
+    tables_read = assemble(config, overrides, faults)
+    crate = _preload_levels(context.obj, tables_read.tables)
+    from rack.boards.config.loader import validate
+    from rack.tools.launch.folder import choose_run_folder
+    from rack.tools.launch.launch import UNFINISHED_HINT, Beginning, run_rack
+    from rack.tools.launch.verdict import format_headline
+    from rack.tools.monitor.display import open_display
 
     if entries is not None:
-        from rack.tools.recording.entries import recorded_entries
+        from rack.tools.recording.entries import load_entries
 
-    rack_config = validated(tables_read)
+    rack_config = validate(tables_read)
     if step and rack_config.clock.mode != "lockstep":
         raise Failure("--step: real time cannot be held between two ticks; add --lockstep", 2)
-    folder = None if no_record else folder_of(out, rack_config.name)
+    folder = None if no_record else choose_run_folder(out, rack_config.name)
     begins = Beginning(crate=crate)
     with ExitStack() as stack:
         if origin is not None:
             warm = crate if isinstance(crate, WarmCrate) else None
-            begins = stack.enter_context(beginning(rack_config, origin, warm, anyway))
+            begins = stack.enter_context(open_beginning(rack_config, origin, warm, anyway))
         # Applies from the start of the run to the end of its report. During the launch, `run_rack`
         # lets a signal end the command at once.
-        unfinished = NO_TIME.format(folder) if folder else ""
-        stack.enter_context(INTERRUPT.orderly(unfinished=unfinished))
-        with display_for(silent=as_json) as display:
+        unfinished = UNFINISHED_HINT.format(folder) if folder else ""
+        stack.enter_context(INTERRUPT.stop_orderly(unfinished=unfinished))
+        with open_display(silent=as_json) as display:
             if entries is not None:
-                begins = Beginning(crate=crate, entries=recorded_entries(rack_config, entries))
+                begins = Beginning(crate=crate, entries=load_entries(rack_config, entries))
             result = run_rack(
                 rack_config,
                 seconds,
@@ -155,44 +158,49 @@ def run(
                 view=view,
                 share=share,
                 step=step,
-                begins=begins,
+                beginning=begins,
             )
-        report = _report(rack_config, folder, result, as_json)
+        report = _report_run(rack_config, folder, result, as_json)
     if not report["worked"]:
         # Print the verdict last and on stderr, where the user sees it in any case.
-        print(headline(rack_config.name, report["outcome"], report["failures"]), file=sys.stderr)
+        print(
+            format_headline(rack_config.name, report["outcome"], report["failures"]),
+            file=sys.stderr,
+        )
     sys.exit(0 if report["worked"] else 1)
 
 
-def _informed(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
+def _preload_levels(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
     """Let the crate load the levels of a config while this process imports the config checks."""
     if crate is not None:
         python_path = tables.get("python_path")
-        crate.send(
+        crate.send_request(
             Preload(
-                named_classes(tables),
+                list_level_classes(tables),
                 (*sys.path, *map(str, python_path if isinstance(python_path, list) else [])),
             )
         )
     return crate
 
 
-def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json: bool) -> Document:
+def _report_run(
+    config: RackConfig, folder: Path | None, result: RunResult, as_json: bool
+) -> Document:
     """Write the report, print it and return it. A run whose report cannot be written has failed."""
-    from rack.tools.recording.folder_size import recorded_line
-    from rack.tools.report.report import unrecorded, write_report
-    from rack.tools.report.report_markdown import summary
+    from rack.tools.recording.folder_size import format_recorded_line
+    from rack.tools.report.report import build_unrecorded_report, write_report
+    from rack.tools.report.report_markdown import format_summary
     from rack.tools.report.stored import print_report
 
-    data = unrecorded(config, asdict(result))
-    text = "\n".join(summary(data))
+    data = build_unrecorded_report(config, asdict(result))
+    text = "\n".join(format_summary(data))
     try:
         if folder is not None:
             data, text = write_report(folder)
     except (Failure, OSError, MemoryError) as error:
         why = f"{folder}: no report: {error or 'out of memory'}"
         data |= {"worked": False, "failures": [*data["failures"], why]}
-        text = "\n".join(summary(data))
+        text = "\n".join(format_summary(data))
     if result.others:
         data["others"] = [asdict(other) for other in result.others]
     print_report(data, text, as_json)
@@ -200,7 +208,7 @@ def _report(config: RackConfig, folder: Path | None, result: RunResult, as_json:
         return data
     if folder is not None:
         lasted_s = result.outcome.ticks * config.clock_ns * 1e-9
-        print(recorded_line(folder, lasted_s))
+        print(format_recorded_line(folder, lasted_s))
     for other in result.others:
         ended = f"{other.rack}: {other.cause} after {other.ticks} ticks"
         print(f"{ended}, digest {other.digest}, {other.folder or 'not recorded'}")

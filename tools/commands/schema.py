@@ -7,8 +7,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from rack.tools.console.answer import Failure, print_answer
-from rack.tools.console.parameters import Json, argument, config_names, option
-from rack.tools.console.tables import fitted
+from rack.tools.console.parameters import Json, argument, complete_config_name, option
+from rack.tools.console.tables import format_fitted_table
 
 if TYPE_CHECKING:
     from rack.boards.config.reference import KeyTable
@@ -25,7 +25,7 @@ def schema(
         "--config CONFIG",
         "config whose levels declare [task] and params",
         "nasrem",
-        autocompletion=config_names,
+        autocompletion=complete_config_name,
     ),
     as_json: Json = False,
 ) -> None:
@@ -42,21 +42,21 @@ def schema(
       rack schema task --config mine.toml
     """
     from rack.boards.config import load
-    from rack.boards.config.reference import find_tables, key_tables
+    from rack.boards.config.reference import find_tables, list_key_tables
 
     rack = load(config)
     try:
-        tables = key_tables(rack) if name is None else find_tables(name, rack)
+        tables = list_key_tables(rack) if name is None else find_tables(name, rack)
     except LookupError as error:
         raise Failure(f'TABLE = "{name}": {error.args[0]}', 2) from None
-    lines = _keys(tables)
+    lines = _format_keys(tables)
     if name is None:
         rows = [[entry.name, entry.heading, entry.meaning] for entry in tables]
-        lines = fitted(["table", "in TOML", "meaning"], rows, ("in TOML",))
+        lines = format_fitted_table(["table", "in TOML", "meaning"], rows, ("in TOML",))
     print_answer([asdict(entry) for entry in tables], lines, as_json)
 
 
-def _keys(tables: list[KeyTable]) -> Iterator[str]:
+def _format_keys(tables: list[KeyTable]) -> Iterator[str]:
     """Yield the lines of each table with its keys."""
     head = ["key", "unit", "type", "permitted", "default", "meaning"]
     for at, table in enumerate(tables):
@@ -64,4 +64,4 @@ def _keys(tables: list[KeyTable]) -> Iterator[str]:
         if at:
             yield ""
         yield f"{table.heading}: {table.meaning}"
-        yield from fitted(head, rows, DROPPED)
+        yield from format_fitted_table(head, rows, DROPPED)

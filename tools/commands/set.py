@@ -8,7 +8,7 @@ from rack.backplane.segment import Segment
 from rack.tools.commands.command import At, Tick, print_reply
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, argument
-from rack.tools.monitor.desk import LiveDesk
+from rack.tools.monitor.desk import LevelCommander
 
 
 def set_param(
@@ -33,6 +33,6 @@ def set_param(
       rack set nasrem board.servo.params.bandwidth=80
       rack set nasrem board.servo.params.damping=0.8 --at 12.5
     """
-    with INTERRUPT.raising(), closing(Segment.attach(rack)) as segment:
-        reply = LiveDesk(segment).set_param(setting, tick, at)
+    with INTERRUPT.raise_interrupted(), closing(Segment.attach(rack)) as segment:
+        reply = LevelCommander(segment).set_param(setting, tick, at)
     print_reply(reply, as_json)

@@ -9,23 +9,23 @@ from typing import Annotated
 
 import typer
 
-from rack.backplane.segment import Segment, racks
+from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.parameters import Json, named_here, rack_names
-from rack.tools.console.tables import console
+from rack.tools.console.parameters import Json, check_local_rack_name, complete_rack_name
+from rack.tools.console.tables import create_console
 from rack.tools.monitor.display import RackView
 from rack.tools.monitor.snapshot import RackMonitor
 from rack.tools.recording.file_names import SPOOL
-from rack.tools.recording.folder_size import recorded_line, size_of
+from rack.tools.recording.folder_size import format_recorded_line, measure_size
 
 OnlyRack = Annotated[
     str | None,
     typer.Argument(
         metavar="RACK",
         help="running rack by name; not needed when only one is running",
-        autocompletion=rack_names,
-        callback=named_here,
+        autocompletion=complete_rack_name,
+        callback=check_local_rack_name,
     ),
 ]
 
@@ -43,24 +43,24 @@ def status(rack: OnlyRack = None, as_json: Json = False) -> None:
       rack status
       rack status nasrem --json
     """
-    with closing(Segment.attach(rack or only_rack())) as segment:
-        snapshot = RackMonitor(segment).look()
-        run = recorded_by(segment)
+    with closing(Segment.attach(rack or find_only_rack())) as segment:
+        snapshot = RackMonitor(segment).take_snapshot()
+        run = find_run_folder(segment)
     if as_json:
-        recording = None if run is None else {"folder": str(run), "bytes": size_of(run)}
+        recording = None if run is None else {"folder": str(run), "bytes": measure_size(run)}
         print_json({**asdict(snapshot), "recording": recording})
         return
-    console().print(RackView(snapshot))
+    create_console().print(RackView(snapshot))
     if run is not None:
-        print(recorded_line(run, snapshot.time_s))
+        print(format_recorded_line(run, snapshot.time_s))
 
 
-def only_rack() -> str:
+def find_only_rack() -> str:
     """Return the name of the only rack on this machine.
 
     Raises `Failure` if there is not exactly one.
     """
-    running = racks()
+    running = list_racks()
     if not running:
         raise Failure("no rack is running")
     if len(running) > 1:
@@ -68,7 +68,7 @@ def only_rack() -> str:
     return running[0]
 
 
-def recorded_by(segment: Segment) -> Path | None:
+def find_run_folder(segment: Segment) -> Path | None:
     """Find the folder into which a rack is recorded.
 
     Returns None if it is not recorded, or if this cannot be seen from this PID namespace.

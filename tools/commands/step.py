@@ -51,13 +51,13 @@ def step(
         raise Failure("--run lets the rack run without holding; leave out the steps", 2)
     stepper = Stepper(Segment.attach(rack))
     if run:
-        stepper.let_go()
+        stepper.release()
         print_answer({"rack": rack, "held": False}, f"rack '{rack}' runs without holding", as_json)
         return
-    held_tick = stepper.hold()
+    held_tick = stepper.hold_rack()
     end_tick = (
-        stepper.after_cycles(held_tick, cycles or 1, until) if ticks is None else held_tick + ticks
+        stepper.find_end_tick(held_tick, cycles or 1, until) if ticks is None else held_tick + ticks
     )
-    stepper.go(end_tick)
-    held_rack = stepper.look()
-    print_answer(asdict(held_rack), held_rack.lines(), as_json)
+    stepper.run_to(end_tick)
+    held_rack = stepper.describe_rack()
+    print_answer(asdict(held_rack), held_rack.format_lines(), as_json)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from contextlib import ExitStack, closing, suppress
 
-from rack.backplane.process import readable
+from rack.backplane.process import wait_readable
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_answer
@@ -57,4 +57,4 @@ def stop_rack(rack: str, timeout_s: float) -> bool:
         # launcher that has closed the rack is still alive while it writes the report.
         is_own = launcher >= 0 and segment.launcher_is_alive
         segment.words[System.STOP_REQUEST] = 1
-        return readable(launcher, timeout_s) if is_own else segment.await_launcher(timeout_s)
+        return wait_readable(launcher, timeout_s) if is_own else segment.await_launcher(timeout_s)

@@ -7,10 +7,10 @@ import threading
 from contextlib import closing
 from importlib.util import find_spec
 
-from rack.tools.commands.status import OnlyRack, only_rack
+from rack.tools.commands.status import OnlyRack, find_only_rack
 from rack.tools.console.interrupt import INTERRUPT
 
-LOOK_S = 0.2
+SNAPSHOT_INTERVAL_S = 0.2
 """Time between two snapshots, s."""
 
 
@@ -39,13 +39,16 @@ def top(rack: OnlyRack = None) -> None:
       rack top nasrem
     """
     from rack.backplane.segment import Segment
-    from rack.tools.console.tables import console
-    from rack.tools.monitor.display import display_for
+    from rack.tools.console.tables import create_console
+    from rack.tools.monitor.display import open_display
     from rack.tools.monitor.snapshot import RackMonitor
 
     ended = threading.Event()
-    with INTERRUPT.orderly(ended.set), closing(Segment.attach(rack or only_rack())) as segment:
-        if console().is_terminal and sys.stdin.isatty():
+    with (
+        INTERRUPT.stop_orderly(ended.set),
+        closing(Segment.attach(rack or find_only_rack())) as segment,
+    ):
+        if create_console().is_terminal and sys.stdin.isatty():
             if find_spec("textual") is not None:
                 from rack.tools.monitor.full_screen import RackScreen
 
@@ -56,7 +59,7 @@ def top(rack: OnlyRack = None) -> None:
                 "no full screen without textual: pip install 'nasrem-rack[live]'", file=sys.stderr
             )
         monitor = RackMonitor(segment)
-        with display_for(silent=False) as display:
-            display.show(monitor.look())
-            while not segment.run_is_over and not ended.wait(LOOK_S):
-                display.show(monitor.look())
+        with open_display(silent=False) as display:
+            display.show(monitor.take_snapshot())
+            while not segment.run_is_over and not ended.wait(SNAPSHOT_INTERVAL_S):
+                display.show(monitor.take_snapshot())

@@ -10,23 +10,29 @@ from pathlib import Path
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.faults.config import as_seconds
+from rack.boards.faults.config import parse_seconds
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, argument, option
-from rack.tools.console.tables import console
-from rack.tools.monitor.polling import looks
-from rack.tools.monitor.signals import Lines, Plot, Rows, Strip, cell
+from rack.tools.console.tables import create_console
+from rack.tools.monitor.polling import poll_run
+from rack.tools.monitor.signals import (
+    EntityRows,
+    SignalHistory,
+    SignalPlot,
+    SignalPrinter,
+    format_value,
+)
 from rack.tools.recording.signal import Signal, Trigger
 
-LOOK_S = 0.02
+READ_INTERVAL_S = 0.02
 """Time between two readings of the rings.
 
 The rings hold 2 s, and a quarter of that in a fast lockstep run.
 """
-SHOWN_S = 10.0
+PLOT_SPAN_S = 10.0
 """Simulated time that a plot covers."""
-MOST_S = 600.0
+MAX_CAPTURE_S = 600.0
 """Longest time that can be captured before or after a trigger, because all of it is in memory."""
 
 
@@ -63,29 +69,29 @@ def watch(
       rack watch nasrem servo.status.torque --when "servo.status.position[2] > -2.5" --before 0.5s
     """
     before_s, after_s, every_s = (
-        _seconds("--before", before),
-        _seconds("--after", after),
-        _seconds("--every", every),
+        _parse_seconds("--before", before),
+        _parse_seconds("--after", after),
+        _parse_seconds("--every", every),
     )
     if out is not None and when is None:
         raise Failure("--out needs --when; give both, or neither", 2)
     segment = Segment.attach(rack)
     boxes = segment.layout.mailboxes
-    shown_signals = [Signal.of(name, boxes) for name in signals]
+    shown_signals = [Signal.parse(name, boxes) for name in signals]
     if when is None:
-        _show(segment, shown_signals, every_s, as_json)
+        _show_signals(segment, shown_signals, every_s, as_json)
         return
     _check_writable(out or Path(f"{rack}.csv"))
-    trigger = Trigger.of(when, boxes)
+    trigger = Trigger.parse(when, boxes)
     ticks_before, ticks_after = (
         round(s * 1e9 / segment.layout.clock_ns) for s in (before_s, after_s)
     )
-    strip = Strip(segment, shown_signals, ticks_before + ticks_after, [trigger.signal])
-    tick = _await_moment(segment, strip, trigger, ticks_after)
+    strip = SignalHistory(segment, shown_signals, ticks_before + ticks_after, [trigger.signal])
+    tick = _await_trigger(segment, strip, trigger, ticks_after)
     path = out or Path(f"{rack}-{tick}.csv")
-    rows = strip.table(tick - ticks_before, tick + ticks_after)
-    _save(path, strip, rows)
-    time_s = strip.time_s(tick)
+    rows = strip.list_rows(tick - ticks_before, tick + ticks_after)
+    _save_csv(path, strip, rows)
+    time_s = strip.to_time_s(tick)
     print_answer(
         {"file": str(path), "tick": tick, "time_s": time_s, "rows": len(rows)},
         f"{when}: held first at {time_s:g} s, tick {tick}; {len(rows)} rows around it: {path}",
@@ -93,13 +99,13 @@ def watch(
     )
 
 
-def _seconds(option: str, text: str) -> float:
+def _parse_seconds(option: str, text: str) -> float:
     """Parse the time of an option, s. Raises `Failure`."""
     seconds = -1.0
     with suppress(ValueError):
-        seconds = as_seconds(text)
-    if not 0.0 <= seconds <= MOST_S:
-        why = f"must be a time, as in 0.5s or 20ms, of at most {MOST_S:g}s"
+        seconds = parse_seconds(text)
+    if not 0.0 <= seconds <= MAX_CAPTURE_S:
+        why = f"must be a time, as in 0.5s or 20ms, of at most {MAX_CAPTURE_S:g}s"
         raise Failure(f"{option} {text}: {why}", 2)
     return seconds
 
@@ -113,28 +119,32 @@ def _check_writable(path: Path) -> None:
         path.unlink()
 
 
-def _show(segment: Segment, signals: Sequence[Signal], every_s: float, as_json: bool) -> None:
+def _show_signals(
+    segment: Segment, signals: Sequence[Signal], every_s: float, as_json: bool
+) -> None:
     """Show signals until the run is over."""
-    span = round(SHOWN_S * 1e9 / segment.layout.clock_ns)
-    strip = Strip(segment, signals, span)
+    span = round(PLOT_SPAN_S * 1e9 / segment.layout.clock_ns)
+    strip = SignalHistory(segment, signals, span)
     first = segment.words[System.TICK]
-    view: Lines | Plot = Lines(strip, first, round(every_s / strip.tick_s), as_json)
-    terminal = console()
+    view: SignalPrinter | SignalPlot = SignalPrinter(
+        strip, first, round(every_s / strip.tick_s), as_json
+    )
+    terminal = create_console()
     with ExitStack() as stack:
         if terminal.is_terminal and not as_json:
             try:
-                view = stack.enter_context(Plot(strip, span, terminal))
+                view = stack.enter_context(SignalPlot(strip, span, terminal))
             except ImportError:
                 print("no curves without plotext: pip install 'nasrem-rack[live]'", file=sys.stderr)
-        for is_over in looks(segment, LOOK_S):
-            strip.take()
-            settles = 0 if is_over else strip.settles
-            view.show(segment.words[System.TICK] - settles)
+        for is_over in poll_run(segment, READ_INTERVAL_S):
+            strip.read_new()
+            settles = 0 if is_over else strip.settling_ticks
+            view.show_until(segment.words[System.TICK] - settles)
     if strip.lost:
         raise Failure(f"{strip.lost} messages were overwritten before they could be shown")
 
 
-def _await_moment(segment: Segment, strip: Strip, trigger: Trigger, after: int) -> int:
+def _await_trigger(segment: Segment, strip: SignalHistory, trigger: Trigger, after: int) -> int:
     """Wait for the first tick at which a condition holds, and `after` more ticks.
 
     Args:
@@ -147,12 +157,12 @@ def _await_moment(segment: Segment, strip: Strip, trigger: Trigger, after: int) 
         Failure: The run ends first.
     """
     tick = -1
-    for _ in looks(segment, LOOK_S):
-        for written in strip.take():
+    for _ in poll_run(segment, READ_INTERVAL_S):
+        for written in strip.read_new():
             if tick < 0 and written.mailbox == trigger.signal.mailbox:
-                holding_ticks = written.ticks[trigger.holds(written.messages)]
+                holding_ticks = written.ticks[trigger.evaluate_messages(written.messages)]
                 tick = int(holding_ticks[0]) if len(holding_ticks) else -1
-        if tick >= 0 and segment.words[System.TICK] > tick + after + strip.settles:
+        if tick >= 0 and segment.words[System.TICK] > tick + after + strip.settling_ticks:
             break
     if tick < 0:
         why = "was interrupted" if INTERRUPT.number else "the run is over"
@@ -160,13 +170,15 @@ def _await_moment(segment: Segment, strip: Strip, trigger: Trigger, after: int) 
     return tick
 
 
-def _save(path: Path, strip: Strip, rows: Rows) -> None:
+def _save_csv(path: Path, strip: SignalHistory, rows: EntityRows) -> None:
     """Write the CSV file. Raises `Failure` when messages are missing."""
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(["time, s", "tick", *(signal.head for signal in strip.signals)])
-            writer.writerows([strip.time_s(tick), tick, *map(cell, row)] for tick, row in rows)
+            writer.writerow(["time, s", "tick", *(signal.heading for signal in strip.signals)])
+            writer.writerows(
+                [strip.to_time_s(tick), tick, *map(format_value, row)] for tick, row in rows
+            )
     except OSError as error:
         raise Failure(f"{path}: {error.strerror}: cut off") from None
     if strip.lost:

@@ -28,7 +28,7 @@ class Operator(NamedTuple):
     certificates: str = ""
 
     @classmethod
-    def of(cls, name: str, certificates: str) -> Operator:
+    def from_options(cls, name: str, certificates: str) -> Operator:
         """Check the options of a command and return the operator.
 
         Args:
@@ -59,7 +59,7 @@ class RackAddress(NamedTuple):
     rack: str
 
     @classmethod
-    def of(cls, text: str) -> RackAddress:
+    def parse_address(cls, text: str) -> RackAddress:
         """Parse HOST[:PORT]/RACK. Raises `Failure`."""
         match = _ADDRESS.fullmatch(text)
         if match is None or not 0 < int(match[2] or PORT) < 1 << 16:
@@ -70,9 +70,9 @@ class RackAddress(NamedTuple):
         return cls(match[1], int(match[2] or PORT), match[3])
 
     @property
-    def at(self) -> str:
+    def endpoint(self) -> str:
         """Host and port as users write them: the default port is left out."""
         return self.host if self.port == PORT else f"{self.host}:{self.port}"
 
     def __str__(self) -> str:
-        return f"{self.at}/{self.rack}"
+        return f"{self.endpoint}/{self.rack}"

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from rack.backplane.json_text import encode_json
 from rack.boards.errors import Failure as Failure
-from rack.boards.errors import one_line
+from rack.boards.errors import to_one_line
 
 Document = dict[str, Any]
 """Plain data, as `--json` prints it and as the files of a run hold it."""
@@ -19,7 +19,7 @@ MAX_LINE = 1300
 
 
 @contextmanager
-def as_failure() -> Iterator[None]:
+def convert_errors() -> Iterator[None]:
     """Convert the errors of backplane and levels to `Failure`, with its exit status."""
     try:
         yield
@@ -66,10 +66,10 @@ def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> Non
         print("\n".join(text))
 
 
-def fail(reason: str, status: int) -> NoReturn:
+def exit_with_failure(reason: str, status: int) -> NoReturn:
     """End the command with a reason on stderr, and with --json as a JSON document on stdout too."""
     lines = [
-        line if line.isprintable() and len(line) <= MAX_LINE else one_line(line, MAX_LINE)
+        line if line.isprintable() and len(line) <= MAX_LINE else to_one_line(line, MAX_LINE)
         for line in reason.splitlines()
     ]
     print(*lines, sep="\n", file=sys.stderr)

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rack.backplane.segment import Segment
 
 
-def waits(segment: Segment) -> str:
+def describe_wait(segment: Segment) -> str:
     """Describe how long a request to the rack must wait. Empty if the rack is not held."""
     tick = segment.words[System.HELD] - 1
     if tick < 0:

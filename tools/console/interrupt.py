@@ -24,7 +24,7 @@ from typing import NamedTuple, NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 BOUND_S = 1.7
 """Longest time from the first signal to the end of the process."""
-GONE_S = 0.25
+CHILDREN_END_S = 0.25
 """Longest wait for killed children to end."""
 SHOW_CURSOR = b"\x1b[?25h\n"
 """Control sequence that shows the cursor of a terminal."""
@@ -34,7 +34,7 @@ class Interrupted(BaseException):
     """Raised in a waiting command so that it withdraws its request."""
 
 
-class _Way(NamedTuple):
+class _SignalReaction(NamedTuple):
     """Reaction to the first signal, with a message for a command that does not end in time."""
 
     stop: Callable[[], object]
@@ -50,14 +50,14 @@ class Interrupt:
 
     def __init__(self) -> None:
         self.number = 0
-        self._ways: list[_Way] = [_Way(self.end)]
+        self._reactions: list[_SignalReaction] = [_SignalReaction(self.end_process)]
 
     @property
     def name(self) -> str:
         """Name of the signal received, such as SIGINT. Empty before that."""
         return signal.Signals(self.number).name if self.number else ""
 
-    def catch(self) -> None:
+    def install_handlers(self) -> None:
         """Install the handlers.
 
         Before that a signal kills the process, with the same exit status.
@@ -65,11 +65,11 @@ class Interrupt:
         for number in SIGNALS:
             # Leave SIGHUP ignored under nohup, so that the command outlives its terminal.
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-                signal.signal(number, self._receive)
-        signal.signal(signal.SIGALRM, lambda number, frame: self.end())
+                signal.signal(number, self._handle_signal)
+        signal.signal(signal.SIGALRM, lambda number, frame: self.end_process())
 
     @contextmanager
-    def orderly(
+    def stop_orderly(
         self, stop: Callable[[], object] = lambda: None, unfinished: str = ""
     ) -> Iterator[None]:
         """Let the first signal call a function in its handler. The command then ends by itself.
@@ -80,23 +80,23 @@ class Interrupt:
                 to
                 do.
         """
-        self._ways.append(_Way(stop, unfinished))
+        self._reactions.append(_SignalReaction(stop, unfinished))
         try:
             if self.number:
                 stop()
             yield
         finally:
-            self._ways.pop()
+            self._reactions.pop()
 
-    def at_once(self) -> AbstractContextManager[None]:
+    def end_at_once(self) -> AbstractContextManager[None]:
         """Let a signal end the process in its handler, even inside `stop_orderly`."""
-        return self.orderly(self.end)
+        return self.stop_orderly(self.end_process)
 
-    def raising(self) -> AbstractContextManager[None]:
+    def raise_interrupted(self) -> AbstractContextManager[None]:
         """Let the first signal raise `Interrupted`, for waits and where contexts clean up files."""
-        return self.orderly(_interrupted)
+        return self.stop_orderly(_raise_interrupted)
 
-    def settle(self) -> None:
+    def exit_if_signalled(self) -> None:
         """End the process with the signal's exit status if one was received.
 
         Call it when the command has finished.
@@ -105,44 +105,52 @@ class Interrupt:
             for stream in (sys.stdout, sys.stderr):
                 with suppress(OSError, ValueError):
                     stream.flush()
-            self._ways = [_Way(self.end)]
-            self.end()
+            self._reactions = [_SignalReaction(self.end_process)]
+            self.end_process()
 
-    def end(self) -> NoReturn:
+    def end_process(self) -> NoReturn:
         """Kill the children of this process, remove its racks, and end at once."""
         try:
             signal.pthread_sigmask(signal.SIG_BLOCK, {*SIGNALS, signal.SIGALRM})
-            family = [pid for pid in descendants(os.getpid(), os.getsid(0)) if not _cleans_up(pid)]
-            for step in (partial(_kill, family), partial(_remove_racks, family), self._take_leave):
+            family = [
+                pid
+                for pid in list_descendants(os.getpid(), os.getsid(0))
+                if not _is_resource_tracker(pid)
+            ]
+            for step in (
+                partial(_kill_children, family),
+                partial(_remove_racks, family),
+                self._print_unfinished,
+            ):
                 # An error in one step must not prevent the other steps or the exit.
                 with suppress(Exception):
                     step()
         finally:
             os._exit(128 + self.number)
 
-    def _take_leave(self) -> None:
+    def _print_unfinished(self) -> None:
         """Restore the cursor of the terminal, and print the message about unfinished work."""
         if os.isatty(1):
             os.write(1, SHOW_CURSOR)
-        if unfinished := self._ways[-1].unfinished:
+        if unfinished := self._reactions[-1].unfinished:
             os.write(2, f"{unfinished}\n".encode())
 
-    def _receive(self, number: int, frame: FrameType | None) -> None:
+    def _handle_signal(self, number: int, frame: FrameType | None) -> None:
         """Handle a signal. The second one ends the process at once."""
         if number == signal.SIGHUP:
             _leave_terminal()
         if self.number:
-            self.end()
+            self.end_process()
         self.number = number
         signal.setitimer(signal.ITIMER_REAL, BOUND_S)
-        self._ways[-1].stop()
+        self._reactions[-1].stop()
 
 
 INTERRUPT = Interrupt()
 """The only instance, because signals belong to the process."""
 
 
-def _cleans_up(pid: int) -> bool:
+def _is_resource_tracker(pid: int) -> bool:
     """Return whether a process is Python's resource tracker.
 
     It removes the semaphores of a process pool when this process has ended, and must not be killed.
@@ -152,7 +160,7 @@ def _cleans_up(pid: int) -> bool:
     return False
 
 
-def _interrupted() -> None:
+def _raise_interrupted() -> None:
     raise Interrupted
 
 
@@ -166,7 +174,7 @@ def _leave_terminal() -> None:
                 os.close(nowhere)
 
 
-def _kill(family: list[int]) -> None:
+def _kill_children(family: list[int]) -> None:
     """Kill every descendant in this session and wait for its end.
 
     A viewer window has its own session and stays open.
@@ -174,7 +182,7 @@ def _kill(family: list[int]) -> None:
     for pid in family:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-    await_ends(family, GONE_S)
+    await_ends(family, CHILDREN_END_S)
 
 
 def await_ends(pids: Iterable[int], bound_s: float) -> None:
@@ -189,7 +197,7 @@ def await_ends(pids: Iterable[int], bound_s: float) -> None:
             os.close(end)
 
 
-def descendants(pid: int, session: int | None = None) -> Iterator[int]:
+def list_descendants(pid: int, session: int | None = None) -> Iterator[int]:
     """Yield the descendants of a process, the youngest generation first.
 
     Args:
@@ -204,7 +212,7 @@ def descendants(pid: int, session: int | None = None) -> Iterator[int]:
     for child in children:
         with suppress(OSError):
             if session is None or os.getsid(child) == session:
-                yield from descendants(child, session)
+                yield from list_descendants(child, session)
                 yield child
 
 

@@ -35,18 +35,18 @@ def argument(name: str, meaning: str, default: Any = ..., **more: Any) -> Any:
     return typer.Argument(default, metavar=name, help=meaning, **more)
 
 
-def config_names(start: str) -> list[str]:
+def complete_config_name(start: str) -> list[str]:
     """List the shipped configs whose names begin with `start`, for shell completion."""
-    from rack.boards.config import names
+    from rack.boards.config import list_names
 
-    return [name for name in names() if name.startswith(start)]
+    return [name for name in list_names() if name.startswith(start)]
 
 
-def rack_names(start: str) -> list[str]:
+def complete_rack_name(start: str) -> list[str]:
     """List the racks in shared memory whose names begin with `start`, for shell completion."""
-    from rack.backplane.segment import racks
+    from rack.backplane.segment import list_racks
 
-    return [name for name in racks() if name.startswith(start)]
+    return [name for name in list_racks() if name.startswith(start)]
 
 
 def check_timeout(timeout: float | None, wait: bool) -> None:
@@ -55,14 +55,14 @@ def check_timeout(timeout: float | None, wait: bool) -> None:
         raise Failure("--timeout needs --wait; give both, or neither", 2)
 
 
-def named(rack: str | None) -> str | None:
+def check_rack_name(rack: str | None) -> str | None:
     """Check the name of a rack. Raises `Failure` if it is empty."""
     if rack == "":
         raise Failure('RACK = "": must be the name of a running rack, as "rack list" shows it', 2)
     return rack
 
 
-def named_here(rack: str | None) -> str | None:
+def check_local_rack_name(rack: str | None) -> str | None:
     """Check the name of a rack.
 
     Raises `Failure` for an empty one and for a rack on another machine.
@@ -73,7 +73,7 @@ def named_here(rack: str | None) -> str | None:
             " only 'rack estop' works from another machine",
             2,
         )
-    return named(rack)
+    return check_rack_name(rack)
 
 
 Json = Annotated[
@@ -84,7 +84,7 @@ ConfigName = Annotated[
     typer.Argument(
         metavar="CONFIG",
         help="config by name, or path to a .toml file",
-        autocompletion=config_names,
+        autocompletion=complete_config_name,
     ),
 ]
 RackName = Annotated[
@@ -92,8 +92,8 @@ RackName = Annotated[
     typer.Argument(
         metavar="RACK",
         help="running rack by name, as 'rack list' shows it",
-        autocompletion=rack_names,
-        callback=named_here,
+        autocompletion=complete_rack_name,
+        callback=check_local_rack_name,
     ),
 ]
 RunFolder = Annotated[

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-KINDS = ("png", "svg")
+PICTURE_FORMATS = ("png", "svg")
 DPI = 150
 NO_PICTURES = "no pictures: they need matplotlib: pip install 'nasrem-rack[charts]'"
 
@@ -26,7 +26,7 @@ def can_draw() -> bool:
 
 
 @contextmanager
-def picture(
+def open_figure(
     paths: Sequence[Path], width_in: float, height_in: float, **settings: Any
 ) -> Iterator[Figure]:
     """Provide an empty figure, and save it when the context ends. Equal figures make equal files.
@@ -48,6 +48,6 @@ def picture(
             figure.savefig(path, dpi=DPI, metadata=metadata)
 
 
-def paths_of(stem: Path) -> list[Path]:
+def list_picture_paths(stem: Path) -> list[Path]:
     """List the paths of a picture: `stem`.png and `stem`.svg."""
-    return [stem.with_name(f"{stem.name}.{kind}") for kind in KINDS]
+    return [stem.with_name(f"{stem.name}.{kind}") for kind in PICTURE_FORMATS]

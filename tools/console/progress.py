@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 
-from rack.tools.console.tables import console
+from rack.tools.console.tables import create_console
 
-PATIENCE_S = 2.0
+LINE_INTERVAL_S = 2.0
 """Least time between two lines about the progress of reading."""
 
 
@@ -27,17 +27,17 @@ class Progress:
         self._prints_lines = prints_lines
         self._task = self._bar.add_task("", total=None)
 
-    def total(self, seconds: float) -> None:
+    def set_total(self, seconds: float) -> None:
         """Set the expected duration of the whole series, s."""
         self._bar.update(self._task, total=seconds)
         self._print(f"about {seconds / 60.0:.0f} minutes")
 
-    def begin(self, text: str) -> None:
+    def begin_run(self, text: str) -> None:
         """Show which run begins."""
         self._bar.update(self._task, description=text)
         self._print(text)
 
-    def end(self, seconds: float, ended: str = "done", shortfalls: Sequence[str] = ()) -> None:
+    def end_run(self, seconds: float, ended: str = "done", shortfalls: Sequence[str] = ()) -> None:
         """Advance by a run that has ended.
 
         Args:
@@ -58,9 +58,9 @@ class Progress:
 
 
 @contextmanager
-def progress_for(silent: bool) -> Iterator[Progress]:
+def open_progress(silent: bool) -> Iterator[Progress]:
     """Provide the progress display that suits stdout, or a silent one."""
-    terminal = console()
+    terminal = create_console()
     if silent or not terminal.is_terminal:
         yield Progress(prints_lines=not silent)
         return
@@ -74,7 +74,9 @@ def progress_for(silent: bool) -> Iterator[Progress]:
         yield Progress(bar)
 
 
-def reading_progress(silent: bool, what: str = "reading the run") -> Callable[[float], None]:
+def create_reading_progress(
+    silent: bool, activity: str = "reading the run"
+) -> Callable[[float], None]:
     """Return a function that prints the progress of reading on stderr from time to time.
 
     The function takes the fraction of the work that is done, 0 to 1.
@@ -83,8 +85,8 @@ def reading_progress(silent: bool, what: str = "reading the run") -> Callable[[f
 
     def show(fraction: float) -> None:
         nonlocal last_shown
-        if not silent and time.monotonic() - last_shown > PATIENCE_S:
+        if not silent and time.monotonic() - last_shown > LINE_INTERVAL_S:
             last_shown = time.monotonic()
-            print(f"{what}: {fraction:.0%}", file=sys.stderr, flush=True)
+            print(f"{activity}: {fraction:.0%}", file=sys.stderr, flush=True)
 
     return show

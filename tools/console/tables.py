@@ -18,11 +18,11 @@ PIPE_WIDTH = 120
 """Width of views that always have one, such as `rack status`, when stdout is not a terminal."""
 GAP = 2
 """Number of spaces between columns."""
-UNLIMITED = 1_000_000
+UNLIMITED_WIDTH = 1_000_000
 """Width of a table that is neither cut nor wrapped."""
 
 
-def console() -> Console:
+def create_console() -> Console:
     """Return the console on stdout."""
     stdout_console = Console()
     return stdout_console if stdout_console.is_terminal else Console(width=PIPE_WIDTH)
@@ -37,7 +37,7 @@ def terminal_width() -> int | None:
     return stdout_console.width if stdout_console.is_terminal else None
 
 
-def table(
+def format_table(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
     width: int | None = None,
@@ -52,13 +52,13 @@ def table(
         dropped: Columns to leave out, in this order, until the table fits. Then long cells are
             wrapped.
     """
-    printer = Console(file=StringIO(), width=width or UNLIMITED, color_system=None)
+    printer = Console(file=StringIO(), width=width or UNLIMITED_WIDTH, color_system=None)
     with printer.capture() as captured:
-        printer.print(grid(head, rows, printer.width, dropped))
+        printer.print(build_grid(head, rows, printer.width, dropped))
     yield from (line.rstrip() for line in captured.get().splitlines())
 
 
-def fitted(
+def format_fitted_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], dropped: Sequence[str] = ()
 ) -> Iterator[str]:
     """Yield the lines of a table that fits the terminal on stdout. In a pipe it is complete.
@@ -68,20 +68,22 @@ def fitted(
         rows: Cells of each row.
         dropped: Columns that a narrow terminal leaves out, in this order.
     """
-    return table(head, rows, terminal_width(), dropped)
+    return format_table(head, rows, terminal_width(), dropped)
 
 
-def fitted_records(
+def format_fitted_records(
     records: Sequence[Mapping[str, object]], dropped: Sequence[str] = ()
 ) -> Iterator[str]:
     """Yield the lines of a table like `format_fitted_table`, with a row for each record.
 
     The keys of the first record are the columns.
     """
-    return fitted([*records[0]], [[*map(str, record.values())] for record in records], dropped)
+    return format_fitted_table(
+        [*records[0]], [[*map(str, record.values())] for record in records], dropped
+    )
 
 
-def grid(
+def build_grid(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
     width: int,
@@ -121,7 +123,7 @@ def is_number(cell: str) -> bool:
     return not cell.strip("0123456789.-+e")
 
 
-def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+def format_markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
     """Yield the lines of a Markdown table, each column as wide as its widest cell."""
     widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
     for number, row in enumerate((head, *rows)):
@@ -156,10 +158,10 @@ class TextTable:
     @property
     def rows(self) -> list[list[str]]:
         """Cells as text, row by row."""
-        return [[cell_text(cell) for cell in record.values()] for record in self.records]
+        return [[format_cell(cell) for cell in record.values()] for record in self.records]
 
 
-def cell_text(cell: Cell) -> str:
+def format_cell(cell: Cell) -> str:
     """Format a cell."""
     if cell is None:
         return "-"
@@ -175,7 +177,7 @@ def render_markdown(blocks: Iterable[str | TextTable]) -> str:
     lines: list[str] = []
     for block in blocks:
         if isinstance(block, TextTable):
-            lines += markdown_table(block.head, block.rows)
+            lines += format_markdown_table(block.head, block.rows)
         else:
             lines.append(block)
     return "\n".join(lines) + "\n"
@@ -185,7 +187,7 @@ def render_text(blocks: Iterable[str | TextTable], width: int | None = None) -> 
     """Yield the lines of a text. Its tables are fitted to `width`, if given."""
     for block in blocks:
         if isinstance(block, TextTable):
-            yield from table(block.head, block.rows, width, block.dropped)
+            yield from format_table(block.head, block.rows, width, block.dropped)
         else:
             yield block
 
@@ -200,23 +202,23 @@ def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
 
 def print_blocks(blocks: Iterable[str | TextTable]) -> None:
     """Print a text on stdout, fitted to a terminal or complete in a pipe."""
-    terminal = console()
+    terminal = create_console()
     if terminal.is_terminal:
         show_blocks(blocks, terminal)
     else:
         print(*render_text(blocks), sep="\n")
 
 
-def decimal(value: float | None, digits: int = 3) -> str:
+def format_decimal(value: float | None, digits: int = 3) -> str:
     """Format a number with a fixed number of decimals, or "-" for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def figure(distribution: Mapping[str, Any] | None, key: str) -> str:
+def format_figure(distribution: Mapping[str, Any] | None, key: str) -> str:
     """Format one figure of a distribution, or "-" if the distribution is None."""
-    return "-" if distribution is None else decimal(distribution[key])
+    return "-" if distribution is None else format_decimal(distribution[key])
 
 
-def ms(time_ns: float | None) -> str:
+def format_ms(time_ns: float | None) -> str:
     """Format a time in ms, to the microsecond, without trailing zeros. "-" for None."""
     return "-" if time_ns is None else f"{time_ns * 1e-6:.3f}".rstrip("0").rstrip(".")

@@ -7,24 +7,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rack.backplane.checked import as_whole
+from rack.backplane.checked import to_integer
 from rack.backplane.fault_table import FaultEntry, FaultTable, Injection, Stage
 from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
-from rack.boards.events import arm_states, statuses
-from rack.boards.faults.bounds import struck_mailboxes
-from rack.boards.faults.describe import board_of
-from rack.boards.faults.kind import KINDS, Kind, kind_of
+from rack.boards.events import iterate_arm_states, iterate_statuses
+from rack.boards.faults.bounds import list_struck_mailboxes
+from rack.boards.faults.describe import find_board
+from rack.boards.faults.kind import KINDS, Kind, find_kind
 from rack.tools.console.answer import Failure
 
 EXTERNAL = "external kill"
 """Name, in reports, of a SIGKILL that a campaign sends directly, without the fault table."""
 
-AT_REST = 0.02
+REST_VELOCITY = 0.02
 """Joint velocity below which an arm counts as at rest, rad/s."""
 
 
-def record_of(kind: str) -> Kind:
+def find_record(kind: str) -> Kind:
     """Return the record of a kind in a report. A kill from outside is treated as a kill.
 
     Raises:
@@ -72,19 +72,19 @@ class Strike:
     injection: Injection | None = None
 
     @property
-    def first(self) -> int:
+    def first_tick(self) -> int:
         """Tick at which it first acted or, if it never did, at which it began."""
         return self.tick if self.tick >= 0 else self.began
 
     @property
-    def affected(self) -> tuple[str, ...]:
+    def affected_mailboxes(self) -> tuple[str, ...]:
         """Mailboxes whose messages it affects."""
         return self.mailboxes if self.record.takes_mailbox else ()
 
     @property
     def record(self) -> Kind:
         """Record of its kind."""
-        return record_of(self.kind)
+        return find_record(self.kind)
 
 
 @dataclass(frozen=True)
@@ -102,35 +102,37 @@ class ArmEnd:
     is_at_rest: bool = True
 
 
-def strikes(segment: Segment, joints: Sequence[str]) -> tuple[Strike, ...]:
+def list_strikes(segment: Segment, joints: Sequence[str]) -> tuple[Strike, ...]:
     """Return all faults that were injected into a rack, in the order of the fault table."""
     entries = FaultTable(segment).entries
     return tuple(
-        _strike(entry, segment.layout, joints) for entry in entries if entry.stage != Stage.FREE
+        _build_strike(entry, segment.layout, joints)
+        for entry in entries
+        if entry.stage != Stage.FREE
     )
 
 
-def arm_of(segment: Segment) -> ArmEnd:
+def read_arm(segment: Segment) -> ArmEnd:
     """Return the state of a rack's arm from its newest messages.
 
     A rack without an arm has no violations and is at rest.
     """
-    arm_statuses = [status for _, status in statuses(segment, "violations")]
-    all_states = [*arm_statuses, *(state for _, state in arm_states(segment))]
+    arm_statuses = [status for _, status in iterate_statuses(segment, "violations")]
+    all_states = [*arm_statuses, *(state for _, state in iterate_arm_states(segment))]
     return ArmEnd(
         violations=max((arm.violations for arm in all_states), default=0),
         touches=max((arm.touches for arm in all_states), default=0),
-        is_at_rest=all(np.abs(arm.velocity).max() < AT_REST for arm in arm_statuses),
+        is_at_rest=all(np.abs(arm.velocity).max() < REST_VELOCITY for arm in arm_statuses),
     )
 
 
-def _strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
+def _build_strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
     """Convert an entry of the fault table."""
-    kind = kind_of(entry)
-    values = kind.values(entry)
-    board = board_of(entry, layout)
+    kind = find_kind(entry)
+    values = kind.read_parameters(entry)
+    board = find_board(entry, layout)
     began = -1 if entry.stage == Stage.WAITING else entry.tick
-    joint = as_whole(values.get("joint", -1))
+    joint = to_integer(values.get("joint", -1))
     joint_name = joints[joint] if 0 <= joint < len(joints) else ""
     return Strike(
         fault=entry.index,
@@ -142,7 +144,7 @@ def _strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
         time_ns=entry.struck_ns,
         count=entry.count,
         hidden=entry.hidden,
-        mailboxes=tuple(box.name for box in struck_mailboxes(layout, entry.mailbox, board)),
+        mailboxes=tuple(box.name for box in list_struck_mailboxes(layout, entry.mailbox, board)),
         joint=joint_name,
         size=values.get("size"),
         injection=Injection(

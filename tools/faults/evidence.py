@@ -16,16 +16,18 @@ from rack.boards.faults.kind import DIED, Where
 from rack.tools.faults.ending import Strike
 
 
-def _codes(alarms: Iterable[Alarm]) -> set[str]:
+def _to_codes(alarms: Iterable[Alarm]) -> set[str]:
     """Return the codes of events that correspond to alarms."""
     return {alarm.name.lower() for alarm in alarms}
 
 
-FOUND = ("detection", "miss", DIED)
+DETECTION_KINDS = ("detection", "miss", DIED)
 """Kinds of events that can be a detection."""
-MAILBOX_ALARMS = _codes(alarm for alarm in Alarm if Alarm.STALE <= alarm <= Alarm.QUEUE_FULL)
-CLOCK_ALARMS = _codes(alarm for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <= Alarm.CLOCK_LATE)
-TASK_ALARMS = _codes((Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED))
+MAILBOX_ALARMS = _to_codes(alarm for alarm in Alarm if Alarm.STALE <= alarm <= Alarm.QUEUE_FULL)
+CLOCK_ALARMS = _to_codes(
+    alarm for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <= Alarm.CLOCK_LATE
+)
+TASK_ALARMS = _to_codes((Alarm.HANG, Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED))
 BRAKES = "brakes_closed"
 LATCHED = "latched"
 """Code of the reaction to a fault that lasted too long: brakes stay closed and the task ends."""
@@ -63,7 +65,7 @@ class Detection:
         return self.bound is None or self.delay <= self.bound
 
     @property
-    def order(self) -> tuple[bool, int, float, float, str]:
+    def sort_key(self) -> tuple[bool, int, float, float, str]:
         """Sort key by which the best of several detections comes first.
 
         Detections within their bounds come first, then early ones, then ones with a tight bound.
@@ -74,7 +76,7 @@ class Detection:
         return not self.is_within, self.delay, self.delay_ms or 0.0, bound, self.event.board
 
 
-def fits(event: Event, strike: Strike) -> bool:
+def can_be_detection(event: Event, strike: Strike) -> bool:
     """Return True if an event can be the detection of a fault.
 
     It must be of the right kind, concern the same target, and not come before the fault. A death
@@ -82,14 +84,14 @@ def fits(event: Event, strike: Strike) -> bool:
     processes can read the new tick.
     """
     return (
-        event.kind in FOUND
+        event.kind in DETECTION_KINDS
         and 0 <= strike.tick <= event.tick + (event.kind == DIED)
         and event.code in strike.record.codes
         and is_about(event, strike)
     )
 
 
-def explains(strike: Strike, event: Event) -> bool:
+def can_explain(strike: Strike, event: Event) -> bool:
     """Return True if an event during a fault may be its detection or a consequence of its kind."""
     consequence = strike.record.consequence
     if event.kind == "miss":
@@ -97,9 +99,9 @@ def explains(strike: Strike, event: Event) -> bool:
         return takes_cycles(strike)
     if event.kind == DIED:
         return strike.board == event.board and consequence.ends_process
-    if event.code in _codes(consequence.arm):
+    if event.code in _to_codes(consequence.arm):
         return True
-    return event.code in _codes(consequence.own).union(strike.record.codes) and is_about(
+    return event.code in _to_codes(consequence.own).union(strike.record.codes) and is_about(
         event, strike
     )
 
@@ -125,7 +127,7 @@ class SkippedTicks:
         name = Alarm.CLOCK_SKIPPED.name.lower()
         self._skips = [event for event in events if event.kind == "miss" and event.code == name]
 
-    def between(self, first: int, last: int) -> int:
+    def count_between(self, first: int, last: int) -> int:
         """Return how many ticks after `first`, up to `last`, were skipped.
 
         Every task reports the skips that it has noticed, so the largest count of one task is taken.
@@ -155,7 +157,7 @@ class Aftermath(NamedTuple):
     lacking: tuple[str, ...] = ()
 
 
-def aftermath(
+def find_aftermath(
     strike: Strike, events: Sequence[Event], horizon: int, owed: Sequence[str]
 ) -> Aftermath:
     """Find the reactions to a fault and when they were undone.
@@ -178,7 +180,7 @@ def aftermath(
         and not (event.code == BRAKES and event.tick in collisions)
         and _can_react(strike, event)
     ]
-    undone_ticks = [_undone(reaction, events_after) for reaction in reactions]
+    undone_ticks = [_find_undone_tick(reaction, events_after) for reaction in reactions]
     flows = {
         event.subject: event.tick
         for event in reversed(events_after)
@@ -217,11 +219,11 @@ def takes_cycles(strike: Strike) -> bool:
 def _are_engaged(tick: int, events: Sequence[Event]) -> bool:
     """Return True if the brakes were closed before a tick and opened only after it."""
     brakings = [e for e in events if e.kind == "reaction" and e.code == BRAKES and e.tick < tick]
-    undone = (_undone(event, events) for event in brakings)
+    undone = (_find_undone_tick(event, events) for event in brakings)
     return any(released is None or released > tick for released in undone)
 
 
-def _undone(reaction: Event, events_after: Sequence[Event]) -> int | None:
+def _find_undone_tick(reaction: Event, events_after: Sequence[Event]) -> int | None:
     """Return the tick at which a reaction was undone, or None."""
     recoveries = (
         event.tick

@@ -12,19 +12,19 @@ from pydantic import TypeAdapter
 from rack.backplane.fault_table import NEVER, Injection
 from rack.backplane.layout import Layout
 from rack.boards.events import Event
-from rack.boards.faults.bounds import MEMORY_NS, RACK_NS, cycle_ticks, last_read
+from rack.boards.faults.bounds import MEMORY_NS, RACK_NS, compute_last_read_ticks, cycle_ticks
 from rack.boards.faults.kind import DIED
 from rack.tools.faults.ending import EXTERNAL, Strike
 from rack.tools.faults.evidence import (
     COLLISION,
-    FOUND,
+    DETECTION_KINDS,
     LATCHED,
     MAILBOX_ALARMS,
     Detection,
     SkippedTicks,
-    aftermath,
-    explains,
-    fits,
+    can_be_detection,
+    can_explain,
+    find_aftermath,
 )
 
 Seen = Literal["detected", "missed", "not struck"]
@@ -90,7 +90,7 @@ class Judgement:
     is_latched: bool = False
 
     @property
-    def part_of_bound(self) -> float | None:
+    def fraction_of_bound(self) -> float | None:
         """Delay divided by its bound, in time if time is bounded. None without a bound."""
         if self.bound_ms is not None and self.delay_ms is not None:
             return self.delay_ms / self.bound_ms
@@ -127,7 +127,9 @@ class Circumstances:
     moving: tuple[str, ...] = ()
 
 
-def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances) -> FaultVerdict:
+def judge_faults(
+    strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
+) -> FaultVerdict:
     """Judge the faults of a run by its events.
 
     An event detects one fault only. If it matches two, it counts for the one that acted first and
@@ -140,7 +142,7 @@ def judge(strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
         events: Events of the run.
         run: Facts about the run.
     """
-    return Judge(strikes, events, run).verdict()
+    return Judge(strikes, events, run).judge_all()
 
 
 class Judge:
@@ -152,39 +154,41 @@ class Judge:
         self._events = events
         self._run = run
         self._layout = run.layout
-        self._strikes = sorted(strikes, key=lambda strike: (strike.first, strike.fault))
+        self._strikes = sorted(strikes, key=lambda strike: (strike.first_tick, strike.fault))
         self._tasks = [process.name for process in run.layout.processes]
         self._cycles = {task.name: cycle_ticks(run.layout, task.name) for task in run.layout.tasks}
         self._skipped = SkippedTicks(events)
         self._last = max((event.tick for event in events), default=0)
         self._settle = round(SETTLE_S * 1e9 / run.layout.clock_ns)
 
-    def verdict(self) -> FaultVerdict:
+    def judge_all(self) -> FaultVerdict:
         """Return the judgement of each fault, and the events that no fault explains."""
         used: set[int] = set()
         judged = []
-        windows = [self._window(strike) for strike in self._strikes]
+        windows = [self._compute_window(strike) for strike in self._strikes]
         for index, strike in enumerate(self._strikes):
             last = windows[index][1]
             later = self._strikes[index + 1 :]
-            detections = self._detections(strike, last, used)
+            detections = self._list_detections(strike, last, used)
             own_detections = [
-                detection for detection in detections if not self._is_of_any(detection, later)
+                detection
+                for detection in detections
+                if not self._is_in_time_for_later(detection, later)
             ]
             # Reactions belong to this fault until the next one acts, or until this one is long
             # over.
             horizon = min([*(s.tick for s in later if s.tick > strike.tick), last + 1])
-            best = min(own_detections, key=lambda detection: detection.order, default=None)
+            best = min(own_detections, key=lambda detection: detection.sort_key, default=None)
             if best:
                 used.add(id(best.event))
             elif self._is_brief(strike):
                 strike = replace(strike, tick=-1)
-            judgement = self._judgement(strike, best, horizon)
+            judgement = self._build_judgement(strike, best, horizon)
             is_too_early = self._last < strike.tick + (judgement.recovery_bound or 0)
             if not judgement.is_recovered and is_too_early and strike.ends < NEVER:
                 # The run ended too early to decide, so a campaign will draw the fault again. A
                 # fault without an end has no recovery.
-                judgement = self._judgement(replace(strike, tick=-1), None, horizon)
+                judgement = self._build_judgement(replace(strike, tick=-1), None, horizon)
             judged.append(judgement)
         stray = [event for event in self._events if self._is_stray(event, windows)]
         return FaultVerdict(
@@ -193,7 +197,7 @@ class Judge:
             misses=tuple(event for event in stray if event.kind == "miss"),
         )
 
-    def _bound(self, strike: Strike, reader: str | None = None) -> int | None:
+    def _compute_bound(self, strike: Strike, reader: str | None = None) -> int | None:
         """Return the ticks from the first action of a fault within which it must be detected.
 
         None if there is no bound, or if the fault never had a detectable effect. Without a
@@ -201,27 +205,29 @@ class Judge:
         """
         task = self._tasks.index(strike.board) if strike.board in self._tasks else -1
         injection = strike.injection or Injection(strike.record.number, task)
-        bound = strike.record.bound_ticks(injection, self._layout, reader)
+        bound = strike.record.compute_bound_ticks(injection, self._layout, reader)
         return bound + strike.hidden if bound is not None and strike.count else None
 
-    def _recovery(self, strike: Strike) -> int:
+    def _compute_recovery(self, strike: Strike) -> int:
         """Return the ticks within which a fault must have been recovered from."""
-        return strike.record.recovery_ticks(strike.board, self._layout, self._run.restart_s)
+        return strike.record.compute_recovery_ticks(strike.board, self._layout, self._run.restart_s)
 
-    def _window(self, strike: Strike) -> tuple[int, int]:
+    def _compute_window(self, strike: Strike) -> tuple[int, int]:
         """Return the first and the last tick at which an event may be caused by a fault."""
-        if strike.record.takes_mailbox and self._layout.task(strike.board).role == "planner":
+        if strike.record.takes_mailbox and self._layout.find_task(strike.board).role == "planner":
             # The planner itself may notice the fault, but only when it makes its next plan.
-            return strike.first - 1, self._last
-        return strike.first - 1, self._last_trace(strike, min(end_of(strike), self._last))
+            return strike.first_tick - 1, self._last
+        return strike.first_tick - 1, self._find_last_effect(
+            strike, min(find_end(strike), self._last)
+        )
 
-    def _last_trace(self, strike: Strike, ends: int) -> int:
+    def _find_last_effect(self, strike: Strike, ends: int) -> int:
         """Return the last tick at which a fault that ends at tick `ends` may cause an event."""
-        over = max(ends, strike.first + (self._bound(strike) or 0))
-        read = last_read(strike.mailboxes, self._layout)
-        return over + self._recovery(strike) + read + self._settle
+        over = max(ends, strike.first_tick + (self._compute_bound(strike) or 0))
+        read = compute_last_read_ticks(strike.mailboxes, self._layout)
+        return over + self._compute_recovery(strike) + read + self._settle
 
-    def _detections(self, strike: Strike, last_tick: int, used: set[int]) -> list[Detection]:
+    def _list_detections(self, strike: Strike, last_tick: int, used: set[int]) -> list[Detection]:
         """Return the unused events up to `last_tick` that may be the detection of a fault."""
         if not strike.count:
             # It need not be detected, so any later detection belongs to something else.
@@ -229,26 +235,27 @@ class Judge:
         fitting = (
             event
             for event in self._events
-            if event.tick <= last_tick and fits(event, strike) and id(event) not in used
+            if event.tick <= last_tick and can_be_detection(event, strike) and id(event) not in used
         )
-        return [self._detection(event, strike) for event in fitting]
+        return [self._build_detection(event, strike) for event in fitting]
 
     def _is_periodic(self, mailbox: str) -> bool:
         """Return True if a mailbox has a message in every period of its writer.
 
         Plans, queues, mailboxes for news, and the mailboxes of host boards do not.
         """
-        mailbox_spec = self._layout.mailbox(mailbox)
+        mailbox_spec = self._layout.find_mailbox(mailbox)
         return (
-            self._layout.task(mailbox_spec.writer).role == "executor"
+            self._layout.find_task(mailbox_spec.writer).role == "executor"
             and mailbox_spec.protocol != "queue"
             and not mailbox_spec.max_age
         )
 
-    def _is_of_any(self, detection: Detection, later: Sequence[Strike]) -> bool:
+    def _is_in_time_for_later(self, detection: Detection, later: Sequence[Strike]) -> bool:
         """Return True if a detection that is too late for one fault is in time for a later one."""
         return not detection.is_within and any(
-            fits(detection.event, strike) and self._detection(detection.event, strike).is_within
+            can_be_detection(detection.event, strike)
+            and self._build_detection(detection.event, strike).is_within
             for strike in later
         )
 
@@ -257,15 +264,15 @@ class Judge:
         if strike.record.where != "arm":
             return False
         active_ticks = strike.hidden + strike.count * cycle_ticks(self._layout, strike.board)
-        return not strike.count or active_ticks < (self._bound(strike) or 0)
+        return not strike.count or active_ticks < (self._compute_bound(strike) or 0)
 
-    def _detection(self, event: Event, strike: Strike) -> Detection:
+    def _build_detection(self, event: Event, strike: Strike) -> Detection:
         """Return an event as the detection of a fault, with its delay and its bound."""
         delay = max(0, event.tick - strike.tick)
         if event.code != "clock_skipped":
-            delay -= self._skipped.between(strike.tick, event.tick)
+            delay -= self._skipped.count_between(strike.tick, event.tick)
         reader = event.board if event.code in MAILBOX_ALARMS else None
-        bound = self._bound(strike, reader)
+        bound = self._compute_bound(strike, reader)
         if self._run.is_lockstep:
             # In lockstep the clock waits for the end of a process that it has killed itself. A
             # kill from outside is not known to the clock, which runs as fast as it can, so neither
@@ -278,15 +285,17 @@ class Judge:
         bound_ms = (RACK_NS + MEMORY_NS) * 1e-6 if event.kind == DIED else None
         return Detection(event, delay, bound, delay_ms, bound_ms)
 
-    def _judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
+    def _build_judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
         """Judge a fault by its best detection and by the reactions up to `horizon`."""
         visible_from = strike.record.visible_from
-        owed = tuple(filter(self._is_periodic, strike.affected)) or strike.affected
-        aftermath_found = aftermath(strike, self._events, horizon, owed)
+        owed = (
+            tuple(filter(self._is_periodic, strike.affected_mailboxes)) or strike.affected_mailboxes
+        )
+        aftermath_found = find_aftermath(strike, self._events, horizon, owed)
         found_tick = best.event.tick if best else strike.tick
         # Ticks from the first action within which every reaction must be undone.
-        ends = max(min(end_of(strike), self._last), found_tick)
-        recovery_bound = ends - strike.tick + self._recovery(strike)
+        ends = max(min(find_end(strike), self._last), found_tick)
+        recovery_bound = ends - strike.tick + self._compute_recovery(strike)
         if not all(map(self._is_periodic, owed)):
             # The writer has no period, so its next message may come at any time in the run.
             recovery_bound = self._last + 1 - strike.tick
@@ -296,7 +305,7 @@ class Judge:
         return Judgement(
             kind=strike.kind,
             board=strike.board,
-            mailbox=strike.affected[0] if len(strike.affected) == 1 else "",
+            mailbox=strike.affected_mailboxes[0] if len(strike.affected_mailboxes) == 1 else "",
             joint=strike.joint,
             size=strike.size,
             began=strike.began,
@@ -309,14 +318,14 @@ class Judge:
             recovery_bound=recovery_bound,
             lacking=aftermath_found.lacking,
             is_latched=is_latched,
-            **self._seen(strike, best),
+            **self._describe_detection(strike, best),
         )
 
-    def _seen(self, strike: Strike, best: Detection | None) -> Report:
+    def _describe_detection(self, strike: Strike, best: Detection | None) -> Report:
         """Return the fields of a judgement that describe the detection."""
         if best is None:
             seen_text = "not struck" if strike.tick < 0 else "missed"
-            return {"seen": seen_text, "bound": self._bound(strike)}
+            return {"seen": seen_text, "bound": self._compute_bound(strike)}
         return {
             "seen": "detected",
             "found_by": "the Rack" if best.event.kind == DIED else best.event.board,
@@ -330,7 +339,7 @@ class Judge:
 
     def _is_stray(self, event: Event, windows: Sequence[tuple[int, int]]) -> bool:
         """Return True if an event is a detection, a death or a miss that no fault explains."""
-        if event.kind not in FOUND or self._is_met(event):
+        if event.kind not in DETECTION_KINDS or self._is_obstacle_collision(event):
             return False
         # An event of a task has the tick of its release, but its cause may act until the end of
         # the cycle.
@@ -339,11 +348,11 @@ class Judge:
             strike.tick >= 0
             and first <= last_tick
             and event.tick <= last
-            and explains(strike, event)
+            and can_explain(strike, event)
             for strike, (first, last) in zip(self._strikes, windows, strict=True)
         )
 
-    def _is_met(self, event: Event) -> bool:
+    def _is_obstacle_collision(self, event: Event) -> bool:
         """Return True if a moving obstacle hit an arm that an earlier fault may have stopped."""
         is_moving = event.code == COLLISION and any(
             f"'{name}'" in event.text for name in self._run.moving
@@ -351,13 +360,13 @@ class Judge:
         return is_moving and any(0 <= strike.tick <= event.tick for strike in self._strikes)
 
 
-def end_of(strike: Strike) -> int:
+def find_end(strike: Strike) -> int:
     """Return the tick at which a fault ended or would have ended."""
     # A hanging task is killed as soon as the hang is detected, before the fault's planned end.
     return strike.tick if strike.record.consequence.ends_process else strike.ends
 
 
-def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
+def report_faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
     """Judge the recorded events of a run and return the results for its report."""
     events = [Event(**event) for event in recorded if "tick" in event]
     outcome: Mapping[str, Any] = next(
@@ -365,14 +374,14 @@ def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
     )
     strikes = TypeAdapter(tuple[Strike, ...]).validate_python(outcome.get("faults", ()))
     is_lockstep = any(event.kind == "start" and event.text == "lockstep" for event in events)
-    verdict = judge(
+    verdict = judge_faults(
         strikes, events, Circumstances(layout, outcome.get("clock_offset_ns", 0), is_lockstep)
     )
     restarts = Counter(event.board for event in events if event.code == "restart")
     return {
         # Faults that never struck come last.
         "faults": [
-            _row(judgement, layout)
+            _build_row(judgement, layout)
             for judgement in sorted(
                 verdict.faults, key=lambda fault: (fault.struck < 0, fault.struck)
             )
@@ -390,7 +399,7 @@ def faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
     }
 
 
-def _row(judgement: Judgement, layout: Layout) -> Report:
+def _build_row(judgement: Judgement, layout: Layout) -> Report:
     """Return a judgement as a row of the report."""
     tick_ms = layout.clock_ns * 1e-6
     recovery_ms = None if judgement.recovery is None else round(judgement.recovery * tick_ms, 6)

@@ -15,17 +15,17 @@ from rack.backplane.process import set_priority
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import read_stored
-from rack.boards.config.injections import injection
-from rack.boards.config.mistakes import mistakes_of
+from rack.boards.config.injections import build_live_injection
+from rack.boards.config.mistakes import convert_errors
 from rack.boards.config.published import PublishedRack
 from rack.boards.errors import ConfigError, Mistake
-from rack.boards.faults.config import FaultConfig, condition_text
-from rack.boards.faults.describe import describe, document
+from rack.boards.faults.config import FaultConfig, format_condition
+from rack.boards.faults.describe import describe_fault, to_document
 from rack.boards.faults.kind import KINDS
 from rack.boards.faults.tasks import act_on_core
 from rack.tools.console.answer import Document, Failure
-from rack.tools.console.held import waits
-from rack.tools.console.tables import fitted
+from rack.tools.console.held import describe_wait
+from rack.tools.console.tables import format_fitted_table
 
 BEGIN_S = 5.0
 """Maximum wait for a fault to begin at the next tick."""
@@ -40,12 +40,12 @@ class LiveRack:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._config = read_stored(self._segment.config)
-        self._levels = PublishedRack.of_rack(self._segment).levels
+        self._levels = PublishedRack.read_from_segment(self._segment).levels
         self._table = FaultTable(self._segment)
         self._joints = self._config.joints
 
-    def inject(
-        self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None
+    def inject_fault(
+        self, settings: Mapping[str, Any], wait: bool, timeout_s: float | None = None
     ) -> Document:
         """Inject a fault and return it as plain data.
 
@@ -53,7 +53,7 @@ class LiveRack:
         condition, or if the rack is held, it returns at once.
 
         Args:
-            given: Keys of `[[fault]]`. Values of None are ignored.
+            settings: Keys of `[[fault]]`. Values of None are ignored.
             wait: Whether to wait until the fault is over.
             timeout_s: Maximum wall-clock time to wait for the end, s. None waits without limit.
 
@@ -63,10 +63,12 @@ class LiveRack:
         """
         if self._segment.run_is_over:
             raise Failure(f"rack '{self._segment.rack}': its run is over")
-        fault = self._fault({key: value for key, value in given.items() if value is not None})
-        checked = injection(fault, self._config, self._levels, self._segment.layout)
-        self._check(fault)
-        entry = self._table.add(checked)
+        fault = self._parse_fault(
+            {key: value for key, value in settings.items() if value is not None}
+        )
+        checked = build_live_injection(fault, self._config, self._levels, self._segment.layout)
+        self._check_fault(fault)
+        entry = self._table.add_fault(checked)
         if KINDS[fault.kind].where == "core":
             # This process itself takes the core.
             self._print_waiting(entry)
@@ -77,40 +79,42 @@ class LiveRack:
                 lambda: entry.stage != Stage.WAITING or words[System.HELD] > 0, BEGIN_S
             ):
                 why = f"the clock has not begun it within {BEGIN_S:g} s"
-                raise Failure(f"{self._described(entry)}: {why}")
+                raise Failure(f"{self._describe_fault(entry)}: {why}")
             if not words[System.HELD]:
                 self._check_begun(entry)
         if wait:
             self._await_end(entry, timeout_s)
-        return {**self._document(entry), "message": self._state(entry)}
+        return {**self._to_document(entry), "message": self._describe_state(entry)}
 
-    def withdraw(self, number: int) -> Document:
+    def withdraw_fault(self, number: int) -> Document:
         """Withdraw a fault that waits for its tick or condition, and return it as plain data.
 
         Raises:
             Failure: The fault is not waiting, or begins before it can be withdrawn.
         """
-        waiting = {entry.index: entry for entry in self._table.staged((Stage.WAITING,))}
+        waiting = {entry.index: entry for entry in self._table.list_entries((Stage.WAITING,))}
         if number not in waiting:
             waiting_numbers = ", ".join(map(str, waiting)) or "none"
             raise Failure(f"fault {number} is not waiting; waiting: {waiting_numbers}", 2)
         entry = waiting[number]
-        answer = self._document(entry)
-        self._table.disarm(entry)
+        answer = self._to_document(entry)
+        self._table.disarm_fault(entry)
         words = self._segment.words
         tick = words[System.TICK]
         # Wait for a tick that cannot begin the fault any more. A held clock begins no fault.
         self._wait_until(lambda: words[System.TICK] > tick + 1 or words[System.HELD] > 0, BEGIN_S)
-        if not self._table.free(entry):
-            raise Failure(f"{self._described(entry)}: it had begun before it could be withdrawn")
+        if not self._table.free_entry(entry):
+            raise Failure(
+                f"{self._describe_fault(entry)}: it had begun before it could be withdrawn"
+            )
         return {**answer, "stage": "free", "message": f"{answer['text']}: withdrawn"}
 
-    def faults(self) -> list[Document]:
+    def list_faults(self) -> list[Document]:
         """Return the faults injected so far, as plain data."""
-        injected = self._table.staged((Stage.WAITING, Stage.ACTIVE, Stage.OVER))
-        return [self._document(entry) for entry in injected]
+        injected = self._table.list_entries((Stage.WAITING, Stage.ACTIVE, Stage.OVER))
+        return [self._to_document(entry) for entry in injected]
 
-    def text(self) -> Iterator[str]:
+    def format_table(self) -> Iterator[str]:
         """Yield the lines of a table of the faults injected so far."""
         columns = {
             "no": "fault",
@@ -122,10 +126,12 @@ class LiveRack:
             "acted": "acted",
             "waits for": "waits_for",
         }
-        rows = [[_cell(fault[key]) for key in columns.values()] for fault in self.faults()]
-        return fitted(list(columns), rows)
+        rows = [
+            [_format_cell(fault[key]) for key in columns.values()] for fault in self.list_faults()
+        ]
+        return format_fitted_table(list(columns), rows)
 
-    def _fault(self, settings: Document) -> FaultConfig:
+    def _parse_fault(self, settings: Document) -> FaultConfig:
         """Validate the keys of a fault. Raises `ConfigError`."""
         # Two faults of one run must not draw the same random numbers.
         settings.setdefault(
@@ -135,9 +141,9 @@ class LiveRack:
             # Values from a command line are texts, so let numbers be converted from text.
             return FaultConfig.model_validate(settings, strict=False)
         except ValidationError as error:
-            raise ConfigError(mistakes_of(error, FaultConfig, settings)) from None
+            raise ConfigError(convert_errors(error, FaultConfig, settings)) from None
 
-    def _check(self, fault: FaultConfig) -> None:
+    def _check_fault(self, fault: FaultConfig) -> None:
         """Check that a running rack, and this process, can have a fault.
 
         Raises:
@@ -182,28 +188,28 @@ class LiveRack:
         """
         self._print_waiting(entry)
         if not self._wait_until(lambda: entry.stage == Stage.OVER, timeout_s):
-            raise Failure(f"timed out after {timeout_s:g} s: {self._state(entry)}")
+            raise Failure(f"timed out after {timeout_s:g} s: {self._describe_state(entry)}")
         self._check_begun(entry)
 
     def _print_waiting(self, entry: FaultEntry) -> None:
         """Print that a fault waits, if it does."""
         if entry.stage == Stage.WAITING:
-            print(self._state(entry), file=sys.stderr, flush=True)
+            print(self._describe_state(entry), file=sys.stderr, flush=True)
 
     def _check_begun(self, entry: FaultEntry) -> None:
         """Raise `Failure` if the run has ended before a fault began."""
         if entry.stage == Stage.WAITING:
-            raise Failure(f"{self._described(entry)}: the run ended before it began")
+            raise Failure(f"{self._describe_fault(entry)}: the run ended before it began")
 
-    def _state(self, entry: FaultEntry) -> str:
+    def _describe_state(self, entry: FaultEntry) -> str:
         """Describe a fault and its state in one line."""
-        fault = self._described(entry)
+        fault = self._describe_fault(entry)
         first = entry.tick
         last = entry.until - 1
         if entry.stage == Stage.WAITING:
             how = f"to withdraw it: rack inject {self._segment.rack} --withdraw {entry.index}"
-            awaited = self._awaited(entry)
-            hold_text = waits(self._segment) if awaited == NEXT_TICK else ""
+            awaited = self._describe_awaited(entry)
+            hold_text = describe_wait(self._segment) if awaited == NEXT_TICK else ""
             return f"{fault}: armed, {hold_text or f'waits for {awaited}'}; {how}"
         if entry.stage == Stage.OVER:
             acted = "once" if entry.count == 1 else f"{entry.count} times"
@@ -211,7 +217,7 @@ class LiveRack:
         end = "the end of the run" if entry.until == NEVER else f"tick {last}"
         return f"{fault}: from tick {first} to {end}"
 
-    def _awaited(self, entry: FaultEntry) -> str:
+    def _describe_awaited(self, entry: FaultEntry) -> str:
         """Return the tick or the condition for which a fault waits."""
         if entry.when_box < 0:
             if entry.tick <= 0:
@@ -219,18 +225,18 @@ class LiveRack:
             tick = self._segment.words[System.TICK]
             return f"tick {entry.tick}; the rack is at tick {tick}"
         when = (entry.when_box, entry.when_field, entry.when_value)
-        return condition_text(when, self._segment.layout)
+        return format_condition(when, self._segment.layout)
 
-    def _document(self, entry: FaultEntry) -> Document:
+    def _to_document(self, entry: FaultEntry) -> Document:
         """Return a fault as plain data. `waits_for` is empty once it has begun."""
-        waits_for = self._awaited(entry) if entry.stage == Stage.WAITING else ""
-        return {**document(entry, self._segment.layout, self._joints), "waits_for": waits_for}
+        waits_for = self._describe_awaited(entry) if entry.stage == Stage.WAITING else ""
+        return {**to_document(entry, self._segment.layout, self._joints), "waits_for": waits_for}
 
-    def _described(self, entry: FaultEntry) -> str:
+    def _describe_fault(self, entry: FaultEntry) -> str:
         """Describe a fault in one line."""
-        return describe(entry, self._segment.layout, self._joints)
+        return describe_fault(entry, self._segment.layout, self._joints)
 
 
-def _cell(value: str | int | None) -> str:
+def _format_cell(value: str | int | None) -> str:
     """Return a cell of the table of faults: "-" for an unknown tick."""
     return "-" if value is None or value == -1 else str(value)

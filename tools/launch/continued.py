@@ -21,36 +21,41 @@ from typing import Self
 
 import numpy as np
 
-from rack.backplane.mailbox.history import chains
+from rack.backplane.mailbox.history import find_chains
 from rack.backplane.segment import Segment
 from rack.boards import Rack
 from rack.boards.classes import extend_path
 from rack.boards.config.loader import load
-from rack.boards.config.resolved import classes
+from rack.boards.config.resolved import list_class_names
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
-from rack.boards.crate.rack import cell_of
+from rack.boards.crate.rack import build_cell_config
 from rack.boards.crate.requests import Preload
-from rack.boards.errors import UNKEPT
-from rack.boards.wiring import Continuation, Entries, SnapshotPolicy
+from rack.boards.errors import NO_SNAPSHOTS_PREFIX
+from rack.boards.wiring import Continuation, ExchangedEntries, SnapshotPolicy
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.launch.launch import Beginning, run_rack
 from rack.tools.monitor.display import Display
-from rack.tools.recording.divergence import other_run, row_of, ticks_of, unlike_messages
-from rack.tools.recording.entries import commands_from, recorded_commands, recorded_entries
+from rack.tools.recording.divergence import (
+    find_other_run,
+    find_row,
+    find_tick_range,
+    list_divergent_messages,
+)
+from rack.tools.recording.entries import load_commands_from, load_entries, load_operator_commands
 from rack.tools.recording.file_names import CONFIG
-from rack.tools.recording.origin import Origin, check_code, continued_at
+from rack.tools.recording.origin import Origin, check_code_state, find_continuation_tick
 from rack.tools.recording.recording import Recording
 
-WHY_NOT = (
+DIFFERENCE_CAUSES = (
     "the code of a level has changed since, it missed cycles in real time, it does not repeat"
     " itself, or somebody injected a fault or stopped it while it ran"
 )
 """Possible reasons why a repeated run differs from its recording."""
 
 
-class RunAgain:
+class RepeatedRun:
     """The rack of a recorded run, which is repeated up to any tick.
 
     Each tick that was reached has a snapshot, from which later ticks are near. A run that continues
@@ -72,78 +77,84 @@ class RunAgain:
         anyway: bool = False,
     ) -> None:
         self.recording = recording
-        self._asked = asked or str(recording.folder)
+        self._error_prefix = asked or str(recording.folder)
         self._anyway = anyway
         ran = recording.rack_config
         # Make the levels that the config names importable.
         extend_path(ran.python_path)
-        check_code(recording, self._asked, anyway)
+        check_code_state(recording, self._error_prefix, anyway)
         self.crate = crate or WarmCrate()
         # The crate imports them while this process reads the run.
-        self.crate.ask(Preload(classes(ran), tuple(sys.path), cell_of(ran)))
+        self.crate.try_request(
+            Preload(list_class_names(ran), tuple(sys.path), build_cell_config(ran))
+        )
         self._has_begun = False
-        self._branched_at = continued_at(recording)
+        self._branched_at = find_continuation_tick(recording)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.crate.end()
+        self.crate.end_crate()
 
     @cached_property
-    def _parent(self) -> RunAgain | None:
+    def _parent(self) -> RepeatedRun | None:
         """The run that this one continues. None if it starts from the beginning."""
         if self._branched_at is None:
             return None
-        folder = other_run(self.recording.folder, Path("origin"), self._asked)
-        return RunAgain(Recording(folder), self._asked, self.crate, self._anyway)
+        folder = find_other_run(self.recording.folder, Path("origin"), self._error_prefix)
+        return RepeatedRun(Recording(folder), self._error_prefix, self.crate, self._anyway)
 
     @cached_property
-    def entries(self) -> Mapping[str, Entries] | None:
+    def entries(self) -> Mapping[str, ExchangedEntries] | None:
         """Messages that host boards and other racks sent in the run.
 
         None if its rack has neither.
         """
         run = self.recording
         config = run.rack_config
-        return recorded_entries(config, run.folder, self._asked) if config.outside else None
+        return (
+            load_entries(config, run.folder, self._error_prefix) if config.outside_state else None
+        )
 
-    def reach(self, tick: int) -> None:
+    def reach_tick(self, tick: int) -> None:
         """Make a snapshot before `tick`. Differences from the recording are noted on stderr.
 
         Raises `Failure` if there is none, because a board is lost at that tick.
         """
         if not self._has_begun and self._branched_at not in (None, tick):
             # First reach the branching tick, so that all later snapshots belong to this run.
-            self.reach(self._branched_at or 0)
-        if self._has_begun and self._nearest(tick) == tick:
+            self.reach_tick(self._branched_at or 0)
+        if self._has_begun and self._nearest_snapshot_tick(tick) == tick:
             return
-        with self.rack_at(tick, SnapshotPolicy(at=tick)) as rack:
-            if differing := unlike_in(self.recording, rack.segment, tick):
-                self._note_unlike(differing, tick)
+        with self.run_rack_to(tick, SnapshotPolicy(at=tick)) as rack:
+            if differing := list_differing_mailboxes(self.recording, rack.segment, tick):
+                self._report_differences(differing, tick)
             notes = [
-                e.text for e in rack.events if e.kind == "printed" or e.text.startswith(UNKEPT)
+                e.text
+                for e in rack.events
+                if e.kind == "printed" or e.text.startswith(NO_SNAPSHOTS_PREFIX)
             ]
-        if self._nearest(tick) != tick:
+        if self._nearest_snapshot_tick(tick) != tick:
             why = (
                 notes[-1]
                 if notes
                 else "a board is lost at this time; choose a time when it is back"
             )
-            raise Failure(f"{self._asked}: {why}", 2)
+            raise Failure(f"{self._error_prefix}: {why}", 2)
 
     @contextmanager
-    def rack_at(self, tick: int, snapshots: SnapshotPolicy | None = None) -> Iterator[Rack]:
+    def run_rack_to(self, tick: int, snapshots: SnapshotPolicy | None = None) -> Iterator[Rack]:
         """Yield the rack after it has run, unchanged, up to `tick`.
 
         Args:
             tick: The tick before which the rack stops.
             snapshots: Which snapshots to keep. None for none.
         """
-        begins = self._begin(tick)
-        config = self._own_config(f"at-{tick}")
+        begins = self._find_beginning(tick)
+        config = self._unique_config(f"at-{tick}")
         with (
-            INTERRUPT.raising(),
+            INTERRUPT.raise_interrupted(),
             Rack(
                 config,
                 crate=self.crate,
@@ -158,39 +169,39 @@ class RunAgain:
             self._has_begun = True
             yield rack
 
-    def _own_config(self, ending: str) -> RackConfig:
+    def _unique_config(self, ending: str) -> RackConfig:
         """Return the config of the run with a unique name, since the original may be in use."""
-        config = branched(self.recording)
+        config = load_branch_config(self.recording)
         return config.model_copy(update={"name": f"{config.name[:16]}-{ending}-{os.getpid()}"})
 
-    def beginning(self, tick: int) -> Beginning:
+    def continue_at(self, tick: int) -> Beginning:
         """Return the state from which a rack can continue at `tick`."""
-        self.reach(tick)
-        return replace(self._begin(tick), origin=Origin.at(self.recording, tick))
+        self.reach_tick(tick)
+        return replace(self._find_beginning(tick), origin=Origin.from_run(self.recording, tick))
 
-    def levels(self, tick: int) -> dict[str, Document]:
+    def read_levels(self, tick: int) -> dict[str, Document]:
         """Return the attributes of the levels' objects before `tick`, by task."""
-        self.reach(tick)
+        self.reach_tick(tick)
         tasks = [task.name for task in self.recording.layout.tasks]
-        texts = {task: self.crate.show(tick, task).attributes for task in tasks}
+        texts = {task: self.crate.read_attributes(tick, task).attributes for task in tasks}
         return {task: json.loads(text) for task, text in texts.items() if text}
 
-    def _begin(self, tick: int) -> Beginning:
+    def _find_beginning(self, tick: int) -> Beginning:
         """Return the state from which this run is repeated towards `tick`."""
         run = self.recording
         begins = Beginning(crate=self.crate, entries=self.entries)
         if self._has_begun:
-            return replace(begins, continues=self._continuation(tick))
+            return replace(begins, continues=self._find_continuation(tick))
         if self._branched_at is not None and self._parent is not None:
-            self._parent.reach(self._branched_at)
-            continues = self._parent._continuation(self._branched_at)
-            requests = commands_from(run, self._branched_at)
+            self._parent.reach_tick(self._branched_at)
+            continues = self._parent._find_continuation(self._branched_at)
+            requests = load_commands_from(run, self._branched_at)
             return replace(begins, continues=continues, requests=requests)
-        if ticks_of(run)[0] > max(task.every for task in run.layout.tasks):
-            raise Failure(f"{self._asked}: the beginning of the run was not recorded", 2)
-        return replace(begins, requests=recorded_commands(run))
+        if find_tick_range(run)[0] > max(task.every for task in run.layout.tasks):
+            raise Failure(f"{self._error_prefix}: the beginning of the run was not recorded", 2)
+        return replace(begins, requests=load_operator_commands(run))
 
-    def _continuation(self, tick: int) -> Continuation:
+    def _find_continuation(self, tick: int) -> Continuation:
         """Return the newest snapshot up to `tick`, with the number of entries in the tables."""
         ran = self.recording.rack_config
         return Continuation(tick, len(ran.fault), len(ran.command), self._losses)
@@ -203,30 +214,33 @@ class RunAgain:
         before = (loss for loss in earlier if loss[1] < (self._branched_at or 0))
         return (*before, *((death["board"], death["tick"]) for death in died))
 
-    def _nearest(self, tick: int) -> int:
+    def _nearest_snapshot_tick(self, tick: int) -> int:
         """Return the tick of the newest snapshot up to `tick`."""
-        return self.crate.show(tick, "").tick
+        return self.crate.read_attributes(tick, "").tick
 
-    def _note_unlike(self, unlike: Sequence[str], tick: int) -> None:
+    def _report_differences(self, unlike: Sequence[str], tick: int) -> None:
         """Report on stderr which mailboxes differ from the recording, with the first difference."""
         names = ", ".join(unlike)
         first = ""
         with suppress(Failure), TemporaryDirectory(prefix="rack-") as folder:
-            first = f"{self._first_unlike(Path(folder) / 'again', tick)}: "
-        print(f"{self._asked}: {names} are not as recorded: {first}{WHY_NOT}", file=sys.stderr)
+            first = f"{self._describe_first_difference(Path(folder) / 'again', tick)}: "
+        print(
+            f"{self._error_prefix}: {names} are not as recorded: {first}{DIFFERENCE_CAUSES}",
+            file=sys.stderr,
+        )
 
-    def _first_unlike(self, folder: Path, tick: int) -> str:
+    def _describe_first_difference(self, folder: Path, tick: int) -> str:
         """Describe the first message up to `tick` that differs from the recording.
 
         The rack runs again for this, and is recorded into `folder`.
         """
-        config = self._own_config("again")
-        begins = self._begin(self._branched_at or 0)
-        run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), begins=begins)
+        config = self._unique_config("again")
+        begins = self._find_beginning(self._branched_at or 0)
+        run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), beginning=begins)
         again = Recording(folder)
-        first = unlike_messages(self.recording, again)[0]
-        box = again.layout.mailbox(first.mailbox)
-        recorded, repeated = (row_of(run, box, first.serial) for run in (self.recording, again))
+        first = list_divergent_messages(self.recording, again)[0]
+        box = again.layout.find_mailbox(first.mailbox)
+        recorded, repeated = (find_row(run, box, first.serial) for run in (self.recording, again))
         where = f"first {box.name} at tick {first.tick}"
         if recorded is None or repeated is None:
             return f"{where}, which is missing in one of the two runs"
@@ -238,7 +252,7 @@ class RunAgain:
         )
 
 
-def run_of(origin: str) -> Path:
+def find_run_config(origin: str) -> Path:
     """Find the config of the run in RUN@TIME. Raises `Failure`."""
     run, at, _ = origin.rpartition("@")
     path = Path(run) / CONFIG
@@ -250,7 +264,7 @@ def run_of(origin: str) -> Path:
 
 
 @contextmanager
-def beginning(
+def open_beginning(
     config: RackConfig, origin: str, crate: WarmCrate | None = None, anyway: bool = False
 ) -> Iterator[Beginning]:
     """Yield the state of a recorded run from which a rack can continue, valid inside the context.
@@ -264,23 +278,23 @@ def beginning(
     Raises:
         Failure: The run cannot be repeated up to this time.
     """
-    recording = Recording(run_of(origin).parent)
+    recording = Recording(find_run_config(origin).parent)
     asked = f"--from {origin}"
-    tick = tick_in(recording, origin.rpartition("@")[2], f"{asked}: ")
-    injected = len(recording.ended.get("faults", ())) - len(recording.rack_config.fault)
+    tick = parse_tick(recording, origin.rpartition("@")[2], f"{asked}: ")
+    injected = len(recording.end_counts.get("faults", ())) - len(recording.rack_config.fault)
     if injected > 0:
         why = "faults were injected by hand during the run and are not repeated"
         print(f"{asked}: {injected} {why}", file=sys.stderr)
-    with RunAgain(recording, asked, crate, anyway) as again:
+    with RepeatedRun(recording, asked, crate, anyway) as again:
         if again.entries is not None:
             lan = config.adapter.lan
             senders = ", ".join(map(repr, (*config.host, *(() if lan is None else lan.racks))))
             why = f"not started: {senders}; their recorded messages are replayed"
             print(f"{asked}: {why}", file=sys.stderr)
-        yield again.beginning(tick)
+        yield again.continue_at(tick)
 
 
-def tick_in(recording: Recording, text: str, asked: str = "") -> int:
+def parse_tick(recording: Recording, text: str, asked: str = "") -> int:
     """Convert a time, s, to a tick of a recorded run.
 
     Args:
@@ -296,7 +310,7 @@ def tick_in(recording: Recording, text: str, asked: str = "") -> int:
     with suppress(ValueError, OverflowError):
         tick = round(float(text) * 1e9 / recording.layout.clock_ns)
     is_kept = any(first <= tick < end for first, end in recording.kept or [(0, tick + 1)])
-    begins, ends = ticks_of(recording)
+    begins, ends = find_tick_range(recording)
     if not (begins <= tick < ends and is_kept):
         first, last = (at * recording.layout.clock_ns * 1e-9 for at in (begins, ends - 1))
         suffix = f"; {recording.kept_text}" if recording.kept else ""
@@ -304,7 +318,7 @@ def tick_in(recording: Recording, text: str, asked: str = "") -> int:
     return tick
 
 
-def branched(
+def load_branch_config(
     recording: Recording, settings: Sequence[str] = (), faults: str | None = None
 ) -> RackConfig:
     """Load the config of a branch of a run, in lockstep.
@@ -321,12 +335,12 @@ def branched(
     return load(str(recording.folder / CONFIG), overrides, faults)
 
 
-def unlike_in(recording: Recording, segment: Segment, tick: int) -> list[str]:
+def list_differing_mailboxes(recording: Recording, segment: Segment, tick: int) -> list[str]:
     """List the mailboxes whose messages up to `tick` differ from those of the recording."""
     differing = []
-    for name, (serial, chain) in chains(segment, tick).items():
+    for name, (serial, chain) in find_chains(segment, tick).items():
         # The chained checksum of a message covers all messages before it.
-        rows = np.flatnonzero(recording.signal(name, "serial") == serial + 1)
-        if len(rows) and recording.signal(name, "chain")[rows[0]] != chain:
+        rows = np.flatnonzero(recording.read_signal(name, "serial") == serial + 1)
+        if len(rows) and recording.read_signal(name, "chain")[rows[0]] != chain:
             differing.append(name)
     return differing

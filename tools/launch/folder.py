@@ -13,15 +13,15 @@ from io import StringIO
 from pathlib import Path
 from typing import TextIO
 
-from rack.boards.events import Event, order_key
+from rack.boards.events import Event, get_event_order
 from rack.tools.console.answer import Document, Failure
 from rack.tools.monitor.display import Display
-from rack.tools.recording.checksums import checked_line
+from rack.tools.recording.checksums import format_checked_line
 
 RUNS = Path("runs")
 
 
-def folder_of(wanted: Path | None, rack: str) -> Path:
+def choose_run_folder(wanted: Path | None, rack: str) -> Path:
     """Choose the folder for a run that is about to start. It is created later.
 
     Args:
@@ -58,26 +58,26 @@ class EventLog:
         self._file: TextIO = self._earlier
         self.has_failed = False
 
-    def add(self, event: Event) -> None:
+    def add_event(self, event: Event) -> None:
         """Show and write an event."""
         self._display.show_event(event)
-        self._write(asdict(event))
+        self._write_entry(asdict(event))
 
-    def open(self, path: Path) -> None:
+    def open_file(self, path: Path) -> None:
         """Write to a file from now on, beginning with the events so far."""
         # Buffer single lines, so that the log of a killed run is complete up to its end.
         self._file = path.open("w", buffering=1)
-        self._put(self._earlier.getvalue())
+        self._write_text(self._earlier.getvalue())
 
-    def end(self, outcome: Document) -> None:
+    def write_outcome(self, outcome: Document) -> None:
         """Write the outcome, close the file, and sort its events.
 
         Until then they are in the order in which they became known.
         """
-        self._write({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
+        self._write_entry({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
         self.close()
         if self._file is not self._earlier and not self.has_failed:
-            self._put_in_order(Path(self._file.name))
+            self._sort_lines(Path(self._file.name))
 
     def close(self) -> None:
         """Close the file, with or without an outcome."""
@@ -85,10 +85,10 @@ class EventLog:
         with suppress(OSError):
             self._file.close()
 
-    def _put_in_order(self, path: Path) -> None:
+    def _sort_lines(self, path: Path) -> None:
         """Sort the lines of the file. On a full disk it stays unsorted."""
         lines = path.read_text().splitlines(keepends=True)
-        ordered = sorted(lines, key=lambda line: order_key(json.loads(line)))
+        ordered = sorted(lines, key=lambda line: get_event_order(json.loads(line)))
         if ordered == lines:
             return
         sorted_file = path.with_suffix(".part")
@@ -97,10 +97,10 @@ class EventLog:
             sorted_file.replace(path)
         sorted_file.unlink(missing_ok=True)
 
-    def _write(self, entry: Document) -> None:
-        self._put(checked_line(entry))
+    def _write_entry(self, entry: Document) -> None:
+        self._write_text(format_checked_line(entry))
 
-    def _put(self, text: str) -> None:
+    def _write_text(self, text: str) -> None:
         """Write a text. The first failure is shown as an event."""
         try:
             if not self.has_failed:

@@ -16,22 +16,22 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.events import Event, Outcome
-from rack.boards.wiring import Continuation, Entries
+from rack.boards.wiring import Continuation, ExchangedEntries
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.faults.ending import Strike, strikes
+from rack.tools.faults.ending import Strike, list_strikes
 from rack.tools.launch.folder import EventLog
-from rack.tools.launch.other_racks import OtherEnd, OtherRacks
+from rack.tools.launch.other_racks import OtherRackEnd, OtherRacks
 from rack.tools.launch.verdict import list_failures
 from rack.tools.monitor.display import Display
-from rack.tools.monitor.holds import Standstill
-from rack.tools.monitor.newest_messages import Newest
-from rack.tools.monitor.queues import queue_fills
+from rack.tools.monitor.holds import StandstillDetector
+from rack.tools.monitor.newest_messages import NewestMessages
+from rack.tools.monitor.queues import list_queue_fills
 from rack.tools.monitor.snapshot import RackMonitor
-from rack.tools.recording.origin import Origin, write_code
+from rack.tools.recording.origin import Origin, write_code_state
 from rack.tools.recording.recorder.process import RecorderProcess
 
-COUNTED = (
+COUNTED_WORDS = (
     "CYCLES",
     "PLANS",
     "DONE",
@@ -45,7 +45,7 @@ COUNTED = (
     "BUS_ERRORS",
 )
 """Words of a task's control block that the result of a run keeps."""
-NO_TIME = "no time for the report: 'rack report {}' makes it"
+UNFINISHED_HINT = "no time for the report: 'rack report {}' makes it"
 VIEWER = "rack.tools.viewer.window"
 """Module of the viewer, imported by name because running and recording do not need it."""
 NO_RECORDER = "the recorder has not begun yet: real time begins without it, lockstep waits"
@@ -70,11 +70,11 @@ class Beginning:
     continues: Continuation | None = None
     crate: CrateLine | None = None
     requests: tuple[Request, ...] = ()
-    entries: Mapping[str, Entries] | None = None
+    entries: Mapping[str, ExchangedEntries] | None = None
     origin: Origin | None = None
 
 
-ANEW = Beginning()
+FROM_START = Beginning()
 """A run from tick 0."""
 
 
@@ -101,7 +101,7 @@ class RunResult:
     faults: tuple[Strike, ...]
     clock_offset_ns: int
     refused: dict[str, int]
-    others: tuple[OtherEnd, ...] = ()
+    others: tuple[OtherRackEnd, ...] = ()
     failed: str = ""
 
     @property
@@ -110,9 +110,9 @@ class RunResult:
 
         Only a report judges the response of the system.
         """
-        return not self.failure()
+        return not self.describe_failure()
 
-    def failure(self) -> str:
+    def describe_failure(self) -> str:
         """Return in one line why the run failed, or an empty text."""
         return "; ".join(list_failures(self.outcome, self.recording, self.failed))
 
@@ -126,7 +126,7 @@ def run_rack(
     view: bool = False,
     share: bool = True,
     step: bool = False,
-    begins: Beginning = ANEW,
+    beginning: Beginning = FROM_START,
 ) -> RunResult:
     """Run a rack, and record it.
 
@@ -142,7 +142,7 @@ def run_rack(
         view: True to open a viewer on the recorder. The user may close it at any time.
         share: As in `Rack`.
         step: True to hold the rack before tick 0 until it is stepped. Only in lockstep.
-        begins: Crate, snapshot and entries of a run that is continued or repeated.
+        beginning: Crate, snapshot and entries of a run that is continued or repeated.
 
     Raises:
         Failure: A file cannot be written. Errors of `Rack` are raised as well; a rack that could
@@ -151,10 +151,10 @@ def run_rack(
     log = EventLog(display)
     with closing(log), ExitStack() as stack:
         # Until the run has begun there is nothing to save, so a signal may end it at once.
-        with INTERRUPT.at_once():
+        with INTERRUPT.end_at_once():
             lan = config.adapter.lan
             # In a repeated run their recorded messages are replayed instead.
-            launches = lan.launch if lan is not None and begins.entries is None else ()
+            launches = lan.launch if lan is not None and beginning.entries is None else ()
             others = stack.enter_context(OtherRacks(launches, config, seconds, folder is not None))
             recorder = None if folder is None else RecorderProcess(folder)
             if recorder is not None:
@@ -162,57 +162,59 @@ def run_rack(
             rack = stack.enter_context(
                 Rack(
                     config,
-                    log.add,
+                    log.add_event,
                     share or bool(others),
-                    begins.crate,
-                    begins.entries,
-                    continues=begins.continues,
-                    requests=begins.requests,
+                    beginning.crate,
+                    beginning.entries,
+                    continues=beginning.continues,
+                    requests=beginning.requests,
                 )
             )
             segment = rack.segment
             segment.words[System.HOLD_AT] = int(step)
             news: list[News] = []
             if recorder is not None:
-                news.append(recorder.news)
-                begin_folder(recorder.folder, config, log, begins.origin)
+                news.append(recorder.read_news)
+                create_run_folder(recorder.folder, config, log, beginning.origin)
                 port = import_module(VIEWER).free_port() if view else None
                 if not recorder.attach(config.name, port, segment.words):
-                    log.add(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
+                    log.add_event(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
                 if port is not None:
                     news.append(_open_viewer(port))
 
         def log_news() -> None:
             for text in [text for source in news for text in source()]:
-                log.add(Event(time.time_ns(), segment.words[System.TICK], "recorder", "", text))
+                log.add_event(
+                    Event(time.time_ns(), segment.words[System.TICK], "recorder", "", text)
+                )
 
-        unfinished = NO_TIME.format(folder) if folder else ""
-        with INTERRUPT.orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
+        unfinished = UNFINISHED_HINT.format(folder) if folder else ""
+        with INTERRUPT.stop_orderly(lambda: rack.stop(f"{INTERRUPT.name} received"), unfinished):
             started = time.monotonic()
-            outcome = _watch(rack, seconds, display, log, log_news, others)
+            outcome = _watch_rack(rack, seconds, display, log, log_news, others)
             wall_s = time.monotonic() - started
         log_news()
         if recorder is not None and not INTERRUPT.number:
             # The recorder could not attach to a closed rack.
-            recorder.await_begun()
+            recorder.wait_until_attached()
         rack.close()
         recording, rows_lost = "none", dict[str, int]()
         if recorder is not None:
             ended = recorder.finish(in_a_hurry=INTERRUPT.number != 0)
             recording, rows_lost = compare_recording(recorder.folder, segment, ended, outcome.ticks)
         log_news()
-        failed = others.finish()
+        failed = others.await_end()
         result = replace(
-            result_of(segment, config, outcome, wall_s, recording, rows_lost),
-            others=others.ends(),
+            build_result(segment, config, outcome, wall_s, recording, rows_lost),
+            others=others.list_ends(),
             failed=failed,
         )
-        log.end(asdict(result))
+        log.write_outcome(asdict(result))
         cut_off = replace(result, recording="events.jsonl ends before the run")
         return cut_off if log.has_failed else result
 
 
-def begin_folder(
+def create_run_folder(
     folder: Path, config: RackConfig, log: EventLog, origin: Origin | None = None
 ) -> None:
     """Create the folder of a run, with config, code and the events so far.
@@ -228,16 +230,16 @@ def begin_folder(
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "config.toml").write_text(config.text())
-        write_code(config, folder)
+        (folder / "config.toml").write_text(config.to_toml_text())
+        write_code_state(config, folder)
         if origin is not None:
             origin.write(folder)
-        log.open(folder / "events.jsonl")
+        log.open_file(folder / "events.jsonl")
     except OSError as error:
         raise Failure(f"{folder}: {error.strerror}") from None
 
 
-def result_of(
+def build_result(
     segment: Segment,
     config: RackConfig,
     outcome: Outcome,
@@ -263,7 +265,8 @@ def result_of(
         tasks={
             task.name: {
                 **{
-                    name.lower(): segment.block(task.name)[getattr(Block, name)] for name in COUNTED
+                    name.lower(): segment.get_block(task.name)[getattr(Block, name)]
+                    for name in COUNTED_WORDS
                 },
                 **segment.count_cycles(task, outcome.ticks)._asdict(),
             }
@@ -271,9 +274,11 @@ def result_of(
         },
         recording=recording,
         rows_lost=rows_lost,
-        faults=strikes(segment, config.joints),
+        faults=list_strikes(segment, config.joints),
         clock_offset_ns=time.time_ns() - time.monotonic_ns(),
-        refused={queue.mailbox: queue.refused for queue in queue_fills(Newest(segment))},
+        refused={
+            queue.mailbox: queue.refused for queue in list_queue_fills(NewestMessages(segment))
+        },
     )
 
 
@@ -288,7 +293,7 @@ def _open_viewer(port: int) -> News:
         return lambda: [news.pop()] if news else []
 
 
-def _watch(
+def _watch_rack(
     rack: Rack,
     seconds: float | None,
     display: Display,
@@ -299,21 +304,21 @@ def _watch(
     """Run the rack to its end, show it, and log events that only the host side can detect."""
     rack.start(seconds)
     monitor = RackMonitor(rack.segment)
-    standstill = Standstill(rack.segment)
+    standstill = StandstillDetector(rack.segment)
     is_running = True
     while is_running:
         # Take one more snapshot after the end: a lockstep run may end between two snapshots.
         is_running = rack.watch(display.period_s)
-        display.show(monitor.look())
+        display.show(monitor.take_snapshot())
         log_news()
-        for event in standstill.look():
-            log.add(event)
-        if why := others.failure():
+        for event in standstill.list_events():
+            log.add_event(event)
+        if why := others.describe_failures():
             rack.stop(why)
     if rack.outcome is None:
         raise Failure("the run ended without an outcome")
-    if not rack.outcome.worked:
-        others.stop()
+    if not rack.outcome.is_success:
+        others.stop_racks()
     return rack.outcome
 
 
@@ -334,22 +339,26 @@ def compare_recording(
     # Import late, because these libraries would delay the launch.
     from rack.tools.recording.occasions import Retention
     from rack.tools.recording.recording import Recording
-    from rack.tools.recording.run_files import find_missing, tally
+    from rack.tools.recording.run_files import count_spool, find_missing
 
     try:
-        retention = Retention.of(segment)
+        retention = Retention.from_config(segment)
         # An interrupted run has no time to convert the rows of a flight recorder to tables.
-        left = None if retention is None else tally(folder)
+        left = None if retention is None else count_spool(folder)
         if retention is None or left is None:
-            missing = Recording(folder).missing(segment)
+            missing = Recording(folder).count_missing_rows(segment)
         else:
             missing = find_missing(segment, left.taken, left.lost)
-            if not missing and (absent := retention.absent(segment, left.kept, ticks)):
+            if not missing and (
+                absent := retention.find_missing_windows(segment, left.kept, ticks)
+            ):
                 first, last = absent[0]
                 return f"ticks {first:,} to {last:,} should have been kept but are missing", {}
         if not missing:
             return "complete", {}
-        gaps = Recording(folder).gaps({name: rows for name, (rows, _) in missing.items()}, ticks)
+        gaps = Recording(folder).find_gaps(
+            {name: rows for name, (rows, _) in missing.items()}, ticks
+        )
     except Failure as error:
         return f"{why}; {error}", {}
     most, name = max((loss, name) for name, loss in missing.items())

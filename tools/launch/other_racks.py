@@ -13,18 +13,18 @@ from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, Self
 
-from rack.backplane.process import die_with_parent, how_ended
+from rack.backplane.process import describe_end, die_with_parent
 from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Document
 
-END_S = 60.0
+MAX_END_S = 60.0
 """Longest wait for the end of the other racks after this rack's end, including their reports."""
-STOP_S = 3.0
+MAX_STOP_S = 3.0
 """Longest wait for the end of a rack that is stopped."""
 
 
 @dataclass(frozen=True)
-class OtherEnd:
+class OtherRackEnd:
     """The end of another rack. `folder` is None if its run was not recorded."""
 
     rack: str
@@ -34,7 +34,7 @@ class OtherEnd:
     folder: str | None
 
 
-class Launched(NamedTuple):
+class LaunchedProcess(NamedTuple):
     """Another rack. Its report goes to a file in memory, because nobody would empty a pipe."""
 
     config: str
@@ -62,7 +62,7 @@ class OtherRacks:
         options += [] if is_recorded else ["--no-record"]
         self._is_stopped = False
         self._failed = ""
-        self._racks: list[Launched] = []
+        self._racks: list[LaunchedProcess] = []
         for other in configs:
             report = os.memfd_create("report")
             # Use a new process group. Otherwise Ctrl-C would reach the rack twice, from the
@@ -74,58 +74,58 @@ class OtherRacks:
                 process_group=0,
                 preexec_fn=partial(die_with_parent, os.getpid()),
             )
-            self._racks.append(Launched(other, process, report))
+            self._racks.append(LaunchedProcess(other, process, report))
 
     def __len__(self) -> int:
         return len(self._racks)
 
-    def failure(self) -> str:
+    def describe_failures(self) -> str:
         """Return which of the racks have failed so far, and how. Empty if none has."""
         # Racks stopped by this process end by a signal, which does not count as a failure.
         if not self._is_stopped:
             failed = [rack for rack in self._racks if rack.process.poll()]
-            self._failed = "; ".join(f"{rack.config}: {_failure_of(rack)}" for rack in failed)
+            self._failed = "; ".join(f"{rack.config}: {_describe_failure(rack)}" for rack in failed)
         return self._failed
 
-    def stop(self) -> None:
+    def stop_racks(self) -> None:
         """Ask all of the racks to end."""
         self._is_stopped = True
         for rack in self._racks:
             rack.process.terminate()
 
-    def finish(self) -> str:
+    def await_end(self) -> str:
         """Wait for the end of the racks, and return their failures as `describe_failures` does."""
-        deadline = time.monotonic() + (STOP_S if self._is_stopped else END_S)
+        deadline = time.monotonic() + (MAX_STOP_S if self._is_stopped else MAX_END_S)
         late = []
         for rack in self._racks:
             try:
                 rack.process.wait(max(0.0, deadline - time.monotonic()))
             except subprocess.TimeoutExpired:
                 late.append(f"{rack.config}: still running")
-        return "; ".join(late) or self.failure()
+        return "; ".join(late) or self.describe_failures()
 
-    def ends(self) -> tuple[OtherEnd, ...]:
+    def list_ends(self) -> tuple[OtherRackEnd, ...]:
         """Return how each rack that ran has ended."""
         ended = []
         for rack in self._racks:
-            report = _report_of(rack)
+            report = _read_report(rack)
             if outcome := report.get("outcome"):
                 end = outcome["cause"], outcome["ticks"], outcome["digest"]
-                ended.append(OtherEnd(report["rack"], *end, report["folder"]))
+                ended.append(OtherRackEnd(report["rack"], *end, report["folder"]))
         return tuple(ended)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.stop()
-        self.finish()
+        self.stop_racks()
+        self.await_end()
         for rack in self._racks:
             rack.process.kill()
             os.close(rack.report)
 
 
-def _report_of(rack: Launched) -> Document:
+def _read_report(rack: LaunchedProcess) -> Document:
     """Return the report of a rack, or an empty document if it is incomplete."""
     with suppress(ValueError):
         report: Document = json.loads(os.pread(rack.report, os.fstat(rack.report).st_size, 0))
@@ -133,8 +133,8 @@ def _report_of(rack: Launched) -> Document:
     return {}
 
 
-def _failure_of(rack: Launched) -> str:
+def _describe_failure(rack: LaunchedProcess) -> str:
     """Describe why a rack failed."""
-    report = _report_of(rack)
+    report = _read_report(rack)
     why = report.get("failures") or report.get("error")
-    return "; ".join(why or [how_ended(rack.process.returncode)])
+    return "; ".join(why or [describe_end(rack.process.returncode)])

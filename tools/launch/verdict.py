@@ -36,7 +36,7 @@ def judge_run(ended: Mapping[str, Any], response: Document | None) -> Document:
     if response is not None and response["crosses_racks"]:
         unjudged.append(ACROSS_RACKS)
     elif response is not None:
-        failures += _long_responses(response)
+        failures += _list_long_responses(response)
     return {"worked": not failures, "failures": failures, "unjudged": unjudged}
 
 
@@ -52,7 +52,7 @@ def list_failures(outcome: Outcome, recording: str, others: str) -> list[str]:
     return [why for why in (outcome.failure, lost, others) if why]
 
 
-def _long_responses(response: Document) -> Iterator[str]:
+def _list_long_responses(response: Document) -> Iterator[str]:
     """Yield a failure for each chain whose response exceeded its bound without a lost cycle."""
     for chains in (response, *response["others"]):
         for direction in ("command", "status"):
@@ -65,7 +65,7 @@ def _long_responses(response: Document) -> Iterator[str]:
                 )
 
 
-def headline(rack: str, outcome: Document | None, failures: list[str]) -> str:
+def format_headline(rack: str, outcome: Document | None, failures: list[str]) -> str:
     """Return the verdict in one line.
 
     Args:

@@ -18,49 +18,55 @@ from rack.backplane.operator_table import (
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import read_stored
-from rack.boards.config.commands import asked, request, takes
+from rack.boards.config.commands import build_request, describe_commands, parse_command
 from rack.boards.config.published import PublishedRack
 from rack.boards.config.schema import CommandConfig
 from rack.boards.errors import ConfigError, Mistake
-from rack.boards.operator import describe, message_of
+from rack.boards.operator import copy_request_message, describe_command
 from rack.levels.operator import EFFECTS, Operation
 from rack.tools.console.answer import Document, Failure
-from rack.tools.console.held import waits
-from rack.tools.console.tables import fitted
-from rack.tools.monitor.holds import resume_command
-from rack.tools.monitor.newest_messages import Newest
-from rack.tools.monitor.replies import LastCycle, Replies, Reply, answering
+from rack.tools.console.held import describe_wait
+from rack.tools.console.tables import format_fitted_table
+from rack.tools.monitor.holds import format_resume_command
+from rack.tools.monitor.newest_messages import NewestMessages
+from rack.tools.monitor.replies import Reply, ReplyDeadline, ReplyReader, find_answering_status
 
-SILENT_S = 5.0
+MAX_SILENCE_S = 5.0
 """A wait is given up after this time without a tick."""
-NOTE_S = 1.5
+EXPLAIN_AFTER_S = 1.5
 """A wait is explained on stderr after this time."""
-LOOK_S = 0.001
+CHECK_INTERVAL_S = 0.001
 """Time between two checks of the rack."""
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 
 
-class LiveDesk:
+class LevelCommander:
     """Commands the levels of one rack."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._config = read_stored(self._segment.config)
-        levels = PublishedRack.of_rack(self._segment).levels
+        levels = PublishedRack.read_from_segment(self._segment).levels
         self._levels = {name: published for name, published in levels.items() if published.commands}
 
-    def levels(self) -> list[dict[str, str]]:
+    def list_levels(self) -> list[dict[str, str]]:
         """List the commands that each level takes, and the one in force, as plain data."""
         return [
-            {"level": name, "in_force": self._in_force(name), "takes": takes(level)}
+            {
+                "level": name,
+                "in_force": self._name_command_in_force(name),
+                "takes": describe_commands(level),
+            }
             for name, level in self._levels.items()
         ]
 
-    def text(self) -> Iterator[str]:
+    def format_levels(self) -> Iterator[str]:
         """Yield the lines of a table of `list_levels`."""
-        return fitted(["level", "in force", "takes"], [list(row.values()) for row in self.levels()])
+        return format_fitted_table(
+            ["level", "in force", "takes"], [list(row.values()) for row in self.list_levels()]
+        )
 
-    def highest(self, *in_force: str) -> list[str]:
+    def list_highest_levels(self, *in_force: str) -> list[str]:
         """List the highest levels that can hold and have one of some commands in force.
 
         A level below another one of the result is left out.
@@ -71,12 +77,14 @@ class LiveDesk:
         levels = [
             name
             for name in self._levels
-            if self._takes_hold(name) and self._in_force(name) in in_force
+            if self._can_hold(name) and self._name_command_in_force(name) in in_force
         ]
-        lower_levels = set[str]().union(*map(self._config.all_below, levels))
+        lower_levels = set[str]().union(*map(self._config.find_boards_below, levels))
         return [name for name in levels if name not in lower_levels]
 
-    def give(self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None) -> Reply:
+    def give_command(
+        self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None
+    ) -> Reply:
         """Give a command, and wait until its level has taken it up or, with `wait`, has done it.
 
         Args:
@@ -89,18 +97,18 @@ class LiveDesk:
             Failure: The command was not given, or not answered in time.
         """
         segment = self._segment
-        command, clock_request = self._request(given)
-        if wait_text := waits(segment):
+        command, clock_request = self._build_request(given)
+        if wait_text := describe_wait(segment):
             # Leave the request in the table for the next step, after this process has ended.
-            entry = OperatorTable(segment).add(clock_request)
-            text = describe(message_of(entry, segment.layout))
+            entry = OperatorTable(segment).add_request(clock_request)
+            text = describe_command(copy_request_message(entry, segment.layout))
             return Reply(0, command.level, text, -1, "waiting", waits=wait_text)
         # Leaving the claim withdraws a request that has not been given, however the wait ends.
-        with OperatorTable(segment).claim(clock_request) as entry:
-            reply = self._await_giving(entry, command.level)
+        with OperatorTable(segment).claim_request(clock_request) as entry:
+            reply = self._await_given(entry, command.level)
         return self._await_reply(reply, wait, timeout_s)
 
-    def attend(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> None:
+    def lease_command(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> None:
         """Give a command under a lease, and stay until a newer one is in force or the run is over.
 
         If this process ends or falls silent before that, the level holds.
@@ -112,30 +120,32 @@ class LiveDesk:
         Raises:
             Failure: As in `give_command`, and for a command that does not stay in force.
         """
-        command, clock_request = self._request(given)
+        command, clock_request = self._build_request(given)
         segment = self._segment
-        if command.said not in EFFECTS or not self._takes_hold(command.level):
+        if command.operation not in EFFECTS or not self._can_hold(command.level):
             lasting = ", ".join(operation.name.lower() for operation in EFFECTS)
             why = f"must be one of {lasting}, to a level that can hold"
             raise Failure(f"--lease: '{command.level}', {command.what}: {why}", 2)
-        if wait_text := waits(segment):
+        if wait_text := describe_wait(segment):
             raise Failure(f"--lease: the rack is held: {wait_text}")
         table = OperatorTable(segment)
-        with table.claim(clock_request, Client.LEASES) as entry:
+        with table.claim_request(clock_request, Client.LEASES) as entry:
             ticket = entry.ticket
-            reply = self._await_reply(self._await_giving(entry, command.level), False, None)
+            reply = self._await_reply(self._await_given(entry, command.level), False, None)
             tell(reply)
-            while reply.worked and table.hear(entry, ticket) and not segment.run_is_over:
-                time.sleep(LOOK_S)
+            while (
+                reply.worked and table.record_heartbeat(entry, ticket) and not segment.run_is_over
+            ):
+                time.sleep(CHECK_INTERVAL_S)
 
-    def _takes_hold(self, level: str) -> bool:
+    def _can_hold(self, level: str) -> bool:
         return Operation.HOLD in (self._levels[level].commands)
 
-    def _request(self, fields: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
+    def _build_request(self, fields: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
         """Build a command and its request to the clock. Raises like `give_command`."""
         tick = self._segment.words[System.TICK]
-        command = asked({key: value for key, value in fields.items() if value is not None})
-        wanted = request(command, self._config, self._levels, self._segment.layout)
+        command = parse_command({key: value for key, value in fields.items() if value is not None})
+        wanted = build_request(command, self._config, self._levels, self._segment.layout)
         if 0 <= wanted.tick <= tick:
             key, value = ("tick", command.tick) if command.at is None else ("at", command.at)
             raise ConfigError([Mistake(key, value, f"has passed; the rack is at tick {tick}")])
@@ -168,14 +178,14 @@ class LiveDesk:
             )
         name = setting.removeprefix(f"{place}.")
         fields = {"level": level, "what": "set", "name": name, "tick": tick, "at": at}
-        return self.give(fields, wait=False)
+        return self.give_command(fields, wait=False)
 
-    def _await_giving(self, entry: RequestEntry, level: str) -> Reply:
+    def _await_given(self, entry: RequestEntry, level: str) -> Reply:
         """Wait until the clock has given a command to its level. Raises `Failure`."""
         ticket = entry.ticket
-        text = describe(message_of(entry, self._segment.layout))
+        text = describe_command(copy_request_message(entry, self._segment.layout))
         about = f"'{level}', {text}"
-        for is_over in self._looks(about, f"waiting for tick {max(0, entry.tick)}"):
+        for is_over in self._poll_run(about, f"waiting for tick {max(0, entry.tick)}"):
             if entry.ticket != ticket:
                 break
             if entry.stage == RequestStage.GIVEN:
@@ -187,16 +197,16 @@ class LiveDesk:
     def _await_reply(self, reply: Reply, wait: bool, timeout_s: float | None) -> Reply:
         """Wait until the level has taken the command up or, with `wait`, has done it."""
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
-        status = answering(self._segment, reply.level)
+        status = find_answering_status(self._segment, reply.level)
         if status is None:
             return reply
-        replies = Replies(self._segment, status, reply)
-        last = LastCycle(self._segment, status)
+        replies = ReplyReader(self._segment, status, reply)
+        last = ReplyDeadline(self._segment, status)
         about = f"command {reply.serial}"
         awaited = f"waiting for '{reply.level}', which runs every {status.every} ticks"
-        for is_over in self._looks(about, awaited):
-            late = last.passed(self._segment.words[System.TICK])
-            reply = replies.look()
+        for is_over in self._poll_run(about, awaited):
+            late = last.explain_silence(self._segment.words[System.TICK])
+            reply = replies.read_statuses()
             if reply.fate not in ("given", "taken") or (reply.fate == "taken" and not wait):
                 break
             if is_over:
@@ -204,11 +214,11 @@ class LiveDesk:
             if reply.fate == "given" and late:
                 raise Failure(f"{about}: '{reply.level}' {late}")
             if time.monotonic() > deadline:
-                still = f"in force until: {resume_command(self._segment.rack, reply.level)}"
+                still = f"in force until: {format_resume_command(self._segment.rack, reply.level)}"
                 raise Failure(f"timed out after {timeout_s:g} s: {reply.line}, not done; {still}")
         return reply
 
-    def _looks(self, about: str, awaited: str) -> Iterator[bool]:
+    def _poll_run(self, about: str, awaited: str) -> Iterator[bool]:
         """Yield at each check of the rack whether the run is over.
 
         A long wait is explained on stderr, once. Raises `Failure` if the clock stops ticking and
@@ -218,11 +228,11 @@ class LiveDesk:
         words = self._segment.words
         tick = words[System.TICK]
         changed = time.monotonic()
-        note_at = changed + NOTE_S
+        note_at = changed + EXPLAIN_AFTER_S
         while True:
             # Read this before the statuses: a reply written just before the run ended still counts.
             yield self._segment.run_is_over
-            time.sleep(LOOK_S)
+            time.sleep(CHECK_INTERVAL_S)
             now = time.monotonic()
             if tick != words[System.TICK] or words[System.HELD]:
                 tick = words[System.TICK]
@@ -232,17 +242,19 @@ class LiveDesk:
                 print(
                     f"{about}: {awaited}; the rack is at tick {tick}", file=sys.stderr, flush=True
                 )
-            if now - changed >= SILENT_S:
-                raise Failure(f"{about}: no answer: the clock has not ticked for {SILENT_S:g} s")
+            if now - changed >= MAX_SILENCE_S:
+                raise Failure(
+                    f"{about}: no answer: the clock has not ticked for {MAX_SILENCE_S:g} s"
+                )
 
-    def _in_force(self, level: str) -> str:
+    def _name_command_in_force(self, level: str) -> str:
         """Return the operator's command in force at a level, or an empty text."""
-        status = Newest(self._segment).message(f"{level}.status")
+        status = NewestMessages(self._segment).read_message(f"{level}.status")
         standing = getattr(status, "standing", 0)
         return Operation(standing).name.lower() if standing else ""
 
 
-def goal_of(what: str, words: Sequence[str]) -> Document:
+def parse_goal(what: str, words: Sequence[str]) -> Document:
     """Parse the words after the verb of a command, as keys of a `[[command]]` table.
 
     Args:
@@ -271,11 +283,11 @@ def goal_of(what: str, words: Sequence[str]) -> Document:
             keys = ", ".join(f"{k}=..." for k in GOAL_KEYS)
             raise Failure(f"'{word}': not a goal; valid goals: home, {keys}", 2)
         else:
-            goal[key] = [_number(value, word) for value in values.split(",")]
+            goal[key] = [_parse_number(value, word) for value in values.split(",")]
     return goal
 
 
-def _number(text: str, word: str) -> float:
+def _parse_number(text: str, word: str) -> float:
     """Parse a number of a goal. Raises `Failure` with the whole word."""
     try:
         return float(text)

@@ -18,8 +18,8 @@ from rich.text import Text
 from rack.backplane.process import DEADLINE
 from rack.boards.events import NO_TORQUE, Event
 from rack.boards.exchange import PortAge
-from rack.tools.console.tables import console, decimal, grid
-from rack.tools.monitor.holds import is_news
+from rack.tools.console.tables import build_grid, create_console, format_decimal
+from rack.tools.monitor.holds import is_new_reason
 from rack.tools.monitor.snapshot import DEAD, LOST, Snapshot, TaskRow
 
 if TYPE_CHECKING:
@@ -38,8 +38,8 @@ COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "missed": lambda row: str(row.missed),
     "skipped": lambda row: str(row.skipped),
     "restarts": lambda row: str(row.restarts),
-    "exec ms": lambda row: decimal(row.exec_ms, 2),
-    "late ms": lambda row: decimal(row.lateness_ms, 2),
+    "exec ms": lambda row: format_decimal(row.exec_ms, 2),
+    "late ms": lambda row: format_decimal(row.lateness_ms, 2),
     "state": lambda row: row.state + " (operator)" * (row.mode == "operator"),
 }
 """Text of each column by its heading."""
@@ -56,7 +56,7 @@ DROPPED = (
     "skipped",
 )
 """Columns that a narrow terminal leaves out, in this order."""
-STATES = {
+STATE_STYLES = {
     "error": "red",
     "failed": "red",
     LOST: "bold red",
@@ -66,14 +66,14 @@ STATES = {
 }
 LOSSES = ("missed", "skipped")
 TROUBLES = ("restarts", "refused", "full", "missing", "late", "unknown_launch", "losses")
-COUNTED = {**dict.fromkeys(LOSSES, "red"), **dict.fromkeys(TROUBLES, "yellow")}
+COUNT_STYLES = {**dict.fromkeys(LOSSES, "red"), **dict.fromkeys(TROUBLES, "yellow")}
 """Colours of counts above 0."""
-HELD = "bold yellow"
+HOLD_STYLE = "bold yellow"
 NO_DEMAND = "none"
 """Demand on an arm that is free to move."""
-EVENTS = {"fault": "magenta", "detection": "yellow", "reaction": "red", "recovery": "green"}
-OTHER_EVENTS = "yellow"
-QUIET = ("launch", "start", "end", "miss")
+EVENT_STYLES = {"fault": "magenta", "detection": "yellow", "reaction": "red", "recovery": "green"}
+DEFAULT_EVENT_STYLE = "yellow"
+HIDDEN_EVENTS = ("launch", "start", "end", "miss")
 """Kinds of events that the table shows already: for example, it counts misses."""
 BRIEF_TICKS = 10
 """Brakes engaged by missed cycles for fewer ticks than this are only counted."""
@@ -93,8 +93,8 @@ class Display:
 
     def show_event(self, event: Event) -> None:
         """Show an event, unless the table shows it already."""
-        if is_shown(event):
-            self.print_event(event_text(event))
+        if is_worth_showing(event):
+            self.print_event(format_event(event))
 
     def print_event(self, text: Text) -> None:
         """Print an event."""
@@ -131,7 +131,7 @@ class PlainDisplay(Display):
         now = time.monotonic()
         if now >= self._next or snapshot.run == "stopped":
             self._next = now + self.period_s
-            print(line_of(snapshot), flush=True)
+            print(format_line(snapshot), flush=True)
 
     def print_event(self, text: Text) -> None:
         """Print the event."""
@@ -139,9 +139,9 @@ class PlainDisplay(Display):
 
 
 @contextmanager
-def display_for(silent: bool) -> Iterator[Display]:
+def open_display(silent: bool) -> Iterator[Display]:
     """Provide the display that suits stdout, or a silent one."""
-    terminal = console()
+    terminal = create_console()
     if silent:
         yield Display()
     elif terminal.is_terminal:
@@ -169,22 +169,22 @@ class RackView:
         """Yield what rich draws, as wide as the terminal permits."""
         snapshot = self.snapshot
         width = options.max_width
-        yield _head(snapshot)
+        yield _format_head(snapshot)
         cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
-        yield grid(list(COLUMNS), cells, width, DROPPED, _style)
+        yield build_grid(list(COLUMNS), cells, width, DROPPED, _choose_style)
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
         sides: tuple[Sequence[Any], ...] = (snapshot.hosts, snapshot.entries)
         for rows in (*sides, snapshot.peers, snapshot.imports, snapshot.exports):
             if records := [asdict(row) for row in rows]:
-                cells = [[_cell(*pair) for pair in row.items()] for row in records]
+                cells = [[_format_cell(*pair) for pair in row.items()] for row in records]
                 yield Text()
-                yield grid(
-                    [key.replace("_", " ") for key in records[0]], cells, width, style=_style
+                yield build_grid(
+                    [key.replace("_", " ") for key in records[0]], cells, width, style=_choose_style
                 )
-        yield from (Text(line, style="red") for line in _reasons(snapshot))
+        yield from (Text(line, style="red") for line in _list_reasons(snapshot))
         yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(inbox.line) for inbox in snapshot.inboxes)
-        yield from (Text(_exchange(*ages)) for ages in snapshot.exchanges.items())
+        yield from (Text(_format_exchange(*ages)) for ages in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
             # Split a long line in two, so that the command in it is not wrapped.
@@ -192,21 +192,21 @@ class RackView:
             hold_text = (
                 hold.line.replace("; to release", "\n  to release") if is_long else hold.line
             )
-            yield Text(hold_text, style=HELD)
+            yield Text(hold_text, style=HOLD_STYLE)
         if (at := snapshot.progress) is not None:
             actions = f"{at.actions_done}/{at.actions}"
             yield Text(f"task: action {actions}, move {at.moves_done}/{at.moves} {at.state}")
 
 
-def _cell(column: str, value: Any) -> str:
+def _format_cell(column: str, value: Any) -> str:
     """Format a cell, with decimals by the unit at the end of the column's name."""
     if not isinstance(value, float | None):
         return str(value)
     digits = {"s": 3, "ticks": 0}
-    return decimal(value, digits.get(column.rpartition("_")[2], 1))
+    return format_decimal(value, digits.get(column.rpartition("_")[2], 1))
 
 
-def line_of(snapshot: Snapshot) -> str:
+def format_line(snapshot: Snapshot) -> str:
     """Format a snapshot as one short line that only counts holds and faults."""
     counts = {
         "missed": sum(row.missed for row in snapshot.tasks),
@@ -222,11 +222,11 @@ def line_of(snapshot: Snapshot) -> str:
     parts += [f"task {at.state} {at.moves_done}/{at.moves}"] if at is not None else []
     # Keep only the text before the colon. The rest is for the table.
     return "  ".join(
-        [*parts, *(line.partition(":")[0] for line in snapshot.lines), *_demanded(snapshot)]
+        [*parts, *(line.partition(":")[0] for line in snapshot.lines), *_list_demands(snapshot)]
     )
 
 
-def _head(snapshot: Snapshot) -> Text:
+def _format_head(snapshot: Snapshot) -> Text:
     """Return the head line: state of the run, time, and warnings."""
     line = Text(
         f"rack {snapshot.rack}: {snapshot.run}, {snapshot.time_s:.2f} s, tick {snapshot.tick}"
@@ -235,17 +235,17 @@ def _head(snapshot: Snapshot) -> Text:
         line.append("; its launcher is gone: 'rack clean' removes it", style="bold red")
     if snapshot.clock_skipped:
         line.append(f", clock skipped {snapshot.clock_skipped} ticks", style="yellow")
-    for name in [*snapshot.lines, *_demanded(snapshot)]:
+    for name in [*snapshot.lines, *_list_demands(snapshot)]:
         line.append(f"  {name}", style="bold red")
     return line
 
 
-def _demanded(snapshot: Snapshot) -> list[str]:
+def _list_demands(snapshot: Snapshot) -> list[str]:
     """Return the demand on the arm, or an empty list."""
     return [f"arm: {snapshot.demand}"] if snapshot.demand != NO_DEMAND else []
 
 
-def _reasons(snapshot: Snapshot) -> list[str]:
+def _list_reasons(snapshot: Snapshot) -> list[str]:
     """Return the reasons that tasks give, except those that a hold already shows."""
     held_levels = {hold.level for hold in snapshot.holds}
     shown_reasons = [hold.why for hold in snapshot.holds]
@@ -254,31 +254,31 @@ def _reasons(snapshot: Snapshot) -> list[str]:
         for row in snapshot.tasks
         if row.reason
         and not (row.state == "holding" and row.task in held_levels)
-        and is_news(row.reason, shown_reasons)
+        and is_new_reason(row.reason, shown_reasons)
     ]
 
 
-def _exchange(board: str, ports: Mapping[str, PortAge]) -> str:
+def _format_exchange(board: str, ports: Mapping[str, PortAge]) -> str:
     """Format the ages of a board's exchanged messages as one line."""
     ages = [f"{port} {age.age} ticks old, taken at tick {age.taken}" for port, age in ports.items()]
     return f"exchange of {board}: {'; '.join(ages) or 'no message yet'}"
 
 
-def _style(column: str, text: str) -> str:
+def _choose_style(column: str, text: str) -> str:
     if column == "state":
-        return STATES.get(text.partition(" (")[0], "")
-    return COUNTED.get(column, "") if text != "0" else ""
+        return STATE_STYLES.get(text.partition(" (")[0], "")
+    return COUNT_STYLES.get(column, "") if text != "0" else ""
 
 
-def is_shown(event: Event) -> bool:
+def is_worth_showing(event: Event) -> bool:
     """Return whether an event tells more than the table."""
     is_brief = event.subject == NO_TORQUE and event.value < BRIEF_TICKS
-    return event.kind not in QUIET and not is_brief
+    return event.kind not in HIDDEN_EVENTS and not is_brief
 
 
-def event_text(event: Event) -> Text:
+def format_event(event: Event) -> Text:
     """Format an event as one line, in the colour of its kind."""
     tick = f"tick {event.tick} " if event.code else ""
     board = f"{event.board}: " if event.board else ""
-    style = EVENTS.get(event.kind, OTHER_EVENTS)
+    style = EVENT_STYLES.get(event.kind, DEFAULT_EVENT_STYLE)
     return Text(f"{tick}{event.kind}: {board}{event.text}", style)

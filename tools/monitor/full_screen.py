@@ -23,23 +23,23 @@ from textual.widgets.option_list import Option
 
 from rack.backplane.lines import UtilityLines
 from rack.backplane.segment import Segment
-from rack.boards.crate.alarm_events import AlarmWatch
+from rack.boards.crate.alarm_events import AlarmReader
 from rack.boards.faults import KINDS
-from rack.boards.timing.trace_times import lateness_ns
-from rack.tools.console.answer import Failure, as_failure
-from rack.tools.console.tables import GAP, grid
+from rack.boards.timing.trace_times import compute_lateness_ns
+from rack.tools.console.answer import Failure, convert_errors
+from rack.tools.console.tables import GAP, build_grid
 from rack.tools.faults.live import LiveRack
 from rack.tools.monitor import display
-from rack.tools.monitor.desk import LiveDesk, goal_of
+from rack.tools.monitor.desk import LevelCommander, parse_goal
 from rack.tools.monitor.message_text import DROPPED, list_mailboxes
 from rack.tools.monitor.snapshot import RackMonitor, Snapshot
 
-LOOK_S = 0.2
-LATE_US = (-np.inf, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, np.inf)
+REFRESH_INTERVAL_S = 0.2
+LATENESS_BORDERS_US = (-np.inf, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, np.inf)
 """Borders of the classes of lateness in which cycles are counted, us."""
 INJECT = "inject"
 """First word of a fault on the command line. Any other word is the level of a command."""
-OWN_PROCESS = [kind.name for kind in KINDS if kind.where == "core"]
+CORE_FAULTS = [kind.name for kind in KINDS if kind.where == "core"]
 """Kinds of faults that keep a core busy with this process, which must not be the screen."""
 
 
@@ -77,7 +77,7 @@ class RackScreen(App[None]):
         self._segment = segment
         self._has_ended = has_ended
         self._monitor = RackMonitor(segment, keeps_longest=True)
-        self._alarms = AlarmWatch(segment)
+        self._alarms = AlarmReader(segment)
         self._lines = UtilityLines(segment)
         self._events: deque[Text] = deque(maxlen=500)  # newest first
         tasks = sorted(segment.layout.tasks, key=lambda task: -task.every)
@@ -88,9 +88,9 @@ class RackScreen(App[None]):
         self._late: dict[str, np.ndarray] = {}
         self._panes: dict[str, Callable[[Snapshot], RenderableType]] = {
             "boards": display.RackView,
-            "mailboxes": self._mailboxes,
+            "mailboxes": self._build_mailbox_table,
             "events": lambda snapshot: Text("\n").join(list(self._events)),
-            "lateness": self._lateness,
+            "lateness": self._build_lateness_table,
         }
 
     def compose(self) -> ComposeResult:
@@ -107,48 +107,48 @@ class RackScreen(App[None]):
 
     def on_mount(self) -> None:
         """Show the first snapshot, and refresh it periodically."""
-        self._look()
-        self.set_interval(LOOK_S, self._look)
+        self._refresh()
+        self.set_interval(REFRESH_INTERVAL_S, self._refresh)
 
-    def _look(self) -> None:
+    def _refresh(self) -> None:
         """Take a snapshot and show it. Exit when the run is over."""
         if self._segment.run_is_over or self._has_ended():
             self.exit()
             return
-        snapshot = self._monitor.look()
+        snapshot = self._monitor.take_snapshot()
         for task, rows in self._monitor.cycles.items():
-            counts, _ = np.histogram(lateness_ns(rows) * 1e-3, LATE_US)
+            counts, _ = np.histogram(compute_lateness_ns(rows) * 1e-3, LATENESS_BORDERS_US)
             self._late[task] = self._late.get(task, 0) + counts
-        for event in (alarm.event for alarm in self._alarms.drain()):
-            if display.is_shown(event):
-                self._events.appendleft(display.event_text(event))
-        self.query_one("#head", Static).update(Text(display.line_of(snapshot)))
-        self.query_one("#levels", Static).update(self._chosen(snapshot))
+        for event in (alarm.event for alarm in self._alarms.read_alarms()):
+            if display.is_worth_showing(event):
+                self._events.appendleft(display.format_event(event))
+        self.query_one("#head", Static).update(Text(display.format_line(snapshot)))
+        self.query_one("#levels", Static).update(self._format_levels(snapshot))
         pane = self.query_one(TabbedContent).active
         self.query_one(f"#{pane} Static", Static).update(self._panes[pane](snapshot))
 
-    def _chosen(self, snapshot: Snapshot) -> Text:
+    def _format_levels(self, snapshot: Snapshot) -> Text:
         """Format the levels, coloured by state. The level that keys command is reversed."""
         states = {row.task: row.state for row in snapshot.tasks}
         chosen = {self._levels[0]: "reverse"}
         levels = [
-            Text(name, f"{display.STATES.get(states[name], '')} {chosen.get(name, '')}")
+            Text(name, f"{display.STATE_STYLES.get(states[name], '')} {chosen.get(name, '')}")
             for name in self._hierarchy
         ]
         return Text(" > ").join(levels)
 
-    def _mailboxes(self, snapshot: Snapshot) -> RenderableType:
+    def _build_mailbox_table(self, snapshot: Snapshot) -> RenderableType:
         """Return the table of mailboxes."""
         rows = list_mailboxes(self._segment)
         cells = [[*map(str, row.values())] for row in rows]
-        return grid([*rows[0]], cells, self.size.width - GAP, DROPPED)
+        return build_grid([*rows[0]], cells, self.size.width - GAP, DROPPED)
 
-    def _lateness(self, snapshot: Snapshot) -> RenderableType:
+    def _build_lateness_table(self, snapshot: Snapshot) -> RenderableType:
         """Return the table of lateness classes of the selected level."""
         level = self._levels[0]
-        classes = zip(LATE_US[1:], self._late[level].tolist(), strict=True)
+        classes = zip(LATENESS_BORDERS_US[1:], self._late[level].tolist(), strict=True)
         rows = [[f"< {border:g}", str(count)] for border, count in classes]
-        return grid(("late us", level), rows, self.size.width)
+        return build_grid(("late us", level), rows, self.size.width)
 
     def action_pane(self, number: int) -> None:
         """Show a pane by its number."""
@@ -215,35 +215,35 @@ class RackScreen(App[None]):
 
     def action_carry_out(self, words: Sequence[str]) -> None:
         """Execute a command in a thread, and show its answer when it arrives."""
-        self.run_worker(partial(self._answer, words), thread=True)
+        self.run_worker(partial(self._execute_in_thread, words), thread=True)
 
-    def _answer(self, words: Sequence[str]) -> None:
+    def _execute_in_thread(self, words: Sequence[str]) -> None:
         """Execute a command and show its answer.
 
         It runs in a thread, since a level may take seconds.
         """
         try:
-            with as_failure():
-                answer = self._result(words)
+            with convert_errors():
+                answer = self._execute(words)
         except Failure as error:
             answer = str(error)
         self._events.appendleft(Text(answer))
         self.notify(answer, markup=False)
 
-    def _result(self, words: Sequence[str]) -> str:
+    def _execute(self, words: Sequence[str]) -> str:
         """Execute a command and return its answer. Raises `Failure`."""
         match words:
             case ["reset"]:
                 self._lines.reset_emergency_stop()
                 return "the emergency stop is reset"
             case [first, board, kind, *given] if first == INJECT:
-                if kind in OWN_PROCESS:
+                if kind in CORE_FAULTS:
                     raise Failure(f"{kind}: needs a separate process; use 'rack inject'")
                 values = dict(word.partition("=")[::2] for word in given)
                 live = LiveRack(self._segment)
                 fault = {"board": board, "kind": kind, **values}
-                return str(live.inject(fault, wait=False)["message"])
+                return str(live.inject_fault(fault, wait=False)["message"])
             case [level, what, *goal]:
-                command = {"level": level, "what": what, **goal_of(what, goal)}
-                return LiveDesk(self._segment).give(command, wait=False).line
+                command = {"level": level, "what": what, **parse_goal(what, goal)}
+                return LevelCommander(self._segment).give_command(command, wait=False).line
         raise Failure(f"'{' '.join(words)}': must be LEVEL WHAT [GOAL], or {INJECT} BOARD KIND ...")

@@ -9,25 +9,25 @@ from dataclasses import dataclass
 
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import MailboxRing
-from rack.backplane.message import AnyMessage, Message, State, reason_of
+from rack.backplane.message import AnyMessage, Message, State, get_reason
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.events import Event
-from rack.boards.lan.awaited import awaited
-from rack.boards.operator import describe
+from rack.boards.lan.awaited import find_waits
+from rack.boards.operator import describe_command
 from rack.levels.messages import Error
-from rack.levels.operator import Answer, Operation, OperatorCommand, answered
-from rack.tools.monitor.newest_messages import Newest
+from rack.levels.operator import Answer, Operation, OperatorCommand, find_answered_serial
+from rack.tools.monitor.newest_messages import NewestMessages
 
-STILL_S = 5.0
+STANDSTILL_S = 5.0
 """A held rack without motion for this simulated time is reported by an event."""
-PASSED_ON = re.compile(r"(?:holding|waiting for \w+): ")
+RELAYED_PREFIX = re.compile(r"(?:holding|waiting for \w+): ")
 """Words that a level puts before a reason of the level below."""
-SAME = 60
+COMPARED_CHARACTERS = 60
 """Number of characters that identify a reason. The end of a long one is cut on its way up."""
-ASKED = {Error.DISABLED: "enable", Error.DRIVES: "reset"}
+NEEDED_COMMANDS = {Error.DISABLED: "enable", Error.DRIVES: "reset"}
 """Command that an arm needs, by the error in its status."""
-OPERATED = frozenset({"standing", "order", "answer"})
+OPERATOR_FIELDS = frozenset({"standing", "order", "answer"})
 """Fields in the status of a level that takes commands of an operator."""
 
 
@@ -53,87 +53,95 @@ class Hold:
         return f"{self.level} {self.why}, since {self.since_s:.2f} s{release_text}"
 
 
-def resume_command(rack: str, level: str) -> str:
+def format_resume_command(rack: str, level: str) -> str:
     """Return the command line that ends an operator's command to a level."""
     return f"rack command {rack} {level} resume"
 
 
-def is_news(reason: str, shown: list[str]) -> bool:
+def is_new_reason(reason: str, shown: list[str]) -> bool:
     """Return whether a reason is new, and add it to those `shown`.
 
     Levels repeat the reasons of the level below, which does not count as new.
     """
-    origin = PASSED_ON.split(reason)[-1][:SAME]
+    origin = RELAYED_PREFIX.split(reason)[-1][:COMPARED_CHARACTERS]
     if any(origin in other for other in shown):
         return False
     shown.append(reason)
     return True
 
 
-def find_holds(newest: Newest) -> tuple[Hold, ...]:
+def find_holds(newest: NewestMessages) -> tuple[Hold, ...]:
     """Find all holds of a rack, beginning with its arm. Empty once its run is over."""
-    return () if newest.segment.run_is_over else tuple(_find_holds(newest))
+    return () if newest.segment.run_is_over else tuple(_list_holds(newest))
 
 
-def _find_holds(newest: Newest) -> Iterator[Hold]:
+def _list_holds(newest: NewestMessages) -> Iterator[Hold]:
     """Yield the holds: emergency stop, lost boards, then levels."""
     segment = newest.segment
 
     def hold(level: str, since: int, why: str, release: str = "") -> Hold:
         return Hold(level, since, since * segment.layout.clock_ns * 1e-9, why, release)
 
-    arm, driving = next(newest.statuses("demand"), ("", None))
+    arm, driving = next(newest.list_statuses("demand"), ("", None))
     if UtilityLines(segment).emergency_stop:
-        is_arm = driving is None or "braked" in _fields(driving)
+        is_arm = driving is None or "braked" in _field_names(driving)
         arm_name, state_text = ("arm", "braked") if is_arm else ("hand", "valves closed")
-        since = segment.block(arm)[Block.LEVEL_SINCE] if arm else 0
+        since = segment.get_block(arm)[Block.LEVEL_SINCE] if arm else 0
         release = f"rack estop {segment.layout.rack} --reset"
         yield hold(arm_name, since, f"{state_text}: emergency stop", release)
-    for board, why in awaited(segment):
-        yield hold(board, segment.block(board)[Block.RELEASED], why)
+    for board, why in find_waits(segment):
+        yield hold(board, segment.get_block(board)[Block.RELEASED], why)
     tasks = {task.name for task in segment.layout.tasks}
     shown_reasons: list[str] = []
-    for level, status in newest.statuses("state"):
+    for level, status in newest.list_statuses("state"):
         if level not in tasks:
             continue
-        if _fields(status) >= OPERATED and status.standing:
-            since, serial, command_text = _command_in_force(segment, level, status)
+        if _field_names(status) >= OPERATOR_FIELDS and status.standing:
+            since, serial, command_text = _find_command_in_force(segment, level, status)
             is_hold = status.standing == Operation.HOLD
             is_done = status.answer == Answer.DONE and serial in (status.order, 0)
             done = ", done" if is_done and not is_hold else ""
             why = f"{'held' if is_hold else 'diverted'} by the operator ({command_text}{done})"
-            yield hold(level, since, why, resume_command(segment.rack, level))
+            yield hold(level, since, why, format_resume_command(segment.rack, level))
         elif status.state == State.HOLDING:
-            needed = ASKED.get(status.error) if level == arm else None
+            needed = NEEDED_COMMANDS.get(status.error) if level == arm else None
             release = f"rack command {segment.rack} {level} {needed}" if needed else ""
-            why = f"holding: {reason_of(status) or 'no reason given'}"
-            if release or is_news(why, shown_reasons):
-                yield hold(level, segment.block(level)[Block.LEVEL_SINCE], why, release)
+            why = f"holding: {get_reason(status) or 'no reason given'}"
+            if release or is_new_reason(why, shown_reasons):
+                yield hold(level, segment.get_block(level)[Block.LEVEL_SINCE], why, release)
 
 
-def _command_in_force(segment: Segment, level: str, status: AnyMessage) -> tuple[int, int, str]:
+def _find_command_in_force(
+    segment: Segment, level: str, status: AnyMessage
+) -> tuple[int, int, str]:
     """Find the operator's command in force at a level.
 
     Returns:
         Its tick, its serial and its text. The serial is 0 if its message has been overwritten.
     """
-    rows = MailboxRing(segment, f"{level}.operator").drain().rows
+    rows = MailboxRing(segment, f"{level}.operator").read_new_rows().rows
     commands = rows["message"]
-    is_candidate = (commands["what"] == status.standing) & (commands["id"] <= answered(status))
+    is_candidate = (commands["what"] == status.standing) & (
+        commands["id"] <= find_answered_serial(status)
+    )
     # A refused command has left the previous one in force.
     if status.answer == Answer.REFUSED and is_candidate.sum() > 1:
         is_candidate &= commands["id"] != status.order
     candidates = rows[is_candidate]
     if not len(candidates):
-        return segment.block(level)[Block.LEVEL_SINCE], 0, Operation(status.standing).name.lower()
+        return (
+            segment.get_block(level)[Block.LEVEL_SINCE],
+            0,
+            Operation(status.standing).name.lower(),
+        )
     answering = candidates[candidates["message"]["id"] == status.order]
     row = (answering if len(answering) else candidates)[-1]
     message = OperatorCommand(commands.dtype)
     message.raw[:] = row["message"].tobytes()
-    return int(row["tick"]), message.id, describe(message)
+    return int(row["tick"]), message.id, describe_command(message)
 
 
-class Standstill:
+class StandstillDetector:
     """Reports each hold that lasts without motion and will not end by itself.
 
     Each is reported once.
@@ -141,25 +149,25 @@ class Standstill:
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
-        self._newest = Newest(segment)
+        self._newest = NewestMessages(segment)
         self._still_since: int | None = None
         self._reported: set[tuple[str, int]] = set()
 
-    def look(self) -> Iterator[Event]:
+    def list_events(self) -> Iterator[Event]:
         """Yield an event for each unreported hold that a user must end."""
         # Import late: this imports the kinds of faults, which would slow down `rack status`.
-        from rack.tools.faults.ending import arm_of
+        from rack.tools.faults.ending import read_arm
 
         tick = self._segment.words[System.TICK]
         holds = [hold for hold in find_holds(self._newest) if hold.release]
-        if not holds or not arm_of(self._segment).is_at_rest:
+        if not holds or not read_arm(self._segment).is_at_rest:
             self._still_since = None
             return
         self._still_since = tick if self._still_since is None else self._still_since
         for hold in holds:
             still = tick - max(self._still_since, hold.since_tick)
             still_s = still * self._segment.layout.clock_ns * 1e-9
-            if still_s >= STILL_S and (hold.level, hold.since_tick) not in self._reported:
+            if still_s >= STANDSTILL_S and (hold.level, hold.since_tick) not in self._reported:
                 self._reported.add((hold.level, hold.since_tick))
                 text = f"nothing has moved for {still_s:.0f} s: {hold.line}"
                 code = "standstill"
@@ -169,5 +177,5 @@ class Standstill:
                 )
 
 
-def _fields(message: Message) -> set[str]:
+def _field_names(message: Message) -> set[str]:
     return {*(message.record.dtype.names or ())}

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rack.backplane.bounded_toml import load_toml
-from rack.backplane.checked import as_named
+from rack.backplane.checked import to_enum
 from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Box, TaskState
-from rack.tools.monitor.newest_messages import Newest
+from rack.tools.monitor.newest_messages import NewestMessages
 
 ADAPTER_STATUS = "adapter_status"
 """Message type of the status of a bus adapter, with a group of counts for each entry."""
@@ -55,42 +55,42 @@ class EntryRow:
     age_ms: float | None
 
 
-def host_rows(segment: Segment) -> tuple[HostRow, ...]:
+def list_host_rows(segment: Segment) -> tuple[HostRow, ...]:
     """List the host boards."""
     rows = []
     for host in segment.layout.hosts:
-        block = segment.block(host.name)
+        block = segment.get_block(host.name)
         # The process that runs a host board locks this word, and the kernel unlocks it.
         is_running = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
-        state = as_named(TaskState, block[Block.STATE]).name.lower() if is_running else AWAY
+        state = to_enum(TaskState, block[Block.STATE]).name.lower() if is_running else AWAY
         if block[Block.STATE] == TaskState.ENDED:
             state = DONE
-        sent = sum(head[Box.HEAD] for head in _heads(segment, host.name))
+        sent = sum(head[Box.HEAD] for head in _list_heads(segment, host.name))
         pid = block[Block.PID] if is_running else 0
-        rows.append(HostRow(host.name, pid, state, sent, restarts(segment, host.name)))
+        rows.append(HostRow(host.name, pid, state, sent, count_restarts(segment, host.name)))
     return tuple(rows)
 
 
-def restarts(segment: Segment, writer: str) -> int:
+def count_restarts(segment: Segment, writer: str) -> int:
     """Count how often a new process took over the mailboxes of a task or host board.
 
     Each process writes in a new epoch.
     """
-    return max([0, *(head[Box.EPOCH] - 1 for head in _heads(segment, writer))])
+    return max([0, *(head[Box.EPOCH] - 1 for head in _list_heads(segment, writer))])
 
 
-def _heads(segment: Segment, writer: str) -> list[memoryview]:
+def _list_heads(segment: Segment, writer: str) -> list[memoryview]:
     """List the words of the mailboxes that a task or host board writes."""
-    return [segment.box(box.name) for box in segment.layout.mailboxes if box.writer == writer]
+    return [segment.get_box(box.name) for box in segment.layout.mailboxes if box.writer == writer]
 
 
-def entry_rows(newest: Newest) -> tuple[EntryRow, ...]:
+def list_entry_rows(newest: NewestMessages) -> tuple[EntryRow, ...]:
     """List the entries of all bus adapters."""
     rows: list[EntryRow] = []
     segment = newest.segment
     tick_ms = segment.layout.clock_ns * 1e-6
-    for mailbox, entry, source in entries_of(segment.layout, segment.config):
-        if (status := newest.message(mailbox)) is not None:
+    for mailbox, entry, source in list_entries(segment.layout, segment.config):
+        if (status := newest.read_message(mailbox)) is not None:
             counts = getattr(status, entry)
             age = int(counts["age"])
             age_ms = None if age < 0 else age * tick_ms
@@ -100,7 +100,7 @@ def entry_rows(newest: Newest) -> tuple[EntryRow, ...]:
     return tuple(rows)
 
 
-def entries_of(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:
+def list_entries(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:
     """Yield status mailbox, name and source of every entry of a rack's bus adapters.
 
     Args:

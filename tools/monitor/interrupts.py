@@ -9,16 +9,16 @@ import numpy as np
 
 from rack.backplane.layout import Layout
 from rack.backplane.mailbox.inbox import Inbox
-from rack.backplane.mailbox.interrupt import how_sent, sent_ns
+from rack.backplane.mailbox.interrupt import compute_send_offset_ns, get_interrupt_spec
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
-from rack.boards.timing.trace_times import distribution
+from rack.boards.timing.trace_times import compute_distribution
 from rack.tools.console.answer import Document
 
 if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
 
-LOST = np.iinfo(np.int64).max
+NEVER_SERVED = np.iinfo(np.int64).max
 """End of service of a message that was lost because the inbox was full."""
 
 
@@ -49,23 +49,23 @@ class InboxFill:
         )
 
 
-def inbox_depths(layout: Layout) -> dict[int, int]:
+def find_inbox_depths(layout: Layout) -> dict[int, int]:
     """Return the depth of the inbox of every board that messages interrupt, by slot."""
     slots = dict.fromkeys(task.slot for task in layout.tasks)
-    boxes = {slot: layout.interrupting(slot) for slot in slots}
+    boxes = {slot: layout.list_interrupting_mailboxes(slot) for slot in slots}
     return {
-        slot: how_sent(interrupting[0]).depth
+        slot: get_interrupt_spec(interrupting[0]).depth
         for slot, interrupting in boxes.items()
         if interrupting
     }
 
 
-def inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
+def list_inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
     """Describe the current inbox of every board that messages interrupt."""
     fills = []
-    for slot, depth in inbox_depths(segment.layout).items():
-        board = segment.layout.handler(slot)
-        block = segment.block(board)
+    for slot, depth in find_inbox_depths(segment.layout).items():
+        board = segment.layout.find_interrupt_task(slot)
+        block = segment.get_block(board)
         served, lost = block[Block.INTERRUPTS], block[Block.INTERRUPTS_LOST]
         fills.append(InboxFill(board, served, lost, block[Block.INTERRUPTS_WAITING], depth))
     return tuple(fills)
@@ -86,26 +86,26 @@ class Arrivals(NamedTuple):
 def replay_inbox(recording: Recording, slot: int) -> Arrivals:
     """Recompute the inbox of the board in a slot from the messages of a run."""
     layout = recording.layout
-    boxes = layout.interrupting(slot)
+    boxes = layout.list_interrupting_mailboxes(slot)
     sent = []
     for box in boxes:
-        visible_at = recording.signal(box.name, "visible_at").astype(np.int64)
+        visible_at = recording.read_signal(box.name, "visible_at").astype(np.int64)
         # A message that overtakes an earlier one of its mailbox waits for it.
         newest = np.maximum.accumulate(visible_at * layout.clock_ns)
-        sent.append(newest + sent_ns(box, layout.clock_ns))
+        sent.append(newest + compute_send_offset_ns(box, layout.clock_ns))
     times = np.concatenate(sent)
     numbers = np.repeat(np.arange(len(boxes)), [len(index) for index in sent])
-    ends = np.full(len(times), LOST)
-    inbox = Inbox(how_sent(boxes[0]).depth)
-    services = [how_sent(box).service_ns for box in boxes]
+    ends = np.full(len(times), NEVER_SERVED)
+    inbox = Inbox(get_interrupt_spec(boxes[0]).depth)
+    services = [get_interrupt_spec(box).service_ns for box in boxes]
     for index in np.lexsort((numbers, times)).tolist():
-        end_ns = inbox.arrive(int(times[index]), services[numbers[index]])
+        end_ns = inbox.add_message(int(times[index]), services[numbers[index]])
         if end_ns is not None:
             ends[index] = end_ns
     return Arrivals(numbers, times, ends, inbox.most_waiting)
 
 
-def interrupts(recording: Recording) -> list[Document]:
+def summarize_interrupts(recording: Recording) -> list[Document]:
     """Describe the interrupts of every board in a run, as plain data.
 
     A latency, us, is the time from sending a message to the end of its service, when a level can
@@ -114,10 +114,10 @@ def interrupts(recording: Recording) -> list[Document]:
     """
     layout = recording.layout
     documents = []
-    for slot, depth in inbox_depths(layout).items():
+    for slot, depth in find_inbox_depths(layout).items():
         arrivals = replay_inbox(recording, slot)
-        is_served = arrivals.end_ns != LOST
-        boxes = layout.interrupting(slot)
+        is_served = arrivals.end_ns != NEVER_SERVED
+        boxes = layout.list_interrupting_mailboxes(slot)
         served, lost = (
             np.bincount(arrivals.mailbox[mask], minlength=len(boxes)).tolist()
             for mask in (is_served, ~is_served)
@@ -125,12 +125,12 @@ def interrupts(recording: Recording) -> list[Document]:
         latency_ns = (arrivals.end_ns - arrivals.sent_ns)[is_served]
         documents.append(
             {
-                "board": layout.handler(slot),
+                "board": layout.find_interrupt_task(slot),
                 "depth": depth,
                 "served": sum(served),
                 "lost": sum(lost),
                 "waiting": arrivals.most_waiting,
-                "latency_us": distribution(latency_ns * 1e-3),
+                "latency_us": compute_distribution(latency_ns * 1e-3),
                 "mailboxes": [
                     {"mailbox": box.name, "served": served[at], "lost": lost[at]}
                     for at, box in enumerate(boxes)

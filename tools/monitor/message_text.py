@@ -8,10 +8,10 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box
 from rack.tools.console.answer import Document
-from rack.tools.console.tables import fitted
-from rack.tools.monitor.signals import cell
-from rack.tools.recording.parquet import HEAD
-from rack.tools.recording.signal import signals_of
+from rack.tools.console.tables import format_fitted_table
+from rack.tools.monitor.signals import format_value
+from rack.tools.recording.parquet import HEAD_COLUMNS
+from rack.tools.recording.signal import list_signals
 
 DROPPED = ("bytes", "message", "protocol", "readers")
 """Columns of the list of mailboxes that a narrow terminal leaves out, in this order."""
@@ -28,21 +28,21 @@ def list_mailboxes(segment: Segment) -> list[Document]:
             "protocol": box.protocol,
             "period_ms": round(box.every * segment.layout.clock_ns * 1e-6, 6),
             "bytes": box.size,
-            "written": segment.box(box.name)[Box.HEAD],
+            "written": segment.get_box(box.name)[Box.HEAD],
         }
         for box in segment.layout.mailboxes
     ]
 
 
-class MessageText:
+class MessageFormatter:
     """Formats the messages of one mailbox. The ticks of its rack last `clock_ns`."""
 
     def __init__(self, box: MailboxSpec, clock_ns: int) -> None:
         self._box = box
         self._clock_ns = clock_ns
-        self._signals = signals_of(box)
+        self._signals = list_signals(box)
 
-    def document(self, row: np.ndarray, tick: int) -> Document:
+    def to_document(self, row: np.ndarray, tick: int) -> Document:
         """Convert a message to a document.
 
         Args:
@@ -52,12 +52,14 @@ class MessageText:
         message = row["message"][None]
         return {
             "mailbox": self._box.name,
-            **{name: int(row[name]) for name in HEAD},
+            **{name: int(row[name]) for name in HEAD_COLUMNS},
             "age_ticks": tick - int(row["tick"]),
-            "fields": {".".join(signal.path): signal.plain(message)[0] for signal in self._signals},
+            "fields": {
+                ".".join(signal.path): signal.extract_plain(message)[0] for signal in self._signals
+            },
         }
 
-    def lines(self, document: Document) -> list[str]:
+    def format_lines(self, document: Document) -> list[str]:
         """Format the document of a message as lines for people."""
         age_ms = document["age_ticks"] * self._clock_ns * 1e-6
         head = (
@@ -65,7 +67,7 @@ class MessageText:
             f" {document['age_ticks']} ticks ({age_ms:g} ms) old"
         )
         rows = [
-            [name, cell(value), signal.unit]
+            [name, format_value(value), signal.unit]
             for (name, value), signal in zip(document["fields"].items(), self._signals, strict=True)
         ]
-        return [head, *fitted(("field", "value", "unit"), rows)]
+        return [head, *format_fitted_table(("field", "value", "unit"), rows)]

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 from rack.backplane.bounded_toml import load_toml
 from rack.backplane.segment import Segment
-from rack.levels.peer import Presence, peer_port
-from rack.tools.monitor.newest_messages import Newest
+from rack.levels.peer import Presence, format_peer_port
+from rack.tools.monitor.newest_messages import NewestMessages
 
-BOARD = "lan"
-STATUS = f"{BOARD}.status"
+ADAPTER = "lan"
+STATUS = f"{ADAPTER}.status"
 COUNTS = (
     "taken",
     "missing",
@@ -77,7 +77,7 @@ class ExportRow:
     sent: int
 
 
-class Entries(NamedTuple):
+class ExchangedEntries(NamedTuple):
     """Exports and imports of a rack, with the source by port, and its partner racks."""
 
     exports: dict[str, str]
@@ -86,9 +86,9 @@ class Entries(NamedTuple):
 
 
 @cache
-def exchanged(config: str) -> Entries | None:
+def read_entries(config: str) -> ExchangedEntries | None:
     """Read from a config, as TOML text, what a rack exchanges. None without a network adapter."""
-    table: dict[str, Any] | None = load_toml(config).get("adapter", {}).get(BOARD)
+    table: dict[str, Any] | None = load_toml(config).get("adapter", {}).get(ADAPTER)
     if table is None:
         return None
     exports, imports = (
@@ -96,44 +96,48 @@ def exchanged(config: str) -> Entries | None:
         for key in ("export", "import")
     )
     racks = [*(source.partition("/")[0] for source in imports.values()), *table.get("peers", ())]
-    return Entries(exports, imports, tuple(dict.fromkeys(racks)))
+    return ExchangedEntries(exports, imports, tuple(dict.fromkeys(racks)))
 
 
-def _entries(segment: Segment) -> Entries:
+def _find_entries(segment: Segment) -> ExchangedEntries:
     """Return what a rack exchanges. Empty without a network adapter."""
-    has_adapter = any(task.name == BOARD for task in segment.layout.tasks)
-    return (exchanged(segment.config) if has_adapter else None) or Entries({}, {}, ())
+    has_adapter = any(task.name == ADAPTER for task in segment.layout.tasks)
+    return (read_entries(segment.config) if has_adapter else None) or ExchangedEntries({}, {}, ())
 
 
-def peer_rows(newest: Newest) -> tuple[PeerRow, ...]:
+def list_peers(newest: NewestMessages) -> tuple[PeerRow, ...]:
     """List the other racks with which a rack works."""
-    racks = _entries(newest.segment).peers
-    peers = ((rack, newest.message(f"{BOARD}.{peer_port(rack)}")) for rack in racks)
-    return tuple(_peer(rack, message) for rack, message in peers if message is not None)
+    racks = _find_entries(newest.segment).peers
+    peers = ((rack, newest.read_message(f"{ADAPTER}.{format_peer_port(rack)}")) for rack in racks)
+    return tuple(_to_peer_row(rack, message) for rack, message in peers if message is not None)
 
 
-def import_rows(newest: Newest) -> tuple[ImportRow, ...]:
+def list_imports(newest: NewestMessages) -> tuple[ImportRow, ...]:
     """List the imports of a rack."""
     rows = []
-    for port, source, counts in _groups(newest, "import", _entries(newest.segment).imports):
+    for port, source, counts in _list_counts(
+        newest, "import", _find_entries(newest.segment).imports
+    ):
         age = int(counts["age"])
         ages = (None, None) if age < 0 else (age, float(counts["age_s"]))
         numbers = {name: int(counts[name]) for name in COUNTS}
-        entry = f"{BOARD}.{port}"
+        entry = f"{ADAPTER}.{port}"
         rows.append(ImportRow(entry, source, **numbers, age_ticks=ages[0], age_s=ages[1]))
     return tuple(rows)
 
 
-def export_rows(newest: Newest) -> tuple[ExportRow, ...]:
+def list_exports(newest: NewestMessages) -> tuple[ExportRow, ...]:
     """List the exports of a rack."""
     return tuple(
-        ExportRow(f"{BOARD}.{port}", source, int(counts["sent"]))
-        for port, source, counts in _groups(newest, "export", _entries(newest.segment).exports)
+        ExportRow(f"{ADAPTER}.{port}", source, int(counts["sent"]))
+        for port, source, counts in _list_counts(
+            newest, "export", _find_entries(newest.segment).exports
+        )
     )
 
 
-def _groups(
-    newest: Newest, kind: str, sources: Mapping[str, str]
+def _list_counts(
+    newest: NewestMessages, kind: str, sources: Mapping[str, str]
 ) -> Iterator[tuple[str, str, Any]]:
     """Yield port, source and counts of all imports or exports, once the adapter has counted.
 
@@ -142,12 +146,12 @@ def _groups(
         kind: "import" or "export".
         sources: Source by port.
     """
-    if (status := newest.message(STATUS)) is not None:
+    if (status := newest.read_message(STATUS)) is not None:
         for port, source in sources.items():
             yield port, source, getattr(status, f"{kind}_{port}")
 
 
-def _peer(rack: str, message: Any) -> PeerRow:
+def _to_peer_row(rack: str, message: Any) -> PeerRow:
     """Convert a message about another rack to a row."""
     is_known = message.uncertainty > 0.0
     clock = (message.offset * 1e3, message.uncertainty * 1e3) if is_known else (None, None)

@@ -11,7 +11,7 @@ from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 
 
-class Newest:
+class NewestMessages:
     """Reads the newest message of any mailbox.
 
     Each mailbox is opened only once, because opening takes longer than many reads.
@@ -21,7 +21,7 @@ class Newest:
         self.segment = segment
         self._readers: dict[str, Reader] = {}
 
-    def message(self, mailbox: str) -> AnyMessage | None:
+    def read_message(self, mailbox: str) -> AnyMessage | None:
         """Return the newest message of a mailbox.
 
         None without a message, or without the mailbox.
@@ -31,19 +31,19 @@ class Newest:
         if mailbox not in self._readers:
             self._readers[mailbox] = open_observer(self.segment, mailbox)
         reading = self._readers[mailbox].peek()
-        return reading.message if reading.is_there else None
+        return reading.message if reading.has_message else None
 
-    def messages(
+    def list_messages(
         self, is_wanted: Callable[[MailboxSpec], bool]
     ) -> Iterator[tuple[str, AnyMessage]]:
         """Yield the writer and the newest message of every wanted mailbox that has one."""
         for box in self.segment.layout.mailboxes:
-            if is_wanted(box) and (message := self.message(box.name)) is not None:
+            if is_wanted(box) and (message := self.read_message(box.name)) is not None:
                 yield box.writer, message
 
-    def statuses(self, field: str) -> Iterator[tuple[str, AnyMessage]]:
+    def list_statuses(self, field: str) -> Iterator[tuple[str, AnyMessage]]:
         """Yield the level and the newest status of every level whose status has a field."""
-        return self.messages(
+        return self.list_messages(
             lambda box: (
                 box.name.endswith(".status")
                 and field in (box_field.name for box_field in box.fields)

@@ -14,16 +14,16 @@ from typing import NamedTuple
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure
-from rack.tools.console.tables import fitted_records
-from rack.tools.monitor.desk import LiveDesk
+from rack.tools.console.tables import format_fitted_records
+from rack.tools.monitor.desk import LevelCommander
 from rack.tools.monitor.snapshot import RackMonitor
 
-LOOK_S = 0.001
+CHECK_INTERVAL_S = 0.001
 """Time between two checks whether the rack holds."""
 
 
 @dataclass(frozen=True)
-class Stepped:
+class HeldRack:
     """A rack that is held. `levels` has a row for each level, with its state, row and reason."""
 
     rack: str
@@ -31,10 +31,10 @@ class Stepped:
     time_s: float
     levels: list[dict[str, str]]
 
-    def lines(self) -> Iterator[str]:
+    def format_lines(self) -> Iterator[str]:
         """Yield the lines of the answer for people."""
         yield f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s"
-        yield from fitted_records(self.levels)
+        yield from format_fitted_records(self.levels)
 
 
 class Stepper:
@@ -50,22 +50,22 @@ class Stepper:
             hint = f"end it, and start it with: rack run {segment.rack} --lockstep --step"
             raise Failure(f"rack '{segment.rack}' runs in real time, which cannot be held; {hint}")
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Let the rack run without holding."""
         self._words[System.HOLD_AT] = 0
 
-    def hold(self) -> int:
+    def hold_rack(self) -> int:
         """Hold the rack if it is not held yet. Returns the tick before which it holds."""
         if not self._words[System.HOLD_AT]:
             self._words[System.HOLD_AT] = 1
-        return self._await_hold(0)
+        return self._await_hold_at(0)
 
-    def go(self, tick: int) -> None:
+    def run_to(self, tick: int) -> None:
         """Let the rack continue, and hold it before `tick`."""
         self._words[System.HOLD_AT] = tick + 1
-        self._await_hold(tick)
+        self._await_hold_at(tick)
 
-    def after_cycles(self, at: int, cycles: int, level: str | None) -> int:
+    def find_end_tick(self, at: int, cycles: int, level: str | None) -> int:
         """Compute the tick after the release of the last of some cycles.
 
         Args:
@@ -83,27 +83,27 @@ class Stepper:
         else:
             known = ", ".join(self._executors)
             raise Failure(f"--until {level}: no such level; valid levels: {known}", 2)
-        return task.grid.since(at) + (cycles - 1) * task.every + 1
+        return task.grid.find_tick(at) + (cycles - 1) * task.every + 1
 
-    def look(self) -> Stepped:
+    def describe_rack(self) -> HeldRack:
         """Describe the rack as it is held."""
         levels = [
             {"level": row.task, "state": row.state, "row": row.row, "reason": row.reason}
-            for row in RackMonitor(self._segment).look().tasks
+            for row in RackMonitor(self._segment).take_snapshot().tasks
             if row.task in self._executors
         ]
         tick = self._words[System.HELD] - 1
         time_s = tick * self._segment.layout.clock_ns * 1e-9
-        return Stepped(self._segment.rack, tick, time_s, levels)
+        return HeldRack(self._segment.rack, tick, time_s, levels)
 
-    def _await_hold(self, tick: int) -> int:
+    def _await_hold_at(self, tick: int) -> int:
         """Wait until the rack holds before `tick` or a later one, and return that tick."""
         while (held_tick := self._words[System.HELD] - 1) < tick:
             if self._segment.run_is_over:
                 raise Failure(
                     f"rack '{self._segment.rack}': its run ended at tick {self._words[System.TICK]}"
                 )
-            time.sleep(LOOK_S)
+            time.sleep(CHECK_INTERVAL_S)
         return held_tick
 
 
@@ -119,26 +119,26 @@ class Pause(NamedTuple):
     levels: list[str]
 
 
-def pause(segment: Segment) -> Pause:
+def pause_rack(segment: Segment) -> Pause:
     """Pause a rack, and return once it is held or its arm is at rest.
 
     Raises `Failure` if the hold is refused, or if no single level is above all others.
     """
     if segment.words[System.LOCKSTEP]:
-        return Pause(Stepper(segment).hold(), [])
-    desk = LiveDesk(segment)
-    levels = desk.highest("", "hold")
+        return Pause(Stepper(segment).hold_rack(), [])
+    desk = LevelCommander(segment)
+    levels = desk.list_highest_levels("", "hold")
     if len(levels) != 1:
         highest = ", ".join(levels) or "none"
         needed = "one of the levels that can hold must be above all others"
         raise Failure(f"rack '{segment.rack}' runs in real time: {needed}; highest: {highest}")
-    reply = desk.give({"level": levels[0], "what": "hold"}, wait=True)
+    reply = desk.give_command({"level": levels[0], "what": "hold"}, wait=True)
     if reply.fate != "done":
         raise Failure(reply.line)
     return Pause(reply.done, levels)
 
 
-def resume(segment: Segment) -> list[str]:
+def resume_rack(segment: Segment) -> list[str]:
     """Let a paused rack continue. Returns the levels that were held.
 
     Raises `Failure` if the rack is not paused.
@@ -147,13 +147,13 @@ def resume(segment: Segment) -> list[str]:
     levels: list[str] = []
     if words[System.LOCKSTEP]:
         is_paused = words[System.HOLD_AT] > 0
-        Stepper(segment).let_go()
+        Stepper(segment).release()
     else:
-        desk = LiveDesk(segment)
-        levels = desk.highest("hold")
+        desk = LevelCommander(segment)
+        levels = desk.list_highest_levels("hold")
         is_paused = bool(levels)
         for level in levels:
-            reply = desk.give({"level": level, "what": "resume"}, wait=False)
+            reply = desk.give_command({"level": level, "what": "resume"}, wait=False)
             if not reply.worked:
                 raise Failure(reply.line)
     if not is_paused:

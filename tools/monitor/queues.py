@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rack.backplane.mailbox.queue import queues_of, taken_name
+from rack.backplane.mailbox.queue import get_position_mailbox, list_queues
 from rack.backplane.words import Box
 from rack.tools.console.answer import Document
-from rack.tools.monitor.newest_messages import Newest
+from rack.tools.monitor.newest_messages import NewestMessages
 
 if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
@@ -38,37 +38,38 @@ class QueueFill:
         return f"queue {self.mailbox}: {self.unread} of {self.capacity} unread{refused}"
 
 
-def queue_fills(newest: Newest) -> tuple[QueueFill, ...]:
+def list_queue_fills(newest: NewestMessages) -> tuple[QueueFill, ...]:
     """Describe every queue of a rack as it is now."""
     fills = []
-    for box in queues_of(newest.segment.layout):
+    for box in list_queues(newest.segment.layout):
         # Read the position first: messages taken after this still count as unread.
-        position = newest.message(taken_name(box.name))
-        words = newest.segment.box(box.name)
+        position = newest.read_message(get_position_mailbox(box.name))
+        words = newest.segment.get_box(box.name)
         unread = words[Box.SENT] - (0 if position is None else position.taken)
         fills.append(QueueFill(box.name, unread, box.capacity, words[Box.REFUSED]))
     return tuple(fills)
 
 
-def queues(recording: Recording) -> list[Document]:
+def summarize_queues(recording: Recording) -> list[Document]:
     """Describe the traffic of every queue in a run, as plain data.
 
     `waiting` is the largest number of messages that a read saw before it took any. `refused` is
     None if
     it was not recorded.
     """
-    refused = recording.ended.get("refused", {})
+    refused = recording.end_counts.get("refused", {})
     documents = []
-    for box in queues_of(recording.layout):
+    for box in list_queues(recording.layout):
         taken, unread = (
-            recording.signal(taken_name(box.name), field) for field in ("taken", "unread")
+            recording.read_signal(get_position_mailbox(box.name), field)
+            for field in ("taken", "unread")
         )
         before = np.concatenate(([0], taken[:-1]))
         documents.append(
             {
                 "mailbox": box.name,
                 "capacity": box.capacity,
-                "sent": int(recording.signal(box.name, "serial").max(initial=0)),
+                "sent": int(recording.read_signal(box.name, "serial").max(initial=0)),
                 "taken": int(taken.max(initial=0)),
                 "waiting": int((taken + unread - before).max(initial=0)),
                 "refused": refused.get(box.name),

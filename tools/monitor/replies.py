@@ -9,10 +9,10 @@ import numpy as np
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.history import MailboxRing
-from rack.backplane.message import text_of
+from rack.backplane.message import decode_text
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
-from rack.levels.operator import DRIVES, SETTINGS, Answer
+from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer
 
 REPLY_CYCLES = 4
 """Number of a level's cycles within which it replies.
@@ -79,7 +79,7 @@ class Reply:
         )
 
 
-def answering(segment: Segment, level: str) -> MailboxSpec | None:
+def find_answering_status(segment: Segment, level: str) -> MailboxSpec | None:
     """Find the status mailbox of a level. None if the status does not answer operators."""
     boxes = [box for box in segment.layout.mailboxes if box.name == f"{level}.status"]
     return next(
@@ -88,7 +88,7 @@ def answering(segment: Segment, level: str) -> MailboxSpec | None:
     )
 
 
-class Replies:
+class ReplyReader:
     """Reads the statuses of a level for its reply to one command.
 
     A newer command supersedes it once the level has accepted that one, except that settings
@@ -106,57 +106,59 @@ class Replies:
         """Kind of each command given to the level, by serial."""
         self.reply = reply
 
-    def look(self) -> Reply:
+    def read_statuses(self) -> Reply:
         """Read the statuses written since the last call."""
-        rows = self._ring.drain().rows
+        rows = self._ring.read_new_rows().rows
         # Read the commands after the statuses: a command is always older than its answer.
-        commands = self._given.drain().rows["message"]
+        commands = self._given.read_new_rows().rows["message"]
         self._kinds.update(zip(commands["id"].tolist(), commands["what"].tolist(), strict=True))
         for row in rows:
             if self.reply.fate in ("given", "taken"):
-                self.reply = self._judge(int(row["tick"]), row["message"])
+                self.reply = self._update_reply(int(row["tick"]), row["message"])
         return self.reply
 
-    def _judge(self, tick: int, status: np.void) -> Reply:
+    def _update_reply(self, tick: int, status: np.void) -> Reply:
         """Return the reply according to one status."""
         reply = self.reply
         answer = status["answer"]
         if status["order"] == reply.serial:
             taken_up = tick if reply.taken_up < 0 else reply.taken_up
             if answer == Answer.REFUSED:
-                objection = text_of(status["objection"])
+                objection = decode_text(status["objection"])
                 return replace(reply, fate="refused", taken_up=taken_up, objection=objection)
             if answer == Answer.DONE:
                 return replace(reply, fate="done", taken_up=taken_up, done=tick)
             return replace(reply, fate="taken", taken_up=taken_up)
         is_newer = status["order"] > reply.serial and answer in (Answer.TAKEN, Answer.DONE)
-        if is_newer and self._replaces(status["order"]):
+        if is_newer and self._supersedes(status["order"]):
             return replace(reply, fate="superseded")
         return reply
 
-    def _replaces(self, serial: int) -> bool:
+    def _supersedes(self, serial: int) -> bool:
         """Return whether a newer accepted command supersedes this one."""
         kind = self._kinds.get(serial)
         if kind in SETTINGS:
             return False
-        return kind not in DRIVES or self._kinds.get(self.reply.serial) in DRIVES
+        return (
+            kind not in DRIVE_OPERATIONS or self._kinds.get(self.reply.serial) in DRIVE_OPERATIONS
+        )
 
 
-class LastCycle:
+class ReplyDeadline:
     """Detects that a level should have answered a command by now.
 
     It counts cycles instead of ticks, because a level on a busy machine skips some of its releases.
     """
 
     def __init__(self, segment: Segment, status: MailboxSpec) -> None:
-        self._block = segment.block(status.writer)
+        self._block = segment.get_block(status.writer)
         self._bound = self._block[Block.CYCLES] + REPLY_CYCLES
         self._cycles = -1
         self._since = 0
         shortest = round(NO_CYCLE_S * 1e9 / segment.layout.clock_ns)
         self._silent = max(REPLY_CYCLES * status.every, shortest)
 
-    def passed(self, tick: int) -> str:
+    def explain_silence(self, tick: int) -> str:
         """Return why no answer will come, or an empty text while one may still come."""
         cycles = self._block[Block.CYCLES]
         if cycles != self._cycles:

@@ -19,11 +19,11 @@ from rack.tools.recording.signal import Signal
 if TYPE_CHECKING:
     from rich.console import Console
 
-Rows = list[tuple[int, list[Any]]]
+EntityRows = list[tuple[int, list[Any]]]
 """Ticks with the value of each signal. A value is None before the first message of its signal."""
 
 
-class Written(NamedTuple):
+class WrittenMessages(NamedTuple):
     """Messages of one mailbox, oldest first, with the ticks at which they were released.
 
     Attributes:
@@ -36,25 +36,25 @@ class Written(NamedTuple):
     lost: int
 
 
-class SignalTap:
+class SignalReader:
     """Reads all new messages in the mailboxes of some signals."""
 
     def __init__(self, segment: Segment, signals: Sequence[Signal]) -> None:
         names = dict.fromkeys(signal.mailbox for signal in signals)
         self._rings = {name: MailboxRing(segment, name) for name in names}
 
-    def take(self) -> Iterator[Written]:
+    def read_new(self) -> Iterator[WrittenMessages]:
         """Yield the messages since the last call.
 
         The first call yields what the rings hold: 2 s.
         """
         for name, ring in self._rings.items():
-            rows, lost = ring.drain()
+            rows, lost = ring.read_new_rows()
             if len(rows) or lost:
-                yield Written(name, rows["tick"], rows["message"], lost)
+                yield WrittenMessages(name, rows["tick"], rows["message"], lost)
 
 
-class Strip:
+class SignalHistory:
     """The last values of some signals by tick. A signal keeps its value until its next message.
 
     Attributes:
@@ -76,24 +76,24 @@ class Strip:
         followed: Sequence[Signal] = (),
     ) -> None:
         """Start to keep the signals."""
-        specs = [segment.layout.mailbox(signal.mailbox) for signal in signals]
+        specs = [segment.layout.find_mailbox(signal.mailbox) for signal in signals]
         self.signals = signals
         self.tick_s = segment.layout.clock_ns * 1e-9
         # A message is written, and becomes visible, before its writer's next period.
-        self.settles = max(spec.every + spec.delay for spec in specs)
+        self.settling_ticks = max(spec.every + spec.delay for spec in specs)
         # One reading may return as much as a ring holds.
-        self._span = span + self.settles + max(spec.every * spec.depth for spec in specs)
+        self._span = span + self.settling_ticks + max(spec.every * spec.depth for spec in specs)
         self._changes: dict[str, deque[tuple[int, dict[str, Any]]]] = defaultdict(deque)
         """By mailbox: ticks, and the values of its signals by name."""
-        self._tap = SignalTap(segment, [*signals, *followed])
+        self._tap = SignalReader(segment, [*signals, *followed])
         self.lost = 0
-        self.take()
+        self.read_new()
         # Messages overwritten before the start do not count.
         self.lost = 0
 
-    def take(self) -> list[Written]:
+    def read_new(self) -> list[WrittenMessages]:
         """Read and return the messages since the last call."""
-        all_written = [*self._tap.take()]
+        all_written = [*self._tap.read_new()]
         for written in all_written:
             self.lost += written.lost
             mailbox_signals = [
@@ -102,7 +102,8 @@ class Strip:
             if mailbox_signals:
                 names = [signal.name for signal in mailbox_signals]
                 values = zip(
-                    *(signal.plain(written.messages) for signal in mailbox_signals), strict=True
+                    *(signal.extract_plain(written.messages) for signal in mailbox_signals),
+                    strict=True,
                 )
                 named_rows = (dict(zip(names, row, strict=True)) for row in values)
                 changes = self._changes[written.mailbox]
@@ -111,7 +112,7 @@ class Strip:
                     changes.popleft()
         return all_written
 
-    def table(self, first: int, last: int) -> Rows:
+    def list_rows(self, first: int, last: int) -> EntityRows:
         """Return a row for each tick from `first` to `last` at which a signal was released."""
         changes = [
             change
@@ -127,21 +128,21 @@ class Strip:
                 table[tick] = [newest.get(signal.name) for signal in self.signals]
         return [*table.items()]
 
-    def time_s(self, tick: int) -> float:
+    def to_time_s(self, tick: int) -> float:
         """Convert a tick to simulated time, s."""
         return round(tick * self.tick_s, 9)
 
 
-def cell(value: Any) -> str:
+def format_value(value: Any) -> str:
     """Format a value of a signal."""
     if isinstance(value, list):
-        return " ".join(map(cell, value))
+        return " ".join(map(format_value, value))
     if value is None:
         return "-"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-class Lines:
+class SignalPrinter:
     """Prints signals as lines of text or JSON.
 
     Args:
@@ -151,30 +152,30 @@ class Lines:
         as_json: True to print JSON documents.
     """
 
-    def __init__(self, strip: Strip, first: int, every: int, as_json: bool) -> None:
+    def __init__(self, strip: SignalHistory, first: int, every: int, as_json: bool) -> None:
         self._strip = strip
         self._next = first
         self._every = max(every, 1)
         self._as_json = as_json
 
-    def show(self, last: int) -> None:
+    def show_until(self, last: int) -> None:
         """Print the lines up to the tick `last` that have not been printed yet."""
-        for tick, values in self._strip.table(self._next, last):
+        for tick, values in self._strip.list_rows(self._next, last):
             if tick >= self._next:
-                self._print(tick, values)
+                self._print_line(tick, values)
                 self._next = tick + self._every
 
-    def _print(self, tick: int, values: list[Any]) -> None:
-        time_s = self._strip.time_s(tick)
+    def _print_line(self, tick: int, values: list[Any]) -> None:
+        time_s = self._strip.to_time_s(tick)
         if self._as_json:
             names = [signal.name for signal in self._strip.signals]
             line = {"time_s": time_s, "tick": tick, **dict(zip(names, values, strict=True))}
             print(encode_json(line), flush=True)
         else:
-            print(f"{time_s:10.4f}", *map(cell, values), sep="  ", flush=True)
+            print(f"{time_s:10.4f}", *map(format_value, values), sep="  ", flush=True)
 
 
-class Plot:
+class SignalPlot:
     """Draws signals as curves on the terminal. Raises `ImportError` without plotext.
 
     Args:
@@ -183,7 +184,7 @@ class Plot:
         terminal: Where it is drawn.
     """
 
-    def __init__(self, strip: Strip, span: int, terminal: Console) -> None:
+    def __init__(self, strip: SignalHistory, span: int, terminal: Console) -> None:
         import plotext
         from rich.live import Live
 
@@ -199,11 +200,11 @@ class Plot:
     def __exit__(self, *error: object) -> None:
         self._live.stop()
 
-    def show(self, last: int) -> None:
+    def show_until(self, last: int) -> None:
         """Draw the curves that end before the tick `last`."""
         from rich.text import Text
 
-        rows = self._strip.table(last - self._span, last)
+        rows = self._strip.list_rows(last - self._span, last)
         plot = self._plotext
         plot.clear_figure()
         # Use the colours of the terminal.
@@ -211,12 +212,12 @@ class Plot:
         # Leave one line free, because the terminal would scroll otherwise.
         plot.plotsize(self._live.console.width, max(self._live.console.height - 1, 4))
         plot.xlabel("simulated time, s")
-        for name, points in self._curves(rows).items():
+        for name, points in self._list_curves(rows).items():
             times, values = zip(*points, strict=True)
             plot.plot(times, values, label=name, marker="braille")
         self._live.update(Text.from_ansi(plot.build()), refresh=True)
 
-    def _curves(self, rows: Rows) -> dict[str, list[tuple[float, float]]]:
+    def _list_curves(self, rows: EntityRows) -> dict[str, list[tuple[float, float]]]:
         """Return points by the name of the curve.
 
         A signal with several numbers has a curve for each.
@@ -224,15 +225,15 @@ class Plot:
         curves = defaultdict(list)
         for tick, values in rows:
             for signal, value in zip(self._strip.signals, values, strict=True):
-                for name, number in _numbers(signal.head, value):
-                    curves[name].append((self._strip.time_s(tick), number))
+                for name, number in _list_numbers(signal.heading, value):
+                    curves[name].append((self._strip.to_time_s(tick), number))
         return curves
 
 
-def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
+def _list_numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
     """Yield the numbers of a value, each with its name."""
     if isinstance(value, list):
         for index, element in enumerate(value):
-            yield from _numbers(f"[{index}] {name}", element)
+            yield from _list_numbers(f"[{index}] {name}", element)
     elif isinstance(value, int | float):
         yield name, value

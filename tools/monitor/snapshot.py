@@ -8,35 +8,41 @@ from dataclasses import dataclass
 import numpy as np
 
 from rack.backplane.bounded_toml import load_toml
-from rack.backplane.checked import as_named
+from rack.backplane.checked import to_enum
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.layout import TaskSpec
 from rack.backplane.lines import UtilityLines
-from rack.backplane.message import AnyMessage, reason_of, state_name
+from rack.backplane.message import AnyMessage, format_state, get_reason
 from rack.backplane.segment import Segment
-from rack.backplane.trace import trace_ring
+from rack.backplane.trace import open_trace_ring
 from rack.backplane.words import Block, Demand, Run, System, TaskState
-from rack.boards.exchange import EXCHANGE, PortAge, ages_of
-from rack.boards.timing.trace_times import execution_ns, lateness_ns
+from rack.boards.exchange import EXCHANGE_PORT, PortAge, list_port_ages
+from rack.boards.timing.trace_times import compute_execution_ns, compute_lateness_ns
 from rack.tools.monitor.holds import Hold, find_holds
-from rack.tools.monitor.host_side import EntryRow, HostRow, entry_rows, host_rows, restarts
-from rack.tools.monitor.interrupts import InboxFill, inbox_fills
+from rack.tools.monitor.host_side import (
+    EntryRow,
+    HostRow,
+    count_restarts,
+    list_entry_rows,
+    list_host_rows,
+)
+from rack.tools.monitor.interrupts import InboxFill, list_inbox_fills
 from rack.tools.monitor.network import (
     ExportRow,
     ImportRow,
     PeerRow,
-    export_rows,
-    import_rows,
-    peer_rows,
+    list_exports,
+    list_imports,
+    list_peers,
 )
-from rack.tools.monitor.newest_messages import Newest
-from rack.tools.monitor.queues import QueueFill, queue_fills
+from rack.tools.monitor.newest_messages import NewestMessages
+from rack.tools.monitor.queues import QueueFill, list_queue_fills
 
 LOST = "lost"
 """State of a task that died or does not respond, until its new process has rejoined."""
 DEAD = "dead"
 """State of a run whose launcher has ended. `rack clean` removes it."""
-HELD = "HELD: 'rack step {}' continues it"
+HELD_WARNING = "HELD: 'rack step {}' continues it"
 """Warning about a rack in lockstep that is held between two ticks."""
 TASK_STATUS = "task_status"
 """Message type of the level that reports the progress of the whole task."""
@@ -143,24 +149,26 @@ class RackMonitor:
 
     def __init__(self, segment: Segment, keeps_longest: bool = False) -> None:
         self._segment = segment
-        self._newest = Newest(segment)
+        self._newest = NewestMessages(segment)
         self._lines = UtilityLines(segment)
         self._faults = FaultTable(segment)
         robot = load_toml(segment.config).get("robot", {})
         self._joints = tuple(robot.get("joints", ()))
-        self._traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
+        self._traces = {
+            task.name: open_trace_ring(segment, task.name) for task in segment.layout.tasks
+        }
         self.cycles: dict[str, np.ndarray] = {}
         self._keeps_longest = keeps_longest
         self._longest_ns: dict[str, np.ndarray] = {}
 
-    def look(self) -> Snapshot:
+    def take_snapshot(self) -> Snapshot:
         """Take a snapshot."""
         segment = self._segment
         words = segment.words
         layout = segment.layout
         run = DEAD
         if segment.launcher_is_alive:
-            run = as_named(Run, words[System.STATE]).name.lower()
+            run = to_enum(Run, words[System.STATE]).name.lower()
         tick = words[System.TICK]
         return Snapshot(
             rack=layout.rack,
@@ -168,39 +176,43 @@ class RackMonitor:
             tick=tick,
             time_s=tick * layout.clock_ns * 1e-9,
             clock_skipped=words[System.CLOCK_SKIPPED],
-            lines=tuple(self._asserted()),
-            demand=as_named(Demand, words[System.DEMAND]).name.lower(),
-            faults=tuple(self._active_faults()),
+            lines=tuple(self._list_warnings()),
+            demand=to_enum(Demand, words[System.DEMAND]).name.lower(),
+            faults=tuple(self._list_active_faults()),
             tasks=tuple(
-                self._row(task) for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
+                self._describe_task(task)
+                for task in sorted(layout.tasks, key=lambda t: (t.slot, t.role))
             ),
-            progress=self._progress(),
+            progress=self._find_progress(),
             holds=find_holds(self._newest),
-            hosts=host_rows(segment),
-            entries=entry_rows(self._newest),
-            queues=queue_fills(self._newest),
-            inboxes=inbox_fills(segment),
-            peers=peer_rows(self._newest),
-            imports=import_rows(self._newest),
-            exports=export_rows(self._newest),
-            exchanges={board: ages_of(message) for board, message in self._of_type(EXCHANGE)},
+            hosts=list_host_rows(segment),
+            entries=list_entry_rows(self._newest),
+            queues=list_queue_fills(self._newest),
+            inboxes=list_inbox_fills(segment),
+            peers=list_peers(self._newest),
+            imports=list_imports(self._newest),
+            exports=list_exports(self._newest),
+            exchanges={
+                board: list_port_ages(message)
+                for board, message in self._list_messages(EXCHANGE_PORT)
+            },
         )
 
-    def _active_faults(self) -> Iterator[str]:
+    def _list_active_faults(self) -> Iterator[str]:
         """Yield a text for each active fault."""
-        for fault in self._faults.staged((Stage.ACTIVE,)):
+        for fault in self._faults.list_entries((Stage.ACTIVE,)):
             # Import late: most racks have no faults, and the import takes a while.
-            from rack.boards.faults.describe import describe
-            from rack.boards.faults.kind import UNKNOWN, kind_of
+            from rack.boards.faults.describe import describe_fault
+            from rack.boards.faults.kind import UNKNOWN, find_kind
 
-            if kind_of(fault) is UNKNOWN:
+            if find_kind(fault) is UNKNOWN:
                 from rack.boards.config.published import PublishedRack
 
                 # Reading this registers the kinds that the levels of the rack add.
-                PublishedRack.of_rack(self._segment)
-            yield describe(fault, self._segment.layout, self._joints)
+                PublishedRack.read_from_segment(self._segment)
+            yield describe_fault(fault, self._segment.layout, self._joints)
 
-    def _asserted(self) -> list[str]:
+    def _list_warnings(self) -> list[str]:
         """Return the asserted utility lines, and warnings."""
         lines = self._lines
         warnings = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
@@ -212,29 +224,29 @@ class RackMonitor:
         warnings += [name for name, asserted in single.items() if asserted]
         words = self._segment.words
         tasks = [task.name for task in self._segment.layout.tasks if task.priority]
-        blocks = zip(tasks, map(self._segment.block, tasks), strict=True)
+        blocks = zip(tasks, map(self._segment.get_block, tasks), strict=True)
         refused = [name for name, block in blocks if block[Block.PID] and not block[Block.PRIORITY]]
         if refused and words[System.STATE] != Run.STARTING and not words[System.LOCKSTEP]:
             warnings.append(f"NO REAL-TIME PRIORITY: {', '.join(refused)}")
         if words[System.HELD]:
-            warnings.append(HELD.format(self._segment.rack))
+            warnings.append(HELD_WARNING.format(self._segment.rack))
         if count := words[System.SNAPSHOTS]:
             warnings.append(f"{count} SNAPSHOTS, {words[System.SNAPSHOT_BYTES] / 1e6:.0f} MB")
         return warnings
 
-    def _row(self, task: TaskSpec) -> TaskRow:
+    def _describe_task(self, task: TaskSpec) -> TaskRow:
         """Describe a task."""
-        block = self._segment.block(task.name)
-        exec_ms, lateness_ms = self._times_ms(task.name)
-        state = as_named(TaskState, block[Block.STATE]).name.lower()
+        block = self._segment.get_block(task.name)
+        exec_ms, lateness_ms = self._longest_times_ms(task.name)
+        state = to_enum(TaskState, block[Block.STATE]).name.lower()
         reason = row = mode = ""
         if block[Block.LOST]:
             state = LOST
-        elif (status := self._newest.message(f"{task.name}.status")) is not None:
+        elif (status := self._newest.read_message(f"{task.name}.status")) is not None:
             # For a user's level without a known state, show the state of its process.
-            state = state_name(getattr(status, "state", None), state)
-            reason = reason_of(status)
-            row = fired(status)
+            state = format_state(getattr(status, "state", None), state)
+            reason = get_reason(status)
+            row = format_table_row(status)
             standing = getattr(status, "standing", None)
             mode = "" if standing is None else "operator" if standing else "automatic"
         return TaskRow(
@@ -249,7 +261,7 @@ class RackMonitor:
             plans=block[Block.PLANS],
             missed=block[Block.MISSED],
             skipped=self._segment.count_cycles(task, self._segment.words[System.TICK] - 1).skipped,
-            restarts=restarts(self._segment, task.name),
+            restarts=count_restarts(self._segment, task.name),
             exec_ms=exec_ms,
             lateness_ms=lateness_ms,
             reason=reason,
@@ -261,35 +273,37 @@ class RackMonitor:
         """Forget the longest times so far."""
         self._longest_ns.clear()
 
-    def _times_ms(self, task: str) -> list[float | None]:
+    def _longest_times_ms(self, task: str) -> list[float | None]:
         """Return the longest execution time and lateness of a task.
 
         Without a new cycle they are those of the previous snapshot.
         """
-        self.cycles[task] = cycles = self._traces[task].drain().rows
+        self.cycles[task] = cycles = self._traces[task].read_new_rows().rows
         longest = self._longest_ns.get(task)
         if len(cycles):
-            newest = np.array([execution_ns(cycles).max(), lateness_ns(cycles).max()])
+            newest = np.array(
+                [compute_execution_ns(cycles).max(), compute_lateness_ns(cycles).max()]
+            )
             if longest is not None and self._keeps_longest:
                 newest = np.maximum(longest, newest)
             longest = self._longest_ns[task] = newest
         return [None, None] if longest is None else (longest * 1e-6).tolist()
 
-    def _of_type(self, message: str) -> Iterator[tuple[str, AnyMessage]]:
+    def _list_messages(self, message: str) -> Iterator[tuple[str, AnyMessage]]:
         """Yield the writer and the newest message of every mailbox with a message type."""
-        return self._newest.messages(lambda box: box.message == message)
+        return self._newest.list_messages(lambda box: box.message == message)
 
-    def _progress(self) -> TaskProgress | None:
+    def _find_progress(self) -> TaskProgress | None:
         """Return the progress of the task. None if no level reports it."""
-        for _, status in self._of_type(TASK_STATUS):
-            state = state_name(status.state)
+        for _, status in self._list_messages(TASK_STATUS):
+            state = format_state(status.state)
             return TaskProgress(
                 status.moves_done, status.moves, status.action, status.actions, state, status.reason
             )
         return None
 
 
-def fired(status: AnyMessage) -> str:
+def format_table_row(status: AnyMessage) -> str:
     """Format the row of a state table that a level executed in its newest cycle.
 
     Empty for a level without a state table.

@@ -22,7 +22,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption,
 from cryptography.x509.oid import NameOID
 
 from rack.backplane.rack_name import RACK_NAME
-from rack.boards.lan.config import Credential
+from rack.boards.lan.config import CredentialError
 from rack.boards.lan.credentials import (
     AUTHORITY,
     OWNER_ONLY,
@@ -35,12 +35,12 @@ from rack.tools.console.answer import Failure
 
 AUTHORITY_KEY = "authority-key.pem"
 AUTHORITY_NAME = "rack test authority"
-EARLIER = timedelta(hours=1)
+CLOCK_MARGIN = timedelta(hours=1)
 """Certificates are valid from this long ago, because the clocks of machines differ."""
 
 
 @dataclass(frozen=True)
-class Made:
+class CredentialFiles:
     """Content of the files that were made, by name, and the time when the certificates expire."""
 
     files: Mapping[str, bytes]
@@ -54,7 +54,9 @@ class Authority(NamedTuple):
     key: ec.EllipticCurvePrivateKey
 
 
-def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int) -> Made:
+def make_credentials(
+    folder: Path, names: Mapping[str, Sequence[str]], days: int
+) -> CredentialFiles:
     """Write a certificate and a key for each name. Create the authority if the folder has none.
 
     Args:
@@ -78,14 +80,14 @@ def make_credentials(folder: Path, names: Mapping[str, Sequence[str]], days: int
     else:
         key = ec.generate_private_key(ec.SECP256R1())
         authority = Authority(sign_certificate(AUTHORITY_NAME, key, None, expires), key)
-        files |= {AUTHORITY: pem_of(authority.certificate), AUTHORITY_KEY: pem_of_key(key)}
+        files |= {AUTHORITY: to_pem(authority.certificate), AUTHORITY_KEY: key_to_pem(key)}
     expires = min(expires, authority.certificate.not_valid_after_utc)
     for rack, addresses in zip(wanted, names.values(), strict=True):
         key = ec.generate_private_key(ec.SECP256R1())
         certificate = sign_certificate(rack.rack, key, authority, expires, addresses)
-        files |= {rack.certificate.name: pem_of(certificate), rack.key.name: pem_of_key(key)}
+        files |= {rack.certificate.name: to_pem(certificate), rack.key.name: key_to_pem(key)}
     write_credentials(folder, files)
-    return Made(files, expires)
+    return CredentialFiles(files, expires)
 
 
 def _load_authority(folder: Path) -> Authority:
@@ -93,7 +95,7 @@ def _load_authority(folder: Path) -> Authority:
     try:
         certificate, *_ = load_certificates(folder / AUTHORITY)
         key = load_private_key(folder / AUTHORITY_KEY)
-    except Credential as flaw:
+    except CredentialError as flaw:
         raise Failure(str(flaw), 2) from None
     if key.public_key() != certificate.public_key():
         raise Failure(f"{folder}: {AUTHORITY_KEY} is not the key of {AUTHORITY}", 2)
@@ -137,7 +139,7 @@ def sign_certificate(
         .issuer_name(issuer)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(min(datetime.now(UTC), expires) - EARLIER)
+        .not_valid_before(min(datetime.now(UTC), expires) - CLOCK_MARGIN)
         .not_valid_after(expires)
         .add_extension(x509.BasicConstraints(is_authority, 0 if is_authority else None), True)
         .add_extension(usage, True)
@@ -147,12 +149,12 @@ def sign_certificate(
         )
     )
     if addresses:
-        names = x509.SubjectAlternativeName(map(_address, addresses))
+        names = x509.SubjectAlternativeName(map(_to_general_name, addresses))
         builder = builder.add_extension(names, False)
     return builder.sign(signer, hashes.SHA256())
 
 
-def _address(text: str) -> x509.GeneralName:
+def _to_general_name(text: str) -> x509.GeneralName:
     """Return an address, or a host name, as an alternative name of a certificate."""
     try:
         return x509.IPAddress(ip_address(text))
@@ -160,12 +162,12 @@ def _address(text: str) -> x509.GeneralName:
         return x509.DNSName(text)
 
 
-def pem_of(certificate: x509.Certificate) -> bytes:
+def to_pem(certificate: x509.Certificate) -> bytes:
     """Return a certificate in PEM form."""
     return certificate.public_bytes(Encoding.PEM)
 
 
-def pem_of_key(key: ec.EllipticCurvePrivateKey) -> bytes:
+def key_to_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
     """Return a private key in PEM form, without a password."""
     return key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
 
@@ -182,7 +184,7 @@ def write_credentials(folder: Path, files: Mapping[str, bytes]) -> None:
             file.write(content)
 
 
-def named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
+def parse_named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
     """Parse the values of `--for`, such as "cell=10.0.0.1,cell.local" or "operator".
 
     Returns:
@@ -204,7 +206,7 @@ def named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
             why = "a file of the set would have this name"
         try:
             for address in addresses:
-                Endpoint.of(f"tls/{f'[{address}]' if ':' in address else address}:1")
+                Endpoint.from_text(f"tls/{f'[{address}]' if ':' in address else address}:1")
         except ValueError:
             why = why or "it must be NAME or NAME=ADDRESS,... with host names or addresses"
         if why:

@@ -20,8 +20,8 @@ from rack.boards.lan.config import LanTable
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.keys import estop_answer_key, estop_key
-from rack.boards.lan.link import Arrived, LanLink
-from rack.boards.lan.remote_estop import CHECK, ESTOP_KIND
+from rack.boards.lan.link import LanLink, ReceivedMessage
+from rack.boards.lan.remote_estop import CHECK_FLAG, ESTOP_KIND
 from rack.levels.errors import LevelError
 from rack.tools.console.address import Operator, RackAddress
 from rack.tools.console.answer import Failure
@@ -42,7 +42,7 @@ DENIED_S = 1.0
 The path to a rack that has just appeared may not exist yet, so the first such return proves
 nothing.
 """
-LOOK_S = 0.2
+PRESENCE_CHECK_S = 0.2
 """Interval at which the presence of a rack is checked."""
 
 
@@ -67,7 +67,7 @@ class EstopSession:
         self._session = secrets.randbits(63)
         self._number = 0
         self._launches: dict[str, int] = {}
-        self._changes = self._link.watch_alive()
+        self._changes = self._link.watch_tokens()
 
     def __enter__(self) -> Self:
         return self
@@ -75,7 +75,7 @@ class EstopSession:
     def __exit__(self, *error: object) -> None:
         self._link.close()
 
-    def _await(self, condition: Callable[[], object], bound_s: float) -> None:
+    def _wait_until(self, condition: Callable[[], object], bound_s: float) -> None:
         """Follow which racks are present until a condition holds or `bound_s` seconds are over."""
         end_s = time.monotonic() + bound_s
         while True:
@@ -88,15 +88,15 @@ class EstopSession:
                 return
             time.sleep(PAUSE_S)
 
-    def launch(self) -> int:
+    def find_launch(self) -> int:
         """Return the number of the rack's launch.
 
         Raises:
             Failure: The rack is not present. The message names the racks that are.
         """
         rack = self._address.rack
-        self._await(lambda: self._launches, CONNECT_S)
-        self._await(lambda: rack in self._launches, OTHERS_S)
+        self._wait_until(lambda: self._launches, CONNECT_S)
+        self._wait_until(lambda: rack in self._launches, OTHERS_S)
         if rack in self._launches:
             return self._launches[rack]
         present = ", ".join(sorted(self._launches))
@@ -104,7 +104,9 @@ class EstopSession:
         if self._operator.certificates:
             with_tls = "its certificate and yours must be of one authority"
         nobody = f"none that knows '{self._operator.name}'; {with_tls}"
-        raise Failure(f"no rack '{rack}' at {self._address.at}; racks there: {present or nobody}")
+        raise Failure(
+            f"no rack '{rack}' at {self._address.endpoint}; racks there: {present or nobody}"
+        )
 
     def set_stop(self, launch: int, flags: int = 0) -> int:
         """Set the emergency stop of the rack, or check whether it could be set.
@@ -120,17 +122,17 @@ class EstopSession:
             Failure: The rack has ended, does not permit the stop, or does not answer.
         """
         rack = self._address.rack
-        rack_text = f"rack '{rack}' at {self._address.at}"
+        rack_text = f"rack '{rack}' at {self._address.endpoint}"
         first_s = time.monotonic()
         # Whether the rack has accepted a request, which its adapter answers in its next cycle.
         was_taken = False
         while True:
             began_s = time.monotonic()
-            if (tick := self._request(launch, flags)) is not None:
+            if (tick := self._send_request(launch, flags)) is not None:
                 return tick
             now_s = time.monotonic()
             was_taken |= now_s - began_s > ANSWER_S / 2
-            self._await(lambda: True, 0.0)
+            self._wait_until(lambda: True, 0.0)
             if self._launches.get(rack) != launch:
                 raise Failure(f"{rack_text} has ended, or is out of reach")
             if not was_taken and now_s - first_s > DENIED_S:
@@ -143,7 +145,7 @@ class EstopSession:
                 raise Failure(f"{rack_text} has not answered for {PATIENCE_S:g} s: {why}")
             time.sleep(PAUSE_S)
 
-    def _request(self, launch: int, flags: int) -> int | None:
+    def _send_request(self, launch: int, flags: int) -> int | None:
         """Send a request once. Return the tick of its answer, or None if there is none."""
         rack, name, sealer = self._address.rack, self._operator.name, self._link.sealer
         self._number += 1
@@ -159,8 +161,8 @@ class EstopSession:
         for reply in replies:
             if reply.ok is None:
                 continue
-            _, envelope, payload = Arrived.of(reply.ok)
-            answer = sealer.opened(estop_answer_key(rack, name), envelope, payload)
+            _, envelope, payload = ReceivedMessage.from_sample(reply.ok)
+            answer = sealer.open_message(estop_answer_key(rack, name), envelope, payload)
             expected = launch, self._number, self._session
             # Compare launch, serial and number, so that an answer to another request is ignored.
             if not isinstance(answer, Flaw) and answer[1:4] == expected:
@@ -168,14 +170,14 @@ class EstopSession:
         return None
 
 
-def stop(address: RackAddress, operator: Operator) -> int:
+def stop_rack(address: RackAddress, operator: Operator) -> int:
     """Set the emergency stop of a rack and return the tick at which it was set.
 
     Raises:
         Failure: The stop could not be set.
     """
     with EstopSession(address, operator) as session:
-        return session.set_stop(session.launch())
+        return session.set_stop(session.find_launch())
 
 
 def stop_when(
@@ -202,10 +204,10 @@ def stop_when(
     """
     with EstopSession(address, operator) as session:
         checked_launch: int | None = None
-        while checked_launch is None or not pressed(LOOK_S):
+        while checked_launch is None or not pressed(PRESENCE_CHECK_S):
             try:
-                if (launch := session.launch()) != checked_launch:
-                    session.set_stop(launch, CHECK)
+                if (launch := session.find_launch()) != checked_launch:
+                    session.set_stop(launch, CHECK_FLAG)
                     checked_launch = launch
                 tell(f"ready to stop rack '{address}'")
             except Failure as failure:
@@ -214,7 +216,7 @@ def stop_when(
                 tell(f"not ready: {failure}")
         while True:
             try:
-                return session.set_stop(session.launch())
+                return session.set_stop(session.find_launch())
             except Failure as failure:
                 tell(f"not stopped yet: {failure}")
 
@@ -225,7 +227,7 @@ def check_reach(rack: RackAddress, operator: Operator) -> None:
     Raises:
         Failure: Nothing listens there, or the operator has no usable certificate but needs one.
     """
-    host_text = rack.at
+    host_text = rack.endpoint
     try:
         with socket.create_connection((rack.host.strip("[]"), rack.port), CONNECT_S) as connection:
             address = ipaddress.ip_address(connection.getpeername()[0].partition("%")[0])
@@ -239,7 +241,7 @@ def check_reach(rack: RackAddress, operator: Operator) -> None:
         ) from None
     if operator.certificates:
         credentials = Credentials(Path(operator.certificates), operator.name)
-        if (flaw := next(credentials.flaws(), None)) is not None:
+        if (flaw := next(credentials.find_flaws(), None)) is not None:
             raise Failure(str(flaw))
     elif not address.is_loopback:
         raise Failure(

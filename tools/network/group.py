@@ -56,12 +56,12 @@ def certificates(
       rack lan certificates certs --for operator --days 30
     """
     try:
-        from rack.tools.network.certificates import make_credentials, named_addresses
+        from rack.tools.network.certificates import make_credentials, parse_named_addresses
     except ImportError:
         raise Failure(
             "certificates are made with 'cryptography', which is missing: install nasrem-rack[lan]"
         ) from None
-    by_name = named_addresses(names)
+    by_name = parse_named_addresses(names)
     credentials = make_credentials(folder, by_name, days)
     answer = {
         "folder": str(folder),

@@ -22,27 +22,32 @@ from rack.backplane.bounded_toml import load_toml
 from rack.backplane.fault_table import NEVER
 from rack.backplane.layout import MailboxSpec, TaskSpec
 from rack.boards.config.schema import LAN
-from rack.tools.recording.divergence import UnlikeMessage, common_ticks, row_of, unlike_messages
-from rack.tools.recording.history import misses
+from rack.tools.recording.divergence import (
+    DivergentMessage,
+    find_common_ticks,
+    find_row,
+    list_divergent_messages,
+)
+from rack.tools.recording.history import list_misses
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.signal import Signal, mailbox_of, signals_of
+from rack.tools.recording.signal import Signal, find_mailbox, list_signals
 
 ClueKind = Literal["fault", "died", "command", "demand", "late", "skipped", "config", "outside"]
-EVENTS: Mapping[str | None, ClueKind] = {
+CLUES_BY_EVENT: Mapping[str | None, ClueKind] = {
     "fault": "fault",
     "died": "died",
     "command": "command",
     "demand": "demand",
 }
 """Clue for each event kind or event code that does not follow from messages."""
-MISSED = {"late": "'{}' missed its deadline", "skipped": "'{}' skipped this cycle"}
-OWN = ("name", "record.", "clock.mode", "clock.speed", "fault", "command", "python_path")
+MISS_TEXTS = {"late": "'{}' missed its deadline", "skipped": "'{}' skipped this cycle"}
+IGNORED_KEYS = ("name", "record.", "clock.mode", "clock.speed", "fault", "command", "python_path")
 """Prefixes of config keys that cannot cause a difference, or whose effects are recorded as events.
 """
 
 
 @dataclass(frozen=True)
-class InBoth:
+class ValueDifference:
     """A value that differs between two runs.
 
     Attributes:
@@ -72,10 +77,10 @@ class Clue:
     text: str
     run: str = ""
     tick: int = -1
-    values: InBoth | None = None
+    values: ValueDifference | None = None
 
 
-class Told(NamedTuple):
+class EventClue(NamedTuple):
     """An event as a clue.
 
     Attributes:
@@ -90,7 +95,7 @@ class Told(NamedTuple):
 
 
 @dataclass(frozen=True)
-class UnlikeCycle:
+class DivergentCycle:
     """The cycle in which a task wrote the first differing message of a mailbox.
 
     Attributes:
@@ -107,7 +112,7 @@ class UnlikeCycle:
     tick: int
     mailbox: str
     writer: str
-    fields: tuple[InBoth, ...]
+    fields: tuple[ValueDifference, ...]
     read: tuple[str, ...]
     unequal: str
     clues: tuple[Clue, ...]
@@ -125,12 +130,12 @@ class Divergence:
 
     def __init__(self, first_run: Recording, second_run: Recording) -> None:
         self.runs = first_run, second_run
-        self.unlike = {
-            message.mailbox: message for message in unlike_messages(first_run, second_run)
+        self.divergent = {
+            message.mailbox: message for message in list_divergent_messages(first_run, second_run)
         }
-        self._begin, _ = common_ticks(first_run, second_run)
+        self._begin, _ = find_common_ticks(first_run, second_run)
 
-    def chain(self, mailbox: str = "") -> tuple[UnlikeCycle, ...]:
+    def trace_cause(self, mailbox: str = "") -> tuple[DivergentCycle, ...]:
         """Follow a difference back to its cause.
 
         Args:
@@ -144,44 +149,51 @@ class Divergence:
             Failure: The mailbox does not exist.
         """
         if mailbox:
-            mailbox_of(mailbox, self.runs[0].layout.timed)
-        name = mailbox or next(iter(self.unlike), "")
-        cycles: dict[str, UnlikeCycle] = {}
+            find_mailbox(mailbox, self.runs[0].layout.timed)
+        name = mailbox or next(iter(self.divergent), "")
+        cycles: dict[str, DivergentCycle] = {}
         # Messages that become visible immediately can form a circle within one tick.
-        while name in self.unlike and name not in cycles:
-            cycles[name] = self._cycle(self.unlike[name])
+        while name in self.divergent and name not in cycles:
+            cycles[name] = self._describe_cycle(self.divergent[name])
             name = cycles[name].unequal
         return tuple(cycles.values())
 
-    def _cycle(self, message: UnlikeMessage) -> UnlikeCycle:
+    def _describe_cycle(self, message: DivergentMessage) -> DivergentCycle:
         """Describe the cycle that wrote a differing message: its inputs and possible causes."""
         layout = self.runs[0].layout
-        box = layout.mailbox(message.mailbox)
+        box = layout.find_mailbox(message.mailbox)
         read = [source for source in layout.timed if box.writer in source.readers]
-        unequal = [source.name for source in read if self._was_unequal(source, box.writer, message)]
-        first = min(unequal, key=lambda name: self.unlike[name].tick, default="")
-        clues = [*self._events(box, message)]
+        unequal = [
+            source.name for source in read if self._has_read_difference(source, box.writer, message)
+        ]
+        first = min(unequal, key=lambda name: self.divergent[name].tick, default="")
+        clues = [*self._find_event_clues(box, message)]
         if box.writer != CLOCK:
-            clues += self._missed(layout.task(box.writer), message.tick)
+            clues += self._find_miss_clues(layout.find_task(box.writer), message.tick)
         if not first and box.writer != CLOCK:
-            clues += [*self._config(box.writer), *self._outside(box.writer)]
-        return UnlikeCycle(
+            clues += [
+                *self._find_config_clues(box.writer),
+                *self._find_unrecorded_inputs(box.writer),
+            ]
+        return DivergentCycle(
             tick=message.tick,
             mailbox=box.name,
             writer=box.writer,
-            fields=tuple(self._fields(box, message.serial)),
+            fields=tuple(self._list_different_fields(box, message.serial)),
             read=tuple(source.name for source in read),
             unequal=first,
             clues=tuple(clues),
         )
 
-    def _was_unequal(self, source: MailboxSpec, reader: str, message: UnlikeMessage) -> bool:
+    def _has_read_difference(
+        self, source: MailboxSpec, reader: str, message: DivergentMessage
+    ) -> bool:
         """Return True if a task had read a differing message from a mailbox.
 
         Only what was visible in the cycle that wrote the task's own differing message counts.
         """
-        earlier = self.unlike.get(source.name)
-        grid = self.runs[0].layout.read_grid(source, reader)
+        earlier = self.divergent.get(source.name)
+        grid = self.runs[0].layout.find_read_grid(source, reader)
         release = message.tick - (message.tick - grid.phase) % grid.every
         return (
             earlier is not None
@@ -189,33 +201,33 @@ class Divergence:
             and earlier.mailbox != message.mailbox
         )
 
-    def _fields(self, box: MailboxSpec, serial: int) -> Iterator[InBoth]:
+    def _list_different_fields(self, box: MailboxSpec, serial: int) -> Iterator[ValueDifference]:
         """Yield the fields of a message that differ.
 
         If the messages come from different cycles, only "tick" is yielded.
         """
-        here, there = (row_of(run, box, serial) for run in self.runs)
+        here, there = (find_row(run, box, serial) for run in self.runs)
         ticks = (None if row is None else int(row["tick"]) for row in (here, there))
         if here is None or there is None or here["tick"] != there["tick"]:
             # The two messages come from different cycles, so their other fields say nothing.
-            yield InBoth("tick", *ticks)
+            yield ValueDifference("tick", *ticks)
             return
         if here["visible_at"] != there["visible_at"]:
-            yield InBoth("visible_at", int(here["visible_at"]), int(there["visible_at"]))
-        for signal in signals_of(box):
-            yield from _unlike_signal(signal, here["message"][None], there["message"][None])
+            yield ValueDifference("visible_at", int(here["visible_at"]), int(there["visible_at"]))
+        for signal in list_signals(box):
+            yield from _compare_signal(signal, here["message"][None], there["message"][None])
         if here["basis"] != there["basis"]:
-            yield InBoth("basis", int(here["basis"]), int(there["basis"]))
+            yield ValueDifference("basis", int(here["basis"]), int(there["basis"]))
 
-    def _events(self, box: MailboxSpec, message: UnlikeMessage) -> Iterator[Clue]:
+    def _find_event_clues(self, box: MailboxSpec, message: DivergentMessage) -> Iterator[Clue]:
         """Yield events of only one run that concern the writer of a message or the whole rack."""
         boards = {name.partition(".")[0] for name in (box.writer, box.name)}
         about = {CLOCK, box.writer, box.name, *boards}
-        event_clues = [list(self._told(run)) for run in self.runs]
+        event_clues = [list(self._list_event_clues(run)) for run in self.runs]
         for this_run, other_run, run in zip(
             event_clues, reversed(event_clues), self.runs, strict=True
         ):
-            row = row_of(run, box, message.serial)
+            row = find_row(run, box, message.serial)
             # A death is reported after the first message is missing, and perhaps none follows it.
             written = NEVER if row is None else int(row["tick"])
             unmatched = Counter(event.key for event in other_run)
@@ -228,43 +240,43 @@ class Divergence:
                 if unmatched[event.key] < 0 and about & {*event.about} and event.clue.tick <= until:
                     yield event.clue
 
-    def _told(self, run: Recording) -> Iterator[Told]:
+    def _list_event_clues(self, run: Recording) -> Iterator[EventClue]:
         """Yield the deaths and external interventions among a run's events."""
         for event in run.events:
-            kind = EVENTS.get(event.get("code")) or EVENTS.get(event["kind"])
+            kind = CLUES_BY_EVENT.get(event.get("code")) or CLUES_BY_EVENT.get(event["kind"])
             if kind is not None and event["tick"] >= self._begin:
                 about = event["board"], event["subject"]
                 # The text of a death contains a process id, which always differs.
                 text = "" if kind == "died" else f"{event['tick']} {event['text']}"
                 clue = Clue(kind, event["text"], str(run.folder), event["tick"])
-                yield Told((kind, *about, text), about, clue)
+                yield EventClue((kind, *about, text), about, clue)
 
-    def _missed(self, task: TaskSpec, tick: int) -> Iterator[Clue]:
+    def _find_miss_clues(self, task: TaskSpec, tick: int) -> Iterator[Clue]:
         """Yield the miss of a task in the cycle of this tick, if only one of the runs has it."""
         miss_clues = [
-            Clue(miss["what"], MISSED[miss["what"]].format(task.name), str(run.folder), tick)
+            Clue(miss["what"], MISS_TEXTS[miss["what"]].format(task.name), str(run.folder), tick)
             for run in self.runs
-            for miss in misses(run)
+            for miss in list_misses(run)
             if miss["task"] == task.name
             and miss["tick"] <= tick < miss["tick"] + miss["count"] * task.every
         ]
         if len({clue.run for clue in miss_clues}) == 1:
             yield from miss_clues
 
-    def _config(self, task: str) -> Iterator[Clue]:
+    def _find_config_clues(self, task: str) -> Iterator[Clue]:
         """Yield the board's settings that differ, or the rack's if none of the board's do."""
         tables = (load_toml(run.config) for run in self.runs)
         differences = [
             difference
-            for difference in unlike_values(*tables)
-            if not difference.name.startswith(OWN)
+            for difference in compare_values(*tables)
+            if not difference.name.startswith(IGNORED_KEYS)
         ]
         board = f"board.{task.partition('.')[0]}."
         of_board = [difference for difference in differences if difference.name.startswith(board)]
         for difference in of_board or differences:
             yield Clue("config", f"{difference.name} differs", values=difference)
 
-    def _outside(self, task: str) -> Iterator[Clue]:
+    def _find_unrecorded_inputs(self, task: str) -> Iterator[Clue]:
         """Yield the inputs of a task that no recording contains."""
         layout = self.runs[0].layout
         hosts = {host.name for host in layout.hosts}
@@ -276,40 +288,42 @@ class Divergence:
             yield Clue("outside", "messages from the network are not recorded")
 
 
-def _unlike_signal(signal: Signal, here: np.ndarray, there: np.ndarray) -> Iterator[InBoth]:
+def _compare_signal(
+    signal: Signal, here: np.ndarray, there: np.ndarray
+) -> Iterator[ValueDifference]:
     """Yield a field if it differs between two messages, each of shape (1,).
 
     Of an array field only the first differing number is yielded.
     """
-    values = [signal.values(message)[0] for message in (here, there)]
+    values = [signal.extract_values(message)[0] for message in (here, there)]
     if values[0].tobytes() == values[1].tobytes():
         return
-    plain = [signal.plain(message)[0] for message in (here, there)]
+    plain = [signal.extract_plain(message)[0] for message in (here, there)]
     index = ""
     # 0.0 and -0.0 compare as equal but have different bytes: show the whole array.
     for place in np.argwhere(values[0] != values[1])[:1].tolist():
         index = "".join(f"[{number}]" for number in place)
         plain = [np.array(value, "O")[tuple(place)] for value in plain]
-    yield InBoth(f"{signal.name}{index}", *plain)
+    yield ValueDifference(f"{signal.name}{index}", *plain)
 
 
-def unlike_values(here: Mapping[str, Any], there: Mapping[str, Any]) -> Iterator[InBoth]:
+def compare_values(here: Mapping[str, Any], there: Mapping[str, Any]) -> Iterator[ValueDifference]:
     """Yield the values that differ between two nested tables, with dotted names."""
-    here_values = dict(_dotted(here))
-    there_values = dict(_dotted(there))
+    here_values = dict(_flatten_table(here))
+    there_values = dict(_flatten_table(there))
     for name in dict.fromkeys((*here_values, *there_values)):
         if here_values.get(name) != there_values.get(name):
-            yield InBoth(name, here_values.get(name), there_values.get(name))
+            yield ValueDifference(name, here_values.get(name), there_values.get(name))
 
 
-def _dotted(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten_table(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yield the values of nested tables with dotted names. Lists of tables get an index."""
     for name, value in table.items():
         is_tables = isinstance(value, list) and value and isinstance(value[0], dict)
         if isinstance(value, dict):
-            yield from _dotted(value, f"{prefix}{name}.")
+            yield from _flatten_table(value, f"{prefix}{name}.")
         elif is_tables:
             tables = {f"{name}[{index}]": entry for index, entry in enumerate(value)}
-            yield from _dotted(tables, prefix)
+            yield from _flatten_table(tables, prefix)
         else:
             yield f"{prefix}{name}", value

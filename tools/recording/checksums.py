@@ -19,9 +19,9 @@ from rack.backplane.regular_file import check_regular_file, read_regular_file
 from rack.tools.console.answer import Document, Failure, write_file
 
 CHECKSUMS = "checksums.xxh128"
-MOST_BYTES = 1 << 30
+MAX_READ_BYTES = 1 << 30
 """Size limit for files that are read into memory."""
-_LARGEST = 1 << 40
+_MAX_FILE_BYTES = 1 << 40
 """Size limit for any file of a run, bytes."""
 _KEY = ', "check": "'
 _WHOLE = re.compile(_KEY + r'\w*"}')
@@ -30,7 +30,7 @@ _WHOLE = re.compile(_KEY + r'\w*"}')
 def read_file(path: Path) -> bytes:
     """Read a file of a run. Raises `Failure` if it is unreadable or no regular file."""
     try:
-        return read_regular_file(path, MOST_BYTES)
+        return read_regular_file(path, MAX_READ_BYTES)
     except OSError as error:
         raise Failure(f"{path}: {error.strerror}", 2) from None
 
@@ -57,7 +57,7 @@ class Checksums:
         """Store the checksums of all regular files that match a pattern. Raises `OSError`."""
         for path in (path for pattern in patterns for path in self._folder.glob(pattern)):
             if path.is_file():
-                self.stored[str(path.relative_to(self._folder))] = _digest(path)
+                self.stored[str(path.relative_to(self._folder))] = _compute_digest(path)
         text = "".join(f"{value}  {name}\n" for name, value in self.stored.items())
         write_file(self._folder / CHECKSUMS, text)
 
@@ -65,7 +65,7 @@ class Checksums:
         """Raise `Failure` for the first of these files that was damaged or changed."""
         for name in names:
             path = self._folder / name
-            if _digest(path) != self.stored.get(name):
+            if _compute_digest(path) != self.stored.get(name):
                 why = f"damaged, or changed later: its checksum differs from {CHECKSUMS}"
                 raise Failure(f"{path}: {why}", 2)
 
@@ -73,25 +73,25 @@ class Checksums:
 def check_file(path: Path) -> None:
     """Raise `Failure` if a file of a run is missing or no regular file."""
     try:
-        check_regular_file(path, _LARGEST)
+        check_regular_file(path, _MAX_FILE_BYTES)
     except OSError as error:
         raise Failure(f"{path}: {error.strerror}", 2) from None
 
 
-def _digest(path: Path) -> str:
+def _compute_digest(path: Path) -> str:
     """Return the checksum of a file as hexadecimal digits."""
     check_file(path)
     with path.open("rb") as file:
         return file_digest(file, xxh3_128).hexdigest()
 
 
-def checked_line(entry: Document) -> str:
+def format_checked_line(entry: Document) -> str:
     """Format an entry of events.jsonl as a line with its own checksum."""
     text = encode_json(entry)
     return f'{text[:-1]}{_KEY}{xxh3_64_hexdigest(text.encode())}"}}\n'
 
 
-def read_line(line: str) -> Document:
+def parse_checked_line(line: str) -> Document:
     """Parse a line of events.jsonl.
 
     Raises:

@@ -23,7 +23,7 @@ from rack.backplane.json_text import encode_json
 STAT = Path("/proc/stat")
 CPUINFO = Path("/proc/cpuinfo")
 CPUFREQ = Path("/sys/devices/system/cpu")
-STEAL = 8
+STEAL_COLUMN = 8
 """Column of the steal count in a core's line of /proc/stat."""
 FREQUENCY_S = 0.5
 """Time between two readings of the frequency, because some kernels interrupt every core for it."""
@@ -56,16 +56,16 @@ class CoreRecord:
     stolen: tuple[Stolen, ...] | None = None
     mhz: tuple[tuple[int, float, float], ...] = ()
 
-    def text(self) -> str:
+    def to_json(self) -> str:
         """Return the record as JSON."""
         return encode_json(asdict(self))
 
     @classmethod
-    def of(cls, text: str | bytes) -> Self:
+    def from_json(cls, text: str | bytes) -> Self:
         """Parse the JSON of a record. Raises `ValueError` for any other text."""
         return TypeAdapter(cls).validate_json(text)
 
-    def stolen_ms(self) -> dict[int, int]:
+    def sum_stolen_ms(self) -> dict[int, int]:
         """Return the stolen time by core. Cores without steal are left out."""
         spans = self.stolen or ()
         return {
@@ -84,13 +84,13 @@ class CoreMeter:
     def __init__(self) -> None:
         self._stolen: list[Stolen] = []
         self._mhz: dict[int, tuple[float, float]] = {}
-        self._counts = _counts()
+        self._counts = _read_steal()
         self._began_ns = self._looked_ns = time.monotonic_ns()
         self._frequency_at = 0.0
 
-    def look(self) -> None:
+    def read_counters(self) -> None:
         """Read the counters and note what changed since the last reading."""
-        counts = _counts()
+        counts = _read_steal()
         now = time.monotonic_ns()
         if counts != self._counts:
             rises = {core: count - self._counts.get(core, count) for core, count in counts.items()}
@@ -103,11 +103,11 @@ class CoreMeter:
         self._looked_ns = now
         if time.monotonic() >= self._frequency_at:
             self._frequency_at = time.monotonic() + FREQUENCY_S
-            for core, mhz in _frequencies():
+            for core, mhz in _read_frequencies():
                 low, high = self._mhz.get(core, (mhz, mhz))
                 self._mhz[core] = min(low, mhz), max(high, mhz)
 
-    def record(self) -> CoreRecord:
+    def build_record(self) -> CoreRecord:
         """Return what was measured up to the last reading."""
         mhz = tuple((core, low, high) for core, (low, high) in sorted(self._mhz.items()))
         return CoreRecord(
@@ -115,17 +115,17 @@ class CoreMeter:
         )
 
 
-def _counts() -> dict[int, int]:
+def _read_steal() -> dict[int, int]:
     """Return the steal of each core in kernel ticks, or {} where the kernel does not count it."""
     lines = [line.split() for line in STAT.read_text().splitlines()]
     return {
-        int(line[0].removeprefix("cpu")): int(line[STEAL])
+        int(line[0].removeprefix("cpu")): int(line[STEAL_COLUMN])
         for line in lines
-        if re.fullmatch(r"cpu\d+", line[0]) and len(line) > STEAL
+        if re.fullmatch(r"cpu\d+", line[0]) and len(line) > STEAL_COLUMN
     }
 
 
-def _frequencies() -> Iterator[tuple[int, float]]:
+def _read_frequencies() -> Iterator[tuple[int, float]]:
     """Yield cores and their MHz, as far as the machine shows them."""
     frequency_files = sorted(CPUFREQ.glob("cpu[0-9]*/cpufreq/scaling_cur_freq"))
     # An offline core has no readable frequency.

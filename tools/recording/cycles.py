@@ -9,9 +9,14 @@ import numpy as np
 
 from rack.backplane.layout import TaskSpec
 from rack.boards.timing.tasks import Budget
-from rack.boards.timing.trace_times import Occupation, overhead_ns, plans, unit_times
+from rack.boards.timing.trace_times import (
+    Occupation,
+    compute_overhead_ns,
+    compute_unit_times,
+    select_plans,
+)
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.stalls import stalls_of
+from rack.tools.recording.stalls import analyze_stalls
 
 START_UP_S = 0.1
 """Simulated time after the start of a process in which its cycles are not judged.
@@ -19,7 +24,7 @@ START_UP_S = 0.1
 A new process touches its memory for the first time and fills its caches. The first cycle of each
 level of the default rack takes 2 to 8 times as long as usual; the sixth takes the usual time.
 """
-WORST = 100.0
+WORST_PERCENTILE = 100.0
 """Percentile that eq. 3.6 demands: the longest of all cycles."""
 
 
@@ -68,12 +73,12 @@ class Cycles:
         return np.asarray(self.communication_ns + self.process_ns)
 
 
-def cycles_of(recording: Recording) -> dict[str, Cycles]:
+def read_cycles(recording: Recording) -> dict[str, Cycles]:
     """Return the cycles of a run by task. Tasks without recorded cycles are left out."""
     tasks = [task for task in recording.layout.tasks if len(recording.cycles.get(task.name, ()))]
-    places = {task.name: recording.place(task) for task in tasks}
-    _, absent = stalls_of(recording)
-    spans = {task.name: Occupation.of(recording.cycles[task.name]) for task in tasks}
+    places = {task.name: recording.find_core_and_priority(task) for task in tasks}
+    _, absent = analyze_stalls(recording)
+    spans = {task.name: Occupation.from_records(recording.cycles[task.name]) for task in tasks}
     with_planner = {task.name for task in recording.layout.tasks if task.role == "planner"}
     by_task = {}
     for task in tasks:
@@ -84,16 +89,18 @@ def cycles_of(recording: Recording) -> dict[str, Cycles]:
             if other_core == core and other_priority > priority
         ]
         rows = recording.cycles[task.name]
-        rows = plans(rows) if task.role == "planner" else rows
+        rows = select_plans(rows) if task.role == "planner" else rows
         if len(rows):
-            preempted_by = Occupation.union([spans[name] for name in higher_priority])
-            exchange_ns, read_ns, process_ns, write_ns = unit_times(rows, preempted_by).T
+            preempted_by = Occupation.merge([spans[name] for name in higher_priority])
+            exchange_ns, read_ns, process_ns, write_ns = compute_unit_times(rows, preempted_by).T
             if task.role == "executor" and f"{task.name}.planner" not in with_planner:
                 # Without a planner, the check for a new plan counts as reading.
                 read_ns = read_ns + exchange_ns
                 exchange_ns = np.zeros_like(read_ns)
-            settled = _settled(recording, task.name, rows["tick"])
-            undisturbed = settled & (absent[core].within(rows["start_ns"], rows["end_ns"]) == 0)
+            settled = _find_settled_cycles(recording, task.name, rows["tick"])
+            undisturbed = settled & (
+                absent[core].compute_overlap(rows["start_ns"], rows["end_ns"]) == 0
+            )
             judged = undisturbed if undisturbed.any() else settled
             by_task[task.name] = Cycles(
                 task=task,
@@ -106,22 +113,22 @@ def cycles_of(recording: Recording) -> dict[str, Cycles]:
                 write_ns=write_ns,
                 is_judged=judged,
                 stalled=int(settled.sum() - judged.sum()),
-                overhead_ns=overhead_ns(rows),
-                stretches=recording.stretch_of(rows["tick"]),
+                overhead_ns=compute_overhead_ns(rows),
+                stretches=recording.find_stretches(rows["tick"]),
             )
     return by_task
 
 
-def _settled(recording: Recording, task: str, ticks: np.ndarray) -> np.ndarray:
+def _find_settled_cycles(recording: Recording, task: str, ticks: np.ndarray) -> np.ndarray:
     """Return which cycles lie outside the start-up of a process, or all if none do."""
     span = round(START_UP_S * 1e9 / recording.layout.clock_ns)
     settled = np.ones(len(ticks), bool)
-    for start_tick in (0, *restarts(recording).get(task, ())):
+    for start_tick in (0, *list_restarts(recording).get(task, ())):
         settled &= (ticks < start_tick) | (ticks >= start_tick + span)
     return settled if settled.any() else np.ones(len(ticks), bool)
 
 
-def restarts(recording: Recording) -> dict[str, list[int]]:
+def list_restarts(recording: Recording) -> dict[str, list[int]]:
     """Return, by task, the ticks at which a restarted process of it rejoined."""
     rejoin_ticks: dict[str, list[int]] = {}
     for event in recording.events:
@@ -130,7 +137,9 @@ def restarts(recording: Recording) -> dict[str, list[int]]:
     return rejoin_ticks
 
 
-def measured_budgets(recording: Recording, percentile: float = WORST) -> dict[str, Budget]:
+def measure_budgets(
+    recording: Recording, percentile: float = WORST_PERCENTILE
+) -> dict[str, Budget]:
     """Return the processor time that each level of a run needed, by board.
 
     Each part is the longest of all cycles (eq. 3.6), and the parts may come from different cycles.
@@ -144,26 +153,28 @@ def measured_budgets(recording: Recording, percentile: float = WORST) -> dict[st
     Returns:
         Budgets by board. Levels that never ran are left out.
     """
-    return budgets_of(cycles_of(recording), percentile)
+    return compute_budgets(read_cycles(recording), percentile)
 
 
-def budgets_of(cycles_by_task: Mapping[str, Cycles], percentile: float) -> dict[str, Budget]:
-    """Return the budgets, by board, of cycles from `measure_cycles`."""
+def compute_budgets(cycles_by_task: Mapping[str, Cycles], percentile: float) -> dict[str, Budget]:
+    """Return the budgets, by board, of cycles from `read_cycles`."""
     executors = {
         name: cycles for name, cycles in cycles_by_task.items() if cycles.task.role == "executor"
     }
     return {
-        cycles.task.board: _budget(cycles, cycles_by_task.get(f"{name}.planner"), percentile)
+        cycles.task.board: _compute_budget(
+            cycles, cycles_by_task.get(f"{name}.planner"), percentile
+        )
         for name, cycles in executors.items()
     }
 
 
-def _budget(executor: Cycles, planner: Cycles | None, percentile: float) -> Budget:
+def _compute_budget(executor: Cycles, planner: Cycles | None, percentile: float) -> Budget:
     """Return the budget of one level."""
 
     def worst_time(cycles: Cycles, times_ns: np.ndarray) -> int:
         """Return the percentile of the times of all judged cycles."""
-        return worst_of(times_ns[cycles.is_judged], percentile)
+        return compute_percentile(times_ns[cycles.is_judged], percentile)
 
     planner_parts = {}
     if planner is not None:
@@ -179,7 +190,7 @@ def _budget(executor: Cycles, planner: Cycles | None, percentile: float) -> Budg
     )
 
 
-def worst_of(times_ns: np.ndarray, percentile: float = WORST) -> int:
+def compute_percentile(times_ns: np.ndarray, percentile: float = WORST_PERCENTILE) -> int:
     """Return the smallest measured time that covers a percentile of the times, shape (n,).
 
     Returns 0 if there are no times.

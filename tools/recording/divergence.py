@@ -15,7 +15,7 @@ from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.origin import Origin
 from rack.tools.recording.recording import Recording
 
-HEADS = ("serial", "tick", "visible_at", "chain")
+COMPARED_COLUMNS = ("serial", "tick", "visible_at", "chain")
 """Columns that are compared. The chain of a message covers everything written before it."""
 Heads = Mapping[str, np.ndarray]
 
@@ -34,7 +34,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class UnlikeMessage:
+class DivergentMessage:
     """The first message of a mailbox that differs between two runs.
 
     If the ticks differ, or one run lacks the message, the earlier tick counts.
@@ -52,7 +52,7 @@ class UnlikeMessage:
     visible_at: int
 
 
-def other_run(run: Path, named: Path, asked: str = "") -> Path:
+def find_other_run(run: Path, named: Path, asked: str = "") -> Path:
     """Return the folder of the run with which `run` is to be compared.
 
     Args:
@@ -67,76 +67,76 @@ def other_run(run: Path, named: Path, asked: str = "") -> Path:
     if str(named) != "origin":
         return named
     asked = f"{asked or '--against origin'}: {run}"
-    origin = Origin.of(Recording(run))
+    origin = Origin.read_from(Recording(run))
     if origin is None:
         raise Failure(f"{asked} does not continue another run; name one with --against RUN", 2)
     origin_folder = Path(origin.folder)
     for folder in (origin_folder, run.resolve().parent / origin_folder.name):
-        if (folder / CONFIG).is_file() and origin.is_of(Recording(folder)):
+        if (folder / CONFIG).is_file() and origin.is_same_run(Recording(folder)):
             return folder
     raise Failure(f"{asked} continues {origin_folder}, but that run no longer exists", 2)
 
 
-def first_difference(first_run: Recording, second_run: Recording) -> Difference | None:
+def find_first_difference(first_run: Recording, second_run: Recording) -> Difference | None:
     """Return where two runs diverge, or None if everything that both wrote is equal.
 
     Only ticks up to the end of the shorter run count. Raises `Failure` in the same cases as
     `list_divergent_messages`.
     """
-    messages = unlike_messages(first_run, second_run)
+    messages = list_divergent_messages(first_run, second_run)
     return Difference(messages[0].tick, messages[0].mailbox) if messages else None
 
 
-def unlike_messages(first_run: Recording, second_run: Recording) -> list[UnlikeMessage]:
+def list_divergent_messages(first_run: Recording, second_run: Recording) -> list[DivergentMessage]:
     """Return the first differing message of each mailbox, if any, sorted by tick.
 
     Raises:
         Failure: The runs are of different racks, or one of them lacks rows.
     """
     for run in (first_run, second_run):
-        _check_whole(run)
-    _check_alike(first_run, second_run)
-    begin, end = common_ticks(first_run, second_run)
+        _check_complete(run)
+    _check_comparable(first_run, second_run)
+    begin, end = find_common_ticks(first_run, second_run)
     written = {*first_run.mailboxes, *second_run.mailboxes}
     boxes = {box.name for box in second_run.layout.timed} & written
     messages = [
         unlike
         for box in first_run.layout.timed
         if box.name in boxes
-        and (unlike := _unlike(first_run, second_run, box, begin, end)) is not None
+        and (unlike := _find_divergent_message(first_run, second_run, box, begin, end)) is not None
     ]
     return sorted(messages, key=lambda unlike: unlike.tick)
 
 
-def ticks_of(recording: Recording) -> tuple[int, int]:
+def find_tick_range(recording: Recording) -> tuple[int, int]:
     """Return the ticks of a recorded run, [first, end)."""
     ticks_by_task = [rows["tick"] for rows in recording.cycles.values()]
-    end: int = recording.ended.get("outcome", {}).get("ticks", 0)
+    end: int = recording.end_counts.get("outcome", {}).get("ticks", 0)
     end = end or max((int(ticks[-1]) + 1 for ticks in ticks_by_task), default=0)
     return min((int(ticks[0]) for ticks in ticks_by_task), default=0), end
 
 
-def common_ticks(first_run: Recording, second_run: Recording) -> tuple[int, int]:
+def find_common_ticks(first_run: Recording, second_run: Recording) -> tuple[int, int]:
     """Return the ticks that two runs have in common, [first, end).
 
     A run that continues another one begins later.
     """
-    begins, ends = zip(ticks_of(first_run), ticks_of(second_run), strict=True)
+    begins, ends = zip(find_tick_range(first_run), find_tick_range(second_run), strict=True)
     return max(begins), min(ends)
 
 
-def _check_whole(recording: Recording) -> None:
+def _check_complete(recording: Recording) -> None:
     """Raise `Failure` if a recording lacks rows."""
     if recording.kept:
         why = recording.kept_text
-    elif lost := sum(recording.lost.values()):
+    elif lost := sum(recording.lost_rows.values()):
         why = f"its recorder lost {lost} rows"
     else:
         return
     raise Failure(f"{recording.folder}: {why}; the two runs cannot be compared", 2)
 
 
-def _check_alike(first_run: Recording, second_run: Recording) -> None:
+def _check_comparable(first_run: Recording, second_run: Recording) -> None:
     """Raise `Failure` if two runs are of racks that cannot be compared."""
     both = f"{first_run.folder} and {second_run.folder}"
     boards, others = ([task.board for task in run.layout.tasks] for run in (first_run, second_run))
@@ -152,15 +152,15 @@ def _check_alike(first_run: Recording, second_run: Recording) -> None:
         raise Failure(f"{both} have no mailbox in common", 2)
 
 
-def _unlike(
+def _find_divergent_message(
     first_run: Recording, second_run: Recording, box: MailboxSpec, begin: int, end: int
-) -> UnlikeMessage | None:
+) -> DivergentMessage | None:
     """Return the first differing message of a mailbox from tick `begin` on, or None.
 
     The serials show where a message is missing, because a damaged message is in no recording. A
     difference in the content of a message shows in the chain of the message after it.
     """
-    heads = [_heads(run, box.name, begin) for run in (first_run, second_run)]
+    heads = [_read_heads(run, box.name, begin) for run in (first_run, second_run)]
     length = min(len(head["serial"]) for head in heads)
     first_serial_difference, first_chain_difference = (
         next(iter(np.flatnonzero(here[:length] != there[:length]).tolist()), length)
@@ -175,7 +175,7 @@ def _unlike(
     if first == length > 0 and not _is_last_equal(first_run, second_run, box, heads):
         first -= 1
     positions = [
-        tuple(int(head[name][first]) for name in HEADS[:-1])
+        tuple(int(head[name][first]) for name in COMPARED_COLUMNS[:-1])
         for head in heads
         if first < len(head["serial"])
     ]
@@ -185,12 +185,12 @@ def _unlike(
     # The other run may have ended before it could write that message.
     if len(positions) == 1 and visible_at >= end:
         return None
-    return UnlikeMessage(box.name, serial, tick, visible_at)
+    return DivergentMessage(box.name, serial, tick, visible_at)
 
 
-def _heads(run: Recording, mailbox: str, begin: int) -> Heads:
+def _read_heads(run: Recording, mailbox: str, begin: int) -> Heads:
     """Return the compared columns of the messages written from tick `begin` on."""
-    columns = {name: run.signal(mailbox, name) for name in HEADS}
+    columns = {name: run.read_signal(mailbox, name) for name in COMPARED_COLUMNS}
     is_later = columns["tick"] >= begin
     return {name: values[is_later] for name, values in columns.items()}
 
@@ -200,14 +200,14 @@ def _is_last_equal(
 ) -> bool:
     """Return True if the last message that both runs have is equal. No chain covers it yet."""
     last = min(len(head["serial"]) for head in heads) - 1
-    if any(heads[0][name][last] != heads[1][name][last] for name in HEADS):
+    if any(heads[0][name][last] != heads[1][name][last] for name in COMPARED_COLUMNS):
         return False
-    rows = (row_of(run, box, int(heads[0]["serial"][last])) for run in (first_run, second_run))
+    rows = (find_row(run, box, int(heads[0]["serial"][last])) for run in (first_run, second_run))
     return len({row["message"].tobytes() for row in rows}) == 1
 
 
-def row_of(run: Recording, box: MailboxSpec, serial: int) -> Any:
+def find_row(run: Recording, box: MailboxSpec, serial: int) -> Any:
     """Return the row of a message, or None if the recording has no message of that serial."""
-    rows = run.rows(box.name)
+    rows = run.read_rows(box.name)
     matches = np.flatnonzero(rows["serial"] == serial)
     return rows[matches[0]] if len(matches) else None

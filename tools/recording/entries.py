@@ -14,16 +14,16 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import COMMAND_ID
 from rack.backplane.operator_table import Request
 from rack.boards.classes import find_class
-from rack.boards.config.commands import requests
+from rack.boards.config.commands import build_requests
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.host.adapter import Adapter
-from rack.boards.wiring import Entries, Rows
+from rack.boards.wiring import EntityRows, ExchangedEntries
 from rack.tools.console.answer import Failure
 from rack.tools.recording.recording import Recording
 
 
-def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Entries]:
+def load_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, ExchangedEntries]:
     """Load the messages that each adapter of a config wrote in a recorded run.
 
     Args:
@@ -49,21 +49,21 @@ def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str
             2,
         )
     recorded_boxes = {mailbox.name: mailbox for mailbox in recording.layout.mailboxes}
-    entries: dict[str, Entries] = {}
+    entries: dict[str, ExchangedEntries] = {}
     for task in plan.tasks:
         adapter_class = find_class(task.target, object)
         ports = (
-            adapter_class.replayed(task.context.params, layout)
+            adapter_class.list_replayed_ports(task.context.params, layout)
             if issubclass(adapter_class, Adapter)
             else {}
         )
         if not ports:
             continue
-        boxes = {port: layout.mailbox(f"{task.task}.{port}") for port in ports}
+        boxes = {port: layout.find_mailbox(f"{task.task}.{port}") for port in ports}
         for box in boxes.values():
-            needed = _type_of(box)
+            needed = _format_type(box)
             recorded_type = (
-                _type_of(recorded_boxes[box.name])
+                _format_type(recorded_boxes[box.name])
                 if box.name in recorded_boxes
                 else "no such mailbox"
             )
@@ -71,24 +71,24 @@ def recorded_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str
                 raise Failure(f"{asked}: {box.name}: {recorded_type}; needed: {needed}", 2)
             if recording.kept:
                 raise Failure(f"{asked}: {recording.kept_text}", 2)
-            _check_whole(box, recording, asked)
+            _check_complete(box, recording, asked)
         entries[task.task] = {
-            port: _rows(recording, box, ports[port]) for port, box in boxes.items()
+            port: _load_rows(recording, box, ports[port]) for port, box in boxes.items()
         }
     if not entries:
         raise Failure(f"{asked}: '{config.name}' has no adapter", 2)
     return entries
 
 
-def recorded_commands(recording: Recording) -> tuple[Request, ...]:
+def load_operator_commands(recording: Recording) -> tuple[Request, ...]:
     """Load the commands that operators gave in a recorded run, in order and with their ticks.
 
     Commands of the run's config are left out. Raises `Failure` if the recording lacks some.
     """
-    commanded = _issued(recording)
+    commanded = _load_issued_commands(recording)
     if commanded and recording.kept:
         raise Failure(f"--from {recording.folder}: {recording.kept_text}", 2)
-    for configured in requests(recording.rack_config, recording.layout):
+    for configured in build_requests(recording.rack_config, recording.layout):
         # In real time the config's command may have been issued after its tick. An equal command
         # issued earlier came from an operator.
         candidates = (request for request in commanded if request.tick >= configured.tick)
@@ -102,7 +102,7 @@ def recorded_commands(recording: Recording) -> tuple[Request, ...]:
     return tuple(commanded)
 
 
-def commands_from(recording: Recording, tick: int) -> tuple[Request, ...]:
+def load_commands_from(recording: Recording, tick: int) -> tuple[Request, ...]:
     """Load all commands issued from `tick` on in a recorded run, including the config's commands.
 
     For a run with a flight recorder, the commands end with the stretch that contains `tick`. Raises
@@ -111,44 +111,48 @@ def commands_from(recording: Recording, tick: int) -> tuple[Request, ...]:
     end = next((end for _, end in recording.kept if tick < end), None)
     return tuple(
         request
-        for request in _issued(recording)
+        for request in _load_issued_commands(recording)
         if tick <= request.tick and (end is None or request.tick < end)
     )
 
 
-def _issued(recording: Recording) -> list[Request]:
+def _load_issued_commands(recording: Recording) -> list[Request]:
     """Load the commands that the clock issued, in order. Raises `Failure` if some are missing."""
     layout = recording.layout
     numbered: list[tuple[int, int, Request]] = []
     for box in layout.mailboxes:
         if box.writer != CLOCK or box.name not in recording.mailboxes:
             continue
-        _check_whole(box, recording, f"--from {recording.folder}")
-        rows = recording.rows(box.name)
+        _check_complete(box, recording, f"--from {recording.folder}")
+        rows = recording.read_rows(box.name)
         messages = rows["message"]
         ids = messages[COMMAND_ID].tolist()
         # Clear the id: the clock assigns it when it issues the command again.
         messages[COMMAND_ID] = 0
         for tick, number, message in zip(rows["tick"].tolist(), ids, messages, strict=True):
             numbered.append(
-                (tick, number, Request(layout.index(box.name), message.tobytes(), tick))
+                (
+                    tick,
+                    number,
+                    Request(layout.find_mailbox_index(box.name), message.tobytes(), tick),
+                )
             )
     numbered.sort(key=lambda command: command[:2])
     return [request for _, _, request in numbered]
 
 
-def _type_of(box: MailboxSpec) -> str:
+def _format_type(box: MailboxSpec) -> str:
     """Describe message type, version and size of a mailbox, to compare and to report it."""
     return f"{box.message} {box.version}, {box.size} bytes"
 
 
-def _check_whole(box: MailboxSpec, recording: Recording, asked: str) -> None:
+def _check_complete(box: MailboxSpec, recording: Recording, asked: str) -> None:
     """Raise `Failure` if the recording lacks messages of a mailbox."""
-    if lost := recording.lost.get(box.name):
+    if lost := recording.lost_rows.get(box.name):
         raise Failure(f"{asked}: {box.name}: its recorder lost {lost} messages", 2)
 
 
-def _rows(recording: Recording, box: MailboxSpec, is_sent: bool) -> Rows:
+def _load_rows(recording: Recording, box: MailboxSpec, is_sent: bool) -> EntityRows:
     """Load the messages of a mailbox in the form of `rack.boards.wiring`.
 
     If `is_sent` is False, the adapter repeats its newest message every cycle, and repeats are left
@@ -158,7 +162,7 @@ def _rows(recording: Recording, box: MailboxSpec, is_sent: bool) -> Rows:
         return []
     rows = [
         (int(row["tick"]), int(row["basis"]), row["message"].tobytes())
-        for row in recording.rows(box.name)
+        for row in recording.read_rows(box.name)
     ]
     return [
         row

@@ -19,7 +19,7 @@ from rack.backplane.layout import MailboxSpec
 from rack.tools.console.answer import Document
 from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.signal import signals_of
+from rack.tools.recording.signal import list_signals
 
 EVENTS = "events"
 EVENT_SCHEMA = {
@@ -28,8 +28,8 @@ EVENT_SCHEMA = {
         name: {"type": "string"} for name in ("kind", "board", "code", "text", "subject")
     },
 }
-ENCODING = "jsonschema"
-BLOCK = 1024
+SCHEMA_ENCODING = "jsonschema"
+BLOCK_MESSAGES = 1024
 """Number of messages of a mailbox that are converted to JSON together."""
 
 
@@ -43,7 +43,9 @@ class ChannelMessage(NamedTuple):
     data: bytes
 
 
-def export(recording: Recording, path: Path, show_progress: Callable[[float], None]) -> int:
+def export_recording(
+    recording: Recording, path: Path, show_progress: Callable[[float], None]
+) -> int:
     """Write a recording as an MCAP file.
 
     Args:
@@ -56,35 +58,39 @@ def export(recording: Recording, path: Path, show_progress: Callable[[float], No
     """
     boxes = {box.name: box for box in recording.layout.mailboxes}
     boxes_recorded = [boxes[name] for name in recording.mailboxes]
-    total = sum(len(recording.signal(box.name, "serial")) for box in boxes_recorded)
+    total = sum(len(recording.read_signal(box.name, "serial")) for box in boxes_recorded)
     count = 0
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start(library="nasrem-rack")
         writer.add_metadata("rack", {"name": recording.layout.rack, CONFIG: recording.config})
-        channels = [_channel(writer, box.name, box.message, _schema(box)) for box in boxes_recorded]
-        streams = [
-            _samples(recording, *pair) for pair in zip(boxes_recorded, channels, strict=True)
+        channels = [
+            _register_channel(writer, box.name, box.message, _build_schema(box))
+            for box in boxes_recorded
         ]
-        events = _channel(writer, EVENTS, "event", EVENT_SCHEMA)
-        for sample in merge(_events(recording, events), *streams):
+        streams = [
+            _encode_messages(recording, *pair)
+            for pair in zip(boxes_recorded, channels, strict=True)
+        ]
+        events = _register_channel(writer, EVENTS, "event", EVENT_SCHEMA)
+        for sample in merge(_encode_events(recording, events), *streams):
             writer.add_message(
                 sample.channel, sample.log_ns, sample.data, sample.publish_ns, sample.sequence
             )
             count += 1
-            if count % BLOCK == 0:
+            if count % BLOCK_MESSAGES == 0:
                 show_progress(count / total)
         writer.finish()  # type: ignore[no-untyped-call]
     return count
 
 
-def _channel(writer: Writer, topic: str, message: str, schema: Document) -> int:
+def _register_channel(writer: Writer, topic: str, message: str, schema: Document) -> int:
     """Register a channel with its schema, and return its number."""
-    schema_id = writer.register_schema(message, ENCODING, encode_json(schema).encode())
+    schema_id = writer.register_schema(message, SCHEMA_ENCODING, encode_json(schema).encode())
     return writer.register_channel(topic, "json", schema_id)
 
 
-def _schema(box: MailboxSpec) -> Document:
+def _build_schema(box: MailboxSpec) -> Document:
     """Return the JSON schema of a mailbox's messages.
 
     Groups of fields are flattened, as in the parquet files.
@@ -93,7 +99,7 @@ def _schema(box: MailboxSpec) -> Document:
         "serial": {"type": "integer", "description": "of the message, rising by one"},
         "tick": {"type": "integer", "description": "release of the cycle that wrote it"},
     }
-    for signal in signals_of(box):
+    for signal in list_signals(box):
         field: Document = {"type": signal.json_type}
         for _ in signal.shape:
             field = {"type": "array", "items": field}
@@ -102,17 +108,19 @@ def _schema(box: MailboxSpec) -> Document:
     return {"type": "object", "properties": head}
 
 
-def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[ChannelMessage]:
+def _encode_messages(
+    recording: Recording, box: MailboxSpec, channel: int
+) -> Iterator[ChannelMessage]:
     """Yield the messages of a mailbox, oldest first."""
-    rows = recording.rows(box.name)
-    signals = signals_of(box)
+    rows = recording.read_rows(box.name)
+    signals = list_signals(box)
     names = ["serial", "tick", *(".".join(signal.path) for signal in signals)]
     clock_ns = recording.layout.clock_ns
     wall_ns = recording.launch.wall_offset_ns
-    for first in range(0, len(rows), BLOCK):
-        block = rows[first : first + BLOCK]
+    for first in range(0, len(rows), BLOCK_MESSAGES):
+        block = rows[first : first + BLOCK_MESSAGES]
         heads = [block[name].tolist() for name in ("serial", "tick")]
-        columns = [*heads, *(signal.plain(block["message"]) for signal in signals)]
+        columns = [*heads, *(signal.extract_plain(block["message"]) for signal in signals)]
         for values, stamp_ns in zip(
             zip(*columns, strict=True), block["stamp_ns"].tolist(), strict=True
         ):
@@ -122,7 +130,7 @@ def _samples(recording: Recording, box: MailboxSpec, channel: int) -> Iterator[C
             yield ChannelMessage(tick * clock_ns, channel, sequence, stamp_ns + wall_ns, data)
 
 
-def _events(recording: Recording, channel: int) -> Iterator[ChannelMessage]:
+def _encode_events(recording: Recording, channel: int) -> Iterator[ChannelMessage]:
     """Yield the events that have a tick, oldest first."""
     ticked = [event for event in recording.events if event.get("tick", -1) >= 0]
     clock_ns = recording.layout.clock_ns

@@ -7,33 +7,33 @@ from pathlib import Path
 
 from rack.tools.recording.file_names import CODE
 
-RECORDED = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", "published.json", CODE)
+RECORDED_ENDINGS = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", "published.json", CODE)
 """Endings of the names of recorded files. Reports and pictures have other endings."""
 
 
-def size_of(folder: Path) -> int:
+def measure_size(folder: Path) -> int:
     """Return the size of a run's recorded files, bytes. Reports and pictures do not count."""
     size = 0
     for file in folder.rglob("*"):
         # A flight recorder may remove files at any time.
         with suppress(FileNotFoundError):
-            if file.name.endswith(RECORDED) and file.is_file():
+            if file.name.endswith(RECORDED_ENDINGS) and file.is_file():
                 size += file.stat().st_size
     return size
 
 
-def size_text(size: int, lasted_s: float) -> str:
+def format_size(size: int, lasted_s: float) -> str:
     """Format the size of a recording, bytes, and its rate over `lasted_s` of simulated time."""
     rate = f", {size * 1e-6 / lasted_s:.2f} MB/s" if lasted_s else ""
     return f"{size * 1e-6:.1f} MB{rate}"
 
 
-def recorded_line(folder: Path, lasted_s: float) -> str:
+def format_recorded_line(folder: Path, lasted_s: float) -> str:
     """Return a line that says where a run is recorded and how large the recording is."""
-    return f"recorded into {folder}: {size_text(size_of(folder), lasted_s)}"
+    return f"recorded into {folder}: {format_size(measure_size(folder), lasted_s)}"
 
 
-def sizes(folder: Path, lasted_s: float) -> dict[str, float | None]:
+def measure_sizes(folder: Path, lasted_s: float) -> dict[str, float | None]:
     """Return the size of a recording and its rate per simulated second, as plain data."""
-    size = size_of(folder)
+    size = measure_size(folder)
     return {"bytes": size, "bytes_per_s": round(size / lasted_s, 1) if lasted_s else None}

@@ -11,18 +11,23 @@ import numpy as np
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.message import State
-from rack.boards.timing.trace_times import is_missed, lasted_ns, lateness_ns, skipped
+from rack.boards.timing.trace_times import (
+    compute_duration_ns,
+    compute_lateness_ns,
+    count_skipped,
+    find_missed,
+)
 from rack.levels.operator import Operation
 from rack.tools.console.answer import Document
 
 if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
 
-OWN = "holding"
+BY_LEVEL = "holding"
 """Value of `by` for a hold that the level itself decided."""
 
 
-def misses(recording: Recording) -> list[Document]:
+def list_misses(recording: Recording) -> list[Document]:
     """List every missed cycle of the trace, earliest first.
 
     A skipped release leaves no record: the next record of the task holds the number of releases
@@ -35,44 +40,46 @@ def misses(recording: Recording) -> list[Document]:
     """
     entries = []
     for task in recording.layout.tasks:
-        entries += _misses_of(task, recording.trace(task.name))
-        done = recording.counts(task.name).get("done")
+        entries += _list_task_misses(task, recording.read_trace(task.name))
+        done = recording.find_task_counts(task.name).get("done")
         if done is None:
             # The end of the run was not recorded, or an earlier version recorded it.
             continue
-        if count := task.count_unfinished(done, recording.ended["outcome"]["ticks"]):
-            entries.append(_skipped(task, task.grid.since(done + 1), count))
+        if count := task.count_unfinished(done, recording.end_counts["outcome"]["ticks"]):
+            entries.append(_build_skip_entry(task, task.grid.find_tick(done + 1), count))
     return sorted(entries, key=lambda miss: (miss["tick"], miss["task"]))
 
 
-def _misses_of(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
+def _list_task_misses(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
     """Return the missed cycles that the trace of one task shows."""
-    rows = cycles[is_missed(cycles) | (skipped(cycles) > 0)]
+    rows = cycles[find_missed(cycles) | (count_skipped(cycles) > 0)]
     entries = []
     columns = (
         rows["tick"],
-        skipped(rows),
-        is_missed(rows),
-        lateness_ns(rows) * 1e-6,
-        lasted_ns(rows) * 1e-6,
+        count_skipped(rows),
+        find_missed(rows),
+        compute_lateness_ns(rows) * 1e-6,
+        compute_duration_ns(rows) * 1e-6,
     )
     for tick, skipped_before, missed, late_ms, lasted_ms in zip(
         *(column.tolist() for column in columns), strict=True
     ):
         if skipped_before:
-            entries.append(_skipped(task, tick - skipped_before * task.every, skipped_before))
+            entries.append(
+                _build_skip_entry(task, tick - skipped_before * task.every, skipped_before)
+            )
         if missed:
             times = {"started_ms": round(late_ms, 6), "took_ms": round(lasted_ms, 6)}
             entries.append({"task": task.name, "tick": tick, "what": "late", "count": 1, **times})
     return entries
 
 
-def _skipped(task: TaskSpec, tick: int, count: int) -> Document:
+def _build_skip_entry(task: TaskSpec, tick: int, count: int) -> Document:
     """Return the entry for skipped releases of a task, of which the first is at `tick`."""
     return {"task": task.name, "tick": tick, "what": "skipped", "count": count}
 
 
-def counted(entries: Sequence[Document]) -> tuple[int, int]:
+def count_misses(entries: Sequence[Document]) -> tuple[int, int]:
     """Return how many cycles of a list from `list_misses` were late, and how many were skipped."""
     late, left_out = (
         sum(miss["count"] for miss in entries if miss["what"] == kind)
@@ -81,23 +88,23 @@ def counted(entries: Sequence[Document]) -> tuple[int, int]:
     return late, left_out
 
 
-def steal(recording: Recording) -> Document:
+def summarize_steal(recording: Recording) -> Document:
     """Return the time that the hypervisor stole from each core, ms and percent of the run.
 
     `measured` is False in lockstep, and where the kernel does not count steal.
     """
     record = recording.cores
-    stolen_ms = {str(core): ms for core, ms in record.stolen_ms().items()}
+    stolen_ms = {str(core): ms for core, ms in record.sum_stolen_ms().items()}
     percent = {core: round(1e8 * ms / record.lasted_ns, 3) for core, ms in stolen_ms.items()}
     return {"measured": record.stolen is not None, "ms": stolen_ms, "percent": percent}
 
 
-def frequency(recording: Recording) -> dict[str, dict[str, float]] | None:
+def summarize_frequency(recording: Recording) -> dict[str, dict[str, float]] | None:
     """Return the lowest and highest frequency of each core, MHz, or None if it was not measured."""
     return {str(core): {"min": low, "max": high} for core, low, high in recording.cores.mhz} or None
 
 
-def holds(recording: Recording) -> list[Document]:
+def list_holds(recording: Recording) -> list[Document]:
     """List every hold, earliest first.
 
     Returns:
@@ -110,11 +117,11 @@ def holds(recording: Recording) -> list[Document]:
         for mailbox in recording.mailboxes
         if mailbox.endswith(".status")
     ]
-    hold_entries = [hold for level in levels for hold in _holds_of(recording, level)]
+    hold_entries = [hold for level in levels for hold in _list_level_holds(recording, level)]
     return sorted(hold_entries, key=lambda hold: (hold["since_s"], hold["level"]))
 
 
-def fired_rows(recording: Recording) -> dict[str, list[Document]]:
+def list_fired_rows(recording: Recording) -> dict[str, list[Document]]:
     """List the rows of state tables that fired, by level.
 
     Returns:
@@ -123,11 +130,13 @@ def fired_rows(recording: Recording) -> dict[str, list[Document]]:
     """
     by_level = {}
     for mailbox in recording.mailboxes:
-        if not {"table", "row", "fired"} <= recording.fields(mailbox):
+        if not {"table", "row", "fired"} <= recording.list_fields(mailbox):
             continue
         columns = ("table", "row", "fired")
-        rows = [*zip(*(recording.signal(mailbox, name).tolist() for name in columns), strict=True)]
-        times_s = recording.signal(mailbox, "tick") * recording.layout.clock_ns * 1e-9
+        rows = [
+            *zip(*(recording.read_signal(mailbox, name).tolist() for name in columns), strict=True)
+        ]
+        times_s = recording.read_signal(mailbox, "tick") * recording.layout.clock_ns * 1e-9
         # Iterate backwards, so that the dictionary keeps the earliest time of each row.
         first_s = dict(zip(reversed(rows), reversed(times_s.tolist()), strict=True))
         by_level[mailbox.removesuffix(".status")] = [
@@ -144,33 +153,33 @@ def fired_rows(recording: Recording) -> dict[str, list[Document]]:
     return by_level
 
 
-def _holds_of(recording: Recording, level: str) -> Iterator[Document]:
+def _list_level_holds(recording: Recording, level: str) -> Iterator[Document]:
     """Yield the holds of one level, from its statuses."""
     mailbox = f"{level}.status"
     tick_s = recording.layout.clock_ns * 1e-9
-    fields = recording.fields(mailbox)
+    fields = recording.list_fields(mailbox)
     if "state" not in fields:
         return
-    ticks = recording.signal(mailbox, "tick")
-    is_level_holding = recording.signal(mailbox, "state") == State.HOLDING
+    ticks = recording.read_signal(mailbox, "tick")
+    is_level_holding = recording.read_signal(mailbox, "state") == State.HOLDING
     standing_commands = (
-        recording.signal(mailbox, "standing").astype(int)
+        recording.read_signal(mailbox, "standing").astype(int)
         if "standing" in fields
         else np.zeros(len(ticks), int)
     )
     # An operator's command takes precedence over the level's own state.
     hold_codes = np.where(standing_commands > 0, standing_commands, -is_level_holding.astype(int))
-    for first, end in _stretches(hold_codes):
+    for first, end in _split_equal_runs(hold_codes):
         is_operators = hold_codes[first] > 0
         why = (
             Operation(hold_codes[first]).name.lower()
             if is_operators
-            else recording.reason(mailbox, end - 1)
+            else recording.read_reason(mailbox, end - 1)
         )
         since, until = ticks[[first, min(end, len(ticks) - 1)]].tolist()
         yield {
             "level": level,
-            "by": "operator" if is_operators else OWN,
+            "by": "operator" if is_operators else BY_LEVEL,
             "why": why,
             "since_s": round(since * tick_s, 6),
             "until_s": round(until * tick_s, 6) if end < len(ticks) else None,
@@ -178,7 +187,7 @@ def _holds_of(recording: Recording, level: str) -> Iterator[Document]:
         }
 
 
-def _stretches(numbers: np.ndarray) -> list[tuple[int, int]]:
+def _split_equal_runs(numbers: np.ndarray) -> list[tuple[int, int]]:
     """Split an array into runs of equal numbers, leaving out runs of 0.
 
     Returns:

@@ -11,11 +11,11 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.bounded_toml import load_toml
 from rack.backplane.message import State
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import Alarm, alarm_ring
+from rack.backplane.watch.alarms import Alarm, open_alarm_ring
 from rack.boards.config.record import RecordConfig
-from rack.boards.timing.trace_times import is_missed, skipped
+from rack.boards.timing.trace_times import count_skipped, find_missed
 
-ORDINARY = (Alarm.COMMANDED,)
+ORDINARY_ALARMS = (Alarm.COMMANDED,)
 """Alarms that are no occasion. All others count: faults, detections, brakes, restarts."""
 
 
@@ -34,7 +34,7 @@ class Retention(NamedTuple):
     after: int
 
     @classmethod
-    def of(cls, segment: Segment) -> Self | None:
+    def from_config(cls, segment: Segment) -> Self | None:
         """Read the settings of a rack. Returns None if its recorder keeps everything."""
         config = RecordConfig.model_validate(load_toml(segment.config).get("record", {}))
         if config.keep is None:
@@ -42,11 +42,11 @@ class Retention(NamedTuple):
         spans_s = (config.keep, config.before, config.after)
         return cls(*(round(span_s * 1e9 / segment.layout.clock_ns) for span_s in spans_s))
 
-    def around(self, tick: int) -> TickRange:
+    def find_window(self, tick: int) -> TickRange:
         """Return the ticks that are kept around an occasion."""
         return TickRange(max(0, tick - self.before), tick + self.after)
 
-    def absent(
+    def find_missing_windows(
         self, segment: Segment, kept: Sequence[tuple[int, int]], ticks: int
     ) -> list[TickRange]:
         """Find the ticks that should have been kept but were not.
@@ -56,8 +56,11 @@ class Retention(NamedTuple):
             kept: Ticks that were kept, as ranges [first, end).
             ticks: Length of the run.
         """
-        occasions = Occasions(segment).alarms()
-        windows = [TickRange(max(0, ticks - self.keep), ticks - 1), *map(self.around, occasions)]
+        occasions = Occasions(segment).find_in_alarms()
+        windows = [
+            TickRange(max(0, ticks - self.keep), ticks - 1),
+            *map(self.find_window, occasions),
+        ]
         clipped = [TickRange(first, min(last, ticks - 1)) for first, last in windows]
         return [
             window
@@ -72,7 +75,7 @@ class Occasions:
     def __init__(self, segment: Segment) -> None:
         layout = segment.layout
         owners = (CLOCK, *(task.name for task in layout.tasks))
-        self._alarms = [alarm_ring(segment, owner) for owner in owners]
+        self._alarms = [open_alarm_ring(segment, owner) for owner in owners]
         self._tasks = {task.name for task in layout.tasks}
         self._holding = {
             box.name: False
@@ -80,17 +83,17 @@ class Occasions:
             if box.name.endswith(".status") and any(field.name == "state" for field in box.fields)
         }
 
-    def alarms(self) -> Iterator[int]:
+    def find_in_alarms(self) -> Iterator[int]:
         """Yield the ticks of alarms since the last call, or of all remaining alarms at first."""
         for ring in self._alarms:
-            rows = ring.drain().rows
-            yield from rows["tick"][~np.isin(rows["code"], ORDINARY)].tolist()
+            rows = ring.read_new_rows().rows
+            yield from rows["tick"][~np.isin(rows["code"], ORDINARY_ALARMS)].tolist()
 
-    def within(self, ring: str, rows: np.ndarray) -> Iterator[int]:
+    def find_in_rows(self, ring: str, rows: np.ndarray) -> Iterator[int]:
         """Yield the ticks of occasions in rows of a ring."""
         ticks = rows["tick"]
         if ring in self._tasks:
-            yield from ticks[is_missed(rows) | (skipped(rows) > 0)].tolist()
+            yield from ticks[find_missed(rows) | (count_skipped(rows) > 0)].tolist()
         elif ring in self._holding and len(rows):
             holding = rows["message"]["state"] == State.HOLDING
             held_before = np.concatenate(([self._holding[ring]], holding[:-1]))

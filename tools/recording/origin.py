@@ -19,7 +19,7 @@ from xxhash import xxh3_128
 
 from rack.backplane.json_text import encode_json
 from rack.boards.config.schema import RackConfig
-from rack.boards.events import CONTINUES
+from rack.boards.events import CONTINUATION_CODE
 from rack.tools.console.answer import Document, Failure
 from rack.tools.recording.checksums import read_file
 from rack.tools.recording.file_names import CODE, ORIGIN
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
 
 PROGRAM = "rack"
-FLOORS = Path(__file__).resolve().parents[2]
+PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 """Folder that contains the packages of the program."""
 
 
-def write_code(config: RackConfig, folder: Path) -> None:
+def write_code_state(config: RackConfig, folder: Path) -> None:
     """Write code.json for a run whose levels have been loaded. Raises `OSError`."""
     files = [getattr(module, "__file__", None) for module in [*sys.modules.values()]]
     code_files = [Path(file) for file in files if file]
@@ -40,10 +40,10 @@ def write_code(config: RackConfig, folder: Path) -> None:
     if config.robot is not None:
         paths.add(config.robot.model.parent)
     names = ["version", "python", PROGRAM, *sorted(map(str, paths))]
-    (folder / CODE).write_text(encode_json({name: _state_of(name) for name in names}) + "\n")
+    (folder / CODE).write_text(encode_json({name: _compute_state(name) for name in names}) + "\n")
 
 
-def check_code(recording: Recording, asked: str, anyway: bool) -> None:
+def check_code_state(recording: Recording, asked: str, anyway: bool) -> None:
     """Check that the code and files of a run are unchanged before it is repeated.
 
     Args:
@@ -60,7 +60,7 @@ def check_code(recording: Recording, asked: str, anyway: bool) -> None:
     else:
         recording.checksums.verify(CODE)
         recorded: dict[str, str] = json.loads(read_file(path))
-        changed = [name for name, state in recorded.items() if _state_of(name) != state]
+        changed = [name for name, state in recorded.items() if _compute_state(name) != state]
         if not changed:
             return
         names = ", ".join("the code of rack" if name == PROGRAM else name for name in changed)
@@ -70,7 +70,7 @@ def check_code(recording: Recording, asked: str, anyway: bool) -> None:
     print(f"{asked}: {why}; digests may differ", file=sys.stderr)
 
 
-def _state_of(name: str) -> str:
+def _compute_state(name: str) -> str:
     """Return the version of a component, or the digest of a file or folder."""
     if name == "version":
         return version("nasrem-rack")
@@ -79,7 +79,7 @@ def _state_of(name: str) -> str:
     paths = [path := Path(name)]
     if name == PROGRAM:
         floors = ("backplane", "levels", "boards")
-        paths = [path for floor in floors for path in (FLOORS / floor).rglob("*.py")]
+        paths = [path for floor in floors for path in (PACKAGES_FOLDER / floor).rglob("*.py")]
     elif path.is_dir():
         paths = [*path.rglob("*.xml")]
     digest = xxh3_128()
@@ -104,12 +104,12 @@ class Origin:
     launched_ns: int
 
     @classmethod
-    def at(cls, run: Recording, tick: int) -> Self:
+    def from_run(cls, run: Recording, tick: int) -> Self:
         """Return the origin of a run that continues `run` from a tick."""
         return cls(str(run.folder), tick, run.launch.created_ns)
 
     @classmethod
-    def of(cls, recording: Recording) -> Self | None:
+    def read_from(cls, recording: Recording) -> Self | None:
         """Read the origin of a recorded run.
 
         Returns:
@@ -124,7 +124,7 @@ class Origin:
         recording.checksums.verify(ORIGIN)
         return cls(**json.loads(read_file(path)))
 
-    def is_of(self, run: Recording) -> bool:
+    def is_same_run(self, run: Recording) -> bool:
         """Return True if this is the origin's run, not another run with the same folder name."""
         return run.launch.created_ns == self.launched_ns
 
@@ -132,12 +132,12 @@ class Origin:
         """Write origin.json into the folder of the later run. Raises `OSError`."""
         (folder / ORIGIN).write_text(encode_json(asdict(self)) + "\n")
 
-    def document(self, clock_ns: int) -> Document:
+    def to_document(self, clock_ns: int) -> Document:
         """Return the origin as plain data, with its tick also as simulated time, s."""
         return {**asdict(self), "time_s": round(self.tick * clock_ns * 1e-9, 9)}
 
 
-def continued_at(recording: Recording) -> int | None:
+def find_continuation_tick(recording: Recording) -> int | None:
     """Return the first tick of a run that continues another one, or None for any other run."""
-    ticks = (event["tick"] for event in recording.events if event.get("code") == CONTINUES)
+    ticks = (event["tick"] for event in recording.events if event.get("code") == CONTINUATION_CODE)
     return next(ticks, None)

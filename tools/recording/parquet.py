@@ -27,9 +27,9 @@ from rack.backplane.trace import FIELDS
 from rack.tools.recording.cores import CoreRecord
 
 TRACE_FIELDS = (pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for name in FIELDS))
-HEAD = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
+HEAD_COLUMNS = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
 """Columns of every mailbox's messages. In a table they follow `TIME_COLUMN`."""
-TIME = "time_s"
+TIME_COLUMN = "time_s"
 """Column with the tick as simulated time, s."""
 TRACE_ROWS = 1 << 16
 MESSAGE_ROWS = 8192
@@ -39,8 +39,8 @@ MESSAGE_BYTES = 16 << 20
 Blocks are large because a file's footer has an entry for every column of every block.
 """
 SIGNALS = "signals"
-TABLE = "{}.parquet"
-PART = "{:04}.parquet"
+TABLE_NAME = "{}.parquet"
+PART_NAME = "{:04}.parquet"
 PART_ENTRIES = 1 << 12
 """Number of footer entries after which a part is finished. An open part keeps 0.7 kB for each."""
 
@@ -64,15 +64,15 @@ class CyclesFile:
             write_page_checksum=True,
         )
 
-    def add(self, task: str, rows: np.ndarray) -> None:
+    def add_records(self, task: str, rows: np.ndarray) -> None:
         """Add trace records of a task, shape (rows,)."""
         if len(rows):
             self._waiting.append((task, rows))
             self._rows += len(rows)
         if self._rows >= TRACE_ROWS:
-            self._flush()
+            self._write_block()
 
-    def _flush(self) -> None:
+    def _write_block(self) -> None:
         """Write the waiting records as one block."""
         if not self._waiting:
             return
@@ -102,10 +102,10 @@ class CyclesFile:
             gaps: Ring, first and last tick of each gap.
             kept: Ticks that a flight recorder kept, as ranges [first, end).
         """
-        self._flush()
+        self._write_block()
         metadata = {
             "lost": encode_json(lost),
-            "cores": cores.text(),
+            "cores": cores.to_json(),
             "gaps": encode_json(gaps),
             "kept": encode_json(kept),
         }
@@ -113,12 +113,12 @@ class CyclesFile:
         self._writer.close()
 
 
-def signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]:
+def create_signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]:
     """Create the tables in signals/, by mailbox, replacing tables of a killed recorder."""
     if folder.exists():
         rmtree(folder)
     return {
-        mailbox.name: SignalTable(folder / TABLE.format(mailbox.name), mailbox, layout)
+        mailbox.name: SignalTable(folder / TABLE_NAME.format(mailbox.name), mailbox, layout)
         for mailbox in layout.timed
     }
 
@@ -130,11 +130,14 @@ class SignalTable:
         folder.mkdir(parents=True)
         self._folder = folder
         self._tick_s = layout.clock_ns * 1e-9
-        self._columns = columns_of(mailbox)
+        self._columns = list_columns(mailbox)
         self._waiting: list[np.ndarray] = []
         head = [
-            pa.field(TIME, pa.float64(), metadata={"unit": "s"}),
-            *(pa.field(name, pa.uint64() if name == "chain" else pa.int64()) for name in HEAD),
+            pa.field(TIME_COLUMN, pa.float64(), metadata={"unit": "s"}),
+            *(
+                pa.field(name, pa.uint64() if name == "chain" else pa.int64())
+                for name in HEAD_COLUMNS
+            ),
         ]
         self._schema = pa.schema([*head, *(column.arrow_field for column in self._columns)])
         self._parts = 0
@@ -145,7 +148,7 @@ class SignalTable:
         self._parts += 1
         self._entries = 0
         self._writer = pq.ParquetWriter(
-            self._folder / PART.format(self._parts),
+            self._folder / PART_NAME.format(self._parts),
             self._schema,
             compression="zstd",
             use_dictionary=[column.label for column in self._columns if column.is_text],
@@ -153,24 +156,24 @@ class SignalTable:
             write_page_checksum=True,
         )
 
-    def add(self, rows: np.ndarray) -> None:
+    def add_rows(self, rows: np.ndarray) -> None:
         """Add at least one row of the mailbox's ring, shape (rows,)."""
         self._waiting.append(rows)
         if (
             sum(map(len, self._waiting)) >= MESSAGE_ROWS
             or sum(block.nbytes for block in self._waiting) >= MESSAGE_BYTES
         ):
-            self._flush()
+            self._write_block()
 
-    def _flush(self) -> None:
+    def _write_block(self) -> None:
         """Write the waiting rows as one block, and finish the part if its footer is large."""
         if not self._waiting:
             return
         rows = np.concatenate(self._waiting)
         self._waiting = []
-        head = [np.ascontiguousarray(rows[name]) for name in HEAD]
+        head = [np.ascontiguousarray(rows[name]) for name in HEAD_COLUMNS]
         time_s = pa.array(rows["tick"] * self._tick_s)
-        arrays = [column.array(rows["message"]) for column in self._columns]
+        arrays = [column.to_arrow(rows["message"]) for column in self._columns]
         self._writer.write_batch(
             pa.record_batch([time_s, *map(pa.array, head), *arrays], schema=self._schema),
             row_group_size=len(rows),
@@ -182,7 +185,7 @@ class SignalTable:
 
     def close(self) -> None:
         """Write the waiting rows and finish the last part."""
-        self._flush()
+        self._write_block()
         self._writer.close()
 
 
@@ -208,7 +211,7 @@ class Column:
     def label(self) -> str:
         """Name of the column in the table. Prefixed if a head column has the same name."""
         name = ".".join(self.path)
-        return f"message.{name}" if name in (TIME, *HEAD) else name
+        return f"message.{name}" if name in (TIME_COLUMN, *HEAD_COLUMNS) else name
 
     @property
     def is_text(self) -> bool:
@@ -223,27 +226,27 @@ class Column:
         metadata = {"shape": encode_json(self.shape), "unit": self.spec.unit}
         return pa.field(self.label, arrow, metadata=metadata)
 
-    def values(self, messages: np.ndarray) -> np.ndarray:
+    def extract_values(self, messages: np.ndarray) -> np.ndarray:
         """Return the field in a block of messages, as a view of shape (rows, *shape)."""
         for key in self.path:
             messages = messages[key]
         return messages
 
-    def array(self, messages: np.ndarray) -> pa.Array:
+    def to_arrow(self, messages: np.ndarray) -> pa.Array:
         """Convert the field in a block of messages to an Arrow array, shape (rows,)."""
-        flat = np.ascontiguousarray(self.values(messages)).reshape(-1)
+        flat = np.ascontiguousarray(self.extract_values(messages)).reshape(-1)
         values = pa.array(np.strings.decode(flat, "ascii", "replace") if self.is_text else flat)
         if not self.shape:
             return values
         return pa.FixedSizeListArray.from_arrays(values, prod(self.shape))
 
 
-def columns_of(mailbox: MailboxSpec) -> list[Column]:
+def list_columns(mailbox: MailboxSpec) -> list[Column]:
     """Return the columns of a mailbox in the order of its fields, with nested fields flattened."""
-    return list(_columns(mailbox.name, (), (), mailbox.fields))
+    return list(_flatten_columns(mailbox.name, (), (), mailbox.fields))
 
 
-def _columns(
+def _flatten_columns(
     mailbox: str, path: tuple[str, ...], outer: tuple[int, ...], fields: Sequence[FieldSpec]
 ) -> Iterator[Column]:
     """Yield the columns of fields, and of groups within them.
@@ -258,6 +261,6 @@ def _columns(
         inner = (*path, field.name)
         shape = outer + field.shape
         if field.fields:
-            yield from _columns(mailbox, inner, shape, field.fields)
+            yield from _flatten_columns(mailbox, inner, shape, field.fields)
         else:
             yield Column(".".join((mailbox, *inner)), mailbox, inner, shape, field)

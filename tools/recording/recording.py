@@ -16,27 +16,27 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from rack.backplane.layout import TaskSpec
-from rack.backplane.mailbox.history import row_dtype
-from rack.backplane.message import printable
-from rack.backplane.segment import Launch, Segment, layout_of
+from rack.backplane.mailbox.history import build_row_dtype
+from rack.backplane.message import escape_text
+from rack.backplane.segment import Launch, Segment, restore_layout
 from rack.backplane.trace import FIELDS, RECORD
 from rack.boards.config import RackConfig, read_stored
 from rack.boards.config.published import PublishedRack
 from rack.boards.errors import ConfigError
-from rack.boards.events import Event, order_key
+from rack.boards.events import Event, get_event_order
 from rack.tools.console.answer import Document, Failure
 from rack.tools.recording.checksums import (
     CHECKSUMS,
     Checksums,
     is_cut_off,
+    parse_checked_line,
     read_file,
-    read_line,
 )
 from rack.tools.recording.cores import CoreRecord
 from rack.tools.recording.file_names import CONFIG, PUBLISHED
-from rack.tools.recording.parquet import HEAD, PART, SIGNALS, TABLE, columns_of
-from rack.tools.recording.run_files import CYCLES, EVENTS, Missing, find_missing, mend
-from rack.tools.recording.spool import STRETCHES, rings
+from rack.tools.recording.parquet import HEAD_COLUMNS, PART_NAME, SIGNALS, TABLE_NAME, list_columns
+from rack.tools.recording.run_files import CYCLES, EVENTS, MissingRows, find_missing, rebuild_files
+from rack.tools.recording.spool import STRETCHES, open_rings
 
 
 class Gap(NamedTuple):
@@ -61,9 +61,9 @@ class Gap(NamedTuple):
         )
 
 
-SHOWN = 20
+MAX_SHOWN_STRETCHES = 20
 """Number of kept stretches that a text lists."""
-UNREADABLE = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
+READ_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
 """Errors raised by reading a damaged file or a file of another kind."""
 
 
@@ -88,34 +88,34 @@ class Recording:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._there(CONFIG)
-        with _naming(folder):
+        self._require_file(CONFIG)
+        with _name_file_in_errors(folder):
             is_flight = (folder / STRETCHES).is_dir()
-            if mend(folder) and not is_flight:
-                _note(
+            if rebuild_files(folder) and not is_flight:
+                _print_note(
                     f"{folder}: its recorder was killed; the rows it had taken are now in"
                     " cycles.parquet and signals"
                 )
-        self._there(CHECKSUMS)
+        self._require_file(CHECKSUMS)
         self.checksums = Checksums(folder)
         self.checksums.verify(CONFIG)
-        self.config = self._text(CONFIG)
-        path = self._there(CYCLES)
-        self._cycles = self._opened(path, ("task", *FIELDS))
-        with _naming(path):
+        self.config = self._read_text(CONFIG)
+        path = self._require_file(CYCLES)
+        self._cycles = self._open_parquet(path, ("task", *FIELDS))
+        with _name_file_in_errors(path):
             metadata = self._cycles.metadata.metadata
-            self.layout = layout_of(json.loads(metadata[b"layout"]))
+            self.layout = restore_layout(json.loads(metadata[b"layout"]))
             self.launch = Launch(*json.loads(metadata[b"launch"]))
-            self.cores = CoreRecord.of(metadata[b"cores"])
+            self.cores = CoreRecord.from_json(metadata[b"cores"])
             kept = [tuple(ends) for ends in json.loads(metadata[b"kept"])]
             self.kept: list[tuple[int, int]] = [] if len(kept) == 1 and kept[0][0] == 0 else kept
             self._gaps = json.loads(metadata[b"gaps"])
-            self._lost_before_the_end = dict[str, int](json.loads(metadata[b"lost"]))
+            self._lost_before_end = dict[str, int](json.loads(metadata[b"lost"]))
         self._shapes = {
-            box.name: {column.label: column.shape for column in columns_of(box)}
+            box.name: {column.label: column.shape for column in list_columns(box)}
             for box in self.layout.mailboxes
         }
-        self._tables = {box.name: self._parts(box.name) for box in self.layout.timed}
+        self._tables = {box.name: self._open_table(box.name) for box in self.layout.timed}
         self.events = self._read_events()
 
     @cached_property
@@ -127,37 +127,37 @@ class Recording:
             mistakes = "; ".join(str(error).splitlines())
             raise Failure(f"{self.folder / 'config.toml'}: {mistakes}", 2) from None
 
-    def adopt_kinds(self) -> None:
+    def register_fault_kinds(self) -> None:
         """Register the fault kinds that the rack's own levels define. Raises `Failure`."""
         path = self.folder / PUBLISHED
         if path.exists():
             self.checksums.verify(PUBLISHED)
-            with _naming(path):
-                PublishedRack.read(self._text(PUBLISHED))
+            with _name_file_in_errors(path):
+                PublishedRack.read(self._read_text(PUBLISHED))
 
-    def _parts(self, mailbox: str) -> list[pq.ParquetFile]:
+    def _open_table(self, mailbox: str) -> list[pq.ParquetFile]:
         """Open the parts of a mailbox's table, oldest first."""
-        path = self._there(f"{SIGNALS}/{TABLE.format(mailbox)}")
-        with _naming(path):
+        path = self._require_file(f"{SIGNALS}/{TABLE_NAME.format(mailbox)}")
+        with _name_file_in_errors(path):
             count = max(len([*path.iterdir()]), 1)
-        parts = [path / PART.format(number) for number in range(1, count + 1)]
+        parts = [path / PART_NAME.format(number) for number in range(1, count + 1)]
         if missing := [part.name for part in parts if not part.exists()]:
             raise Failure(f"{path}: {missing[0]} is missing", 2)
-        return [self._opened(part, (*HEAD, *self._shapes[mailbox])) for part in parts]
+        return [self._open_parquet(part, (*HEAD_COLUMNS, *self._shapes[mailbox])) for part in parts]
 
-    def _opened(self, path: Path, columns: Iterable[str]) -> pq.ParquetFile:
+    def _open_parquet(self, path: Path, columns: Iterable[str]) -> pq.ParquetFile:
         """Open an undamaged parquet file that has these columns. Raises `Failure`."""
         self.checksums.verify(str(path.relative_to(self.folder)))
-        with _naming(path):
+        with _name_file_in_errors(path):
             file = pq.ParquetFile(path, page_checksum_verification=True)
         names = file.schema_arrow.names
         if missing := [column for column in columns if column not in names]:
             raise Failure(f"{path}: not a recording of a rack: it has no column '{missing[0]}'", 2)
         return file
 
-    def _text(self, name: str) -> str:
+    def _read_text(self, name: str) -> str:
         """Read a text file of the run. Raises `Failure`."""
-        path = self._there(name)
+        path = self._require_file(name)
         try:
             return read_file(path).decode()
         except UnicodeDecodeError as error:
@@ -165,7 +165,7 @@ class Recording:
                 f"{path}: not text: byte {error.start} is 0x{error.object[error.start]:02x}", 2
             ) from None
 
-    def _there(self, name: str) -> Path:
+    def _require_file(self, name: str) -> Path:
         """Return the path of a file that every run has. Raises `Failure` if it is missing."""
         if not (self.folder / name).exists():
             raise Failure(f"{self.folder}: not a run: it has no {name}", 2)
@@ -176,17 +176,19 @@ class Recording:
         path = self.folder / EVENTS
         if not path.exists():
             return []
-        *lines, last = self._text(EVENTS).split("\n")
+        *lines, last = self._read_text(EVENTS).split("\n")
         if last and is_cut_off(last):
             # A killed run can leave an incomplete last line.
-            _note(f"{path}: line {len(lines) + 1} is cut off, and left out")
+            _print_note(f"{path}: line {len(lines) + 1} is cut off, and left out")
         elif last:
             lines.append(last)
-        events = (_event(line, f"{path}: line {number}") for number, line in enumerate(lines, 1))
-        return sorted(events, key=order_key)
+        events = (
+            _parse_event(line, f"{path}: line {number}") for number, line in enumerate(lines, 1)
+        )
+        return sorted(events, key=get_event_order)
 
     @cached_property
-    def ended(self) -> Document:
+    def end_counts(self) -> Document:
         """Counts at the end of the run, as in `rack.tools.launch.launch.RunResult`.
 
         Empty if the end was not recorded.
@@ -194,11 +196,11 @@ class Recording:
         return next((event for event in self.events if event["kind"] == "outcome"), {})
 
     @property
-    def lost(self) -> dict[str, int]:
+    def lost_rows(self) -> dict[str, int]:
         """Number of rows that were written but are not in the files, by task and by mailbox."""
-        return dict(self.ended.get("rows_lost", self._lost_before_the_end))
+        return dict(self.end_counts.get("rows_lost", self._lost_before_end))
 
-    def stretch_of(self, ticks: np.ndarray) -> np.ndarray:
+    def find_stretches(self, ticks: np.ndarray) -> np.ndarray:
         """Return the number of the kept stretch in which each tick lies, shape (n,).
 
         Nothing is known between two stretches. If everything was kept, all ticks are in stretch 0.
@@ -216,11 +218,17 @@ class Recording:
         """Sentence that says which stretches were kept, or "" if everything was kept."""
         tick_s = self.layout.clock_ns * 1e-9
         spans = [f"{first * tick_s:.1f} s to {end * tick_s:.1f} s" for first, end in self.kept]
-        more = [f"{len(spans) - SHOWN} more stretches"] if len(spans) > SHOWN else []
-        text = " and ".join([*spans[:SHOWN], *more])
+        more = (
+            [f"{len(spans) - MAX_SHOWN_STRETCHES} more stretches"]
+            if len(spans) > MAX_SHOWN_STRETCHES
+            else []
+        )
+        text = " and ".join([*spans[:MAX_SHOWN_STRETCHES], *more])
         return f"kept {text}; the rest was not kept, as [record] keep says" if text else ""
 
-    def gaps(self, lost: Mapping[str, int] | None = None, ticks: int | None = None) -> list[Gap]:
+    def find_gaps(
+        self, lost: Mapping[str, int] | None = None, ticks: int | None = None
+    ) -> list[Gap]:
         """Find the places where rows are missing, in order. Overlapping gaps are merged.
 
         Args:
@@ -228,12 +236,12 @@ class Recording:
             ticks: Length of the run. Defaults to its recorded length. Rows that the files do not
                 report as lost were lost between their last row and this tick.
         """
-        lost = self.lost if lost is None else lost
-        ticks = self.ended.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
+        lost = self.lost_rows if lost is None else lost
+        ticks = self.end_counts.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
         gaps = list(self._gaps)
         for name, count in lost.items():
-            if count > self._lost_before_the_end.get(name, 0):
-                gaps.append((name, self._last_tick(name) + 1, ticks - 1))
+            if count > self._lost_before_end.get(name, 0):
+                gaps.append((name, self._find_last_tick(name) + 1, ticks - 1))
         merged: list[Gap] = []
         # If only the row of the last tick is missing, `first` is after `last`.
         for ring, first, last in sorted(
@@ -247,22 +255,22 @@ class Recording:
                 merged.append(Gap(first, last, (ring,)))
         return merged
 
-    def _last_tick(self, name: str) -> int:
+    def _find_last_tick(self, name: str) -> int:
         """Return the tick of the newest row of a task or mailbox, or -1 if it has none."""
         if name in self.cycles:
             return int(self.cycles[name]["tick"][-1])
-        return int(self.signal(name, "tick")[-1]) if name in self.mailboxes else -1
+        return int(self.read_signal(name, "tick")[-1]) if name in self.mailboxes else -1
 
-    def untraced(self) -> dict[str, tuple[int, int]]:
+    def count_untraced(self) -> dict[str, tuple[int, int]]:
         """Return recorded and total number of cycles, for tasks with missing trace records."""
-        traced = {task.name: len(self.trace(task.name)) for task in self.layout.tasks}
+        traced = {task.name: len(self.read_trace(task.name)) for task in self.layout.tasks}
         return {
-            name: (rows, rows + self.lost[name])
+            name: (rows, rows + self.lost_rows[name])
             for name, rows in traced.items()
-            if self.lost.get(name)
+            if self.lost_rows.get(name)
         }
 
-    def missing(self, segment: Segment) -> dict[str, Missing]:
+    def count_missing_rows(self, segment: Segment) -> dict[str, MissingRows]:
         """Count the rows that the files lack of the rings of a rack that has ended.
 
         Args:
@@ -272,12 +280,12 @@ class Recording:
             The missing rows by task and by mailbox.
         """
         taken = {}
-        lost = dict(self.lost)
-        for name, ring in rings(segment).items():
+        lost = dict(self.lost_rows)
+        for name, ring in open_rings(segment).items():
             if name in self.cycles:
                 taken[name] = ring.before + lost[name] + len(self.cycles[name])
             else:
-                serials = self.signal(name, "serial")
+                serials = self.read_signal(name, "serial")
                 taken[name] = int(serials[-1]) if len(serials) else ring.before
                 # Rows missing before the last serial were lost or skipped as damaged. Count only
                 # lost ones, and not those lost after the last row, which the ring reports itself.
@@ -287,7 +295,7 @@ class Recording:
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
         """The trace by task: records of type `rack.backplane.trace.RECORD`, oldest first."""
-        with _naming(self.folder / CYCLES):
+        with _name_file_in_errors(self.folder / CYCLES):
             table = self._cycles.read()
             tasks = table["task"].to_numpy()
             rows = np.empty(len(tasks), dtype=RECORD)
@@ -295,23 +303,23 @@ class Recording:
                 rows[name] = table[name].to_numpy()
         return {str(task): rows[tasks == task] for task in dict.fromkeys(tasks)}
 
-    def counts(self, task: str) -> Document:
+    def find_task_counts(self, task: str) -> Document:
         """Return the counts of a task at the end of the run. Empty if the end was not recorded."""
-        return dict(self.ended.get("tasks", {}).get(task, {}))
+        return dict(self.end_counts.get("tasks", {}).get(task, {}))
 
-    def place(self, task: TaskSpec) -> tuple[int, int]:
+    def find_core_and_priority(self, task: TaskSpec) -> tuple[int, int]:
         """Return the core and the priority that a task obtained.
 
         If the end of the run was not recorded, these are the settings of its config.
         """
-        counted = self.counts(task.name)
+        counted = self.find_task_counts(task.name)
         return counted.get("core", task.core), counted.get("priority", task.priority)
 
-    def trace(self, task: str) -> np.ndarray:
+    def read_trace(self, task: str) -> np.ndarray:
         """Return the trace of a task, as in `cycles`. Empty for a task without trace records."""
         return self.cycles.get(task, np.empty(0, dtype=RECORD))
 
-    def signal(self, mailbox: str, field: str) -> np.ndarray:
+    def read_signal(self, mailbox: str, field: str) -> np.ndarray:
         """Return one field of all messages of a mailbox.
 
         Args:
@@ -326,8 +334,8 @@ class Recording:
         Raises:
             KeyError: The messages have no such field.
         """
-        shape = () if field in HEAD else self._shapes[mailbox][field]
-        with _naming(self.folder / SIGNALS / TABLE.format(mailbox)):
+        shape = () if field in HEAD_COLUMNS else self._shapes[mailbox][field]
+        with _name_file_in_errors(self.folder / SIGNALS / TABLE_NAME.format(mailbox)):
             tables = [file.read(columns=[field]) for file in self._tables.get(mailbox, ())]
         if not any(map(len, tables)):
             return np.empty((0, *shape))
@@ -335,24 +343,24 @@ class Recording:
         values = column.flatten() if shape else column
         return np.asarray(values.to_numpy(zero_copy_only=False).reshape(-1, *shape))
 
-    def reason(self, mailbox: str, row: int) -> str:
+    def read_reason(self, mailbox: str, row: int) -> str:
         """Return the reason in a status as printable text, or "" if the status has none."""
-        has_reason = "reason" in self.fields(mailbox)
-        return printable(str(self.signal(mailbox, "reason")[row])) if has_reason else ""
+        has_reason = "reason" in self.list_fields(mailbox)
+        return escape_text(str(self.read_signal(mailbox, "reason")[row])) if has_reason else ""
 
-    def rows(self, name: str) -> np.ndarray:
+    def read_rows(self, name: str) -> np.ndarray:
         """Return the recorded rows of a ring, oldest first: trace records or rows of a mailbox."""
         if name in self.cycles:
             return self.cycles[name]
-        box = self.layout.mailbox(name)
-        rows = np.zeros(len(self.signal(name, "tick")), row_dtype(box))
-        for field in HEAD:
-            rows[field] = self.signal(name, field)
-        for column in columns_of(box):
-            column.values(rows["message"])[...] = self.signal(name, column.label)
+        box = self.layout.find_mailbox(name)
+        rows = np.zeros(len(self.read_signal(name, "tick")), build_row_dtype(box))
+        for field in HEAD_COLUMNS:
+            rows[field] = self.read_signal(name, field)
+        for column in list_columns(box):
+            column.extract_values(rows["message"])[...] = self.read_signal(name, column.label)
         return rows
 
-    def fields(self, mailbox: str) -> set[str]:
+    def list_fields(self, mailbox: str) -> set[str]:
         """Return the names of all fields of a mailbox's messages."""
         return {*self._shapes[mailbox]}
 
@@ -364,24 +372,24 @@ class Recording:
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def _name_file_in_errors(path: Path) -> Iterator[None]:
     """Turn an error of reading into a `Failure` that names the file."""
     try:
         yield
-    except UNREADABLE as error:
+    except READ_ERRORS as error:
         raise Failure(
             f"{path}: not readable as a recording: {' '.join(str(error).split()) or error!r}", 2
         ) from None
 
 
-def _event(line: str, place: str) -> Document:
+def _parse_event(line: str, place: str) -> Document:
     """Parse a line of events.jsonl.
 
     Raises:
         Failure: The line is damaged or no event. The message begins with `place`.
     """
     try:
-        event = read_line(line)
+        event = parse_checked_line(line)
         if event["kind"] == "outcome":
             {**event["outcome"], **event["tasks"]}
         else:
@@ -392,6 +400,6 @@ def _event(line: str, place: str) -> Document:
     return dict(event)
 
 
-def _note(text: str) -> None:
+def _print_note(text: str) -> None:
     """Print a note for the user on stderr."""
     print(text, file=sys.stderr)

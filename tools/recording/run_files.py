@@ -18,33 +18,33 @@ from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreRecord
 from rack.tools.recording.file_names import SPOOL
-from rack.tools.recording.parquet import SIGNALS, CyclesFile, signal_tables
+from rack.tools.recording.parquet import SIGNALS, CyclesFile, create_signal_tables
 from rack.tools.recording.spool import (
-    OPEN,
+    OPEN_END,
     STRETCHES,
     Frame,
     Part,
     StretchEnd,
     StretchHead,
-    locked,
-    read,
+    list_ring_dtypes,
+    open_rings,
     read_head,
-    ring_dtypes,
-    rings,
+    read_spool,
+    try_lock,
 )
 
 CYCLES = "cycles.parquet"
-TABLES = (CYCLES, f"{SIGNALS}/*/*")
+TABLE_PATTERNS = (CYCLES, f"{SIGNALS}/*/*")
 """Patterns of the files that hold rows."""
 EVENTS = "events.jsonl"
-MENDED = "-mended"
+REBUILT_SUFFIX = "-mended"
 POLL_S = 0.2
 """Time between two attempts to lock the spool of a recorder that is finishing."""
 FINISH_S = 20.0
 """Longest time to wait for a recorder that finishes after its launcher has gone."""
 
 
-class Missing(NamedTuple):
+class MissingRows(NamedTuple):
     """Number of rows of a ring that a recording lacks, and number of rows written to that ring."""
 
     rows: int
@@ -53,7 +53,7 @@ class Missing(NamedTuple):
 
 def find_missing(
     segment: Segment, taken: Mapping[str, int], lost: Mapping[str, int]
-) -> dict[str, Missing]:
+) -> dict[str, MissingRows]:
     """Count the rows that a recording lacks of the rings of a rack that has ended.
 
     Args:
@@ -65,12 +65,12 @@ def find_missing(
         The missing rows by task and by mailbox. Complete rings are left out.
     """
     missing = {}
-    for name, ring in rings(segment).items():
-        ring.resume(taken[name])
-        written = taken[name] - ring.before + ring.waiting
-        left, overwritten = ring.drain()
+    for name, ring in open_rings(segment).items():
+        ring.resume_after(taken[name])
+        written = taken[name] - ring.before + ring.waiting_count
+        left, overwritten = ring.read_new_rows()
         if rows := lost[name] + overwritten + len(left):
-            missing[name] = Missing(rows, written)
+            missing[name] = MissingRows(rows, written)
     return missing
 
 
@@ -88,7 +88,7 @@ class Tally:
 
     def __init__(self, layout: Layout, before: Mapping[str, int] | None = None) -> None:
         self.tasks = [task.name for task in layout.tasks]
-        self._dtypes = ring_dtypes(layout)
+        self._dtypes = list_ring_dtypes(layout)
         self.lost = dict.fromkeys(self._dtypes, 0)
         self.taken = {**self.lost, **(before or {})}
         self.rows = dict(self.lost)
@@ -96,18 +96,18 @@ class Tally:
         self.number = 0
         self._newest = -1
 
-    def take(self, part: Part) -> None:
+    def count_part(self, part: Part) -> None:
         """Count the content of one part of a spool."""
         match part:
             case StretchHead():
-                self.begin(part)
+                self.begin_stretch(part)
             case StretchEnd():
-                self.end(part.tick)
+                self.end_stretch(part.tick)
             case Frame():
-                for block in part.unpack(self._dtypes):
-                    self.add(*block)
+                for block in part.unpack_rows(self._dtypes):
+                    self.add_rows(*block)
 
-    def begin(self, stretch: StretchHead) -> None:
+    def begin_stretch(self, stretch: StretchHead) -> None:
         """Begin a stretch. Stretches before it may have been removed."""
         follows = stretch.number == self.number + 1
         if follows:
@@ -117,13 +117,13 @@ class Tally:
         self.taken.update(stretch.taken)
         self.rows.update(stretch.rows)
         if follows and self.kept:
-            self.kept[-1] = self.kept[-1][0], OPEN
+            self.kept[-1] = self.kept[-1][0], OPEN_END
         else:
-            self.end()
-            self.kept.append((stretch.begin, OPEN))
+            self.end_stretch()
+            self.kept.append((stretch.begin, OPEN_END))
         self.number = stretch.number
 
-    def add(self, name: str, rows: np.ndarray, lost: int) -> None:
+    def add_rows(self, name: str, rows: np.ndarray, lost: int) -> None:
         """Count rows of a ring.
 
         Args:
@@ -131,14 +131,14 @@ class Tally:
             rows: The rows, shape (rows,).
             lost: Number of rows lost before them.
         """
-        self.count(name, len(rows), lost)
+        self.count_rows(name, len(rows), lost)
         if len(rows):
             self._newest = int(rows["tick"][-1])
             if name not in self.tasks:
                 # The recorder skips damaged messages, so counting rows would fall behind.
                 self.taken[name] = int(rows["serial"][-1])
 
-    def count(self, name: str, rows: int, lost: int) -> None:
+    def count_rows(self, name: str, rows: int, lost: int) -> None:
         """Add to the counts of a ring.
 
         Args:
@@ -150,11 +150,11 @@ class Tally:
         self.rows[name] += rows
         self.taken[name] += lost + rows
 
-    def end(self, tick: int = OPEN) -> None:
+    def end_stretch(self, tick: int = OPEN_END) -> None:
         """End the last stretch at a tick, or after its newest row if its recorder was killed."""
-        if self.kept and self.kept[-1][1] == OPEN:
+        if self.kept and self.kept[-1][1] == OPEN_END:
             first = self.kept[-1][0]
-            self.kept[-1] = first, max(first, self._newest + 1) if tick == OPEN else tick
+            self.kept[-1] = first, max(first, self._newest + 1) if tick == OPEN_END else tick
 
 
 class RunFiles(Tally):
@@ -177,15 +177,15 @@ class RunFiles(Tally):
         self._reached = dict.fromkeys(self.lost, (-1, 0))
         """Newest tick of each ring, and the number of rows lost up to that tick."""
         self._cycles = CyclesFile(folder / f"{CYCLES}{suffix}", layout, launch)
-        self._signals = signal_tables(folder / f"{SIGNALS}{suffix}", layout)
+        self._signals = create_signal_tables(folder / f"{SIGNALS}{suffix}", layout)
 
-    def begin(self, stretch: StretchHead) -> None:
+    def begin_stretch(self, stretch: StretchHead) -> None:
         """Begin a stretch. Rows between it and an earlier one were removed, not lost."""
         if stretch.number != self.number + 1:
             self._reached = {name: (stretch.begin - 1, lost) for name, lost in self.lost.items()}
-        super().begin(stretch)
+        super().begin_stretch(stretch)
 
-    def add(self, name: str, rows: np.ndarray, lost: int) -> None:
+    def add_rows(self, name: str, rows: np.ndarray, lost: int) -> None:
         """Write rows of a ring, and note the gap if rows were lost before them.
 
         Args:
@@ -193,26 +193,26 @@ class RunFiles(Tally):
             rows: The rows, shape (rows,).
             lost: Number of rows lost before them.
         """
-        super().add(name, rows, lost)
+        super().add_rows(name, rows, lost)
         if len(rows):
             tick, before = self._reached[name]
             if self.lost[name] > before:
                 self.gaps.append((name, tick + 1, int(rows["tick"][0]) - 1))
             self._reached[name] = int(rows["tick"][-1]), self.lost[name]
         if name in self.tasks:
-            self._cycles.add(name, rows)
+            self._cycles.add_records(name, rows)
         elif len(rows):
-            self._signals[name].add(rows)
+            self._signals[name].add_rows(rows)
 
     def close(self, cores: CoreRecord = UNMEASURED) -> None:
         """Finish all files, and store the steal and frequencies of the cores with the trace."""
-        self.end()
+        self.end_stretch()
         for table in self._signals.values():
             table.close()
         self._cycles.close(self.lost, cores, self.gaps, self.kept)
 
 
-def mend(folder: Path) -> bool:
+def rebuild_files(folder: Path) -> bool:
     """Build the files of a run from the spool of a killed recorder or of a flight recorder.
 
     Returns:
@@ -225,27 +225,27 @@ def mend(folder: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        _lock(file, path)
+        _lock_spool(file, path)
         if not path.is_file():
             # The recorder finished its files while this process waited for the lock.
             return False
         layout, launch = read_head(file, path)
-        files = RunFiles(folder, layout, launch, MENDED)
-        for part in read(file, folder):
-            files.take(part)
+        files = RunFiles(folder, layout, launch, REBUILT_SUFFIX)
+        for part in read_spool(file, folder):
+            files.count_part(part)
         # Keep the lock, so that another process that opens this run waits for the files.
         files.close()
         rmtree(folder / SIGNALS, ignore_errors=True)
         for name in (CYCLES, SIGNALS):
-            (folder / f"{name}{MENDED}").replace(folder / name)
-        Checksums(folder).store(*TABLES)
+            (folder / f"{name}{REBUILT_SUFFIX}").replace(folder / name)
+        Checksums(folder).store(*TABLE_PATTERNS)
         # Remove the spool first: without it, leftover stretches are not mistaken for a run.
         path.unlink()
         rmtree(folder / STRETCHES, ignore_errors=True)
     return True
 
 
-def tally(folder: Path) -> Tally | None:
+def count_spool(folder: Path) -> Tally | None:
     """Count what a flight recorder has left in a folder, without unpacking its rows.
 
     Returns:
@@ -260,20 +260,20 @@ def tally(folder: Path) -> Tally | None:
     with path.open("rb") as file:
         layout, _ = read_head(file, path)
         counted = Tally(layout)
-        for part in read(file, folder):
+        for part in read_spool(file, folder):
             if isinstance(part, Frame):
                 for counts in part.counts:
-                    counted.count(*counts)
+                    counted.count_rows(*counts)
             else:
-                counted.take(part)
-    counted.end()
+                counted.count_part(part)
+    counted.end_stretch()
     return counted
 
 
-def _lock(file: IO[bytes], path: Path) -> None:
+def _lock_spool(file: IO[bytes], path: Path) -> None:
     """Lock a spool, waiting for a recorder that is finishing without its launcher."""
     deadline = time.monotonic() + FINISH_S
-    while not locked(file):
+    while not try_lock(file):
         if _is_running(*read_head(file, path)):
             raise Failure(f"{path}: another recorder is still writing it")
         if time.monotonic() > deadline:

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
-from rack.backplane.message import text_of
+from rack.backplane.message import decode_text
 from rack.tools.console.answer import Failure
-from rack.tools.recording.parquet import Column, columns_of
+from rack.tools.recording.parquet import Column, list_columns
 
-NAME = re.compile(r"([\w.]+)((?:\[\d{1,9}\])*)")
-CONDITION = re.compile(r"\s*(\S+?)\s*(==|!=|<=|>=|<|>)\s*(\S+)\s*")
+NAME_PATTERN = re.compile(r"([\w.]+)((?:\[\d{1,9}\])*)")
+CONDITION_PATTERN = re.compile(r"\s*(\S+?)\s*(==|!=|<=|>=|<|>)\s*(\S+)\s*")
 COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
     "==": operator.eq,
     "!=": operator.ne,
@@ -31,7 +31,7 @@ COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
     "<": operator.lt,
     ">": operator.gt,
 }
-NEAREST = 3
+MAX_SUGGESTIONS = 3
 """Number of similar names that are suggested for an unknown name."""
 
 
@@ -46,22 +46,22 @@ class Signal(Column):
     index: tuple[int, ...] = ()
 
     @classmethod
-    def all(cls, boxes: Sequence[MailboxSpec]) -> dict[str, Signal]:
+    def build_by_name(cls, boxes: Sequence[MailboxSpec]) -> dict[str, Signal]:
         """Return a signal for every field of these mailboxes, by name."""
-        return {column.name: cls(**vars(column)) for box in boxes for column in columns_of(box)}
+        return {column.name: cls(**vars(column)) for box in boxes for column in list_columns(box)}
 
     @classmethod
-    def of(cls, text: str, boxes: Sequence[MailboxSpec]) -> Signal:
+    def parse(cls, text: str, boxes: Sequence[MailboxSpec]) -> Signal:
         """Parse the name of a signal.
 
         Raises:
             Failure: The name is unknown, or the index is out of range. The message contains the
                 nearest names or the valid indices.
         """
-        known = cls.all(boxes)
-        match = NAME.fullmatch(text)
+        known = cls.build_by_name(boxes)
+        match = NAME_PATTERN.fullmatch(text)
         if match is None or match[1] not in known:
-            raise _unknown("signal", text, known, boxes)
+            raise _build_failure("signal", text, known, boxes)
         whole = known[match[1]]
         index = tuple(int(number) for number in re.findall(r"\d+", match[2]))
         shape = whole.shape[: len(index)]
@@ -84,7 +84,7 @@ class Signal(Column):
         return "number" if np.dtype(self.spec.kind).kind == "f" else "integer"
 
     @property
-    def head(self) -> str:
+    def heading(self) -> str:
         """Name and unit, as the heading of a column."""
         return f"{self.name}, {self.unit}".removesuffix(", ")
 
@@ -93,63 +93,65 @@ class Signal(Column):
         """True if the signal is a single number."""
         return len(self.index) == len(self.shape) and not self.is_text
 
-    def values(self, messages: np.ndarray) -> np.ndarray:
+    def extract_values(self, messages: np.ndarray) -> np.ndarray:
         """Return the signal in each of these messages, as a view.
 
         Its shape is (messages, *shape of what the index selects).
         """
-        return self.part(super().values(messages))
+        return self.select_part(super().extract_values(messages))
 
-    def part(self, values: np.ndarray) -> np.ndarray:
+    def select_part(self, values: np.ndarray) -> np.ndarray:
         """Select the signal from values of its whole field, shape (messages, *field shape)."""
         place: Any = (slice(None), *self.index)
         selected: np.ndarray = values[place]
         return selected
 
-    def in_message(self, message: np.ndarray) -> Any:
+    def read_message(self, message: np.ndarray) -> Any:
         """Return the signal in one message: a number, an array, text, or the name of a state."""
-        value = self.named(self.values(message[None]))[0]
-        return text_of(value) if isinstance(value, bytes) else value
+        value = self.replace_numbers(self.extract_values(message[None]))[0]
+        return decode_text(value) if isinstance(value, bytes) else value
 
-    def named(self, values: np.ndarray) -> np.ndarray:
+    def replace_numbers(self, values: np.ndarray) -> np.ndarray:
         """Replace numbers that stand for names, such as states, by these names."""
         if not self.spec.values:
             return values
         names = {number: name for name, number in self.spec.values}
         return np.asarray(np.vectorize(lambda number: names.get(number, number), "O")(values))
 
-    def plain(self, messages: np.ndarray) -> list[Any]:
+    def extract_plain(self, messages: np.ndarray) -> list[Any]:
         """Return the signal in each of these messages as users read it.
 
         Values are numbers, names of states, text, or nested lists of these; None if not finite.
         """
-        values = self.values(messages)
+        values = self.extract_values(messages)
         if values.dtype.kind == "S":
-            values = np.vectorize(text_of, "O")(values)
+            values = np.vectorize(decode_text, "O")(values)
         elif self.spec.values:
-            values = self.named(values)
+            values = self.replace_numbers(values)
         elif values.dtype.kind == "f" and not np.isfinite(values).all():
             values = np.where(np.isfinite(values), values, np.array(None))
         plain_values: list[Any] = values.tolist()
         return plain_values
 
 
-def signals_of(box: MailboxSpec) -> list[Signal]:
+def list_signals(box: MailboxSpec) -> list[Signal]:
     """Return a signal for each field of a mailbox, in the order of the fields."""
-    return [*Signal.all([box]).values()]
+    return [*Signal.build_by_name([box]).values()]
 
 
-def mailbox_of(name: str, boxes: Sequence[MailboxSpec]) -> MailboxSpec:
+def find_mailbox(name: str, boxes: Sequence[MailboxSpec]) -> MailboxSpec:
     """Find a mailbox by its name. Raises `Failure` with the nearest names."""
     known = {box.name: box for box in boxes}
     if name not in known:
-        raise _unknown("mailbox", name, known, boxes)
+        raise _build_failure("mailbox", name, known, boxes)
     return known[name]
 
 
-def _unknown(what: str, name: str, known: Collection[str], boxes: Sequence[MailboxSpec]) -> Failure:
+def _build_failure(
+    what: str, name: str, known: Collection[str], boxes: Sequence[MailboxSpec]
+) -> Failure:
     """Return a `Failure` for an unknown name, with the nearest names or else all mailboxes."""
-    near = get_close_matches(name.partition("[")[0], known, NEAREST)
+    near = get_close_matches(name.partition("[")[0], known, MAX_SUGGESTIONS)
     offered = "nearest" if near else "mailboxes"
     names = near or [box.name for box in boxes]
     return Failure(f"{name}: no such {what}; {offered}: {', '.join(names)}", 2)
@@ -170,13 +172,13 @@ class Trigger:
     number: float
 
     @classmethod
-    def of(cls, text: str, boxes: Sequence[MailboxSpec]) -> Trigger:
+    def parse(cls, text: str, boxes: Sequence[MailboxSpec]) -> Trigger:
         """Parse a condition. Raises `Failure`."""
-        match = CONDITION.fullmatch(text)
+        match = CONDITION_PATTERN.fullmatch(text)
         if match is None:
             example = "servo.status.position[2] > 1.2"
             raise Failure(f'"{text}" is not a condition; write one like "{example}"', 2)
-        signal = Signal.of(match[1], boxes)
+        signal = Signal.parse(match[1], boxes)
         if not signal.is_number:
             shape = list(signal.shape[len(signal.index) :])
             what = f"numbers of shape {shape}" if shape else "text"
@@ -191,6 +193,6 @@ class Trigger:
             raise Failure(f'"{text}": nothing can be compared with nan', 2)
         return cls(signal, match[2], number)
 
-    def holds(self, messages: np.ndarray) -> np.ndarray:
+    def evaluate_messages(self, messages: np.ndarray) -> np.ndarray:
         """Return, for each of these messages, whether the condition is true, shape (messages,)."""
-        return np.asarray(COMPARISONS[self.sign](self.signal.values(messages), self.number))
+        return np.asarray(COMPARISONS[self.sign](self.signal.extract_values(messages), self.number))

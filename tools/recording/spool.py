@@ -30,17 +30,17 @@ import numpy as np
 import pyarrow as pa
 
 from rack.backplane.layout import Layout
-from rack.backplane.mailbox.history import MailboxRing, row_dtype
+from rack.backplane.mailbox.history import MailboxRing, build_row_dtype
 from rack.backplane.ring import Ring
-from rack.backplane.segment import Launch, Segment, layout_of
-from rack.backplane.trace import RECORD, trace_ring
+from rack.backplane.segment import Launch, Segment, restore_layout
+from rack.backplane.trace import RECORD, open_trace_ring
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import (
     Checksums,
     check_file,
-    checked_line,
+    format_checked_line,
     is_cut_off,
-    read_line,
+    parse_checked_line,
 )
 from rack.tools.recording.file_names import CODE, CONFIG, ORIGIN, SPOOL
 
@@ -51,7 +51,7 @@ SIGKILL of all processes loses what boards wrote during this time, between two d
 one or two passes of the recorder, which last longer on a busy machine.
 """
 STRETCHES = "stretches"
-OPEN = -1
+OPEN_END = -1
 """End of a stretch that is still being written, or whose recorder was killed."""
 
 
@@ -73,7 +73,7 @@ class Frame(NamedTuple):
     counts: list[tuple[str, int, int]]
     data: str
 
-    def unpack(self, dtypes: Mapping[str, np.dtype]) -> Iterator[tuple[str, np.ndarray, int]]:
+    def unpack_rows(self, dtypes: Mapping[str, np.dtype]) -> Iterator[tuple[str, np.ndarray, int]]:
         """Yield the blocks of rows.
 
         Args:
@@ -117,7 +117,7 @@ class StretchEnd(NamedTuple):
 
 
 Part = StretchHead | Frame | StretchEnd
-KINDS = {kind.__name__: kind for kind in (SpoolHead, StretchHead, Frame, StretchEnd)}
+PART_TYPES = {kind.__name__: kind for kind in (SpoolHead, StretchHead, Frame, StretchEnd)}
 
 
 class Spool:
@@ -136,12 +136,12 @@ class Spool:
         self._waiting: list[tuple[str, np.ndarray, int]] = []
         self._flush_at = 0.0
         try:
-            if not locked(self._file):
+            if not try_lock(self._file):
                 raise Failure(f"{self.path}: another recorder is still writing it")
             if not self.path.stat().st_size:
                 # The launcher has written these files before it starts the recorder.
                 Checksums(folder).store(CONFIG, ORIGIN, CODE)
-                _write(self._file, SpoolHead(asdict(layout), launch))
+                _write_part(self._file, SpoolHead(asdict(layout), launch))
             with self.path.open("rb") as left:
                 recorded_head = read_head(left, self.path)
             if recorded_head != (layout, launch):
@@ -153,7 +153,7 @@ class Spool:
             self.close()
             raise
 
-    def resume(self) -> Iterator[Part]:
+    def read_rest(self) -> Iterator[Part]:
         """Yield the parts that another recorder left, then cut off a damaged last line."""
         with self.path.open("rb") as left:
             read_head(left, self.path)
@@ -164,9 +164,9 @@ class Spool:
         self._file.truncate(whole)
         # The head of a stretch contains all counts before it. The newest head may be cut off, so
         # read the last two stretches.
-        yield from _read_stretches(stretch_files(self._folder)[-2:])
+        yield from _read_stretches(list_stretch_files(self._folder)[-2:])
 
-    def divert(self, stretch: StretchHead, end: int) -> Path:
+    def begin_stretch(self, stretch: StretchHead, end: int) -> Path:
         """Finish the current stretch at a tick, and write into a new stretch from now on.
 
         Args:
@@ -181,17 +181,17 @@ class Spool:
         path = self._folder / STRETCHES / f"{stretch.number:08}.spool"
         path.parent.mkdir(exist_ok=True)
         self._out = path.open("wb", buffering=0)
-        _write(self._out, stretch)
+        _write_part(self._out, stretch)
         return path
 
     def _finish_stretch(self, end: int) -> None:
         """Close the file of the current stretch, if any, and mark its end if the end is known."""
         if self._out is not self._file:
-            if end != OPEN:
-                _write(self._out, StretchEnd(end))
+            if end != OPEN_END:
+                _write_part(self._out, StretchEnd(end))
             self._out.close()
 
-    def add(self, ring: str, rows: np.ndarray, lost: int) -> None:
+    def add_rows(self, ring: str, rows: np.ndarray, lost: int) -> None:
         """Queue rows of a ring for the next flush.
 
         Args:
@@ -222,7 +222,7 @@ class Spool:
             data = b"".join(rows.tobytes() for _, rows, _ in self._waiting)
             packed = b64encode(pa.compress(data, codec="zstd", asbytes=True)).decode()
             self._waiting = []
-            _write(self._out, Frame(counts, packed))
+            _write_part(self._out, Frame(counts, packed))
         return True
 
     def remove(self) -> None:
@@ -230,15 +230,15 @@ class Spool:
         self.path.unlink()
         self.close()
 
-    def close(self, end: int = OPEN) -> None:
+    def close(self, end: int = OPEN_END) -> None:
         """Close the spool so that another recorder can continue it. Its stretch ends at `end`."""
         self._finish_stretch(end)
         self._file.close()
 
 
-def _write(file: IO[bytes], part: SpoolHead | Part) -> None:
+def _write_part(file: IO[bytes], part: SpoolHead | Part) -> None:
     """Write a part as a line to an unbuffered file. Raises `OSError` if the disk is full."""
-    line = checked_line({type(part).__name__: part}).encode()
+    line = format_checked_line({type(part).__name__: part}).encode()
     while line:
         # An unbuffered write may accept only part of the data.
         line = line[file.write(line) :]
@@ -255,12 +255,12 @@ def _read_parts(file: IO[bytes], path: Path) -> Iterator[Any]:
         if not is_whole and is_cut_off(line):
             return
         try:
-            ((kind, fields),) = read_line(line).items()
+            ((kind, fields),) = parse_checked_line(line).items()
         except ValueError as error:
             where = f"damaged, or of an earlier version, before byte {file.tell()}"
             raise Failure(f"{path}: {where}: {error}", 2) from None
         if is_whole:
-            yield KINDS[kind](*fields)
+            yield PART_TYPES[kind](*fields)
 
 
 def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
@@ -269,13 +269,13 @@ def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
     head = next(_read_parts(file, path), None)
     if head is None:
         raise Failure(f"{path}: it ends before its first row", 2)
-    return layout_of(head.layout), Launch(*head.launch)
+    return restore_layout(head.layout), Launch(*head.launch)
 
 
-def read(file: IO[bytes], folder: Path) -> Iterator[Part]:
+def read_spool(file: IO[bytes], folder: Path) -> Iterator[Part]:
     """Yield the parts of a spool that is open after its head, then the parts of its stretches."""
     yield from _read_parts(file, folder / SPOOL)
-    yield from _read_stretches(stretch_files(folder))
+    yield from _read_stretches(list_stretch_files(folder))
 
 
 def _read_stretches(paths: Iterable[Path]) -> Iterator[Part]:
@@ -286,26 +286,26 @@ def _read_stretches(paths: Iterable[Path]) -> Iterator[Part]:
             yield from _read_parts(file, path)
 
 
-def stretch_files(folder: Path) -> list[Path]:
+def list_stretch_files(folder: Path) -> list[Path]:
     """List the files of the stretches in a folder, oldest first."""
     return sorted((folder / STRETCHES).glob("*.spool"))
 
 
-def rings(segment: Segment) -> dict[str, Ring]:
+def open_rings(segment: Segment) -> dict[str, Ring]:
     """Return every ring of a rack: traces by task, then messages by mailbox."""
-    traces = {task.name: trace_ring(segment, task.name) for task in segment.layout.tasks}
+    traces = {task.name: open_trace_ring(segment, task.name) for task in segment.layout.tasks}
     return traces | {
         mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in segment.layout.timed
     }
 
 
-def ring_dtypes(layout: Layout) -> dict[str, np.dtype]:
+def list_ring_dtypes(layout: Layout) -> dict[str, np.dtype]:
     """Return the row type of every ring of a rack: traces by task, then messages by mailbox."""
     traces = {task.name: RECORD for task in layout.tasks}
-    return traces | {mailbox.name: row_dtype(mailbox) for mailbox in layout.timed}
+    return traces | {mailbox.name: build_row_dtype(mailbox) for mailbox in layout.timed}
 
 
-def locked(file: IO[bytes]) -> bool:
+def try_lock(file: IO[bytes]) -> bool:
     """Try to lock a file. Returns False if another process has locked it."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

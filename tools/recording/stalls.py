@@ -16,18 +16,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.clock.driver import LATE_PART
+from rack.backplane.clock.driver import LATE_DIVISOR
 from rack.backplane.trace import Flag
-from rack.boards.config.layout import obtained_core
-from rack.boards.timing.trace_times import STAMPS, Occupation, is_missed, skipped
+from rack.boards.config.layout import find_core
+from rack.boards.timing.trace_times import STAMPS, Occupation, count_skipped, find_missed
 from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
 
 QUOTA_NS = 100_000_000
 """Period of CPU quotas: the default of Linux (cpu.max), so of libvirt, Docker and Kubernetes."""
-LEAST_STALLS = 5
-CLUSTERED = 0.75
-WINDOW = 0.02
+MIN_STALLS = 5
+CLUSTERED_PART = 0.75
+WINDOW_PART = 0.02
 """Thresholds of the quota test: number of stalls, their share in one window, and its width.
 
 The width is a fraction of the quota period. If phases have nothing to do with the period, four of
@@ -86,7 +86,7 @@ class Stalls:
     quota: Quota | None
 
 
-def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
+def analyze_stalls(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
     """Find the absences of cores in a run, and the cycles lost to them.
 
     While the clock's core is away without steal, the whole machine may be, so that time counts as
@@ -96,11 +96,11 @@ def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
         The summary, and the times at which each core was away.
     """
     clock = recording.rack_config.clock
-    clock_core = obtained_core(clock.core)
-    cycles = _Cycles(recording)
+    clock_core = find_core(clock.core)
+    cycles = _CycleTable(recording)
     # In lockstep no cycle has a due time.
     is_shown = clock.mode == "realtime" and clock.priority > 0 and cycles.is_urgent.any()
-    late_clock = cycles.late_clock(recording.events if is_shown else [])
+    late_clock = cycles.find_clock_absences(recording.events if is_shown else [])
     without_clock = Occupation(*late_clock)
     spans = np.array(recording.cores.stolen or (), np.int64).reshape(-1, 4)
     absent_spans = {}
@@ -110,27 +110,27 @@ def stalls_of(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
         on_core = cycles.core == core
         is_home = core == clock_core
         stolen = Occupation(*spans[spans[:, 2] == core, :2].T)
-        since, until = late_clock if is_home else cycles.unstamped(on_core, is_shown)
+        since, until = late_clock if is_home else cycles.find_idle_spans(on_core, is_shown)
         # Without the clock no task is released, which explains idle time on the other cores.
-        explained = stolen if is_home else Occupation.union([stolen, without_clock])
-        is_away = until - since > cycles.grid_ns // LATE_PART
-        is_away &= explained.within(since, until) == 0
+        explained = stolen if is_home else Occupation.merge([stolen, without_clock])
+        is_away = until - since > cycles.grid_ns // LATE_DIVISOR
+        is_away &= explained.compute_overlap(since, until) == 0
         unstolen = Occupation(since[is_away], until[is_away])
         if len(durations_ns := unstolen.ends - unstolen.starts):
-            lost = cycles.lost_during(unstolen, on_core | is_home)
+            lost = cycles.count_lost_during(unstolen, on_core | is_home)
             absences.append(Absence(core, len(durations_ns), int(durations_ns.max()) / 1e6, lost))
-        during_steal += cycles.lost_during(stolen, on_core)
-        absent_spans[core] = Occupation.union([stolen, unstolen, without_clock])
+        during_steal += cycles.count_lost_during(stolen, on_core)
+        absent_spans[core] = Occupation.merge([stolen, unstolen, without_clock])
     levels_ns = {
         task.name: task.every * cycles.grid_ns
         for task in recording.layout.tasks
         if task.role == "executor"
     }
-    quota = _quota(cycles.ends(), levels_ns)
+    quota = _detect_quota(cycles.find_stall_ends(), levels_ns)
     return Stalls(int(cycles.lost.sum()), during_steal, absences, quota), absent_spans
 
 
-class _Cycles:
+class _CycleTable:
     """All cycles of a run, task by task. All arrays have shape (n,).
 
     Attributes:
@@ -145,30 +145,30 @@ class _Cycles:
 
     def __init__(self, recording: Recording) -> None:
         tasks = recording.layout.tasks
-        traces = [recording.trace(task.name) for task in tasks]
-        places = [(*recording.place(task), task.every) for task in tasks]
+        traces = [recording.read_trace(task.name) for task in tasks]
+        places = [(*recording.find_core_and_priority(task), task.every) for task in tasks]
         self.rows = rows = np.concatenate(traces)
         self.core, priority, every = np.repeat(places, [len(trace) for trace in traces], axis=0).T
         self.is_urgent = priority > 0
         self.grid_ns = recording.rack_config.tick_ns
-        self.due_ns = rows["release_ns"] - skipped(rows) * every * self.grid_ns
+        self.due_ns = rows["release_ns"] - count_skipped(rows) * every * self.grid_ns
         # The cause of skipped releases was over when the next cycle began. The cause of a late
         # cycle may have occurred during that cycle.
-        self.resumed_ns = np.where(is_missed(rows), rows["end_ns"], rows["start_ns"])
-        self.lost = skipped(rows) + is_missed(rows)
+        self.resumed_ns = np.where(find_missed(rows), rows["end_ns"], rows["start_ns"])
+        self.lost = count_skipped(rows) + find_missed(rows)
 
-    def lost_during(self, occupied: Occupation, among: np.ndarray) -> int:
+    def count_lost_during(self, occupied: Occupation, among: np.ndarray) -> int:
         """Count the cycles among `among` that were lost while a core was occupied."""
-        is_hit = occupied.within(self.due_ns, self.resumed_ns) > 0
+        is_hit = occupied.compute_overlap(self.due_ns, self.resumed_ns) > 0
         return int(self.lost[among & is_hit].sum())
 
-    def ends(self) -> np.ndarray:
+    def find_stall_ends(self) -> np.ndarray:
         """Return the end times of the spans in which executors lost cycles."""
         # Plans are left out: their time slice may be longer than a stall.
         counted = (self.lost > 0) & (self.rows["flags"] & Flag.PLANNED == 0)
         return Occupation(self.due_ns[counted], self.resumed_ns[counted]).ends
 
-    def late_clock(self, events: list[Document]) -> tuple[np.ndarray, np.ndarray]:
+    def find_clock_absences(self, events: list[Document]) -> tuple[np.ndarray, np.ndarray]:
         """Return from when to when the clock board was away, for each late wake-up."""
         late = [
             (e["since"], e["value"])
@@ -181,7 +181,7 @@ class _Cycles:
         due_ns = start_ns + since * self.grid_ns
         return due_ns, due_ns + late_ns
 
-    def unstamped(self, on_core: np.ndarray, is_shown: bool) -> tuple[np.ndarray, np.ndarray]:
+    def find_idle_spans(self, on_core: np.ndarray, is_shown: bool) -> tuple[np.ndarray, np.ndarray]:
         """Return the span before each cycle of a core in which no task ran although one was due.
 
         Args:
@@ -201,7 +201,7 @@ class _Cycles:
         return np.maximum(due_ns, stamps[np.searchsorted(stamps, starts) - 1]), starts
 
 
-def _quota(ends: np.ndarray, periods_ns: dict[str, int]) -> Quota | None:
+def _detect_quota(ends: np.ndarray, periods_ns: dict[str, int]) -> Quota | None:
     """Return the quota that stalls point to, or None if their phases look random.
 
     Args:
@@ -209,21 +209,21 @@ def _quota(ends: np.ndarray, periods_ns: dict[str, int]) -> Quota | None:
             which ends when the last of them runs again.
         periods_ns: Period of each level.
     """
-    if len(ends) < LEAST_STALLS or (
-        at_one_phase := _at_one_phase(ends, QUOTA_NS)
-    ) < CLUSTERED * len(ends):
+    if len(ends) < MIN_STALLS or (
+        at_one_phase := _count_at_one_phase(ends, QUOTA_NS)
+    ) < CLUSTERED_PART * len(ends):
         return None
     levels = [
         name
         for name, ns in periods_ns.items()
-        if not ns % QUOTA_NS and _at_one_phase(ends, ns) >= at_one_phase
+        if not ns % QUOTA_NS and _count_at_one_phase(ends, ns) >= at_one_phase
     ]
     return Quota(at_one_phase, len(ends), levels)
 
 
-def _at_one_phase(ends: np.ndarray, period_ns: int) -> int:
+def _count_at_one_phase(ends: np.ndarray, period_ns: int) -> int:
     """Return the largest number of times that fall within one window of a period."""
     phases = np.sort(ends % period_ns)
     around = np.append(phases, phases + period_ns)
-    following = np.searchsorted(around, phases + WINDOW * QUOTA_NS, side="right")
+    following = np.searchsorted(around, phases + WINDOW_PART * QUOTA_NS, side="right")
     return int((following - np.arange(len(phases))).max())

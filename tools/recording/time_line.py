@@ -20,10 +20,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rack.levels.peer import DRIFT_PPM, PeerPresence, Presence, peer_port
+from rack.levels.peer import DRIFT_PPM, PeerPresence, Presence, format_peer_port
 from rack.tools.console.answer import Failure
-from rack.tools.recording.divergence import unlike_messages
-from rack.tools.recording.origin import continued_at
+from rack.tools.recording.divergence import list_divergent_messages
+from rack.tools.recording.origin import find_continuation_tick
 from rack.tools.recording.recording import Recording
 
 Ints = NDArray[np.int64]
@@ -70,7 +70,7 @@ class RackGrid:
         )
         """The first and the last one recorded."""
 
-    def stamp_ns(self, ticks: Ints, within_ns: Ints | int = 0) -> Ints:
+    def convert_ticks(self, ticks: Ints, within_ns: Ints | int = 0) -> Ints:
         """Convert ticks to CLOCK_MONOTONIC time stamps.
 
         Args:
@@ -80,14 +80,14 @@ class RackGrid:
         within: Ints = np.asarray(within_ns) * self.period_ns // self.clock_ns
         return self.epoch_ns + ticks * self.period_ns + within
 
-    def time_ns(self, stamps_ns: Ints) -> Ints:
+    def convert_stamps(self, stamps_ns: Ints) -> Ints:
         """Convert CLOCK_MONOTONIC time stamps to simulated time."""
         whole, rest = np.divmod(stamps_ns - self.epoch_ns, self.period_ns)
         return np.asarray(whole * self.clock_ns + rest * self.clock_ns // self.period_ns)
 
 
 @dataclass(frozen=True)
-class Shift:
+class ClockOffset:
     """Offset between the CLOCK_MONOTONIC of two machines.
 
     Attributes:
@@ -100,19 +100,19 @@ class Shift:
     by_ns: Ints
     uncertainty_ns: int
 
-    def to_other(self, stamps_ns: Ints) -> Ints:
+    def convert_stamps(self, stamps_ns: Ints) -> Ints:
         """Convert time stamps of the first machine to the clock of the second machine."""
         # Interpolate relative to the first value, because floats have only 53 bits.
         first = self.by_ns[0]
         by_ns = np.interp(stamps_ns - self.at_ns[0], self.at_ns - self.at_ns[0], self.by_ns - first)
         return np.asarray(stamps_ns - first - np.rint(by_ns).astype(np.int64))
 
-    def reversed(self) -> Shift:
+    def swap_machines(self) -> ClockOffset:
         """Return the offset with the two machines exchanged."""
-        return Shift(self.at_ns - self.by_ns, -self.by_ns, self.uncertainty_ns)
+        return ClockOffset(self.at_ns - self.by_ns, -self.by_ns, self.uncertainty_ns)
 
 
-class Mark(NamedTuple):
+class TimeLineNote(NamedTuple):
     """A note for the user at a tick of the time line."""
 
     tick: int
@@ -134,14 +134,14 @@ class RackPlace:
 
     own: RackGrid
     line: RackGrid
-    shifts: tuple[Shift, ...] = ()
+    offsets: tuple[ClockOffset, ...] = ()
     by_ticks: bool = False
-    marks: tuple[Mark, ...] = ()
+    marks: tuple[TimeLineNote, ...] = ()
 
     @property
     def uncertainty_ns(self) -> int:
         """Largest error of its time stamps after conversion to the line's machine."""
-        return sum(shift.uncertainty_ns for shift in self.shifts)
+        return sum(shift.uncertainty_ns for shift in self.offsets)
 
     @property
     def note(self) -> str:
@@ -149,36 +149,40 @@ class RackPlace:
         text = f"rack '{self.own.rack}' is on the time line of '{self.line.rack}'"
         if self.own.is_lockstep:
             return f"{text}: both ran in lockstep, tick by tick"
-        begin = self.line.time_ns(self.stamps_ns(np.array([self.own.epoch_ns])))[0] * 1e-9
+        begin = (
+            self.line.convert_stamps(self.convert_stamps(np.array([self.own.epoch_ns])))[0] * 1e-9
+        )
         uncertain_ms = self.uncertainty_ns * self.line.clock_ns / self.line.period_ns * 1e-6
         return (
             f"{text}: it begins at {begin:+.6f} s; its times are uncertain by {uncertain_ms:.3f} ms"
         )
 
-    def stamps_ns(self, stamps_ns: Ints) -> Ints:
+    def convert_stamps(self, stamps_ns: Ints) -> Ints:
         """Convert time stamps of the rack's machine to the clock of the line's machine."""
-        for shift in self.shifts:
-            stamps_ns = shift.to_other(stamps_ns)
+        for shift in self.offsets:
+            stamps_ns = shift.convert_stamps(stamps_ns)
         return stamps_ns
 
-    def times_ns(self, ticks: Ints, within_ns: Ints | int) -> Ints:
+    def convert_ticks(self, ticks: Ints, within_ns: Ints | int) -> Ints:
         """Convert ticks of the rack to simulated time of the line.
 
         Args:
             ticks: The ticks, shape (n,).
             within_ns: Simulated time of the rack after each tick.
         """
-        if not self.shifts:
+        if not self.offsets:
             return ticks * self.own.clock_ns + within_ns
-        return self.line.time_ns(self.stamps_ns(self.own.stamp_ns(ticks, within_ns)))
+        return self.line.convert_stamps(
+            self.convert_stamps(self.own.convert_ticks(ticks, within_ns))
+        )
 
-    def wall_ns(self, stamps_ns: Ints) -> Ints:
+    def convert_to_wall_clock(self, stamps_ns: Ints) -> Ints:
         """Convert time stamps to the line's wall clock, or to its own if it has no offsets."""
-        launch = self.line.launch if self.shifts else self.own.launch
-        return self.stamps_ns(stamps_ns) + launch.wall_offset_ns
+        launch = self.line.launch if self.offsets else self.own.launch
+        return self.convert_stamps(stamps_ns) + launch.wall_offset_ns
 
 
-def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
+def place_on_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
     """Place the racks of these recordings on the time line of the first one.
 
     Raises:
@@ -186,14 +190,14 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
     """
     grids = [RackGrid(recording) for recording in recordings]
     for index, grid in enumerate(grids):
-        _check_company(grid, grids[:index])
+        _check_compatible(grid, grids[:index])
     placed = {0: RackPlace(grids[0], grids[0])}
     while len(placed) < len(grids):
         connections = (
             (near, far, offsets)
             for near in placed
             for far in range(len(grids))
-            if far not in placed and (offsets := _way(grids[far], grids[near])) is not None
+            if far not in placed and (offsets := _find_offsets(grids[far], grids[near])) is not None
         )
         if (connection := next(connections, None)) is None:
             unplaced = next(grid for index, grid in enumerate(grids) if index not in placed)
@@ -205,12 +209,12 @@ def on_one_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
                 2,
             )
         near, far, shifts = connection
-        place = RackPlace(grids[far], grids[0], (*shifts, *placed[near].shifts))
-        placed[far] = replace(place, marks=(Mark(0, place.note),))
+        place = RackPlace(grids[far], grids[0], (*shifts, *placed[near].offsets))
+        placed[far] = replace(place, marks=(TimeLineNote(0, place.note),))
     return [placed[index] for index in range(len(grids))]
 
 
-def side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
+def place_side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
     """Align two runs of the same rack tick by tick, for example a branch and its origin.
 
     Each run gets the name of its folder.
@@ -221,7 +225,7 @@ def side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
     folders = [recording.folder.resolve() for recording in recordings]
     if len(recordings) != 2 or folders[0] == folders[1]:
         raise Failure("--against needs two runs of the same rack, in different folders", 2)
-    differences = unlike_messages(*recordings)
+    differences = list_divergent_messages(*recordings)
     other = recordings[1]
     grids = [RackGrid(recording) for recording in recordings]
     names = [folder.name for folder in folders]
@@ -230,12 +234,14 @@ def side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
     for grid, name in zip(grids, names, strict=True):
         grid.rack = name
     marks = []
-    if (tick := continued_at(other)) is not None:
-        marks.append(Mark(tick, f"{names[1]} branches off"))
+    if (tick := find_continuation_tick(other)) is not None:
+        marks.append(TimeLineNote(tick, f"{names[1]} branches off"))
     if differences:
         first = differences[0]
-        marks.append(Mark(first.tick, f"{names[1]} differs from {names[0]}: {first.mailbox}"))
-    marks = marks or [Mark(0, f"all that {names[0]} and {names[1]} both wrote is equal")]
+        marks.append(
+            TimeLineNote(first.tick, f"{names[1]} differs from {names[0]}: {first.mailbox}")
+        )
+    marks = marks or [TimeLineNote(0, f"all that {names[0]} and {names[1]} both wrote is equal")]
     line = grids[0]
     return [
         RackPlace(line, line, by_ticks=True),
@@ -243,7 +249,7 @@ def side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
     ]
 
 
-def _check_company(grid: RackGrid, others: Sequence[RackGrid]) -> None:
+def _check_compatible(grid: RackGrid, others: Sequence[RackGrid]) -> None:
     """Raise `Failure` if a rack cannot share a time line with one of the others."""
     for other in others:
         if other.rack == grid.rack:
@@ -261,7 +267,7 @@ def _check_company(grid: RackGrid, others: Sequence[RackGrid]) -> None:
             raise Failure(f"{where}: they have no time in common", 2)
 
 
-def _way(grid: RackGrid, other: RackGrid) -> tuple[Shift, ...] | None:
+def _find_offsets(grid: RackGrid, other: RackGrid) -> tuple[ClockOffset, ...] | None:
     """Return the clock offset between two racks, or None if neither has met the other.
 
     In lockstep no offset is needed, so the result is empty.
@@ -271,45 +277,45 @@ def _way(grid: RackGrid, other: RackGrid) -> tuple[Shift, ...] | None:
             _has_met(observer, observed) for observer, observed in ((grid, other), (other, grid))
         ]
         return () if any(have_met) else None
-    measured = _sighting(other, grid), _sighting(grid, other)
+    measured = _read_offset(other, grid), _read_offset(grid, other)
     offsets = [
         shift
-        for shift in (measured[0], measured[1] and measured[1].reversed())
+        for shift in (measured[0], measured[1] and measured[1].swap_machines())
         if shift is not None
     ]
     return (min(offsets, key=lambda shift: shift.uncertainty_ns),) if offsets else None
 
 
-def _mailbox(observer: RackGrid, peer: RackGrid) -> str | None:
+def _find_peer_mailbox(observer: RackGrid, peer: RackGrid) -> str | None:
     """Return the mailbox in which a rack recorded the presence of a peer, or None."""
     boxes = observer.recording.layout.mailboxes
     names = (
         box.name
         for box in boxes
         if box.message == PeerPresence.message_type.name
-        and box.name.endswith(f".{peer_port(peer.rack)}")
+        and box.name.endswith(f".{format_peer_port(peer.rack)}")
     )
     return next((name for name in names if name in observer.recording.mailboxes), None)
 
 
-def _sighting(observer: RackGrid, peer: RackGrid) -> Shift | None:
+def _read_offset(observer: RackGrid, peer: RackGrid) -> ClockOffset | None:
     """Return the offset of a peer's clock as recorded by a rack, or None if it never measured it.
 
     Raises:
         Failure: The rack has met only other launches of the peer.
     """
-    if (mailbox := _mailbox(observer, peer)) is None:
+    if (mailbox := _find_peer_mailbox(observer, peer)) is None:
         return None
-    read = observer.recording.signal
+    read = observer.recording.read_signal
     uncertainty = read(mailbox, "uncertainty")
     is_measured = uncertainty >= 0.0
     if not is_measured.any():
         return None
     ticks = read(mailbox, "tick")[is_measured]
     by_ns = np.rint(read(mailbox, "offset")[is_measured] * 1e9).astype(np.int64)
-    at_ns = observer.stamp_ns(ticks) + by_ns
+    at_ns = observer.convert_ticks(ticks) + by_ns
     seen_ns = np.rint(ticks * observer.clock_ns + read(mailbox, "ahead")[is_measured] * 1e9)
-    disagreement_ns = peer.time_ns(at_ns) - seen_ns
+    disagreement_ns = peer.convert_stamps(at_ns) - seen_ns
     # A peer that had not started yet cannot be matched to a launch.
     is_this = (np.abs(disagreement_ns) <= TOLERANCE_NS) & (seen_ns > 0)
     if not is_this.any():
@@ -326,10 +332,10 @@ def _sighting(observer: RackGrid, peer: RackGrid) -> Shift | None:
     at_ns = at_ns[order]
     by_ns = by_ns[order]
     # The clocks may drift between two comparisons, before the first and after the last.
-    ends = peer.stamp_ns(np.array(peer.ticks))
+    ends = peer.convert_ticks(np.array(peer.ticks))
     longest_gap_ns = int(np.diff(np.sort(np.concatenate((at_ns, ends)))).max())
     worst_ns = round(float(uncertainty[is_measured][is_this].max()) * 1e9)
-    return Shift(at_ns, by_ns, worst_ns + longest_gap_ns * DRIFT_PPM // 1_000_000)
+    return ClockOffset(at_ns, by_ns, worst_ns + longest_gap_ns * DRIFT_PPM // 1_000_000)
 
 
 def _has_met(observer: RackGrid, peer: RackGrid) -> bool:
@@ -338,10 +344,10 @@ def _has_met(observer: RackGrid, peer: RackGrid) -> bool:
     Raises:
         Failure: It worked with a different launch of that rack.
     """
-    mailbox = _mailbox(observer, peer)
+    mailbox = _find_peer_mailbox(observer, peer)
     if (
         mailbox is None
-        or not (observer.recording.signal(mailbox, "presence") == Presence.THERE).any()
+        or not (observer.recording.read_signal(mailbox, "presence") == Presence.THERE).any()
     ):
         return False
     lan = observer.recording.rack_config.adapter.lan
@@ -360,8 +366,8 @@ def _check_import(
         or source_mailbox not in peer.recording.mailboxes
     ):
         return
-    imported = importer.recording.rows(import_mailbox)
-    sent = peer.recording.rows(source_mailbox)
+    imported = importer.recording.read_rows(import_mailbox)
+    sent = peer.recording.read_rows(source_mailbox)
     at_ns = sent["tick"] * peer.clock_ns
     content = [row.tobytes() for row in sent["message"]]
     for row in imported:

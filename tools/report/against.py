@@ -8,21 +8,21 @@ from dataclasses import asdict
 
 from rack.backplane.address_map import CLOCK
 from rack.tools.console.answer import Document, Failure
-from rack.tools.monitor.signals import cell
-from rack.tools.recording.causes import Clue, Divergence, InBoth, UnlikeCycle
+from rack.tools.monitor.signals import format_value
+from rack.tools.recording.causes import Clue, Divergence, DivergentCycle, ValueDifference
 from rack.tools.recording.divergence import Difference
-from rack.tools.recording.history import misses
+from rack.tools.recording.history import list_misses
 from rack.tools.recording.recording import Recording
-from rack.tools.report.cycle_again import Repetition, repeated
+from rack.tools.report.cycle_again import Repetition, repeat_cycle
 from rack.tools.report.report import OtherRun
 
-SHOWN = 4
+MAX_SHOWN = 4
 """Number of fields, attributes and so on that the text lists. The data contain all."""
-OF_CONFIG = ("config", "outside")
+INCONCLUSIVE_CLUES = ("config", "outside")
 """Kinds of clues that do not rule out a difference in the level's state."""
 
 
-def compared(recording: Recording, other_run: OtherRun) -> Document:
+def compare_runs(recording: Recording, other_run: OtherRun) -> Document:
     """Compare a run with another one, and explain the difference.
 
     Raises:
@@ -30,20 +30,20 @@ def compared(recording: Recording, other_run: OtherRun) -> Document:
     """
     divergence = Divergence(recording, Recording(other_run.folder))
     first_miss = min(
-        (miss["tick"] for run in divergence.runs for miss in misses(run)), default=None
+        (miss["tick"] for run in divergence.runs for miss in list_misses(run)), default=None
     )
-    first = next(iter(divergence.unlike.values()), None)
-    chain = divergence.chain(other_run.of)
-    repetition = _repeated(divergence, chain[-1], other_run.repeats) if chain else ""
+    first = next(iter(divergence.divergent.values()), None)
+    chain = divergence.trace_cause(other_run.mailbox)
+    repetition = _try_repetition(divergence, chain[-1], other_run.may_repeat) if chain else ""
     other_folder = str(other_run.folder)
-    lines = [line for cycle in chain for line in _cycle_lines(cycle, other_folder)]
+    lines = [line for cycle in chain for line in _format_cycle(cycle, other_folder)]
     why_not = ""
     if isinstance(repetition, Repetition):
-        lines += _repetition_lines(repetition, chain[-1], other_folder)
+        lines += _format_repetition(repetition, chain[-1], other_folder)
     elif why_not := repetition:
         lines.append(f"not repeated: {why_not}")
-    if other_run.of and not chain:
-        lines.append(f"{other_run.of} is equal in both")
+    if other_run.mailbox and not chain:
+        lines.append(f"{other_run.mailbox} is equal in both")
     return {
         "folder": other_folder,
         "first_difference": first and asdict(Difference(first.tick, first.mailbox)),
@@ -56,7 +56,9 @@ def compared(recording: Recording, other_run: OtherRun) -> Document:
     }
 
 
-def _repeated(divergence: Divergence, last: UnlikeCycle, is_wanted: bool) -> Repetition | str:
+def _try_repetition(
+    divergence: Divergence, last: DivergentCycle, is_wanted: bool
+) -> Repetition | str:
     """Repeat the cycle that diverged, if that can add anything to the clues.
 
     Args:
@@ -67,20 +69,23 @@ def _repeated(divergence: Divergence, last: UnlikeCycle, is_wanted: bool) -> Rep
     Returns:
         The result, or the reason why there is none. "" if the clues already exclude state and code.
     """
-    if last.unequal or any(clue.kind not in OF_CONFIG for clue in last.clues):
+    if last.unequal or any(clue.kind not in INCONCLUSIVE_CLUES for clue in last.clues):
         return ""
     if not is_wanted:
         return "--repeat runs both racks again, up to that cycle"
     print(f"repeating tick {last.tick} in both runs", file=sys.stderr)
     try:
-        return repeated(divergence, last)
+        return repeat_cycle(divergence, last)
     except Failure as failure:
         return str(failure)
 
 
-def _cycle_lines(cycle: UnlikeCycle, other: str) -> Iterator[str]:
+def _format_cycle(cycle: DivergentCycle, other: str) -> Iterator[str]:
     """Yield sentences about a cycle: the difference, its inputs, and possible causes."""
-    yield f"at tick {cycle.tick}: {_several(_field(cycle, field, other) for field in cycle.fields)}"
+    yield (
+        f"at tick {cycle.tick}: "
+        f"{_join_clauses(_format_field(cycle, field, other) for field in cycle.fields)}"
+    )
     if cycle.unequal:
         yield f"'{cycle.writer}' wrote it after reading {cycle.unequal}, which already differed"
     elif cycle.writer == CLOCK:
@@ -91,14 +96,14 @@ def _cycle_lines(cycle: UnlikeCycle, other: str) -> Iterator[str]:
     else:
         yield f"'{cycle.writer}' wrote it; it reads no mailbox"
     settings = [clue.values for clue in cycle.clues if clue.values is not None]
-    yield from (_clue(clue) for clue in cycle.clues if clue.values is None)
+    yield from (_format_clue(clue) for clue in cycle.clues if clue.values is None)
     if settings:
-        yield _several(_values(values, other, "not set") for values in settings)
+        yield _join_clauses(_format_difference(values, other, "not set") for values in settings)
     if not (cycle.clues or cycle.unequal):
         yield f"no fault, loss, miss or setting of '{cycle.writer}' differs"
 
 
-def _field(cycle: UnlikeCycle, field: InBoth, other_folder: str) -> str:
+def _format_field(cycle: DivergentCycle, field: ValueDifference, other_folder: str) -> str:
     """Return a clause about a field that differs."""
     box = cycle.mailbox
     values = field.here, field.there
@@ -113,41 +118,43 @@ def _field(cycle: UnlikeCycle, field: InBoth, other_folder: str) -> str:
             return f"{box} was visible from tick {here}, in {other_folder} from tick {other}"
         case "basis", here, other:
             return f"{box} is based on tick {here}, in {other_folder} on tick {other}"
-    return _values(field, other_folder)
+    return _format_difference(field, other_folder)
 
 
-def _values(difference: InBoth, other_folder: str, absent: str = "-") -> str:
+def _format_difference(difference: ValueDifference, other_folder: str, absent: str = "-") -> str:
     """Return a clause with both values of a field or setting."""
-    texts = [_text(value, absent) for value in (difference.here, difference.there)]
+    texts = [_format_value(value, absent) for value in (difference.here, difference.there)]
     if texts[0] == texts[1]:
         # The numbers differ only in a digit that is not shown.
         texts = [repr(difference.here), repr(difference.there)]
     return f"{difference.name} is {texts[0]}, in {other_folder} {texts[1]}"
 
 
-def _text(value: object, absent: str) -> str:
+def _format_value(value: object, absent: str) -> str:
     """Format a value. None becomes the text `absent`."""
-    return absent if value is None else cell(value) or '""'
+    return absent if value is None else format_value(value) or '""'
 
 
-def _several(texts: Iterator[str]) -> str:
+def _join_clauses(texts: Iterator[str]) -> str:
     """Join clauses. Beyond `MAX_SHOWN` clauses, only the number of the others is given."""
     clauses = [*texts]
-    more = [f"{len(clauses) - SHOWN} more"] if len(clauses) > SHOWN else []
-    return "; ".join([*clauses[:SHOWN], *more])
+    more = [f"{len(clauses) - MAX_SHOWN} more"] if len(clauses) > MAX_SHOWN else []
+    return "; ".join([*clauses[:MAX_SHOWN], *more])
 
 
-def _clue(clue: Clue) -> str:
+def _format_clue(clue: Clue) -> str:
     """Return a sentence for a clue."""
     return f"in {clue.run} only, at tick {clue.tick}: {clue.text}" if clue.run else clue.text
 
 
-def _repetition_lines(repetition: Repetition, cycle: UnlikeCycle, other: str) -> Iterator[str]:
+def _format_repetition(repetition: Repetition, cycle: DivergentCycle, other: str) -> Iterator[str]:
     """Yield sentences about the result of a repetition."""
     task = cycle.writer
     runs = " and ".join(repetition.runs)
     if repetition.attributes:
-        attributes = _several(_values(attribute, other) for attribute in repetition.attributes)
+        attributes = _join_clauses(
+            _format_difference(attribute, other) for attribute in repetition.attributes
+        )
         yield f"before that cycle the state of '{task}' differed: {attributes}"
     else:
         yield f"before that cycle the state of '{task}' was equal, as far as it can be compared"

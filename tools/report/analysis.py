@@ -11,24 +11,30 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import TaskSpec
-from rack.boards.config import rack_timing
-from rack.boards.config.timing import without_interrupts
+from rack.boards.config import build_rack_timing
+from rack.boards.config.timing import subtract_interrupts
 from rack.boards.timing import trace_times
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, EquationVerdict, verdicts
+from rack.boards.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, EquationVerdict, judge_rack
 from rack.tools.console.answer import Failure
-from rack.tools.recording.cycles import WORST, Cycles, budgets_of, cycles_of, worst_of
+from rack.tools.recording.cycles import (
+    WORST_PERCENTILE,
+    Cycles,
+    compute_budgets,
+    compute_percentile,
+    read_cycles,
+)
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.measured_response import system_response
+from rack.tools.timing.measured_response import measure_system_response
 
-MOSTLY = 99.0
+MOST_CYCLES_PERCENTILE = 99.0
 """Percentile for the question whether a level fails in most of its cycles."""
-OBSERVED = ("3.2", "3.3", "3.7", RESPONSE_TIME, LOAD)
+OBSERVED_EQUATIONS = ("3.2", "3.3", "3.7", RESPONSE_TIME, LOAD)
 """Equations that a run shows directly. The others follow from the times of its levels."""
 
 
 @dataclass(frozen=True)
-class Pair:
+class EquationPair:
     """Predicted and measured verdict on one equation and one subject.
 
     Attributes:
@@ -44,7 +50,7 @@ class Pair:
     measured: EquationVerdict | None
 
     @property
-    def disagrees(self) -> bool:
+    def is_contradicted(self) -> bool:
         """True if the run contradicts the prediction."""
         if self.predicted is None or self.measured is None:
             return False
@@ -53,7 +59,7 @@ class Pair:
         return self.predicted.holds != self.measured.holds and not is_full
 
     @property
-    def fails(self) -> bool:
+    def is_failed(self) -> bool:
         """True if the equation failed in the run."""
         return self.measured is not None and not self.measured.holds
 
@@ -82,14 +88,14 @@ class Analysis:
     loads: Mapping[int, float]
     predicted: RackTiming
     measured: RackTiming
-    pairs: tuple[Pair, ...]
-    mostly: tuple[Pair, ...]
+    pairs: tuple[EquationPair, ...]
+    mostly: tuple[EquationPair, ...]
 
     @classmethod
-    def of(
+    def from_recording(
         cls,
         recording: Recording,
-        percentile: float = WORST,
+        percentile: float = WORST_PERCENTILE,
         progress: Callable[[float], None] = lambda part: None,
     ) -> Analysis:
         """Analyze a recorded run.
@@ -104,53 +110,63 @@ class Analysis:
         """
         config = recording.rack_config
         layout = recording.layout
-        cycles = cycles_of(recording)
+        cycles = read_cycles(recording)
         if not cycles:
             raise Failure(
                 f"{recording.folder}: no cycle was traced; there is nothing to analyze", 2
             )
         progress(0.4)
-        predicted = rack_timing(config, layout)
-        loads = core_loads(recording, cycles, predicted)
+        predicted = build_rack_timing(config, layout)
+        loads = compute_core_loads(recording, cycles, predicted)
         meaning = "time used by its tasks"
         used = [
             EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
             for core, load in loads.items()
         ]
-        response = system_response(recording)
+        response = measure_system_response(recording)
 
-        def judge_equations(percent: float) -> tuple[RackTiming, tuple[Pair, ...]]:
+        def judge_equations(percent: float) -> tuple[RackTiming, tuple[EquationPair, ...]]:
             """Return the measured timing at a percentile, and the verdicts on all equations."""
-            budgets = without_interrupts(predicted, budgets_of(cycles, percent))
-            rack = rack_timing(config, layout, budgets)
-            observed = [*_system(response, rack), *_tasks(cycles, rack, percent), *used]
-            derived = [verdict for verdict in verdicts(rack) if verdict.equation not in OBSERVED]
-            return rack, tuple(_paired(verdicts(predicted), [*derived, *observed]))
+            budgets = subtract_interrupts(predicted, compute_budgets(cycles, percent))
+            rack = build_rack_timing(config, layout, budgets)
+            observed = [
+                *_judge_response(response, rack),
+                *_judge_tasks(cycles, rack, percent),
+                *used,
+            ]
+            derived = [
+                verdict
+                for verdict in judge_rack(rack)
+                if verdict.equation not in OBSERVED_EQUATIONS
+            ]
+            return rack, tuple(_pair_verdicts(judge_rack(predicted), [*derived, *observed]))
 
         measured, pairs = judge_equations(percentile)
         progress(0.7)
-        _, mostly = judge_equations(min(percentile, MOSTLY))
+        _, mostly = judge_equations(min(percentile, MOST_CYCLES_PERCENTILE))
         return cls(recording, percentile, cycles, loads, predicted, measured, pairs, mostly)
 
     @property
-    def holds(self) -> bool:
+    def is_fulfilled(self) -> bool:
         """True if every equation held in the run."""
-        return not any(pair.fails for pair in self.pairs)
+        return not any(pair.is_failed for pair in self.pairs)
 
 
-def _paired(
+def _pair_verdicts(
     predicted: Sequence[EquationVerdict], measured: Sequence[EquationVerdict]
-) -> list[Pair]:
+) -> list[EquationPair]:
     """Pair the verdicts on each equation and subject, in the order of the equations."""
-    sides = [{_key(verdict): verdict for verdict in side} for side in (predicted, measured)]
+    sides = [
+        {_build_pair_key(verdict): verdict for verdict in side} for side in (predicted, measured)
+    ]
     pairs = [
-        Pair(*key[:2], *(side.get(key) for side in sides))
+        EquationPair(*key[:2], *(side.get(key) for side in sides))
         for key in dict.fromkeys([*sides[0], *sides[1]])
     ]
     return sorted(pairs, key=lambda pair: ORDER.index(pair.equation))
 
 
-def _key(verdict: EquationVerdict) -> tuple[str, str, str]:
+def _build_pair_key(verdict: EquationVerdict) -> tuple[str, str, str]:
     """Return the key by which predicted and measured verdicts are paired."""
     # The response is judged in two directions, and eq. 3.7 differs between a config and a run, so
     # the meaning must match as well.
@@ -158,7 +174,9 @@ def _key(verdict: EquationVerdict) -> tuple[str, str, str]:
     return verdict.equation, verdict.subject, meaning
 
 
-def _system(response: Mapping[str, Any] | None, rack: RackTiming) -> Iterator[EquationVerdict]:
+def _judge_response(
+    response: Mapping[str, Any] | None, rack: RackTiming
+) -> Iterator[EquationVerdict]:
     """Yield eqs. 3.2 and 3.3 for the longest response of the run, in both directions.
 
     The bound of eq. 3.3 is the sum of the cycles and of the waits for the grid.
@@ -183,30 +201,30 @@ def _system(response: Mapping[str, Any] | None, rack: RackTiming) -> Iterator[Eq
         yield EquationVerdict("3.3", chain["subject"], longest_ns, "<=", bound_ns, meaning)
 
 
-def _tasks(
+def _judge_tasks(
     cycles_by_task: Mapping[str, Cycles], rack: RackTiming, percentile: float
 ) -> Iterator[EquationVerdict]:
     """Yield eq. 3.7 for executors, and in real time the response time of every task."""
     for name, cycles in cycles_by_task.items():
         rows = cycles.rows
         if cycles.task.role == "executor":
-            every_ns = cycle_ns(rack, cycles.task)
+            every_ns = compute_cycle_ns(rack, cycles.task)
             # Use the traced number of skipped releases, because a restart or a row lost by the
             # recorder is not a skipped release.
-            steps_ns = (1 + trace_times.skipped(rows)) * every_ns
-            step_ns = worst_of(steps_ns[cycles.is_judged], percentile)
+            steps_ns = (1 + trace_times.count_skipped(rows)) * every_ns
+            step_ns = compute_percentile(steps_ns[cycles.is_judged], percentile)
             yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
-            deadline_ns = slice_ns(rack, cycles.task)
+            deadline_ns = compute_slice_ns(rack, cycles.task)
             # A cycle that the trace marks as missed has missed its deadline, whenever it ended.
-            least_ns = np.where(trace_times.is_missed(rows), deadline_ns + 1, 0)
-            response_ns = np.maximum(trace_times.response_ns(rows), least_ns)
-            worst_ns = worst_of(response_ns[cycles.is_judged], percentile)
+            least_ns = np.where(trace_times.find_missed(rows), deadline_ns + 1, 0)
+            response_ns = np.maximum(trace_times.compute_response_ns(rows), least_ns)
+            worst_ns = compute_percentile(response_ns[cycles.is_judged], percentile)
             meaning = "measured response <= deadline"
             yield EquationVerdict(RESPONSE_TIME, name, worst_ns, "<=", deadline_ns, meaning)
 
 
-def core_loads(
+def compute_core_loads(
     recording: Recording, cycles_by_task: Mapping[str, Cycles], rack: RackTiming
 ) -> dict[int, float]:
     """Return the part of each core's time that its tasks used, without the clock board.
@@ -229,17 +247,17 @@ def core_loads(
     for name, cycles in cycles_by_task.items():
         used_ns = recording.cycles[name]["processor_ns"]
         if cycles.task.role == "executor":
-            loads[cycles.core] += float(used_ns.mean()) / cycle_ns(rack, cycles.task)
+            loads[cycles.core] += float(used_ns.mean()) / compute_cycle_ns(rack, cycles.task)
         else:
             loads[cycles.core] += int(used_ns.sum()) / lasted_ns
     return dict(sorted(loads.items()))
 
 
-def cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
+def compute_cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
     """Return R_i of a task's level, the time between two of its cycles."""
     return rack.boards[task.board].every * rack.tick_ns
 
 
-def slice_ns(rack: RackTiming, task: TaskSpec) -> int:
+def compute_slice_ns(rack: RackTiming, task: TaskSpec) -> int:
     """Return the time available to a cycle of a task. For a planner it is the time slice, d R_i."""
     return task.slice * rack.tick_ns

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from rack.backplane.message import printable, state_name
+from rack.backplane.message import escape_text, format_state
 from rack.boards.config import RackConfig
 from rack.levels.messages import ArmState, Scene, TaskStatus
 from rack.tools.console.answer import Document
@@ -24,14 +24,14 @@ A report must not import levels that only other racks have.
 """
 FALLING_M_S = 0.05
 """Speed above which an object is falling. Slipping grips and lowering fingers are slower."""
-BOUNCE = 2
+BOUNCE_SAMPLES = 2
 """Number of samples that may separate two parts of the same fall."""
-SETTLE = 20
+SETTLE_SAMPLES = 20
 """Number of samples after a fall until the object rests.
 
 At first it sinks into the surface on which it landed, or bounces.
 """
-LEAST_M = 0.005
+MIN_FALL_M = 0.005
 """Smallest fall that is reported.
 
 Tasks let go up to 2 mm above the support, and opening pads can take an object along.
@@ -42,32 +42,32 @@ Signals = Callable[[str], np.ndarray]
 """Function that returns a field of all messages of a mailbox, by the field's name."""
 
 
-def task_outcome(recording: Recording) -> Document | None:
+def summarize_task(recording: Recording) -> Document | None:
     """Return the last status of the level that reports on the whole task, or None."""
-    status = signals_of(recording, TaskStatus.message_type.name)
+    status = find_signals(recording, TaskStatus.message_type.name)
     if status is None:
         return None
     counts = ("action", "actions", "moves_done", "moves", "error")
     return {
-        "state": state_name(int(status("state")[-1])),
-        "reason": printable(str(status("reason")[-1])),
+        "state": format_state(int(status("state")[-1])),
+        "reason": escape_text(str(status("reason")[-1])),
         **{name: int(status(name)[-1]) for name in counts},
     }
 
 
-def objects(recording: Recording, config: RackConfig) -> Iterator[Document]:
+def summarize_objects(recording: Recording, config: RackConfig) -> Iterator[Document]:
     """Yield, for each object with a goal, its final position and its falls."""
-    for end in recording.ended.get("outcome", {}).get("objects", ()):
+    for end in recording.end_counts.get("outcome", {}).get("objects", ()):
         row = config.scene.objects.index(end["object"])
-        yield {**end, "drops": list(_drops(recording, row))}
+        yield {**end, "drops": list(_find_drops(recording, row))}
 
 
-def _drops(recording: Recording, row: int) -> Iterator[Document]:
+def _find_drops(recording: Recording, row: int) -> Iterator[Document]:
     """Yield the falls of an object: tick and height, mm.
 
     An object falls while it moves down quickly and its distance from the tool changes.
     """
-    scene = signals_of(recording, Scene.message_type.name)
+    scene = find_signals(recording, Scene.message_type.name)
     if scene is None:
         return
     ticks = scene("tick")
@@ -77,37 +77,37 @@ def _drops(recording: Recording, row: int) -> Iterator[Document]:
     height = position[:, 2]
     threshold_m = FALLING_M_S * recording.layout.clock_ns * 1e-9 * np.diff(ticks)
     falling = np.flatnonzero(np.minimum(-np.diff(height), np.abs(np.diff(distance))) > threshold_m)
-    first = falling[np.diff(falling, prepend=-BOUNCE - 1) > BOUNCE]
-    last = falling[np.diff(falling, append=len(ticks) + BOUNCE) > BOUNCE] + 1
+    first = falling[np.diff(falling, prepend=-BOUNCE_SAMPLES - 1) > BOUNCE_SAMPLES]
+    last = falling[np.diff(falling, append=len(ticks) + BOUNCE_SAMPLES) > BOUNCE_SAMPLES] + 1
     for begin, end in zip(first, last, strict=True):
-        if (fallen := height[begin] - height[end:][:SETTLE][-1]) > LEAST_M:
-            yield {"tick": int(ticks[begin]), "mm": rounded(fallen * 1e3)}
+        if (fallen := height[begin] - height[end:][:SETTLE_SAMPLES][-1]) > MIN_FALL_M:
+            yield {"tick": int(ticks[begin]), "mm": round_figure(fallen * 1e3)}
 
 
-def motion(recording: Recording) -> Document | None:
+def summarize_motion(recording: Recording) -> Document | None:
     """Return the tracking error, mrad, and the counts of an arm, or None without an arm.
 
     The error is None if no status contains it. The counts are touches, exceeded limits, and refused
     or cut commands.
     """
-    status = signals_of(recording, *DRIVING)
-    counts = _counts(recording, status)
-    if not counts or signals_of(recording, HAND_STATUS) is not None:
+    status = find_signals(recording, *DRIVING)
+    counts = _read_counts(recording, status)
+    if not counts or find_signals(recording, HAND_STATUS) is not None:
         return None
     tracking: Document = dict.fromkeys(("tracking_rms_mrad", "tracking_peak_mrad"))
     if status is not None:
         error = (status("position") - status("target")) * 1e3
-        tracking = dict(zip(tracking, _rms_and_peak(error), strict=True))
+        tracking = dict(zip(tracking, _compute_rms_and_peak(error), strict=True))
     return tracking | counts
 
 
-def _counts(recording: Recording, status: Signals | None) -> Document:
+def _read_counts(recording: Recording, status: Signals | None) -> Document:
     """Return the final counts of an arm or hand, or {} without one.
 
     They come from the arm's state and from the status of the board that drives it, which counts
     commands that it cut itself. The larger count is returned.
     """
-    state = signals_of(recording, ArmState.message_type.name)
+    state = find_signals(recording, ArmState.message_type.name)
     if not (sources := [source for source in (status, state) if source is not None]):
         return {}
     fields = {
@@ -119,46 +119,46 @@ def _counts(recording: Recording, status: Signals | None) -> Document:
     return {key: max(int(source(name)[-1]) for source in sources) for key, name in fields.items()}
 
 
-def _rms_and_peak(error: np.ndarray) -> tuple[float, float]:
+def _compute_rms_and_peak(error: np.ndarray) -> tuple[float, float]:
     """Return the root mean square and the largest magnitude of an error."""
-    return rounded(np.sqrt(np.mean(error**2))), rounded(np.abs(error).max())
+    return round_figure(np.sqrt(np.mean(error**2))), round_figure(np.abs(error).max())
 
 
-def rounded(value: float) -> float:
+def round_figure(value: float) -> float:
     """Round a number to the precision of reports."""
     return round(float(value), 6)
 
 
-def hand(recording: Recording, config: RackConfig) -> Document | None:
+def summarize_hand(recording: Recording, config: RackConfig) -> Document | None:
     """Return the results of a hand, or None without one.
 
     They are tensions and their errors, N, the largest force of each finger, N, and counts.
     """
-    status = signals_of(recording, HAND_STATUS)
+    status = find_signals(recording, HAND_STATUS)
     if status is None or config.robot is None or config.robot.hand is None:
         return None
     tension = status("tension")
-    rms_n, peak_n = _rms_and_peak(tension - status("wanted"))
+    rms_n, peak_n = _compute_rms_and_peak(tension - status("wanted"))
     largest_forces = np.linalg.norm(status("force"), axis=2).max(axis=0)
     fingers = [finger.name for finger in config.robot.hand.finger]
     return {
         "tension_rms_n": rms_n,
         "tension_peak_n": peak_n,
-        "least_tension_n": rounded(tension.min()),
-        "largest_tension_n": rounded(tension.max()),
-        "largest_force_n": dict(zip(fingers, map(rounded, largest_forces), strict=True)),
+        "least_tension_n": round_figure(tension.min()),
+        "largest_tension_n": round_figure(tension.max()),
+        "largest_force_n": dict(zip(fingers, map(round_figure, largest_forces), strict=True)),
         "closed_cycles": int(np.count_nonzero(status("stopped"))),
-        **_counts(recording, status),
+        **_read_counts(recording, status),
     }
 
 
-def force(recording: Recording) -> Document | None:
+def summarize_force(recording: Recording) -> Document | None:
     """Return the largest force, N, and torque, N m, at the wrist, and the force error, N.
 
     None without a wrist sensor.
     """
-    wrench = signals_of(recording, WRENCH)
-    status = signals_of(recording, FORCE_STATUS)
+    wrench = find_signals(recording, WRENCH)
+    status = find_signals(recording, FORCE_STATUS)
     if wrench is None:
         return None
     force_and_torque = wrench("wrench").reshape(-1, 2, 3)
@@ -169,23 +169,23 @@ def force(recording: Recording) -> Document | None:
         surplus = status("wanted") + status("wrench")
         error = surplus[:, :3][status("selected")[:, :3] == 1]
     return {
-        "largest_force_n": rounded(most_n),
-        "largest_torque_nm": rounded(most_nm),
+        "largest_force_n": round_figure(most_n),
+        "largest_torque_nm": round_figure(most_nm),
         "exceeded_cycles": int(wrench("exceeded")[-1]),
-        "force_rms_n": _rms_and_peak(error)[0] if len(error) else None,
+        "force_rms_n": _compute_rms_and_peak(error)[0] if len(error) else None,
     }
 
 
-def signals_of(recording: Recording, *messages: str) -> Signals | None:
+def find_signals(recording: Recording, *messages: str) -> Signals | None:
     """Return the signals of the first mailbox that carries one of these message types.
 
     None if there is no such mailbox, or if it is empty.
     """
     name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
-    return partial(recording.signal, name) if name in recording.mailboxes else None
+    return partial(recording.read_signal, name) if name in recording.mailboxes else None
 
 
-def outcome_text(report: RunReport) -> Iterator[str]:
+def format_outcome(report: RunReport) -> Iterator[str]:
     """Yield sentences about the task, the objects, and the arm or hand."""
     if (task := report.task) is not None:
         done = (
@@ -200,14 +200,14 @@ def outcome_text(report: RunReport) -> Iterator[str]:
         for drop in end.get("drops", ()):
             yield f"Object {end['object']} fell {drop['mm']:.0f} mm at tick {drop['tick']}."
     if report.motion is not None:
-        yield _motion_text(report.motion)
+        yield _format_motion(report.motion)
     if report.hand is not None:
-        yield from _hand_text(report.hand)
+        yield from _format_hand(report.hand)
     if report.force is not None:
-        yield _force_text(report.force)
+        yield _format_force(report.force)
 
 
-def _motion_text(motion: Document) -> str:
+def _format_motion(motion: Document) -> str:
     """Return a sentence about the tracking error and the counts of an arm."""
     tracking = ""
     if motion["tracking_rms_mrad"] is not None:
@@ -215,10 +215,10 @@ def _motion_text(motion: Document) -> str:
             f"Tracking error {motion['tracking_rms_mrad']:.3f} mrad RMS,"
             f" {motion['tracking_peak_mrad']:.3f} peak; "
         )
-    return f"{tracking}{_counts_text(motion)}"
+    return f"{tracking}{_format_counts(motion)}"
 
 
-def _counts_text(report: Document) -> str:
+def _format_counts(report: Document) -> str:
     """Return a sentence about the counts of an arm or hand."""
     return (
         f"{report['touches']} touches; commands refused or cut in {report['clipped_cycles']}"
@@ -227,19 +227,19 @@ def _counts_text(report: Document) -> str:
     )
 
 
-def _hand_text(hand: Document) -> Iterator[str]:
+def _format_hand(hand: Document) -> Iterator[str]:
     """Yield sentences about the tensions and forces of a hand."""
     yield (
         f"Tension error {hand['tension_rms_n']:.2f} N RMS, {hand['tension_peak_n']:.2f} peak;"
         f" tensions from {hand['least_tension_n']:.2f} to {hand['largest_tension_n']:.2f} N;"
         f" valves closed in {hand['closed_cycles']} cycles;"
-        f" {_counts_text(hand)}"
+        f" {_format_counts(hand)}"
     )
     forces = ", ".join(f"{finger} {force:.2f}" for finger, force in hand["largest_force_n"].items())
     yield f"Largest force on each tip, N: {forces}."
 
 
-def _force_text(force: Document) -> str:
+def _format_force(force: Document) -> str:
     """Return a sentence about the contact forces of an arm."""
     rms_n = force["force_rms_n"]
     error = "" if rms_n is None else f"; force error {rms_n:.2f} N RMS"

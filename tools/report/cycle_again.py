@@ -13,14 +13,14 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.mailbox.history import chains
-from rack.tools.console.answer import Failure, as_failure
+from rack.backplane.mailbox.history import find_chains
+from rack.tools.console.answer import Failure, convert_errors
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.launch.continued import RunAgain, unlike_in
-from rack.tools.recording.causes import Divergence, InBoth, UnlikeCycle, unlike_values
+from rack.tools.launch.continued import RepeatedRun, list_differing_mailboxes
+from rack.tools.recording.causes import Divergence, DivergentCycle, ValueDifference, compare_values
 from rack.tools.recording.recording import Recording
 
-TIMES = 2
+REPETITIONS = 2
 """Number of times that a cycle is repeated."""
 Because = Literal["state", "code", "chance"]
 
@@ -38,13 +38,13 @@ class Repetition:
             the result is uncertain.
     """
 
-    attributes: tuple[InBoth, ...]
+    attributes: tuple[ValueDifference, ...]
     because: Because
     runs: tuple[str, ...]
     strays: Mapping[str, tuple[str, ...]]
 
 
-class _Again(NamedTuple):
+class _RepeatedCycle(NamedTuple):
     """A repeated cycle of one run.
 
     Attributes:
@@ -58,7 +58,7 @@ class _Again(NamedTuple):
     is_equal: bool
 
 
-def repeated(divergence: Divergence, cycle: UnlikeCycle) -> Repetition:
+def repeat_cycle(divergence: Divergence, cycle: DivergentCycle) -> Repetition:
     """Repeat a cycle in both runs.
 
     Raises:
@@ -69,36 +69,44 @@ def repeated(divergence: Divergence, cycle: UnlikeCycle) -> Repetition:
     for run in divergence.runs:
         if run.rack_config.clock.mode != "lockstep":
             raise Failure(f"{run.folder} ran in real time, and only lockstep can be repeated")
-    until = divergence.unlike[cycle.mailbox].visible_at + 1
-    with INTERRUPT.raising(), as_failure():
-        again_by_run = {run: _again(run, cycle, until) for run in divergence.runs}
+    until = divergence.divergent[cycle.mailbox].visible_at + 1
+    with INTERRUPT.raise_interrupted(), convert_errors():
+        again_by_run = {run: _repeat_in_run(run, cycle, until) for run in divergence.runs}
     not_repeating = [run for run in divergence.runs if cycle.mailbox in again_by_run[run].unlike]
     is_chance = not all(again_by_run[run].is_equal for run in not_repeating)
     layout = divergence.runs[0].layout
     strays = {
         str(run.folder): tuple(
-            name for name in again_by_run[run].unlike if layout.mailbox(name).writer != cycle.writer
+            name
+            for name in again_by_run[run].unlike
+            if layout.find_mailbox(name).writer != cycle.writer
         )
         for run in divergence.runs
     }
     because: Because = "code" if not_repeating else "state"
     return Repetition(
-        attributes=tuple(unlike_values(*(again_by_run[run].attributes for run in divergence.runs))),
+        attributes=tuple(
+            compare_values(*(again_by_run[run].attributes for run in divergence.runs))
+        ),
         because="chance" if is_chance else because,
         runs=tuple(str(run.folder) for run in not_repeating),
         strays={folder: names for folder, names in strays.items() if names},
     )
 
 
-def _again(run: Recording, cycle: UnlikeCycle, until: int) -> _Again:
+def _repeat_in_run(run: Recording, cycle: DivergentCycle, until: int) -> _RepeatedCycle:
     """Repeat a cycle of a run up to tick `until`, at which its message is visible."""
-    with RunAgain(run, f"{run.folder} at tick {cycle.tick}", anyway=True) as again:
-        attributes = again.levels(cycle.tick)[cycle.writer]
+    with RepeatedRun(run, f"{run.folder} at tick {cycle.tick}", anyway=True) as again:
+        attributes = again.read_levels(cycle.tick)[cycle.writer]
         repetitions = []
-        for _ in range(TIMES):
-            with again.rack_at(until) as rack:
+        for _ in range(REPETITIONS):
+            with again.run_rack_to(until) as rack:
                 # Serial and chain of the message that it wrote.
-                wrote = chains(rack.segment, until)[cycle.mailbox]
-                repetitions.append((wrote, tuple(unlike_in(run, rack.segment, until))))
+                wrote = find_chains(rack.segment, until)[cycle.mailbox]
+                repetitions.append(
+                    (wrote, tuple(list_differing_mailboxes(run, rack.segment, until)))
+                )
     wrote, differing = repetitions[0]
-    return _Again(attributes, differing, all(repetition == wrote for repetition, _ in repetitions))
+    return _RepeatedCycle(
+        attributes, differing, all(repetition == wrote for repetition, _ in repetitions)
+    )

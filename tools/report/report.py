@@ -11,34 +11,34 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import Layout, TaskSpec
-from rack.boards.config import RackConfig, wire
-from rack.boards.timing.trace_times import distribution, plan_ages
-from rack.levels.peer import Presence, peer_port
+from rack.boards.config import RackConfig, resolve_layout
+from rack.boards.timing.trace_times import compute_distribution, compute_plan_ages
+from rack.levels.peer import Presence, format_peer_port
 from rack.tools.console.answer import Document, write_file, write_json
-from rack.tools.faults.judge import faults
+from rack.tools.faults.judge import report_faults
 from rack.tools.launch.verdict import UNRECORDED, judge_run
-from rack.tools.monitor.host_side import ENTRY_COUNTS, entries_of
-from rack.tools.monitor.interrupts import interrupts
-from rack.tools.monitor.network import BOARD, COUNTS, STATUS, exchanged
-from rack.tools.monitor.queues import queues
+from rack.tools.monitor.host_side import ENTRY_COUNTS, list_entries
+from rack.tools.monitor.interrupts import summarize_interrupts
+from rack.tools.monitor.network import ADAPTER, COUNTS, STATUS, read_entries
+from rack.tools.monitor.queues import summarize_queues
 from rack.tools.recording.checksums import Checksums
-from rack.tools.recording.folder_size import sizes
+from rack.tools.recording.folder_size import measure_sizes
 from rack.tools.recording.history import (
-    counted,
-    fired_rows,
-    frequency,
-    holds,
-    misses,
-    steal,
+    count_misses,
+    list_fired_rows,
+    list_holds,
+    list_misses,
+    summarize_frequency,
+    summarize_steal,
 )
 from rack.tools.recording.origin import Origin
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.stalls import stalls_of
+from rack.tools.recording.stalls import analyze_stalls
 from rack.tools.report import arm_outcome
-from rack.tools.report.report_markdown import markdown
+from rack.tools.report.report_markdown import format_markdown
 from rack.tools.report.run_report import RunReport
-from rack.tools.report.task_times import task_times
-from rack.tools.timing.measured_response import system_response
+from rack.tools.report.task_times import compute_task_times
+from rack.tools.timing.measured_response import measure_system_response
 
 COMPARISON = "rack.tools.report.against"
 """Module that compares two runs, by name, since it needs code that reports on one run do not."""
@@ -55,8 +55,8 @@ class OtherRun:
     """
 
     folder: Path
-    of: str
-    repeats: bool
+    mailbox: str
+    may_repeat: bool
 
 
 def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Document, str]:
@@ -70,82 +70,82 @@ def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Documen
         The report as data and as text.
     """
     recording = Recording(folder)
-    report = report_of(recording)
-    report |= sizes(folder, report["simulated_s"])
+    report = build_report(recording)
+    report |= measure_sizes(folder, report["simulated_s"])
     if against is not None:
         report["against"] = import_module(COMPARISON).compared(recording, against)
-    text = markdown(report)
+    text = format_markdown(report)
     write_json(folder / "report.json", report)
     write_file(folder / "report.md", text)
     Checksums(folder).store("report.*")
     return report, text
 
 
-def report_of(recording: Recording) -> Document:
+def build_report(recording: Recording) -> Document:
     """Return the report of a recorded run as plain data."""
     config = recording.rack_config
     layout = recording.layout
-    ended = recording.ended
-    recording.adopt_kinds()
-    origin = Origin.of(recording)
-    missed_cycles = misses(recording)
+    ended = recording.end_counts
+    recording.register_fault_kinds()
+    origin = Origin.read_from(recording)
+    missed_cycles = list_misses(recording)
     last_tick = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
-    response = system_response(recording)
-    report = _head(config, ended, last_tick + 1, response)
+    response = measure_system_response(recording)
+    report = _build_head(config, ended, last_tick + 1, response)
     if not ended:
         # The end of the run is not recorded, so count the misses in the trace.
-        missed, skipped = counted(missed_cycles)
+        missed, skipped = count_misses(missed_cycles)
         report = replace(report, missed=missed, skipped=skipped)
     return replace(
         report,
         folder=str(recording.folder),
-        continues=None if origin is None else origin.document(layout.clock_ns),
+        continues=None if origin is None else origin.to_document(layout.clock_ns),
         misses=missed_cycles,
-        steal=steal(recording),
-        stalls=asdict(stalls_of(recording)[0]),
-        frequency_mhz=frequency(recording),
+        steal=summarize_steal(recording),
+        stalls=asdict(analyze_stalls(recording)[0]),
+        frequency_mhz=summarize_frequency(recording),
         notes=[event["text"] for event in recording.events if event["kind"] == "ready"],
-        holds=holds(recording),
-        state_tables=fired_rows(recording),
-        **faults(recording.events, layout),
-        tasks={task.name: _task(recording, config, task) for task in layout.tasks},
+        holds=list_holds(recording),
+        state_tables=list_fired_rows(recording),
+        **report_faults(recording.events, layout),
+        tasks={task.name: _build_task_entry(recording, config, task) for task in layout.tasks},
         system_response=response,
-        entries=_entries(recording),
-        network=network(recording),
-        task=arm_outcome.task_outcome(recording),
-        objects=list(arm_outcome.objects(recording, config)),
-        motion=arm_outcome.motion(recording),
-        hand=arm_outcome.hand(recording, config),
-        force=arm_outcome.force(recording),
-        queues=queues(recording),
-        interrupts=interrupts(recording),
+        entries=_summarize_entries(recording),
+        network=summarize_network(recording),
+        task=arm_outcome.summarize_task(recording),
+        objects=list(arm_outcome.summarize_objects(recording, config)),
+        motion=arm_outcome.summarize_motion(recording),
+        hand=arm_outcome.summarize_hand(recording, config),
+        force=arm_outcome.summarize_force(recording),
+        queues=summarize_queues(recording),
+        interrupts=summarize_interrupts(recording),
         recording=ended.get("recording", "without the end of the run"),
-        rows_lost={name: count for name, count in recording.lost.items() if count},
-        gaps=[gap._asdict() for gap in recording.gaps()],
-        untraced=recording.untraced(),
+        rows_lost={name: count for name, count in recording.lost_rows.items() if count},
+        gaps=[gap._asdict() for gap in recording.find_gaps()],
+        untraced=recording.count_untraced(),
         kept=recording.kept_text or None,
-    ).document()
+    ).to_document()
 
 
-def unrecorded(config: RackConfig, ended: Mapping[str, Any]) -> Document:
+def build_unrecorded_report(config: RackConfig, ended: Mapping[str, Any]) -> Document:
     """Return the report of a run without a recording.
 
     It has the same keys, but null for everything that needs a recording.
     """
-    layout = wire(config)
-    head = _head(config, ended, 0, None)
+    layout = resolve_layout(config)
+    head = _build_head(config, ended, 0, None)
     return replace(
         head,
         unjudged=[*head.unjudged, UNRECORDED],
         tasks={
-            task.name: {**_about(task, layout), **ended["tasks"][task.name]}
+            task.name: {**_describe_task(task, layout), **ended["tasks"][task.name]}
             for task in layout.tasks
         },
         recording=ended["recording"],
-    ).document()
+    ).to_document()
 
 
-def _head(
+def _build_head(
     config: RackConfig, ended: Mapping[str, Any], ticks: int, response: Document | None
 ) -> RunReport:
     """Return the part of a report that needs no recording.
@@ -175,36 +175,36 @@ def _head(
     )
 
 
-def _task(recording: Recording, config: RackConfig, task: TaskSpec) -> Document:
+def _build_task_entry(recording: Recording, config: RackConfig, task: TaskSpec) -> Document:
     """Return the entry of a task: its place in the rack, counts and times."""
     is_lockstep = config.clock.mode == "lockstep"
     layout = recording.layout
-    cycles = recording.trace(task.name)
-    stretches = recording.stretch_of(cycles["tick"])
+    cycles = recording.read_trace(task.name)
+    stretches = recording.find_stretches(cycles["tick"])
     period_ns = layout.clock_ns if is_lockstep else config.tick_ns
     entry = {
-        **_about(task, layout),
-        **recording.counts(task.name),
-        **task_times(task, cycles, period_ns, is_lockstep, stretches=stretches),
+        **_describe_task(task, layout),
+        **recording.find_task_counts(task.name),
+        **compute_task_times(task, cycles, period_ns, is_lockstep, stretches=stretches),
     }
     if task.role == "executor" and f"{task.board}.plan" in recording.mailboxes:
-        entry["plan_age_ms"] = distribution(plan_ages_ms(recording, task.board))
+        entry["plan_age_ms"] = compute_distribution(compute_plan_ages_ms(recording, task.board))
     return entry
 
 
-def plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
+def compute_plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
     """Return the age of the plan that each cycle of an executor could read, in simulated time.
 
     See `plan_ages`.
     """
     plan = f"{board}.plan"
-    plan_ticks = recording.signal(plan, "tick")
-    visible_at = recording.signal(plan, "visible_at")
-    ticks = recording.trace(board)["tick"]
-    cycle_stretches = recording.stretch_of(ticks)
-    plan_stretches = recording.stretch_of(plan_ticks)
+    plan_ticks = recording.read_signal(plan, "tick")
+    visible_at = recording.read_signal(plan, "visible_at")
+    ticks = recording.read_trace(board)["tick"]
+    cycle_stretches = recording.find_stretches(ticks)
+    plan_stretches = recording.find_stretches(plan_ticks)
     ages = [
-        plan_ages(
+        compute_plan_ages(
             ticks[cycle_stretches == stretch],
             plan_ticks[plan_stretches == stretch],
             visible_at[plan_stretches == stretch],
@@ -214,66 +214,71 @@ def plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
     return np.concatenate(ages) * (recording.layout.clock_ns * 1e-6)
 
 
-def _about(task: TaskSpec, layout: Layout) -> Document:
+def _describe_task(task: TaskSpec, layout: Layout) -> Document:
     """Return role, slot and rate of a task."""
     return {"role": task.role, "slot": task.slot, "rate_hz": 1e9 / (task.every * layout.clock_ns)}
 
 
-def _entries(recording: Recording) -> list[Document]:
+def _summarize_entries(recording: Recording) -> list[Document]:
     """Return the entries of all bus adapters: their final counts and the ages of messages, ms."""
     entries = []
     tick_ms = recording.layout.clock_ns * 1e-6
-    for mailbox, entry, source in entries_of(recording.layout, recording.config):
+    for mailbox, entry, source in list_entries(recording.layout, recording.config):
         if mailbox in recording.mailboxes:
-            ages = recording.signal(mailbox, f"{entry}.age")
-            counts = {name: _last(recording, mailbox, f"{entry}.{name}") for name in ENTRY_COUNTS}
+            ages = recording.read_signal(mailbox, f"{entry}.age")
+            counts = {
+                name: _read_last_count(recording, mailbox, f"{entry}.{name}")
+                for name in ENTRY_COUNTS
+            }
             name = f"{mailbox.partition('.')[0]}.{entry}"
-            ages_ms = distribution(ages[ages >= 0] * tick_ms)
+            ages_ms = compute_distribution(ages[ages >= 0] * tick_ms)
             entries.append({"entry": name, "source": source, **counts, "age_ms": ages_ms})
     return entries
 
 
-def network(recording: Recording) -> Document | None:
+def summarize_network(recording: Recording) -> Document | None:
     """Return the traffic with other racks, with ages in ms, and the losses of these racks.
 
     None if the rack has no network adapter, or nothing of it was recorded.
     """
-    exchange = exchanged(recording.config)
+    exchange = read_entries(recording.config)
     if exchange is None or STATUS not in recording.mailboxes:
         return None
     imports = []
     for port, source in exchange.imports.items():
-        ages_s = recording.signal(STATUS, f"import_{port}.age_s")
-        counts = {name: _last(recording, STATUS, f"import_{port}.{name}") for name in COUNTS}
+        ages_s = recording.read_signal(STATUS, f"import_{port}.age_s")
+        counts = {
+            name: _read_last_count(recording, STATUS, f"import_{port}.{name}") for name in COUNTS
+        }
         # The age at every cycle of the adapter. It grows until the next message comes.
-        ages = distribution(ages_s[ages_s >= 0.0] * 1e3)
-        imports.append({"entry": f"{BOARD}.{port}", "source": source, **counts, "age_ms": ages})
+        ages = compute_distribution(ages_s[ages_s >= 0.0] * 1e3)
+        imports.append({"entry": f"{ADAPTER}.{port}", "source": source, **counts, "age_ms": ages})
     exports = [
         {
-            "entry": f"{BOARD}.{port}",
+            "entry": f"{ADAPTER}.{port}",
             "source": source,
-            "sent": _last(recording, STATUS, f"export_{port}.sent"),
+            "sent": _read_last_count(recording, STATUS, f"export_{port}.sent"),
         }
         for port, source in exchange.exports.items()
     ]
-    peers = [_peer(recording, rack) for rack in exchange.peers]
+    peers = [_summarize_peer(recording, rack) for rack in exchange.peers]
     return {"imports": imports, "exports": exports, "peers": peers}
 
 
-def _peer(recording: Recording, rack: str) -> Document:
+def _summarize_peer(recording: Recording, rack: str) -> Document:
     """Return the final state of another rack, and how often and how long it was lost."""
-    mailbox = f"{BOARD}.{peer_port(rack)}"
-    presence = recording.signal(mailbox, "presence")
-    cycle_s = recording.layout.task(BOARD).every * recording.layout.clock_ns * 1e-9
+    mailbox = f"{ADAPTER}.{format_peer_port(rack)}"
+    presence = recording.read_signal(mailbox, "presence")
+    cycle_s = recording.layout.find_task(ADAPTER).every * recording.layout.clock_ns * 1e-9
     return {
         "peer": rack,
         "state": Presence(int(presence[-1])).name.lower(),
-        "losses": _last(recording, mailbox, "losses"),
-        "restarts": max(0, _last(recording, mailbox, "launches") - 1),
+        "losses": _read_last_count(recording, mailbox, "losses"),
+        "restarts": max(0, _read_last_count(recording, mailbox, "launches") - 1),
         "lost_s": round(float((presence == Presence.LOST).sum() * cycle_s), 6),
     }
 
 
-def _last(recording: Recording, mailbox: str, count: str) -> int:
+def _read_last_count(recording: Recording, mailbox: str, count: str) -> int:
     """Return a count in the last message of a mailbox."""
-    return int(recording.signal(mailbox, count)[-1])
+    return int(recording.read_signal(mailbox, count)[-1])

@@ -5,47 +5,47 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from rack.boards.events import Braking, braked_text
+from rack.boards.events import Braking, format_brakings
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import (
     Blocks,
     Cell,
     TextTable,
-    decimal,
-    figure,
+    format_decimal,
+    format_figure,
     render_markdown,
 )
-from rack.tools.launch.verdict import headline
-from rack.tools.monitor.holds import resume_command
-from rack.tools.recording.history import counted
+from rack.tools.launch.verdict import format_headline
+from rack.tools.monitor.holds import format_resume_command
+from rack.tools.recording.history import count_misses
 from rack.tools.recording.recording import Gap
-from rack.tools.report.arm_outcome import outcome_text
+from rack.tools.report.arm_outcome import format_outcome
 from rack.tools.report.run_report import RunReport
-from rack.tools.report.task_times import times_text
+from rack.tools.report.task_times import format_times
 
-SHOWN = 10
+MAX_SHOWN_ROWS = 10
 """Number of misses, holds and long responses in the text. report.json contains all."""
-JUDGED = {True: "ok", False: "beyond", None: "-"}
-CHANGED = 1.05
+VERDICT_WORDS = {True: "ok", False: "beyond", None: "-"}
+CHANGED_RATIO = 1.05
 """Ratio of a core's highest to its lowest frequency above which the text mentions it."""
 
 
-def markdown(report: Document) -> str:
+def format_markdown(report: Document) -> str:
     """Return the text of report.md."""
-    return render_markdown(report_blocks(report))
+    return render_markdown(format_report(report))
 
 
-def terminal_blocks(report: Document) -> Blocks:
+def format_for_terminal(report: Document) -> Blocks:
     """Yield a report for a terminal, with the names of the files that contain the rest."""
-    yield from report_blocks(report)
+    yield from format_report(report)
     yield ""
     yield f"all columns: {report['folder']}/report.md; all data: report.json"
 
 
-def summary(document: Document) -> Iterator[str]:
+def format_summary(document: Document) -> Iterator[str]:
     """Yield the verdict and the figures that are known even without a recording."""
-    report = RunReport.of(document)
-    yield f"# {headline(report.rack, report.outcome, report.failures)}"
+    report = RunReport.from_document(document)
+    yield f"# {format_headline(report.rack, report.outcome, report.failures)}"
     yield ""
     yield (
         f"{report.simulated_s:.2f} s simulated in {report.wall_s:.2f} s, {report.mode}, "
@@ -54,41 +54,41 @@ def summary(document: Document) -> Iterator[str]:
     )
     yield from (f"- not judged: {line}" for line in report.unjudged)
     if brakings := (report.outcome or {}).get("brakings"):
-        yield f"- {braked_text([Braking(**braking) for braking in brakings])}"
+        yield f"- {format_brakings([Braking(**braking) for braking in brakings])}"
 
 
-def report_blocks(document: Document) -> Blocks:
+def format_report(document: Document) -> Blocks:
     """Yield a report as text for people."""
-    report = RunReport.of(document)
-    yield from summary(document)
-    yield from _notes(report)
-    yield from outcome_text(report)
-    yield from _queues(report.queues)
-    yield from _interrupts(report.interrupts)
+    report = RunReport.from_document(document)
+    yield from format_summary(document)
+    yield from _format_notes(report)
+    yield from format_outcome(report)
+    yield from _format_queues(report.queues)
+    yield from _format_interrupts(report.interrupts)
     if report.holds:
-        yield from _holds(report.rack, report.holds)
+        yield from _format_holds(report.rack, report.holds)
     if report.state_tables:
-        yield from ("", "## State tables", "", _state_tables(report.state_tables))
-    yield from times_text(report)
-    yield from _faults(report)
+        yield from ("", "## State tables", "", _build_state_tables(report.state_tables))
+    yield from format_times(report)
+    yield from _format_faults(report)
     if report.misses:
-        yield from _misses(report)
+        yield from _format_misses(report)
     if (response := report.system_response) is not None:
         yield from ("", "## System response, ms of simulated time")
         for chain in (response, *response["others"]):
-            yield from _response_along(chain)
+            yield from _format_response(chain)
     if report.entries:
         yield from ("", "## Bus adapters, ages in ms of simulated time", "")
-        yield _passed(report.entries, ("superseded", "waiting", "source"))
-    yield from _network(report.network)
+        yield _build_traffic_table(report.entries, ("superseded", "waiting", "source"))
+    yield from _format_network(report.network)
 
 
-def _notes(report: RunReport) -> Iterator[str]:
+def _format_notes(report: RunReport) -> Iterator[str]:
     """Yield notes on the origin of the run, on the machine, and on gaps of the recording."""
     if origin := report.continues:
         yield f"- continues {origin['folder']} from {origin['time_s']:g} s"
     yield from (f"- {note}" for note in report.notes)
-    yield from _machine(report)
+    yield from _format_machine(report)
     if report.recording != "complete":
         yield f"- recording: {report.recording}"
     if report.kept:
@@ -97,26 +97,28 @@ def _notes(report: RunReport) -> Iterator[str]:
         yield f"- the recorder lost rows: {lost}"
         yield from (f"- {Gap(**gap)}" for gap in report.gaps)
     if report.against:
-        yield from _against(report.against)
+        yield from _format_comparison(report.against)
 
 
-def _the_most(rows: Sequence[Any], which: str) -> str:
+def _format_selection(rows: Sequence[Any], which: str) -> str:
     """Return the part of a heading that says which rows are shown, or "" if all are."""
-    return f"; the {which} {SHOWN}" if len(rows) > SHOWN else ""
+    return f"; the {which} {MAX_SHOWN_ROWS}" if len(rows) > MAX_SHOWN_ROWS else ""
 
 
-def _holds(rack: str, holds: Sequence[Document]) -> Blocks:
+def _format_holds(rack: str, holds: Sequence[Document]) -> Blocks:
     """Yield the section with the longest holds, and commands that release an operator's holds."""
-    yield from ("", f"## Holds: {len(holds)}{_the_most(holds, 'longest')}", "")
+    yield from ("", f"## Holds: {len(holds)}{_format_selection(holds, 'longest')}", "")
     rows = [
         {
             "level": hold["level"],
             "by": f"{'operator: ' if hold['by'] == 'operator' else ''}{hold['why']}",
-            "since, s": decimal(hold["since_s"], 2),
-            "until, s": "the end" if hold["until_s"] is None else decimal(hold["until_s"], 2),
-            "lasted, s": decimal(hold["lasted_s"], 2),
+            "since, s": format_decimal(hold["since_s"], 2),
+            "until, s": "the end"
+            if hold["until_s"] is None
+            else format_decimal(hold["until_s"], 2),
+            "lasted, s": format_decimal(hold["lasted_s"], 2),
         }
-        for hold in sorted(holds, key=lambda hold: -hold["lasted_s"])[:SHOWN]
+        for hold in sorted(holds, key=lambda hold: -hold["lasted_s"])[:MAX_SHOWN_ROWS]
     ]
     yield TextTable(rows)
     for hold in holds:
@@ -124,11 +126,12 @@ def _holds(rack: str, holds: Sequence[Document]) -> Blocks:
             level = hold["level"]
             yield from (
                 "",
-                f"Still held at the end: {level}; `{resume_command(rack, level)}` releases it.",
+                f"Still held at the end: {level}; `{format_resume_command(rack, level)}` "
+                "releases it.",
             )
 
 
-def _state_tables(levels: dict[str, list[Document]]) -> TextTable:
+def _build_state_tables(levels: dict[str, list[Document]]) -> TextTable:
     """Return a table with one line per level: its state table, and which rows fired."""
     rows = []
     for level, fired in levels.items():
@@ -150,7 +153,7 @@ def _state_tables(levels: dict[str, list[Document]]) -> TextTable:
     return TextTable(rows)
 
 
-def _machine(report: RunReport) -> Iterator[str]:
+def _format_machine(report: RunReport) -> Iterator[str]:
     """Yield notes on absences of cores, with their causes if known, and on changed frequencies."""
     steal = report.steal
     stalls = report.stalls
@@ -169,7 +172,9 @@ def _machine(report: RunReport) -> Iterator[str]:
             f"- {quota['together']} of {quota['stalls']} stalls end at the same phase of a 100 ms"
             f" period, which suggests {' or '.join(causes)}"
         )
-    changed = {core: mhz for core, mhz in frequency.items() if mhz["max"] > CHANGED * mhz["min"]}
+    changed = {
+        core: mhz for core, mhz in frequency.items() if mhz["max"] > CHANGED_RATIO * mhz["min"]
+    }
     if changed:
         cores = ", ".join(
             f"core {core} {mhz['min']:.0f} to {mhz['max']:.0f} MHz" for core, mhz in changed.items()
@@ -177,7 +182,7 @@ def _machine(report: RunReport) -> Iterator[str]:
         yield f"- the processor changed its frequency: {cores}"
 
 
-def _against(against: Document) -> Iterator[str]:
+def _format_comparison(against: Document) -> Iterator[str]:
     """Yield the comparison with another run."""
     difference = against["first_difference"]
     if difference is None:
@@ -192,11 +197,11 @@ def _against(against: Document) -> Iterator[str]:
     yield from (f"  - {line}" for line in against["why"])
 
 
-def _faults(report: RunReport) -> Blocks:
+def _format_faults(report: RunReport) -> Blocks:
     """Yield the sections with faults, restarts and unexplained detections."""
     if faults := report.faults:
         yield from ("", f"## Faults: {len(faults)}", "")
-        yield TextTable([_fault_row(fault) for fault in faults])
+        yield TextTable([_build_fault_row(fault) for fault in faults])
     if restarts := ", ".join(f"{task} {count}" for task, count in report.restarts.items()):
         yield from ("", f"Restarts: {restarts}.")
     if unexplained := report.unexplained:
@@ -207,7 +212,7 @@ def _faults(report: RunReport) -> Blocks:
         )
 
 
-def _fault_row(fault: Document) -> dict[str, Cell]:
+def _build_fault_row(fault: Document) -> dict[str, Cell]:
     """Return the row of a fault in the table of faults."""
     unit = "cycles" if fault["bound_ms"] is None else "ms"
     after, bound = (
@@ -228,11 +233,11 @@ def _fault_row(fault: Document) -> dict[str, Cell]:
     }
 
 
-def _misses(report: RunReport) -> Blocks:
+def _format_misses(report: RunReport) -> Blocks:
     """Yield the section with the first missed cycles, and why some may not be listed."""
     misses = report.misses
-    late, skipped = counted(misses)
-    which = f"{late} and {skipped}{_the_most(misses, 'first')}"
+    late, skipped = count_misses(misses)
+    which = f"{late} and {skipped}{_format_selection(misses, 'first')}"
     yield from ("", f"## Missed and skipped cycles: {which}", "")
     if (late, skipped) != (report.missed, report.skipped):
         counts = f"{report.missed} and {report.skipped}"
@@ -245,15 +250,15 @@ def _misses(report: RunReport) -> Blocks:
             "tick": miss["tick"],
             "task": miss["task"],
             "what": miss["what"] if miss["what"] == "late" else f"{miss['count']} skipped",
-            "started late, ms": decimal(miss.get("started_ms")),
-            "took, ms": decimal(miss.get("took_ms")),
+            "started late, ms": format_decimal(miss.get("started_ms")),
+            "took, ms": format_decimal(miss.get("took_ms")),
         }
-        for miss in misses[:SHOWN]
+        for miss in misses[:MAX_SHOWN_ROWS]
     ]
     yield TextTable(rows)
 
 
-def _response_along(response: Document) -> Blocks:
+def _format_response(response: Document) -> Blocks:
     """Yield the response along one chain of levels, with the responses that exceeded the bound."""
     yield ""
     bounds = (
@@ -272,10 +277,10 @@ def _response_along(response: Document) -> Blocks:
                 if len(measured["levels"]) == len(response["levels"])
                 else f"{direction} from {measured['levels'][0]}"
             ),
-            "measured p50": figure(measured["measured_ms"], "p50"),
-            "measured max": figure(measured["measured_ms"], "max"),
+            "measured p50": format_figure(measured["measured_ms"], "p50"),
+            "measured max": format_figure(measured["measured_ms"], "max"),
             "bound": measured["bound_ms"],
-            "": JUDGED[measured["holds"]],
+            "": VERDICT_WORDS[measured["holds"]],
         }
         for direction, measured in directions.items()
         if measured["levels"]
@@ -283,16 +288,16 @@ def _response_along(response: Document) -> Blocks:
     yield TextTable(rows)
     for direction, measured in directions.items():
         if exceeding := measured["beyond"]:
-            selection = _the_most(exceeding, "longest")
+            selection = _format_selection(exceeding, "longest")
             yield from ("", f"{direction}: {len(exceeding)} exceeded the bound{selection}:")
-        for slow in sorted(exceeding, key=lambda slow: -slow["ms"])[:SHOWN]:
+        for slow in sorted(exceeding, key=lambda slow: -slow["ms"])[:MAX_SHOWN_ROWS]:
             why = "; ".join(slow["delayed_by"]) or "no cause is recorded"
             yield f"- {slow['ms']:g} ms from tick {slow['tick']}: {why}"
         if unseen := measured["unseen"]:
             yield from ("", f"{direction}: {unseen} not measured, because messages are missing.")
 
 
-def _queues(queues: Sequence[Document]) -> Iterator[str]:
+def _format_queues(queues: Sequence[Document]) -> Iterator[str]:
     """Yield a sentence about each queue."""
     for queue in queues:
         refused = f", {queue['refused']} refused" if queue["refused"] else ""
@@ -302,7 +307,7 @@ def _queues(queues: Sequence[Document]) -> Iterator[str]:
         )
 
 
-def _interrupts(boards: Sequence[Document]) -> Iterator[str]:
+def _format_interrupts(boards: Sequence[Document]) -> Iterator[str]:
     """Yield a sentence about the interrupts of each board."""
     for board in boards:
         lost = f", {board['lost']} lost" if board["lost"] else ""
@@ -319,25 +324,25 @@ def _interrupts(boards: Sequence[Document]) -> Iterator[str]:
         )
 
 
-def _passed(rows: Sequence[Document], dropped: Sequence[str]) -> TextTable:
+def _build_traffic_table(rows: Sequence[Document], dropped: Sequence[str]) -> TextTable:
     """Return a table of the messages that passed an adapter, and of their ages."""
     cells = [
         {
             **{name: count for name, count in row.items() if name != "age_ms"},
-            **{f"age {key}": figure(row["age_ms"], key) for key in ("p50", "p99", "max")},
+            **{f"age {key}": format_figure(row["age_ms"], key) for key in ("p50", "p99", "max")},
         }
         for row in rows
     ]
     return TextTable(cells, dropped)
 
 
-def _network(network: Document | None) -> Blocks:
+def _format_network(network: Document | None) -> Blocks:
     """Yield the section with the traffic to other racks, and the losses of these racks."""
     if network is None:
         return
     yield from ("", "## Network, ages in ms of simulated time", "")
     if imports := network["imports"]:
-        yield _passed(imports, ("disordered", "repeated", "superseded", "source"))
+        yield _build_traffic_table(imports, ("disordered", "repeated", "superseded", "source"))
     for row in network["exports"]:
         yield f"- {row['entry']}: {row['source']} sent {row['sent']} times"
     for row in network["peers"]:

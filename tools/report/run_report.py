@@ -70,11 +70,11 @@ class RunReport:
     against: Any = None
 
     @classmethod
-    def of(cls, document: Document) -> RunReport:
+    def from_document(cls, document: Document) -> RunReport:
         """Return a report from its plain data. Missing keys become None."""
         values: Document = {field.name: document.get(field.name) for field in fields(cls)}
         return cls(**values)
 
-    def document(self) -> Document:
+    def to_document(self) -> Document:
         """Return the report as plain data."""
         return dict(vars(self))

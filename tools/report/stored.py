@@ -13,28 +13,30 @@ from rack.tools.console.answer import Document, Failure, print_json
 from rack.tools.recording.checksums import Checksums, read_file
 from rack.tools.recording.file_names import SPOOL
 
-FILES = ("report.json", "report.md")
-RECORDED = ("config.toml", "cycles.parquet", "signals", "events.jsonl")
-PROGRAM = Path(__file__).resolve().parents[2]
-FLOORS = ("backplane", "levels", "boards", "tools")
+REPORT_FILES = ("report.json", "report.md")
+RECORDED_FILES = ("config.toml", "cycles.parquet", "signals", "events.jsonl")
+PROGRAM_FOLDER = Path(__file__).resolve().parents[2]
+PROGRAM_PACKAGES = ("backplane", "levels", "boards", "tools")
 
 
-def stored_report(folder: Path) -> tuple[Document, str] | None:
+def read_stored_report(folder: Path) -> tuple[Document, str] | None:
     """Return the stored report of a run as data and as text.
 
     None if the report must be made again, for example because the recording was damaged since.
     """
     try:
         checksums = Checksums(folder)
-        files = (*FILES, *RECORDED)
+        files = (*REPORT_FILES, *RECORDED_FILES)
         checksums.verify(*(name for name in checksums.stored if name.startswith(files)))
-        made_ns = min((folder / name).stat().st_mtime_ns for name in FILES)
-        program = (path for floor in FLOORS for path in (PROGRAM / floor).rglob("*.py"))
-        basis = chain((folder / name for name in RECORDED), program)
+        made_ns = min((folder / name).stat().st_mtime_ns for name in REPORT_FILES)
+        program = (
+            path for floor in PROGRAM_PACKAGES for path in (PROGRAM_FOLDER / floor).rglob("*.py")
+        )
+        basis = chain((folder / name for name in RECORDED_FILES), program)
         if (folder / SPOOL).exists() or any(made_ns <= path.stat().st_mtime_ns for path in basis):
             return None
-        data = json.loads(read_file(folder / FILES[0]))
-        text = read_file(folder / FILES[1]).decode()
+        data = json.loads(read_file(folder / REPORT_FILES[0]))
+        text = read_file(folder / REPORT_FILES[1]).decode()
     except (OSError, ValueError, Failure):
         return None
     if not isinstance(data, dict) or data.get("against") or data.get("folder") != str(folder):
@@ -43,9 +45,9 @@ def stored_report(folder: Path) -> tuple[Document, str] | None:
     return data, text
 
 
-def newest_report(folder: Path) -> tuple[Document, str]:
+def load_report(folder: Path) -> tuple[Document, str]:
     """Return the stored report of a run, or a new one if that is missing or out of date."""
-    report = stored_report(folder)
+    report = read_stored_report(folder)
     if report is None:
         # This import takes long.
         from rack.tools.report.report import write_report
@@ -56,7 +58,7 @@ def newest_report(folder: Path) -> tuple[Document, str]:
 
 def show_report(run: str | Path, as_json: bool) -> None:
     """Print the report of a run."""
-    print_report(*newest_report(Path(run)), as_json)
+    print_report(*load_report(Path(run)), as_json)
 
 
 def print_report(data: Document, text: str, as_json: bool) -> None:
@@ -74,8 +76,8 @@ def print_report(data: Document, text: str, as_json: bool) -> None:
     from rack.tools.console.tables import print_blocks, terminal_width
 
     if terminal_width() is not None and data["folder"] is not None:
-        from rack.tools.report.report_markdown import terminal_blocks
+        from rack.tools.report.report_markdown import format_for_terminal
 
-        print_blocks(terminal_blocks(data))
+        print_blocks(format_for_terminal(data))
     else:
         print(text)

@@ -6,20 +6,20 @@ from collections.abc import Iterator
 
 from rack.boards.timing.level import LevelTiming
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.trace_times import counts, distribution
-from rack.boards.timing.verdicts import EquationVerdict, verdicts
+from rack.boards.timing.trace_times import compute_distribution, count_misses_and_skips
+from rack.boards.timing.verdicts import EquationVerdict, judge_rack
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks
-from rack.tools.recording.cycles import START_UP_S, Cycles, restarts
-from rack.tools.report.analysis import MOSTLY, Analysis, Pair
-from rack.tools.report.task_times import MS, task_times, times_table
-from rack.tools.timing.summary import tightest
-from rack.tools.timing.tables import level_table, verdict_table
+from rack.tools.recording.cycles import START_UP_S, Cycles, list_restarts
+from rack.tools.report.analysis import MOST_CYCLES_PERCENTILE, Analysis, EquationPair
+from rack.tools.report.task_times import MS_PER_NS, build_times_table, compute_task_times
+from rack.tools.timing.summary import find_tightest
+from rack.tools.timing.tables import build_level_table, build_verdict_table
 
 _Side = LevelTiming | EquationVerdict | None
 
 
-def document(analysis: Analysis) -> Document:
+def build_document(analysis: Analysis) -> Document:
     """Return an analysis as plain data. Infinite numbers are null.
 
     Restarts and the response of the system are in report.json.
@@ -35,17 +35,19 @@ def document(analysis: Analysis) -> Document:
         "context_switch_ms": config.timing.context_switch_ms,
         "percentile": analysis.percentile,
         "start_up_s": START_UP_S,
-        "rows_lost": {name: count for name, count in recording.lost.items() if count},
-        "gaps": [gap._asdict() for gap in recording.gaps()],
-        "untraced": recording.untraced(),
+        "rows_lost": {name: count for name, count in recording.lost_rows.items() if count},
+        "gaps": [gap._asdict() for gap in recording.find_gaps()],
+        "untraced": recording.count_untraced(),
         "kept": recording.kept_text or None,
-        "holds": analysis.holds,
+        "holds": analysis.is_fulfilled,
         "levels": {
-            name: _sides(analysis.predicted.levels.get(name), analysis.measured.levels.get(name))
+            name: _build_sides(
+                analysis.predicted.levels.get(name), analysis.measured.levels.get(name)
+            )
             for name in config.board
         },
         "tasks": {
-            name: task_document(cycles, analysis.predicted)
+            name: build_task_document(cycles, analysis.predicted)
             for name, cycles in analysis.cycles.items()
         },
         "core_loads": {f"core {core}": load for core, load in analysis.loads.items()},
@@ -53,37 +55,39 @@ def document(analysis: Analysis) -> Document:
             {
                 "equation": pair.equation,
                 "subject": pair.subject,
-                **_sides(pair.predicted, pair.measured),
-                "disagrees": pair.disagrees,
+                **_build_sides(pair.predicted, pair.measured),
+                "disagrees": pair.is_contradicted,
             }
             for pair in analysis.pairs
         ],
         "mostly": {
-            "percentile": MOSTLY,
+            "percentile": MOST_CYCLES_PERCENTILE,
             "failed": [
-                {"equation": p.equation, "subject": p.subject} for p in analysis.mostly if p.fails
+                {"equation": p.equation, "subject": p.subject}
+                for p in analysis.mostly
+                if p.is_failed
             ],
         },
     }
 
 
-def _sides(predicted: _Side, measured: _Side) -> Document:
+def _build_sides(predicted: _Side, measured: _Side) -> Document:
     """Return the predicted and the measured side as plain data."""
     sides = {"predicted": predicted, "measured": measured}
     return {
-        side: None if side_timing is None else side_timing.document()
+        side: None if side_timing is None else side_timing.to_document()
         for side, side_timing in sides.items()
     }
 
 
-def task_document(cycles: Cycles, rack: RackTiming) -> Document:
+def build_task_document(cycles: Cycles, rack: RackTiming) -> Document:
     """Return times of the judged cycles of a task, ms, with parts in processor time.
 
     Includes all entries of `compute_task_times`.
     """
     judged = cycles.is_judged
     rows = cycles.rows[judged]
-    missed, skipped = counts(rows)
+    missed, skipped = count_misses_and_skips(rows)
     return {
         "role": cycles.task.role,
         "core": cycles.core,
@@ -93,9 +97,9 @@ def task_document(cycles: Cycles, rack: RackTiming) -> Document:
         "stalled": cycles.stalled,
         "missed": missed,
         "skipped": skipped,
-        "used_ms": distribution(cycles.used_ns[judged] * MS),
-        "beside_ms": round(cycles.overhead_ns * MS, 6),
-        **task_times(
+        "used_ms": compute_distribution(cycles.used_ns[judged] * MS_PER_NS),
+        "beside_ms": round(cycles.overhead_ns * MS_PER_NS, 6),
+        **compute_task_times(
             cycles.task,
             rows,
             rack.tick_ns,
@@ -106,33 +110,35 @@ def task_document(cycles: Cycles, rack: RackTiming) -> Document:
     }
 
 
-def analysis_blocks(analysis: Analysis, is_verbose: bool) -> Blocks:
+def format_analysis(analysis: Analysis, is_verbose: bool) -> Blocks:
     """Yield an analysis as text: how the run ended, which equations held, and what to do.
 
     If `is_verbose`, tables of all levels, tasks and equations follow.
     """
-    yield from _head(analysis)
+    yield from _format_summary(analysis)
     if not is_verbose:
         yield "--verbose shows every level, task and equation"
         return
     yield ""
     yield (
-        f"Levels: processor time in ms, {_worst_words(analysis.percentile)}; t_residual is alpha of"
+        f"Levels: processor time in ms, {_format_percentile(analysis.percentile)}; "
+        "t_residual is alpha of"
         " eq. 3.6."
     )
     sides = {"predicted": analysis.predicted.levels, "measured": analysis.measured.levels}
     names = analysis.recording.rack_config.board
-    yield level_table(
+    yield build_level_table(
         ((side, of[name]) for name in names for side, of in sides.items() if name in of), "side"
     )
     yield ""
     yield "Tasks, ms: exec and comm are processor time; R of a planner is its time slice."
     tasks = {
-        name: task_document(cycles, analysis.predicted) for name, cycles in analysis.cycles.items()
+        name: build_task_document(cycles, analysis.predicted)
+        for name, cycles in analysis.cycles.items()
     }
-    yield times_table(tasks, analysis.predicted.is_lockstep)
+    yield build_times_table(tasks, analysis.predicted.is_lockstep)
     yield from ("", "Equations: in ms, predicted from the budgets, and measured.")
-    yield verdict_table(
+    yield build_verdict_table(
         (side, verdict)
         for pair in analysis.pairs
         for side, verdict in (("predicted", pair.predicted), ("measured", pair.measured))
@@ -140,39 +146,39 @@ def analysis_blocks(analysis: Analysis, is_verbose: bool) -> Blocks:
     )
 
 
-def _worst_words(percentile: float) -> str:
+def _format_percentile(percentile: float) -> str:
     """Return a clause that names the percentile."""
     return "in the worst cycle" if percentile >= 100 else f"in {percentile:g} of 100 cycles"
 
 
-def _head(analysis: Analysis) -> Iterator[str]:
+def _format_summary(analysis: Analysis) -> Iterator[str]:
     """Yield the summary: the end of the run, the equations, advice, and limitations."""
     config = analysis.recording.rack_config
     pairs = [pair for pair in analysis.pairs if pair.measured is not None]
-    failing = [pair for pair in pairs if pair.fails]
-    yield f"{config.name}: {_ended(analysis)}"
+    failing = [pair for pair in pairs if pair.is_failed]
+    yield f"{config.name}: {_describe_end(analysis)}"
     if not failing:
         yield f"all {len(pairs)} equations held"
     else:
         yield f"{len(pairs) - len(failing)} of {len(pairs)} equations held"
-        yield f"failed: {_named(failing)}"
-        if analysis.percentile > MOSTLY:
-            mostly = [pair for pair in analysis.mostly if pair.fails]
-            yield f"failed in more than 1 of 100 cycles: {_named(mostly) or 'none'}"
-    if differing := [pair for pair in pairs if pair.disagrees]:
-        yield f"not as predicted: {_named(differing)}"
-    yield from tightest([pair.measured for pair in pairs if pair.measured is not None])
-    yield _advice(analysis, failing)
+        yield f"failed: {_join_equations(failing)}"
+        if analysis.percentile > MOST_CYCLES_PERCENTILE:
+            mostly = [pair for pair in analysis.mostly if pair.is_failed]
+            yield f"failed in more than 1 of 100 cycles: {_join_equations(mostly) or 'none'}"
+    if differing := [pair for pair in pairs if pair.is_contradicted]:
+        yield f"not as predicted: {_join_equations(differing)}"
+    yield from find_tightest([pair.measured for pair in pairs if pair.measured is not None])
+    yield _choose_advice(analysis, failing)
     if not analysis.predicted.levels:
         yield "no prediction: the config has no budgets (board.<name>.budget)"
     if analysis.predicted.is_lockstep:
         yield "lockstep: no deadlines, no lateness; processor times are real"
-    if restarted := restarts(analysis.recording):
+    if restarted := list_restarts(analysis.recording):
         yield "restarts: " + ", ".join(f"{task} {len(ticks)}" for task, ticks in restarted.items())
-    yield from _left_out(analysis)
+    yield from _list_unjudged(analysis)
 
 
-def _left_out(analysis: Analysis) -> Iterator[str]:
+def _list_unjudged(analysis: Analysis) -> Iterator[str]:
     """Yield sentences about everything that was not judged."""
     config = analysis.recording.rack_config
     measured = analysis.measured.levels
@@ -192,21 +198,21 @@ def _left_out(analysis: Analysis) -> Iterator[str]:
         f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled
     ):
         yield f"stalled cycles are not judged: {stalled}"
-    for name, (traced, ran) in analysis.recording.untraced().items():
+    for name, (traced, ran) in analysis.recording.count_untraced().items():
         yield f"{name}: judged by {traced:,} of {ran:,} cycles"
     yield from (
         f"{count} rows of {name} were lost"
-        for name, count in analysis.recording.lost.items()
+        for name, count in analysis.recording.lost_rows.items()
         if count
     )
-    yield from map(str, analysis.recording.gaps())
+    yield from map(str, analysis.recording.find_gaps())
     if kept := analysis.recording.kept_text:
         yield kept
 
 
-def _ended(analysis: Analysis) -> str:
+def _describe_end(analysis: Analysis) -> str:
     """Return a clause that says how the run ended and how many cycles it missed."""
-    ended = analysis.recording.ended
+    ended = analysis.recording.end_counts
     cause = ended.get("outcome", {}).get("cause", "no end recorded")
     counts = ended.get("tasks", {}).values()
     missed = sum(count["missed"] for count in counts)
@@ -216,16 +222,16 @@ def _ended(analysis: Analysis) -> str:
     return f"{cause}, {missed} cycles missed, {skipped} skipped"
 
 
-def _advice(analysis: Analysis, failing: list[Pair]) -> str:
+def _choose_advice(analysis: Analysis, failing: list[EquationPair]) -> str:
     """Return advice for failed equations, or for a run that failed although all equations held."""
     folder = analysis.recording.folder
     if not failing:
-        outcome = analysis.recording.ended.get("outcome", {"cause": "time over"})
+        outcome = analysis.recording.end_counts.get("outcome", {"cause": "time over"})
         if outcome.get("faults") or outcome["cause"] not in ("task done", "time over"):
             return f"to do: rack report {folder} says why the run failed; its timing held"
         return "to do: nothing"
-    if any(pair.fails for pair in analysis.mostly):
-        if all(verdict.holds for verdict in verdicts(analysis.measured)):
+    if any(pair.is_failed for pair in analysis.mostly):
+        if all(verdict.holds for verdict in judge_rack(analysis.measured)):
             return "to do: nothing about the config: its levels' own times fit; see --verbose"
         return (
             f"to do: rack check CONFIG --from {folder} lists changes that make it fit, if there are"
@@ -237,7 +243,7 @@ def _advice(analysis: Analysis, failing: list[Pair]) -> str:
     )
 
 
-def _named(pairs: list[Pair]) -> str:
+def _join_equations(pairs: list[EquationPair]) -> str:
     """Join equations by subject, as in "servo 3.1, 3.6; core 1 load"."""
     subjects = dict.fromkeys(pair.subject for pair in pairs)
     named = {

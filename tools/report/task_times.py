@@ -8,19 +8,19 @@ import numpy as np
 
 from rack.backplane.layout import TaskSpec
 from rack.boards.timing.trace_times import (
-    communication_ns,
-    distribution,
-    execution_ns,
-    gaps_ns,
-    lateness_ns,
-    residual_ns,
+    compute_communication_ns,
+    compute_distribution,
+    compute_execution_ns,
+    compute_gaps_ns,
+    compute_lateness_ns,
+    compute_residual_ns,
 )
 from rack.tools.console.answer import Document
-from rack.tools.console.tables import Blocks, TextTable, decimal, figure
+from rack.tools.console.tables import Blocks, TextTable, format_decimal, format_figure
 from rack.tools.report.run_report import RunReport
 
-MS = 1e-6
-BY_THE_CLOCK = {
+MS_PER_NS = 1e-6
+CLOCK_COLUMNS = {
     "late p50": ("lateness_ms", "p50"),
     "late p99": ("lateness_ms", "p99"),
     "late max": ("lateness_ms", "max"),
@@ -32,7 +32,7 @@ BY_THE_CLOCK = {
 
 Each gives the key in the entry of a task, and the figure of the distribution.
 """
-USED = {
+USED_COLUMNS = {
     "exec p50": ("execution_ms", "p50"),
     "exec p99": ("execution_ms", "p99"),
     "exec max": ("execution_ms", "max"),
@@ -40,7 +40,7 @@ USED = {
     "proc p99": ("processor_ms", "p99"),
     "plan age max": ("plan_age_ms", "max"),
 }
-DROPPED = (
+DROPPED_COLUMNS = (
     "deviation",
     "comm p99",
     "proc p99",
@@ -56,7 +56,7 @@ DROPPED = (
 """Columns that a narrow terminal leaves out, in that order."""
 
 
-def task_times(
+def compute_task_times(
     task: TaskSpec,
     cycles: np.ndarray,
     period_ns: int,
@@ -80,12 +80,15 @@ def task_times(
         parts_ns: t_exec and t_comm of each cycle. Defaults to the traced times on the wall clock.
     """
     slice_ns = task.slice * period_ns
-    gaps = gaps_ns(cycles, stretches)
-    execution, communication = parts_ns or (execution_ns(cycles), communication_ns(cycles))
+    gaps = compute_gaps_ns(cycles, stretches)
+    execution, communication = parts_ns or (
+        compute_execution_ns(cycles),
+        compute_communication_ns(cycles),
+    )
     by_the_clock: Document = {
-        "lateness_ms": distribution(lateness_ns(cycles) * MS),
-        "residual_ms": distribution(residual_ns(cycles, slice_ns) * MS),
-        "largest_gap_ms": round(float(gaps.max()) * MS, 6) if len(gaps) else None,
+        "lateness_ms": compute_distribution(compute_lateness_ns(cycles) * MS_PER_NS),
+        "residual_ms": compute_distribution(compute_residual_ns(cycles, slice_ns) * MS_PER_NS),
+        "largest_gap_ms": round(float(gaps.max()) * MS_PER_NS, 6) if len(gaps) else None,
         "alpha_ms": None,
         "deviation_ms": None,
     }
@@ -94,37 +97,41 @@ def task_times(
         # execution and the longest communication may come from different cycles. Smooth motion
         # needs a small deviation.
         alpha_ns = slice_ns - int(execution.max()) - int(communication.max())
-        by_the_clock["alpha_ms"] = round(alpha_ns * MS, 6)
-        by_the_clock["deviation_ms"] = round(float((execution + communication).std()) * MS, 6)
+        by_the_clock["alpha_ms"] = round(alpha_ns * MS_PER_NS, 6)
+        by_the_clock["deviation_ms"] = round(
+            float((execution + communication).std()) * MS_PER_NS, 6
+        )
     return {
         "traced": len(cycles),
-        "slice_ms": slice_ns * MS,
-        "execution_ms": distribution(execution * MS),
-        "communication_ms": distribution(communication * MS),
-        "processor_ms": distribution(cycles["processor_ns"] * MS),
+        "slice_ms": slice_ns * MS_PER_NS,
+        "execution_ms": compute_distribution(execution * MS_PER_NS),
+        "communication_ms": compute_distribution(communication * MS_PER_NS),
+        "processor_ms": compute_distribution(cycles["processor_ns"] * MS_PER_NS),
         **(dict.fromkeys(by_the_clock) if is_lockstep else by_the_clock),
     }
 
 
-def times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextTable:
+def build_times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextTable:
     """Return a table with one line per task. Leaves out columns that mean nothing in lockstep."""
-    columns = USED if is_lockstep else BY_THE_CLOCK | USED
+    columns = USED_COLUMNS if is_lockstep else CLOCK_COLUMNS | USED_COLUMNS
     rows = [
         {
             "task": name,
             "R": task["slice_ms"],
             **{key: task.get(key) for key in ("cycles", "missed", "skipped")},
             **{
-                column: figure(task.get(key), quantile) if quantile else decimal(task[key])
+                column: format_figure(task.get(key), quantile)
+                if quantile
+                else format_decimal(task[key])
                 for column, (key, quantile) in columns.items()
             },
         }
         for name, task in tasks.items()
     ]
-    return TextTable(rows, DROPPED)
+    return TextTable(rows, DROPPED_COLUMNS)
 
 
-def times_text(report: RunReport) -> Blocks:
+def format_times(report: RunReport) -> Blocks:
     """Yield the section of a report with the table of cycles."""
     is_lockstep = report.mode == "lockstep"
     yield from ("", "## Cycles, ms", "")
@@ -136,4 +143,4 @@ def times_text(report: RunReport) -> Blocks:
         yield ""
     for name, (traced, ran) in report.untraced.items():
         yield from (f"Times of {name} are from {traced:,} of {ran:,} cycles.", "")
-    yield times_table(report.tasks, is_lockstep)
+    yield build_times_table(report.tasks, is_lockstep)

@@ -16,24 +16,24 @@ import numpy as np
 
 from rack.levels.algebra import Mask
 from rack.levels.errors import RobotError
-from rack.levels.robot.hand import actuator_moments
-from rack.levels.robot.linkage import tied_joints
-from rack.levels.robot.lookup import below, find
-from rack.levels.robot.model import SCALAR_JOINTS, check_number, listed
+from rack.levels.robot.hand import compute_moments
+from rack.levels.robot.linkage import find_tied_joints
+from rack.levels.robot.lookup import find, mark_descendants
+from rack.levels.robot.model import SCALAR_JOINTS, check_joint_count, format_names
 
-OF_GRIPPER = re.compile("finger|grip|jaw|claw|knuckle|thumb", re.IGNORECASE)
+GRIPPER_NAMES = re.compile("finger|grip|jaw|claw|knuckle|thumb", re.IGNORECASE)
 """Joints with such names belong to a gripper."""
-LEAST_JOINTS = 4
+MIN_ARM_JOINTS = 4
 """Number of joints in a row that make a branch an arm."""
-MOST_IN_FINGER = 4
+MAX_FINGER_JOINTS = 4
 """Branches of about equal length with at most this many joints are the fingers of a hand."""
-BASE_JOINTS = 3
+MIN_BASE_JOINTS = 3
 """Least number of joints before a branch for it to be a hand."""
 
 
-REFERRING = ("tendon", "equality", "actuator", "contact", "deformable", "sensor", "custom")
+REFERRING_SECTIONS = ("tendon", "equality", "actuator", "contact", "deformable", "sensor", "custom")
 """Sections of an MJCF file that refer to others."""
-KINDS = {
+REFERENCE_KINDS = {
     "jointinparent": "joint",
     **dict.fromkeys(("node", "subtree", "target", "xbody"), "body"),
     **dict.fromkeys(("refsite", "sidesite", "cranksite", "slidersite"), "site"),
@@ -63,7 +63,7 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
     Raises:
         RobotError: A name is unknown, the model has no arm, or nothing drives some of its joints.
     """
-    driven = driven_joints(model)
+    driven = find_driven_joints(model)
     scalar = np.isin(model.jnt_type, SCALAR_JOINTS)
     others: list[int] = []
     if joints:
@@ -74,11 +74,11 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
         body = mujoco.mjtObj.mjOBJ_BODY
         end = int(model.site_bodyid[site]) if site >= 0 else find(model, body, tip, "--tip")
     else:
-        end, others = _longest(model, scalar, driven)
+        end, others = _find_longest_arm(model, scalar, driven)
     if not joints:
         moving = np.flatnonzero(scalar).tolist()
-        chain = [k for k in moving if below(model, model.jnt_bodyid[[k]])[end]]
-        cut = next((k for k in chain[1:] if OF_GRIPPER.search(_name(model, k))), None)
+        chain = [k for k in moving if mark_descendants(model, model.jnt_bodyid[[k]])[end]]
+        cut = next((k for k in chain[1:] if GRIPPER_NAMES.search(_joint_name(model, k))), None)
         if cut is not None:
             end = int(model.body_parentid[model.jnt_bodyid[cut]])
             chain = chain[: chain.index(cut)]
@@ -87,19 +87,24 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
         # A mobile base does not move: skip passive joints and slides without limits.
         while chain and (chain[0] not in driven_in_chain or _is_endless(model, chain[0])):
             chain = chain[1:]
-        joints = [_name(model, joint) for joint in chain]
-        if passive := [_name(model, joint) for joint in chain if joint not in driven_in_chain]:
+        joints = [_joint_name(model, joint) for joint in chain]
+        if passive := [
+            _joint_name(model, joint) for joint in chain if joint not in driven_in_chain
+        ]:
             raise RobotError(
-                f"nothing drives {listed(passive)}, though other joints of the arm have an actuator"
+                f"nothing drives {format_names(passive)}, though other joints of the arm "
+                "have an actuator"
                 " or an effort; --tip names a body before them, --joints what to drive"
             )
     if not joints:
         raise RobotError("no arm: no hinge or slide joints in a row; --tip names a body at its end")
-    check_number(joints)
-    beyond = np.flatnonzero(scalar & below(model, np.array([end]))[model.jnt_bodyid]).tolist()
-    beyond = [joint for joint in beyond if _name(model, joint) not in joints]
-    names = tuple(_name(model, joint) for joint in beyond)
-    has_gripper = not driven or driven & {*beyond} or any(map(OF_GRIPPER.search, names))
+    check_joint_count(joints)
+    beyond = np.flatnonzero(
+        scalar & mark_descendants(model, np.array([end]))[model.jnt_bodyid]
+    ).tolist()
+    beyond = [joint for joint in beyond if _joint_name(model, joint) not in joints]
+    names = tuple(_joint_name(model, joint) for joint in beyond)
+    has_gripper = not driven or driven & {*beyond} or any(map(GRIPPER_NAMES.search, names))
     return ArmParts(
         tuple(joints),
         model.body(end).name,
@@ -109,19 +114,19 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
     )
 
 
-def driven_joints(model: mujoco.MjModel) -> set[int]:
+def find_driven_joints(model: mujoco.MjModel) -> set[int]:
     """Return the ids of the joints for which a model states a drive.
 
     A drive is an actuator, directly or through a tendon, the effort of a URDF, or a coupling to
     other joints.
     """
     every = np.arange(model.njnt)
-    drives = actuator_moments(model, every, model.qpos0[model.jnt_qposadr]).any(axis=0)
+    drives = compute_moments(model, every, model.qpos0[model.jnt_qposadr]).any(axis=0)
     driven = every[drives | model.jnt_actfrclimited]
-    return set(driven.tolist()).union(*(tied_joints(model, k) for k in range(model.neq)))
+    return set(driven.tolist()).union(*(find_tied_joints(model, k) for k in range(model.neq)))
 
 
-def hold(path: Path, kept: Iterable[str]) -> list[str]:
+def fix_joints(path: Path, kept: Iterable[str]) -> list[str]:
     """Fix all joints of an MJCF file except some, and remove free bodies.
 
     Bodies moved from outside (mocap) and everything that refers to a removed element are removed
@@ -158,13 +163,14 @@ def hold(path: Path, kept: Iterable[str]) -> list[str]:
                 removed.add(("joint", joint.get("name", "")))
     for keys in root.findall("keyframe"):
         root.remove(keys)
-    sections = [section for section in root if section.tag in REFERRING]
+    sections = [section for section in root if section.tag in REFERRING_SECTIONS]
     # Repeat, because other elements may refer to those just removed.
     while referring := [
         (section, element)
         for section in parents + sections
         for element in section
-        if (section in sections or element.tag in ("camera", "light")) and _refers(element, removed)
+        if (section in sections or element.tag in ("camera", "light"))
+        and _refers_to_removed(element, removed)
     ]:
         for section, element in referring:
             section.remove(element)
@@ -174,19 +180,21 @@ def hold(path: Path, kept: Iterable[str]) -> list[str]:
     return free_bodies
 
 
-def _refers(element: ElementTree.Element, removed: set[tuple[str, str]]) -> bool:
+def _refers_to_removed(element: ElementTree.Element, removed: set[tuple[str, str]]) -> bool:
     """Return whether an element, or one inside it, refers to a removed element."""
     for inner in element.iter():
         for key, value in inner.items():
             is_typed = key in ("objname", "refname")
             kind = (inner.get(f"{key[:3]}type", "") if is_typed else key).rstrip("12")
             names = value.split() if inner.tag == "flex" else [value]
-            if any((KINDS.get(kind, kind), name) in removed for name in names):
+            if any((REFERENCE_KINDS.get(kind, kind), name) in removed for name in names):
                 return True
     return False
 
 
-def _longest(model: mujoco.MjModel, scalar: Mask, driven: set[int]) -> tuple[int, list[int]]:
+def _find_longest_arm(
+    model: mujoco.MjModel, scalar: Mask, driven: set[int]
+) -> tuple[int, list[int]]:
     """Find the longest arm: the chain with the most joints, ending at a driven one if possible.
 
     Args:
@@ -218,9 +226,9 @@ def _longest(model: mujoco.MjModel, scalar: Mask, driven: set[int]) -> tuple[int
             return body, others
         longest = depth[branches[0]]
         is_even = len(branches) > 1 and depth[branches[1]] >= longest - 1
-        if is_even and passed_joints >= BASE_JOINTS and longest <= MOST_IN_FINGER:
+        if is_even and passed_joints >= MIN_BASE_JOINTS and longest <= MAX_FINGER_JOINTS:
             return body, others
-        others += [k for k in branches[1:] if depth[k] >= LEAST_JOINTS]
+        others += [k for k in branches[1:] if depth[k] >= MIN_ARM_JOINTS]
         body = branches[0]
 
 
@@ -228,5 +236,5 @@ def _is_endless(model: mujoco.MjModel, joint: int) -> bool:
     return bool(model.jnt_type[joint] == SCALAR_JOINTS[1] and not model.jnt_limited[joint])
 
 
-def _name(model: mujoco.MjModel, joint: int) -> str:
+def _joint_name(model: mujoco.MjModel, joint: int) -> str:
     return str(model.joint(joint).name)

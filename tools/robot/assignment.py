@@ -21,29 +21,36 @@ from rack.levels.motion.path import Path
 from rack.levels.planning.ik import MAX_RESTARTS, InverseKinematics
 from rack.levels.planning.motion_planner import MotionPlanner
 from rack.levels.planning.moves import Situation
-from rack.levels.planning.pose import pointing, pose
+from rack.levels.planning.pose import build_pointing_quaternion, make_pose
 from rack.levels.robot.abilities import Statics
 from rack.levels.robot.cell import Cell, check_start
 from rack.levels.tables import SceneConfig
 from rack.levels.task.actions import LEANING_RESTARTS, rehearse
-from rack.levels.task.grasps import FULL_ORIENTATION, QUARTERS
+from rack.levels.task.grasps import FULL_ORIENTATION, QUARTER_TURNS
 from rack.levels.task.program import DOWN, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
 from rack.tools.console.answer import Document
-from rack.tools.robot.draft import LEAST_PART, NOTHING, Draft, FittedGripper, find_home, poses
+from rack.tools.robot.draft import (
+    EMPTY_SCENE,
+    MIN_SPARE_TORQUE,
+    Draft,
+    FittedGripper,
+    find_home,
+    sample_poses,
+)
 
 SEED = 1990
 """Seed of `nasrem`."""
-HEIGHTS = (0.05, 0.2, -0.1, 0.4, 0.6)
-DISTANCES = (0.55, 0.7, 0.42, 0.34)
-FRONTS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
+TABLE_HEIGHTS = (0.05, 0.2, -0.1, 0.4, 0.6)
+TABLE_DISTANCES = (0.55, 0.7, 0.42, 0.34)
+TABLE_DIRECTIONS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 """Tables that are tried: height over the base, distance of the centre, and direction in rad.
 
 Heights and distances are fractions of the reach."""
-SPOTS = ((-0.04, -0.1), (0.04, -0.26), (-0.04, 0.1), (0.04, 0.26))
+BLOCK_PLACES = ((-0.04, -0.1), (0.04, -0.26), (-0.04, 0.1), (0.04, 0.26))
 """Starts and ends of the blocks: outward and sideways from the centre, as fractions of the reach.
 """
-TABLES = 4
+MAX_TABLES = 4
 """Maximum number of tables on which the whole task is rehearsed."""
 SEARCH_S = 15.0
 """Processor time for the search for a table, roughly. After that the arm gets a tour."""
@@ -53,16 +60,16 @@ REHEARSAL_S = 10.0
 Successful rehearsals took at most 1.6 s. Without a path between the blocks, each attempt to find
 one takes 2 s.
 """
-STOPS = 4
+TOUR_POSES = 4
 """Number of poses in a tour."""
-OBJECTS = ("block1", "block2")
-TABLE = "table"
+BLOCK_NAMES = ("block1", "block2")
+TABLE_NAME = "table"
 """Names of table and blocks. Others are used if the model has these already."""
-MOST_BLOCK_M = 0.05
+MAX_BLOCK_M = 0.05
 DENSITY = 400.0  # kg/m3
-CLEAR_M = 0.008
+TABLE_CLEARANCE_M = 0.008
 """Clearance between fingers and table when a block is taken."""
-LOOSE_M = 0.004
+EXTRA_CLEARANCE_M = 0.004
 """Additional clearance where it is a guess how the fingers follow.
 
 With less, Robotiq's 140 touches the table.
@@ -73,9 +80,9 @@ class TableSpot(NamedTuple):
     """A place for a table, with two starts and two ends for blocks."""
 
     top: float  # m
-    front: float  # rad
+    direction: float  # rad
     places: list[Array]  # four, (2,), m
-    middle: Array  # (2,), m
+    centre: Array  # (2,), m
 
 
 @dataclass(frozen=True)
@@ -93,40 +100,44 @@ class Assignment:
     kind: str
 
 
-def lay_out(draft: Draft) -> Assignment:
+def find_assignment(draft: Draft) -> Assignment:
     """Find a task for an arm. Raises `RobotError` if it cannot even tour poses.
 
     The draft's home is changed to suit the task, and its model gets table and blocks.
     """
     if draft.gripper is not None:
-        result = _pick_and_place(draft, draft.gripper)
+        result = _find_transfers(draft, draft.gripper)
         if isinstance(result, Assignment):
             return result
         draft.notes.append(f"no transfer, but a tour of poses: {result}")
-    return _tour(draft)
+    return _find_tour(draft)
 
 
-def _pick_and_place(draft: Draft, gripper: FittedGripper) -> Assignment | str:
+def _find_transfers(draft: Draft, gripper: FittedGripper) -> Assignment | str:
     """Find a table on which the arm can move two blocks, or return why there is none."""
     cell = draft.cell()
     fingertips = gripper.fingertips
-    width = min(fingertips.block, MOST_BLOCK_M)
+    width = min(fingertips.block_width, MAX_BLOCK_M)
     # The tool goes to the centre of a standing block, so the block keeps the fingers off the table.
-    clear = CLEAR_M + LOOSE_M * bool(gripper.config.follow)
-    half = 0.5 * np.array([width, width, max(width, 2.0 * (fingertips.below + clear))])
-    reach = _reach(cell)
+    clear = TABLE_CLEARANCE_M + EXTRA_CLEARANCE_M * bool(gripper.config.follow)
+    half = 0.5 * np.array([width, width, max(width, 2.0 * (fingertips.length_below + clear))])
+    reach = _estimate_reach(cell)
     lift = round(min(0.1, 0.12 * reach), 3)
     reason = "no table on which the tool comes down to blocks"
-    spots = (spot for spot in _spots(cell, reach) if _serves(cell, spot, half[2], lift))
+    spots = (
+        spot
+        for spot in _list_table_spots(cell, reach)
+        if _can_reach_places(cell, spot, half[2], lift)
+    )
     used_names = {body.name for body in draft.spec.bodies} | {
         geom.name for geom in draft.spec.geoms
     }
     table, *blocks = (
-        f"{name} of rack" if name in used_names else name for name in (TABLE, *OBJECTS)
+        f"{name} of rack" if name in used_names else name for name in (TABLE_NAME, *BLOCK_NAMES)
     )
     scene = SceneConfig(objects=tuple(blocks), supports=(table,))
-    for spot in itertools.islice(spots, TABLES):
-        added = _furnish(draft.spec, scene, spot, half, reach)
+    for spot in itertools.islice(spots, MAX_TABLES):
+        added = _add_furniture(draft.spec, scene, spot, half, reach)
         draft.write_model()
         height = round(spot.top + half[2], 4)
         actions: list[Document] = [
@@ -143,7 +154,7 @@ def _pick_and_place(draft: Draft, gripper: FittedGripper) -> Assignment | str:
             draft.home = find_home(
                 draft, scene, [np.array(action["to"]) for action in actions[:-1]]
             )
-            _rehearse(draft, scene, actions)
+            _rehearse_program(draft, scene, actions)
             return Assignment(scene, actions, "a table, two blocks to move")
         except (Refused, RobotError) as refused:
             reason = str(refused)
@@ -154,54 +165,56 @@ def _pick_and_place(draft: Draft, gripper: FittedGripper) -> Assignment | str:
     return reason
 
 
-def _reach(cell: Cell) -> float:
+def _estimate_reach(cell: Cell) -> float:
     """Estimate the largest distance of the tool from the base, m."""
     ik = InverseKinematics(cell, SEED)
-    base = _base(cell)
-    return max(norm(ik.tool_at(q).position - base) for q in poses(cell))
+    base = _locate_base(cell)
+    return max(norm(ik.compute_tool_pose(q).position - base) for q in sample_poses(cell))
 
 
-def _base(cell: Cell) -> Array:
+def _locate_base(cell: Cell) -> Array:
     """Return the base of the arm, (3,), m: below its first joint, at the height of its root."""
-    data = cell.start()
+    data = cell.build_start_data()
     joint = cell.model.dof_jntid[cell.dof[0]]
     root = cell.model.body_rootid[cell.model.jnt_bodyid[joint]]
     return np.array([*data.xanchor[joint][:2], data.xpos[root][2]])
 
 
-def _spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
+def _list_table_spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
     """Yield places for a table until `SEARCH_S` is over."""
-    base = _base(cell)
+    base = _locate_base(cell)
     end = time.process_time() + SEARCH_S
-    for height, distance, front in itertools.product(HEIGHTS, DISTANCES, FRONTS):
+    for height, distance, front in itertools.product(
+        TABLE_HEIGHTS, TABLE_DISTANCES, TABLE_DIRECTIONS
+    ):
         if time.process_time() > end:
             return
         out = np.array([np.cos(front), np.sin(front)])
         side = np.array([-out[1], out[0]])
         middle = base[:2] + distance * reach * out
-        places = [middle + reach * (a * out + b * side) for a, b in SPOTS]
+        places = [middle + reach * (a * out + b * side) for a, b in BLOCK_PLACES]
         yield TableSpot(round(base[2] + height * reach, 3), front, places, middle)
 
 
-def _serves(cell: Cell, spot: TableSpot, half: float, lift: float) -> bool:
+def _can_reach_places(cell: Cell, spot: TableSpot, half: float, lift: float) -> bool:
     """Return whether the tool can come down to every place from above."""
     ik = InverseKinematics(cell, SEED)
     # An arm with fewer joints has fewer solutions, so search longer for one.
     restarts = MAX_RESTARTS if len(cell.qpos) >= FULL_ORIENTATION else LEANING_RESTARTS
 
     def is_reached(place: Array) -> bool:
-        for quarter in QUARTERS:
-            orientation = pointing(DOWN, -(spot.front + 0.5 * np.pi * quarter))
-            placed = pose([*place, spot.top + half], orientation)
-            raised = ik.reachable(placed.raised(lift), cell.home, restarts=restarts)
-            if any(ik.nearby(placed, q) is not None for q in raised):
+        for quarter in QUARTER_TURNS:
+            orientation = build_pointing_quaternion(DOWN, -(spot.direction + 0.5 * np.pi * quarter))
+            placed = make_pose([*place, spot.top + half], orientation)
+            raised = ik.find_solutions(placed.raise_by(lift), cell.home, restarts=restarts)
+            if any(ik.find_nearby(placed, q) is not None for q in raised):
                 return True
         return False
 
     return all(is_reached(place) for place in spot.places)
 
 
-def _furnish(
+def _add_furniture(
     spec: mujoco.MjSpec, scene: SceneConfig, spot: TableSpot, half: Array, reach: float
 ) -> list[mujoco.MjsBody]:
     """Add table and blocks to a model.
@@ -216,9 +229,9 @@ def _furnish(
     Returns:
         The added bodies.
     """
-    quaternion = [np.cos(0.5 * spot.front), 0.0, 0.0, np.sin(0.5 * spot.front)]
+    quaternion = [np.cos(0.5 * spot.direction), 0.0, 0.0, np.sin(0.5 * spot.direction)]
     (name,) = scene.supports
-    table = spec.worldbody.add_body(name=name, pos=[*spot.middle, spot.top - 0.02], quat=quaternion)
+    table = spec.worldbody.add_body(name=name, pos=[*spot.centre, spot.top - 0.02], quat=quaternion)
     box = mujoco.mjtGeom.mjGEOM_BOX
     sizes = [0.15 * reach, 0.4 * reach, 0.02]
     table.add_geom(name=name, type=box, size=sizes, rgba=[0.6, 0.5, 0.4, 1.0])
@@ -249,7 +262,7 @@ def _furnish(
     return added
 
 
-class _Hurried(MotionPlanner):
+class _TimedMotionPlanner(MotionPlanner):
     """A motion planner that refuses to plan after `REHEARSAL_S`."""
 
     def __init__(self, cell: Cell, scene: SceneConfig, seed: int) -> None:
@@ -263,33 +276,36 @@ class _Hurried(MotionPlanner):
         return super().plan(*args, **wishes)
 
 
-def _rehearse(draft: Draft, scene: SceneConfig, actions: list[Document]) -> Rehearsal:
+def _rehearse_program(draft: Draft, scene: SceneConfig, actions: list[Document]) -> Rehearsal:
     """Plan a whole program. Raises `Refused`, or `RobotError` if the start is in contact."""
     cell = draft.cell(scene)
     check_start(cell, draft.robot, "home", cell.home)
-    data = cell.start()
+    data = cell.build_start_data()
     situation = Situation(data.xpos[cell.bodies].copy(), data.xquat[cell.bodies].copy())
-    start = Rehearsal(_Hurried(cell, scene, SEED), cell.home, situation)
+    start = Rehearsal(_TimedMotionPlanner(cell, scene, SEED), cell.home, situation)
     return rehearse(TaskConfig.model_validate({"action": actions}), scene, start)
 
 
-def _tour(draft: Draft) -> Assignment:
+def _find_tour(draft: Draft) -> Assignment:
     """Find poses that can be reached one after the other. Raises `RobotError` if none can."""
     cell = draft.cell()
     check_start(cell, draft.robot, "home", cell.home)
-    planner = MotionPlanner(cell, NOTHING, SEED)
+    planner = MotionPlanner(cell, EMPTY_SCENE, SEED)
     statics = Statics(cell)
     actions: list[Document] = []
-    for q in poses(cell):
+    for q in sample_poses(cell):
         action = {"do": "goto", "joints": q.round(3).tolist()}
         try:
-            if planner.checker.free(q) and statics.held(q)[0].min() > LEAST_PART:
-                _rehearse(draft, NOTHING, [*actions, action])
+            if (
+                planner.checker.is_free(q)
+                and statics.compute_load_limits(q)[0].min() > MIN_SPARE_TORQUE
+            ):
+                _rehearse_program(draft, EMPTY_SCENE, [*actions, action])
                 actions.append(action)
         except Refused:
             continue
-        if len(actions) == STOPS:
+        if len(actions) == TOUR_POSES:
             break
     if not actions:
         raise RobotError("no pose can be reached from home without contact")
-    return Assignment(NOTHING, [*actions, {"do": "home"}], "a tour of poses")
+    return Assignment(EMPTY_SCENE, [*actions, {"do": "home"}], "a tour of poses")

@@ -19,62 +19,62 @@ from pydantic import ValidationError
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
 from rack.levels.planning.collision import CollisionChecker
-from rack.levels.planning.ik import sampling_range
+from rack.levels.planning.ik import find_sampling_range
 from rack.levels.robot.abilities import Statics
 from rack.levels.robot.cell import (
     Cell,
     build_cell,
+    build_unchecked_cell,
     check_fingers,
-    unchecked_cell,
-    unintended_contacts,
+    find_unintended_contacts,
 )
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.engine import set_margins
 from rack.levels.robot.linkage import check_couplings
-from rack.levels.robot.model import compile_spec, listed, load_spec, stated_torque
+from rack.levels.robot.model import compile_spec, find_torque_limit, format_names, load_spec
 from rack.levels.servo.control import LoopGains
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig, ToolConfig
-from rack.tools.robot.arm import ArmParts, driven_joints, find_arm, hold
-from rack.tools.robot.fingertips import Fingertips, find_fingertips, tool_outward
-from rack.tools.robot.gripper import fit_fingers
+from rack.tools.robot.arm import ArmParts, find_arm, find_driven_joints, fix_joints
+from rack.tools.robot.fingertips import Fingertips, choose_outward_tool, measure_fingertips
+from rack.tools.robot.gripper import fit_gripper
 from rack.tools.robot.pieces import cut_meshes
 from rack.tools.robot.source import Source, copy_model
 
 CLOCK_NS = 2_500_000
 """Clock period of `nasrem`, whose levels and boards the arm gets."""
-SPEED = {mujoco.mjtJoint.mjJNT_HINGE: 1.5, mujoco.mjtJoint.mjJNT_SLIDE: 0.25}
+GUESSED_SPEED = {mujoco.mjtJoint.mjJNT_HINGE: 1.5, mujoco.mjtJoint.mjJNT_SLIDE: 0.25}
 """Guessed velocity limits by joint type, rad/s and m/s."""
 SPEED_UP_S = 0.5
 """Time to full speed of planned motion, if the motors permit.
 
 The jerk limit is ten times the acceleration limit.
 """
-LEAST_PART = 0.2
+MIN_SPARE_TORQUE = 0.2
 """Fraction of each torque limit that must be left over at home after gravity."""
-ROOM = 2.0
+TORQUE_MARGIN = 2.0
 """Guessed torque limits, as a multiple of the torque for weight, friction and acceleration."""
-DRAG_PART = 0.4
+MAX_DRAG_FRACTION = 0.4
 """Fraction of the torque left over by gravity that friction may take at a guessed velocity."""
-REST_RAD = 0.002
+MAX_REST_ERROR_RAD = 0.002
 """Largest error at which dry friction may hold a joint at rest. Tasks permit 0.003 rad."""
-MOST_BANDWIDTH = 100.0
+MAX_BANDWIDTH = 100.0
 """Upper bound for the bandwidth of the joint loop, rad/s."""
-POSES = 400
+POSE_COUNT = 400
 """Number of poses that are sampled."""
-SKIN_M = 1e-4
+CONTACT_DISTANCE_M = 1e-4
 """Bodies closer than this, m, count as touching, because the planner would reject such a pose."""
-APART_M = 0.005
+PREFERRED_CLEARANCE_M = 0.005
 """Preferred clearance at home, m, because a linkage settles slightly off its equalities."""
-ALWAYS = 0.95
+OVERLAP_FRACTION = 0.95
 """Bodies in contact in this fraction of the poses are neighbours whose shapes overlap."""
-TOOLS = ("tcp", "tool", "grip_site", "attachment", "eef", "ee_", "pinch", "hand", "flange")
+TOOL_NAMES = ("tcp", "tool", "grip_site", "attachment", "eef", "ee_", "pinch", "hand", "flange")
 """Name parts of frames at the end of an arm, in order of preference."""
-NOTHING = SceneConfig()
+EMPTY_SCENE = SceneConfig()
 """A scene without objects or supports."""
 
 
 @dataclass(frozen=True)
-class Wishes:
+class ArmOptions:
     """Options of the user. An empty one leaves the choice to the draft."""
 
     tip: str = ""
@@ -129,7 +129,7 @@ class Draft:
 
     model: Path  # MJCF file of the draft
     spec: mujoco.MjSpec  # content of that file, possibly with changes not yet written
-    wishes: Wishes
+    options: ArmOptions
     arm: ArmParts
     keyframes: Mapping[str, Array]  # positions of the arm's joints, (joints,), by name
     notes: list[str]
@@ -161,9 +161,10 @@ class Draft:
     def guessed(self) -> dict[str, str]:
         """Keys of the table whose values are guesses, each with its reason."""
         limits = self.limits
-        torque = f"{ROOM:g} times what weight, friction and inertia take"
+        torque = f"{TORQUE_MARGIN:g} times what weight, friction and inertia take"
         reasons = {
-            "velocity": limits.unstated and f"the model states none for {listed(limits.unstated)}",
+            "velocity": limits.unstated
+            and f"the model states none for {format_names(limits.unstated)}",
             "gripper": self.gripper and self.gripper.guess,
             "tool": self.tool.guess,
             "exclude": self.exclude and "these bodies overlap in every pose",
@@ -184,12 +185,12 @@ class Draft:
             key = ".".join(map(str, first["loc"]))
             raise RobotError(f"robot.{key} = {first['input']}: {first['msg'].lower()}") from None
 
-    def cell(self, scene: SceneConfig = NOTHING, **changes: Any) -> Cell:
+    def cell(self, scene: SceneConfig = EMPTY_SCENE, **changes: Any) -> Cell:
         """Build the cell of the arm as drafted so far, with changed keys of the table if given.
 
         Raises `RobotError`.
         """
-        return unchecked_cell(self.robot.model_copy(update=changes), scene, CLOCK_NS)
+        return build_unchecked_cell(self.robot.model_copy(update=changes), scene, CLOCK_NS)
 
     def write_model(self) -> None:
         """Write the model to its file. Raises `RobotError`."""
@@ -197,14 +198,14 @@ class Draft:
         self.model.write_text(self.spec.to_xml(), encoding="utf-8")
 
 
-def draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
+def draft_arm(source: Source, options: ArmOptions, folder: Path, name: str) -> Draft:
     """Draft the arm of a model such that `rack run` accepts it.
 
     A gripper that `rack run` would refuse is fixed in place instead of driven.
 
     Args:
         source: The user's model.
-        wanted: Options that the user stated.
+        options: Options that the user stated.
         folder: Folder to which the draft's own model is written.
         name: Name of that model file, without suffix.
 
@@ -212,22 +213,22 @@ def draft(source: Source, wanted: Wishes, folder: Path, name: str) -> Draft:
         RobotError: Nothing can be made of the model. The message is one line.
     """
     try:
-        result = _draft(source, wanted, folder, name)
+        result = _run_steps(source, options, folder, name)
     except RobotError as error:
         raise RobotError("; ".join([str(error), *source.notes])) from None
     try:
-        build_cell(result.robot, NOTHING, CLOCK_NS)
+        build_cell(result.robot, EMPTY_SCENE, CLOCK_NS)
     except RobotError as error:
         if result.gripper is None:
             raise
-        result = _draft(source, replace(wanted, gripper="none"), folder, name)
+        result = _run_steps(source, replace(options, gripper="none"), folder, name)
         result.notes.append(f"no gripper: {error}")
     return result
 
 
-def _draft(source: Source, wishes: Wishes, folder: Path, name: str) -> Draft:
+def _run_steps(source: Source, wishes: ArmOptions, folder: Path, name: str) -> Draft:
     """Run the steps of a draft. Each returns a record that is computed from the draft so far."""
-    model = source.compiled()
+    model = source.compile_model()
     arm = find_arm(model, wishes.tip, wishes.joints)
     # Equalities with joints that are fixed disappear with them, so check the couplings first.
     check_couplings(model, arm.joints, of_bodies=False)
@@ -239,7 +240,7 @@ def _draft(source: Source, wishes: Wishes, folder: Path, name: str) -> Draft:
     path = folder / f"{name}.xml"
     copy_model(source, path)
     springs = [joint for joint in arm.passive if model.joint(joint).stiffness > 0.0]
-    left_out = hold(path, (*arm.joints, *fingers, *springs))
+    left_out = fix_joints(path, (*arm.joints, *fingers, *springs))
     notes = [*source.notes, *_describe_rest(model, arm, left_out)]
     spec = load_spec(path)
     limits = _read_limits(source, model, spec, arm.joints, wishes.torque)
@@ -253,7 +254,7 @@ def _draft(source: Source, wishes: Wishes, folder: Path, name: str) -> Draft:
         except RobotError as error:
             notes.append(f"no gripper: {error}")
             result.write_model()
-            hold(path, arm.joints)
+            fix_joints(path, arm.joints)
             result.spec = load_spec(path)
     if not wishes.tool:
         result.tool = _choose_tool(result)
@@ -271,16 +272,20 @@ def _draft(source: Source, wishes: Wishes, folder: Path, name: str) -> Draft:
 def _describe_rest(model: mujoco.MjModel, arm: ArmParts, left_out: list[str]) -> Iterator[str]:
     """Yield notes about parts of the model that the draft leaves out, fixes or cannot limit."""
     if left_out:
-        yield f"left out, because they are not attached: {listed(left_out)}"
+        yield f"left out, because they are not attached: {format_names(left_out)}"
     if endless := [joint for joint in arm.joints if not model.joint(joint).limited]:
-        yield f"joints without limits: {listed(endless)}; [robot] position can state them"
+        yield f"joints without limits: {format_names(endless)}; [robot] position can state them"
     if arm.passive:
         yield (
-            f"passive joints beyond the arm: {listed([*arm.passive])}; those without a spring are"
+            f"passive joints beyond the arm: {format_names([*arm.passive])}; those "
+            "without a spring are"
             " fixed; --joints drives them"
         )
     if arm.others:
-        yield f"fixed: other arms that begin at {listed([*arm.others])}; --tip chooses one of them"
+        yield (
+            f"fixed: other arms that begin at {format_names([*arm.others])}; --tip chooses "
+            "one of them"
+        )
 
 
 def _read_limits(
@@ -295,11 +300,13 @@ def _read_limits(
     Raises `RobotError` if nothing drives the arm and the user states no torques.
     """
     ids = {model.joint(joint).id for joint in joints}
-    if not (wanted or driven_joints(model) & ids):
+    if not (wanted or find_driven_joints(model) & ids):
         why = "no actuator and no effort"
-        raise RobotError(f"{why} at {listed([*joints])}; --torque T,... states the limits")
-    torque = wanted or [stated_torque(spec, joint, spec.actuators) for joint in joints]
-    velocity = [source.velocity.get(joint, SPEED[spec.joint(joint).type]) for joint in joints]
+        raise RobotError(f"{why} at {format_names([*joints])}; --torque T,... states the limits")
+    torque = wanted or [find_torque_limit(spec, joint, spec.actuators) for joint in joints]
+    velocity = [
+        source.velocity.get(joint, GUESSED_SPEED[spec.joint(joint).type]) for joint in joints
+    ]
     return JointLimits(
         *(velocity, velocity, velocity, [limit or 1e6 for limit in torque]),
         unstated=[joint for joint in joints if joint not in source.velocity],
@@ -314,7 +321,7 @@ def _find_mount(model: mujoco.MjModel, tip: str) -> str:
         if model.body_parentid[body] in carried and not model.body_jntnum[body]:
             carried.append(body)
     names = [model.body(body).name for body in carried]
-    named = [name for name_part in TOOLS for name in names[1:] if name_part in name.lower()]
+    named = [name for name_part in TOOL_NAMES for name in names[1:] if name_part in name.lower()]
     return str((named or names[-1:])[0])
 
 
@@ -323,24 +330,25 @@ def _fit_gripper(draft: Draft) -> FittedGripper:
 
     Raises `RobotError` if the gripper cannot be used.
     """
-    wanted = draft.wishes.gripper
+    wanted = draft.options.gripper
     arm = draft.arm
     if wanted and wanted not in arm.fingers:
         raise RobotError(
-            f"--gripper: no joint '{wanted}' beyond the arm; {listed(list(arm.fingers))}, none"
+            f"--gripper: no joint '{wanted}' beyond the arm; "
+            f"{format_names(list(arm.fingers))}, none"
         )
-    config, guess = fit_fingers(draft.spec, compile_spec(draft.spec, draft.model), arm, wanted)
+    config, guess = fit_gripper(draft.spec, compile_spec(draft.spec, draft.model), arm, wanted)
 
     draft.write_model()
     cell = draft.cell(gripper=config)
-    fingertips = find_fingertips(cell, arm.tip)
+    fingertips = measure_fingertips(cell, arm.tip)
     notes = []
-    if fingertips.is_one:
+    if fingertips.has_one_finger:
         pieces = cut_meshes(draft.spec, cell, fingertips.out)
         why = f"; their meshes are cut to {pieces} convex pieces" if pieces else ""
         notes.append(f"one finger closes on a fixed jaw{why}")
         draft.write_model()
-        fingertips = find_fingertips(draft.cell(gripper=config), arm.tip, is_one=True)
+        fingertips = measure_fingertips(draft.cell(gripper=config), arm.tip, has_one_finger=True)
     config = config.model_copy(update={"open": round(fingertips.opening, 5)})
     cell = draft.cell(gripper=config)
     # Home is not known yet, so let the fingers settle without contacts with the rest of the arm.
@@ -354,34 +362,34 @@ def _fit_gripper(draft: Draft) -> FittedGripper:
 def _choose_tool(draft: Draft) -> ToolFrame:
     """Place the tool between the fingers, or at the end of an arm without a usable gripper."""
     if draft.gripper is None:
-        tool = tool_outward(draft.cell(), draft.tool.name)
+        tool = choose_outward_tool(draft.cell(), draft.tool.name)
         return ToolFrame(*tool, "z along the last joint, outward")
     fingertips = draft.gripper.fingertips
-    sides = "finger and fixed jaw" if fingertips.is_one else "the fingers"
+    sides = "finger and fixed jaw" if fingertips.has_one_finger else "the fingers"
     guess = f"between {sides}, z out of the hand, y across"
     return ToolFrame(draft.arm.tip, fingertips.tool, guess)
 
 
 def _find_overlaps(cell: Cell) -> tuple[tuple[str, str], ...]:
     """Find pairs of bodies whose shapes overlap in nearly every pose."""
-    set_margins(cell.model, SKIN_M)
-    data = cell.start()
+    set_margins(cell.model, CONTACT_DISTANCE_M)
+    data = cell.build_start_data()
     count: Counter[tuple[str, str]] = Counter()
-    for q in poses(cell):
-        count.update(touching(cell, data, q))
-    return tuple(sorted(pair for pair, n in count.items() if n >= ALWAYS * POSES))
+    for q in sample_poses(cell):
+        count.update(find_touching_bodies(cell, data, q))
+    return tuple(sorted(pair for pair, n in count.items() if n >= OVERLAP_FRACTION * POSE_COUNT))
 
 
-def poses(cell: Cell) -> list[Array]:
+def sample_poses(cell: Cell) -> list[Array]:
     """Sample poses all over the joints' ranges, (joints,) each, rad."""
-    low, high = sampling_range(cell)
+    low, high = find_sampling_range(cell)
     edge = 0.1 * (high - low)
-    drawn = np.random.default_rng(0).uniform(low + edge, high - edge, (POSES, len(low)))
+    drawn = np.random.default_rng(0).uniform(low + edge, high - edge, (POSE_COUNT, len(low)))
     return list(drawn)
 
 
-def touching(
-    cell: Cell, data: mujoco.MjData, q: Array, skin_m: float = SKIN_M
+def find_touching_bodies(
+    cell: Cell, data: mujoco.MjData, q: Array, skin_m: float = CONTACT_DISTANCE_M
 ) -> set[tuple[str, str]]:
     """Find pairs of bodies in unintended contact at a pose.
 
@@ -397,7 +405,7 @@ def touching(
     model = cell.model
     data.qpos[cell.qpos] = q
     mujoco.mj_fwdPosition(model, data)
-    bodies = model.geom_bodyid[unintended_contacts(data, cell.geoms.touch, skin_m)]
+    bodies = model.geom_bodyid[find_unintended_contacts(data, cell.geoms.touch, skin_m)]
     names = [sorted(str(model.body(body).name) for body in pair) for pair in bodies]
     return {(first, second) for first, second in names}
 
@@ -414,7 +422,7 @@ def _compute_limits(draft: Draft) -> JointLimits:
     velocity = np.array(stated.velocity)
     weight, drag, inertia = np.zeros((3, len(velocity)))
     least_inertia = np.full(len(velocity), np.inf)
-    for q in poses(cell):
+    for q in sample_poses(cell):
         # The terms are views of one array.
         bias, still = (dynamics.terms(q, v).bias.copy() for v in (velocity, 0.0 * velocity))
         weight = np.maximum(weight, np.abs(still))
@@ -424,31 +432,35 @@ def _compute_limits(draft: Draft) -> JointLimits:
         least_inertia = np.minimum(least_inertia, joint_inertia)
     weight = weight + np.abs(dynamics.friction(velocity))
     wanted = velocity / SPEED_UP_S
-    needed_torque = ROOM * (weight + drag + inertia * wanted)
+    needed_torque = TORQUE_MARGIN * (weight + drag + inertia * wanted)
     torque = np.where(stated.is_torque_stated, stated.torque, needed_torque)
     spare_torque = torque - weight
-    scale = np.clip(DRAG_PART * spare_torque / np.maximum(drag, 1e-9), LEAST_PART, 1.0)
+    scale = np.clip(
+        MAX_DRAG_FRACTION * spare_torque / np.maximum(drag, 1e-9), MIN_SPARE_TORQUE, 1.0
+    )
     scale[[joint not in stated.unstated for joint in draft.arm.joints]] = 1.0
     acceleration = np.clip(0.5 * (spare_torque - scale * drag) / inertia, 0.1 * wanted, wanted)
     friction_acceleration = float(np.max(dynamics.dry / least_inertia))  # rad/s2
-    needed = min(np.sqrt(friction_acceleration / REST_RAD), MOST_BANDWIDTH)
+    needed = min(np.sqrt(friction_acceleration / MAX_REST_ERROR_RAD), MAX_BANDWIDTH)
     default = LoopGains().bandwidth
     return replace(
         stated,
-        velocity=_rounded(scale * velocity),
-        acceleration=_rounded(acceleration),
-        jerk=_rounded(10.0 * acceleration),
-        torque=_rounded(torque),
+        velocity=_round_values(scale * velocity),
+        acceleration=_round_values(acceleration),
+        jerk=_round_values(10.0 * acceleration),
+        torque=_round_values(torque),
         bandwidth=round(float(needed), 1) if needed > default else None,
         friction_error=friction_acceleration / default**2,
     )
 
 
-def _rounded(values: Array) -> list[float]:
+def _round_values(values: Array) -> list[float]:
     return [float(f"{value:.3g}") for value in values]
 
 
-def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] = ()) -> HomePose:
+def find_home(
+    draft: Draft, scene: SceneConfig = EMPTY_SCENE, ends: Sequence[Array] = ()
+) -> HomePose:
     """Find a home in which the arm carries itself and touches nothing.
 
     A keyframe that qualifies is preferred. The alternative is the best sampled pose.
@@ -462,29 +474,29 @@ def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] 
     Raises:
         RobotError: No sampled pose qualifies, or the keyframe that the user named is unknown.
     """
-    wanted = draft.wishes.home
+    wanted = draft.options.home
     keyframes = draft.keyframes
     cell = draft.cell(scene)
-    data = cell.start()
+    data = cell.build_start_data()
     checker = CollisionChecker(cell, scene)
     later = CollisionChecker(cell, scene)
     if ends:
-        later.place(np.array(ends), data.xquat[cell.bodies])
+        later.place_bodies(np.array(ends), data.xquat[cell.bodies])
     statics = Statics(cell)
     low, high = cell.limits.position.T
 
     def left(q: Array) -> float:
         """Return the fraction of torque that gravity leaves, or -1 for an unusable pose."""
         is_within = np.all(q >= low) and np.all(q <= high)
-        if is_within and checker.free(q, 0.0) and (not ends or later.free(q)):
-            return float(statics.held(q)[0].min()) - LEAST_PART
+        if is_within and checker.is_free(q, 0.0) and (not ends or later.is_free(q)):
+            return float(statics.compute_load_limits(q)[0].min()) - MIN_SPARE_TORQUE
         return -1.0
 
     if wanted and wanted not in keyframes:
         try:
             return HomePose([float(value) for value in wanted.split(",")])
         except ValueError:
-            known = listed(list(keyframes))
+            known = format_names(list(keyframes))
             raise RobotError(
                 f"--home: '{wanted}' is not a keyframe; valid: {known}, or q1,q2,..."
             ) from None
@@ -492,15 +504,15 @@ def find_home(draft: Draft, scene: SceneConfig = NOTHING, ends: Sequence[Array] 
     for name in named:
         if left(keyframes[name]) > 0:
             return HomePose(keyframes[name].round(5).tolist())
-    set_margins(cell.model, 0.5 * APART_M)
+    set_margins(cell.model, 0.5 * PREFERRED_CLEARANCE_M)
 
     def rate_pose(q: Array) -> float:
         # Forward kinematics at `q` is a side effect of `find_touching_bodies`.
-        is_near = bool(touching(cell, data, q, APART_M))
+        is_near = bool(find_touching_bodies(cell, data, q, PREFERRED_CLEARANCE_M))
         downward = -float(data.site_xmat[cell.tool, 8])
         return left(q) + downward - 2.0 * is_near
 
-    best = max((q for q in poses(cell) if left(q) > 0), key=rate_pose, default=None)
+    best = max((q for q in sample_poses(cell) if left(q) > 0), key=rate_pose, default=None)
     if best is None:
         raise RobotError(
             "no pose was found that is free of contact and held by the motors; give one with --home"

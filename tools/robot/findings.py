@@ -11,15 +11,15 @@ import numpy as np
 
 from rack.levels.errors import RobotError
 from rack.levels.planning.payload import Payloads, find_fixed_jaw
-from rack.levels.robot.abilities import Abilities, Statics, abilities
-from rack.levels.robot.cell import Cell, check_fingers, unchecked_cell
+from rack.levels.robot.abilities import Abilities, Statics, compute_abilities
+from rack.levels.robot.cell import Cell, build_unchecked_cell, check_fingers
 from rack.levels.robot.model import load_spec
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 from rack.levels.task.program import DOWN
 from rack.tools.console.answer import Document
-from rack.tools.robot.draft import touching
+from rack.tools.robot.draft import find_touching_bodies
 
-MOST_TURN = 0.5
+MAX_PHASE_RAD = 0.5
 """Largest phase angle of a vibration in one step, rad, at which its simulation is trustworthy."""
 
 
@@ -33,7 +33,7 @@ class Observation:
 
 
 @dataclass(frozen=True)
-class Examined:
+class ArmExamination:
     """An arm with the results of its examination."""
 
     cell: Cell
@@ -42,7 +42,7 @@ class Examined:
     findings: list[Observation]
 
 
-def examine(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Examined:
+def examine_arm(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> ArmExamination:
     """Examine an arm in its cell. Contacts at home are reported, not refused.
 
     Args:
@@ -53,16 +53,16 @@ def examine(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Examined:
     Raises:
         RobotError: The cell cannot be built.
     """
-    cell = unchecked_cell(robot, scene, clock_ns)
-    able = abilities(cell)
-    findings = list(_findings(cell, robot, scene, able))
-    return Examined(cell, list(_joints(cell, robot)), able, findings)
+    cell = build_unchecked_cell(robot, scene, clock_ns)
+    able = compute_abilities(cell)
+    findings = list(_check_arm(cell, robot, scene, able))
+    return ArmExamination(cell, list(_list_joints(cell, robot)), able, findings)
 
 
-def _joints(cell: Cell, robot: RobotConfig) -> Iterator[Document]:
+def _list_joints(cell: Cell, robot: RobotConfig) -> Iterator[Document]:
     """Yield a row of figures for each joint."""
-    data = cell.start()
-    left, _ = Statics(cell).held(cell.home)
+    data = cell.build_start_data()
+    left, _ = Statics(cell).compute_load_limits(cell.home)
     for k, name in enumerate(robot.joints):
         joint = cell.model.dof_jntid[cell.dof[k]]
         yield {
@@ -77,12 +77,12 @@ def _joints(cell: Cell, robot: RobotConfig) -> Iterator[Document]:
         }
 
 
-def _findings(
+def _check_arm(
     cell: Cell, robot: RobotConfig, scene: SceneConfig, able: Abilities
 ) -> Iterator[Observation]:
     """Yield the result of each check."""
     model = cell.model
-    data = cell.start()
+    data = cell.build_start_data()
     low, high = cell.limits.position.T
     outside = [
         n for n, q, a, b in zip(robot.joints, cell.home, low, high, strict=True) if not a <= q <= b
@@ -90,12 +90,13 @@ def _findings(
     yield Observation(
         "home", f"outside its limits: {', '.join(outside) or 'no joint'}", bool(outside)
     )
-    is_too_weak = able.left < 0.0
+    is_too_weak = able.torque_left < 0.0
     weight_text = (
-        f"gravity takes {100 * (1 - able.left):.0f} % of '{robot.joints[able.joint]}' at worst"
+        f"gravity takes {100 * (1 - able.torque_left):.0f} % of '{robot.joints[able.joint]}' "
+        "at worst"
     )
     yield Observation("weight", weight_text, is_too_weak)
-    pairs = sorted(" and ".join(pair) for pair in touching(cell, data, cell.home))
+    pairs = sorted(" and ".join(pair) for pair in find_touching_bodies(cell, data, cell.home))
     yield Observation("contacts at home", ", ".join(pairs) or "none", bool(pairs))
     known_addresses = {*cell.qpos, *cell.object_qpos, *model.jnt_qposadr[model.jnt_stiffness > 0.0]}
     if cell.gripper is not None:
@@ -107,20 +108,20 @@ def _findings(
     }
     names = sorted(model.body(body).name for body in loose_bodies)
     yield Observation("unattached bodies", ", ".join(names) or "none", bool(names))
-    kinds = Counter(map(_kind, load_spec(robot.model).actuators))
+    kinds = Counter(map(_actuator_kind, load_spec(robot.model).actuators))
     yield Observation(
         "actuators", ", ".join(f"{n} {kind}" for kind, n in kinds.items()) or "none", False
     )
     if robot.gripper is not None:
-        coupling_error = _elsewhere(cell, robot.gripper)
+        coupling_error = _find_coupling_error(cell, robot.gripper)
         yield Observation(
             "coupling",
             coupling_error or "fingers settle where planning poses them",
             bool(coupling_error),
         )
-        yield Observation("fingers", _facing(cell, scene), False)
-    phase, spring = _fastest(cell)
-    needed_substeps = int(np.ceil(robot.substeps * phase / MOST_TURN)) or 1
+        yield Observation("fingers", _describe_fingers(cell, scene), False)
+    phase, spring = _find_fastest_vibration(cell)
+    needed_substeps = int(np.ceil(robot.substeps * phase / MAX_PHASE_RAD)) or 1
     text = f"{spring:.3g} Hz at most; {needed_substeps} of {robot.substeps} substeps are enough"
     yield Observation("natural frequency", text, needed_substeps > robot.substeps)
     hit_geom = np.full(1, -1, dtype=np.int32)
@@ -132,13 +133,13 @@ def _findings(
         yield Observation("guessed", ", ".join(robot.guessed), False)
 
 
-def _kind(actuator: mujoco.MjsActuator) -> str:
+def _actuator_kind(actuator: mujoco.MjsActuator) -> str:
     if actuator.biastype == mujoco.mjtBias.mjBIAS_NONE:
         return "motor"
     return "position" if actuator.biasprm[1] else "velocity"
 
 
-def _facing(cell: Cell, scene: SceneConfig) -> str:
+def _describe_fingers(cell: Cell, scene: SceneConfig) -> str:
     """Describe what closes at the tool, and how far it opens."""
     payloads = Payloads(cell, scene.objects)
     if not payloads.jaws:
@@ -149,7 +150,7 @@ def _facing(cell: Cell, scene: SceneConfig) -> str:
     return f"{sides}; {1e3 * payloads.jaws[0].gap:.0f} mm open at the tool"
 
 
-def _elsewhere(cell: Cell, config: GripperConfig) -> str:
+def _find_coupling_error(cell: Cell, config: GripperConfig) -> str:
     """Return why the fingers do not settle where planning poses them, or an empty text."""
     try:
         check_fingers(cell, config)
@@ -158,14 +159,14 @@ def _elsewhere(cell: Cell, config: GripperConfig) -> str:
     return ""
 
 
-def _fastest(cell: Cell) -> tuple[float, float]:
+def _find_fastest_vibration(cell: Cell) -> tuple[float, float]:
     """Find the fastest vibration against springs and the loop of the gripper.
 
     Returns:
         Its phase angle in one step, rad, and its frequency, Hz.
     """
     model = cell.model
-    data = cell.start()
+    data = cell.build_start_data()
     inertia = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, inertia)
     stiffness = model.jnt_stiffness[model.dof_jntid].copy()

@@ -13,40 +13,40 @@ from numpy.typing import NDArray
 
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import RobotError
-from rack.levels.planning.collision import farthest
+from rack.levels.planning.collision import compute_extent
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.lookup import below
+from rack.levels.robot.lookup import mark_descendants
 from rack.levels.tables import ToolConfig
 
 STEP_M = 0.0025
 """Spacing of the points between the fingers at which rays are cast."""
 FROM_TIP_M = 0.012
 """Distance of the tool's origin from the tips of the fingers."""
-ROOM_M = 0.001
+JAW_CLEARANCE_M = 0.001
 """Distance from the surface of a fixed jaw to the line of points that are tried."""
-BLOCK_PART = 0.5
-FACING_PART = 0.35
+BLOCK_FRACTION = 0.5
+JAW_BLOCK_FRACTION = 0.35
 """Width of a block as a fraction of the gap, with two fingers, and with one finger and a jaw.
 
 A finger that turns faces its jaw only when it is nearly closed.
 """
-LEAST_GAP_M = 0.012
+MIN_GAP_M = 0.012
 """A gripper that opens less than this cannot take a block."""
-NEARLY, NEARER = 0.6, 0.85
+NEARLY_CLOSED, NEARLY_CLOSED_ON_JAW = 0.6, 0.85
 """Fractions of the way to closed at which the meeting point is measured: two fingers, one finger.
 
 The tip of a single turning finger is near its jaw only when it is nearly closed.
 """
-LEAST_WAY_M = 1e-4
+MIN_FINGER_MOTION_M = 1e-4
 """A geom that moves less than this does not belong to a finger."""
-FINGERS, STILL = np.eye(6, dtype=np.uint8)[1:3]
+FINGER_GROUP, JAW_GROUP = np.eye(6, dtype=np.uint8)[1:3]
 """Geom groups that a ray can hit: moving fingers, and the jaw that a single finger closes on."""
-ASIDE_M = (0.0, 0.01, -0.01, 0.02, -0.02)
+RAY_OFFSETS_M = (0.0, 0.01, -0.01, 0.02, -0.02)
 """Sideways offsets at which rays start, in order: the middle of three fingers may miss the others.
 """
-ALIGNED = 0.98
+ALIGNED_COSINE = 0.98
 """Cosine above which a direction is replaced by the axis of the body."""
-ABOUT = 0.9
+LOOSELY_ALIGNED_COSINE = 0.9
 """Like `ALIGNED_COSINE`, for the direction to a single finger, which is beside the hand's centre.
 """
 
@@ -56,54 +56,59 @@ class Fingertips(NamedTuple):
 
     tool: ToolConfig  # z out of the hand, y across
     opening: float  # m or rad: the widest at which they face each other
-    block: float  # width of a block for them, m
-    below: float  # length of the fingers beyond the tool, m
-    is_one: bool  # True for one finger that closes on a fixed jaw
+    block_width: float  # width of a block for them, m
+    length_below: float  # length of the fingers beyond the tool, m
+    has_one_finger: bool  # True for one finger that closes on a fixed jaw
     out: Array  # (3,), z of the tool with the arm at its start
 
 
-def find_fingertips(cell: Cell, tip: str, is_one: bool = False) -> Fingertips:
+def measure_fingertips(cell: Cell, tip: str, has_one_finger: bool = False) -> Fingertips:
     """Measure what a gripper can take, and place the tool between its fingers.
 
     Args:
         cell: The arm with its gripper.
         tip: Body that carries the gripper.
-        is_one: True if the gripper is known to have one finger, because its meshes have been cut.
+        has_one_finger: True if the gripper is known to have one finger, because its meshes have
+            been cut.
 
     Raises:
         RobotError: The fingers do not close on each other or on a jaw, or open too little.
     """
-    fingers = _Fingers(cell, tip, is_one)
+    fingers = _Fingers(cell, tip, has_one_finger)
     out = fingers.out
     across = fingers.across
-    points = [place for place in fingers.places() if np.isfinite(fingers.gap(place)).all()]
+    points = [
+        place for place in fingers.list_points() if np.isfinite(fingers.measure_gap(place)).all()
+    ]
     if not points:
         raise RobotError("the fingers close neither on each other nor on a jaw")
     origin = points[min(int(FROM_TIP_M / STEP_M), len(points) // 2)]
-    left, right = fingers.gap(origin)
+    left, right = fingers.measure_gap(origin)
     if not fingers.is_one:
         origin = origin + 0.5 * (left - right) * across
     for fraction in np.linspace(0.0, fingers.near, 16 if fingers.is_one else 8):
         fingers.close(fraction)
-        width = sum(fingers.gap(origin))
+        width = sum(fingers.measure_gap(origin))
         if np.isfinite(width):
             break
-    if not LEAST_GAP_M < width < np.inf:
+    if not MIN_GAP_M < width < np.inf:
         raise RobotError(
-            f"the fingers open by {1e3 * width:.0f} mm; {1e3 * LEAST_GAP_M:g} mm are needed"
+            f"the fingers open by {1e3 * width:.0f} mm; {1e3 * MIN_GAP_M:g} mm are needed"
         )
-    block = BLOCK_PART * width
+    block = BLOCK_FRACTION * width
     if fingers.is_one:
-        block = FACING_PART * width
+        block = JAW_BLOCK_FRACTION * width
         origin = origin + (0.5 * block - right) * across
     # Fingers that turn reach farther as they close.
     reaches = []
     for step in np.linspace(fraction, 1.0, 5):
         fingers.close(step)
-        reaches.append(farthest(cell.model, fingers.data, fingers.geoms, out))
+        reaches.append(compute_extent(cell.model, fingers.data, fingers.geoms, out))
     reach = max(reaches) - float(origin @ out)
-    tool = _placed(fingers.data, cell.model.body(tip).id, origin, across, out)
-    return Fingertips(tool, fingers.opening(float(fraction)), block, reach, fingers.is_one, out)
+    tool = _to_body_frame(fingers.data, cell.model.body(tip).id, origin, across, out)
+    return Fingertips(
+        tool, fingers.to_joint_position(float(fraction)), block, reach, fingers.is_one, out
+    )
 
 
 class _Fingers:
@@ -114,17 +119,17 @@ class _Fingers:
         model = cell.model
         self._model = model
         self._gripper = cell.gripper
-        self.data = cell.start()
+        self.data = cell.build_start_data()
         solid = (model.geom_contype | model.geom_conaffinity) != 0
         self.geoms = cell.geoms.gripper[solid[cell.geoms.gripper]]
         closed = self.close(1.0)
-        displacements = self.close(NEARLY) - closed
-        is_moving = np.linalg.norm(displacements, axis=1) > LEAST_WAY_M
+        displacements = self.close(NEARLY_CLOSED) - closed
+        is_moving = np.linalg.norm(displacements, axis=1) > MIN_FINGER_MOTION_M
         if not is_moving.any():
             raise RobotError("the fingers do not move")
         displacements = displacements[is_moving]
         self.is_one = is_one or bool((displacements @ displacements.T).min() >= 0.0)
-        self.near = NEARER if self.is_one else NEARLY
+        self.near = NEARLY_CLOSED_ON_JAW if self.is_one else NEARLY_CLOSED
         # Rays hit the solid geoms of the gripper and nothing else.
         model.geom_group[:] = 0
         model.geom_group[self.geoms] = 1 + (self.is_one & ~is_moving)
@@ -134,7 +139,9 @@ class _Fingers:
         if self.is_one:
             across = displacements.mean(axis=0)
             self._middle = nearly_closed.mean(axis=0)
-            out = _snapped(closed[is_moving].mean(axis=0) - self.data.xpos[hand], axes, ABOUT)
+            out = _snap_to_axis(
+                closed[is_moving].mean(axis=0) - self.data.xpos[hand], axes, LOOSELY_ALIGNED_COSINE
+            )
         else:
             across = np.linalg.svd(displacements - displacements.mean(axis=0))[2][0]
             side = displacements @ across > 0
@@ -142,11 +149,11 @@ class _Fingers:
                 nearly_closed[side].mean(axis=0) + nearly_closed[~side].mean(axis=0)
             )
             out = self._middle - self.data.xpos[hand]
-            out = _snapped(out - across * (across @ out), axes)
+            out = _snap_to_axis(out - across * (across @ out), axes)
         self.out = out  # (3,), of the hand
-        self.across = _snapped(across - out * (across @ out), axes)  # (3,)
+        self.across = _snap_to_axis(across - out * (across @ out), axes)  # (3,)
 
-    def opening(self, part: float) -> float:
+    def to_joint_position(self, part: float) -> float:
         """Return the position of the driven joint, m or rad, at a fraction of the way to closed."""
         return self._gripper.open + part * (self._gripper.closed - self._gripper.open)
 
@@ -155,33 +162,35 @@ class _Fingers:
 
         Returns the centres of its geoms, (geoms, 3), m.
         """
-        self._gripper.linkage.set(self.data.qpos, self.opening(part))
+        self._gripper.linkage.set_opening(self.data.qpos, self.to_joint_position(part))
         mujoco.mj_forward(self._model, self.data)
         return np.array(self.data.geom_xpos[self.geoms])
 
-    def gap(self, at: Array) -> tuple[float, float]:
+    def measure_gap(self, at: Array) -> tuple[float, float]:
         """Measure the distances from a point to the fingers on both sides, m.
 
         Infinite without a hit.
         """
-        other = STILL if self.is_one else FINGERS
-        return self._ray(at, self.across, FINGERS), self._ray(at, -self.across, other)
+        other = JAW_GROUP if self.is_one else FINGER_GROUP
+        return self._cast_ray(at, self.across, FINGER_GROUP), self._cast_ray(
+            at, -self.across, other
+        )
 
-    def places(self) -> list[Array]:
+    def list_points(self) -> list[Array]:
         """List points between the fingers, or beside a fixed jaw, the outermost first."""
         points = [self._middle + self.out * step * STEP_M for step in range(60, -40, -1)]
         if not self.is_one:
             return points
         # Move the points from inside the finger to the surface of the jaw near its tip.
-        distances = np.array([self._ray(point, -self.across, STILL) for point in points])
+        distances = np.array([self._cast_ray(point, -self.across, JAW_GROUP) for point in points])
         at_tip = distances[np.isfinite(distances)][: int(FROM_TIP_M / STEP_M)]
         if not len(at_tip):
             return []
-        return [point - (at_tip.min() - ROOM_M) * self.across for point in points]
+        return [point - (at_tip.min() - JAW_CLEARANCE_M) * self.across for point in points]
 
-    def _ray(self, point: Array, direction: Array, group: NDArray[np.uint8]) -> float:
+    def _cast_ray(self, point: Array, direction: Array, group: NDArray[np.uint8]) -> float:
         """Return the distance to the first geom of a group in a direction, m, or infinity."""
-        starts = (point + aside * np.cross(self.across, self.out) for aside in ASIDE_M)
+        starts = (point + aside * np.cross(self.across, self.out) for aside in RAY_OFFSETS_M)
         rays = (
             mujoco.mj_ray(self._model, self.data, start, direction, group, 1, -1, None)
             for start in starts
@@ -189,7 +198,7 @@ class _Fingers:
         return next((distance for distance in rays if distance >= 0), np.inf)
 
 
-def tool_outward(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
+def choose_outward_tool(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
     """Choose a tool frame whose z axis points along the last joint, away from the arm.
 
     Args:
@@ -200,27 +209,27 @@ def tool_outward(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
         A site of the model, or the body with the pose of the tool on it.
     """
     model = cell.model
-    data = cell.start()
+    data = cell.build_start_data()
     at = data.xpos[model.body(body).id]
     axes = data.xmat[model.body(body).id].reshape(3, 3).T
     last, before = (int(model.dof_jntid[dof]) for dof in (cell.dof[-1], cell.dof[-2:][0]))
     out = data.xaxis[last]
     if out @ (at - data.xanchor[before]) < 0.0:
         out = -out
-    out = _snapped(out, axes)
-    carried = below(model, model.jnt_bodyid[[last]])[model.site_bodyid]
+    out = _snap_to_axis(out, axes)
+    carried = mark_descendants(model, model.jnt_bodyid[[last]])[model.site_bodyid]
     carried[cell.tool] = False
-    along = data.site_xmat[:, [2, 5, 8]] @ out > ALIGNED
+    along = data.site_xmat[:, [2, 5, 8]] @ out > ALIGNED_COSINE
     named = [model.site(site).name for site in np.flatnonzero(carried & along)]
     if sites := [str(name) for name in named if name]:
         return sites[-1], None
     side = axes[int(np.argmin(np.abs(axes @ out)))]
     side = side - out * (side @ out)
     side /= norm(side)
-    return body, _placed(data, model.body(body).id, at, side, out)
+    return body, _to_body_frame(data, model.body(body).id, at, side, out)
 
 
-def _snapped(way: Array, axes: Array, least: float = ALIGNED) -> Array:
+def _snap_to_axis(way: Array, axes: Array, least: float = ALIGNED_COSINE) -> Array:
     """Normalize a direction, and replace it by an axis that is nearly parallel to it.
 
     Args:
@@ -234,7 +243,9 @@ def _snapped(way: Array, axes: Array, least: float = ALIGNED) -> Array:
     return np.sign(along[nearest]) * axes[nearest] if abs(along[nearest]) > least else way
 
 
-def _placed(data: mujoco.MjData, body: int, origin: Array, across: Array, out: Array) -> ToolConfig:
+def _to_body_frame(
+    data: mujoco.MjData, body: int, origin: Array, across: Array, out: Array
+) -> ToolConfig:
     """Convert a frame in the world to a frame on a body.
 
     Args:

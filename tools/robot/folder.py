@@ -11,7 +11,8 @@ from rack.levels.tables import Table
 from rack.tools.robot.assignment import Assignment
 from rack.tools.robot.draft import Draft
 
-HEAD = """# {name}: the levels and boards of nasrem with the arm of {model!r}, by `rack robot new`.
+CONFIG_HEAD = """\
+# {name}: the levels and boards of nasrem with the arm of {model!r}, by `rack robot new`.
 format = 2
 name = "{name}"
 extends = ["nasrem"]
@@ -23,7 +24,7 @@ extends = ["nasrem"]
 STIFF = "stiff enough against dry friction"
 
 
-def config_text(draft: Draft, layout: Assignment, name: str, model: Path) -> str:
+def format_config(draft: Draft, layout: Assignment, name: str, model: Path) -> str:
     """Format the config of a drafted arm.
 
     Args:
@@ -32,45 +33,49 @@ def config_text(draft: Draft, layout: Assignment, name: str, model: Path) -> str
         name: Name of the rack.
         model: The user's model file, which is named in a comment.
     """
-    head = HEAD.format(name=name, model=model.name)
-    return head + "\n".join(_lines(draft, layout, name)) + "\n"
+    head = CONFIG_HEAD.format(name=name, model=model.name)
+    return head + "\n".join(_format_tables(draft, layout, name)) + "\n"
 
 
-def _lines(draft: Draft, layout: Assignment, name: str) -> Iterator[str]:
+def _format_tables(draft: Draft, layout: Assignment, name: str) -> Iterator[str]:
     """Yield the lines of the config after its head."""
     table: dict[str, Any] = {"guessed": list(draft.guessed), **draft.table, "model": f"{name}.xml"}
     subtables = {key: value for key, value in table.items() if isinstance(value, Table)}
-    yield from _keys({k: v for k, v in table.items() if k not in subtables}, draft.guessed)
+    yield from _format_keys({k: v for k, v in table.items() if k not in subtables}, draft.guessed)
     for key, value in subtables.items():
-        yield f"\n[robot.{key}]" + _comment(draft.guessed.get(key))
+        yield f"\n[robot.{key}]" + _format_guess(draft.guessed.get(key))
         settings = value.model_dump(exclude_none=True)
         follow = settings.pop("follow", ())
-        yield from _keys(settings, {})
+        yield from _format_keys(settings, {})
         for follower in follow:
             yield f"[[robot.{key}.follow]]"
-            yield from _keys(follower, {})
+            yield from _format_keys(follower, {})
     if draft.limits.bandwidth is not None:
-        yield f"\n[board.servo.params]\nbandwidth = {draft.limits.bandwidth:g}" + _comment(STIFF)
+        yield f"\n[board.servo.params]\nbandwidth = {draft.limits.bandwidth:g}" + _format_guess(
+            STIFF
+        )
     yield "\n[scene]"
-    yield from _keys({"objects": layout.scene.objects, "supports": layout.scene.supports}, {})
+    yield from _format_keys(
+        {"objects": layout.scene.objects, "supports": layout.scene.supports}, {}
+    )
     yield f"\n[task]  # {layout.kind}"
     for action in layout.actions:
         yield "[[task.action]]"
-        yield from _keys(action, {})
+        yield from _format_keys(action, {})
 
 
-def _keys(table: Mapping[str, Any], guessed: Mapping[str, str]) -> Iterator[str]:
+def _format_keys(table: Mapping[str, Any], guessed: Mapping[str, str]) -> Iterator[str]:
     """Yield a line of TOML for each key, with the reason of a guess as a comment."""
     # For numbers, texts and lists JSON and TOML are the same.
     for key, value in table.items():
-        yield f"{key} = {encode_json(value)}" + _comment(guessed.get(key))
+        yield f"{key} = {encode_json(value)}" + _format_guess(guessed.get(key))
 
 
-def _comment(guess: str | None) -> str:
+def _format_guess(guess: str | None) -> str:
     return f"  # guessed: {guess}" if guess else ""
 
 
-def document(draft: Draft, layout: Assignment, folder: Path, name: str) -> dict[str, Any]:
+def build_document(draft: Draft, layout: Assignment, folder: Path, name: str) -> dict[str, Any]:
     """Return the answer to `--json`.
 
     Args:

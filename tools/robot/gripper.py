@@ -9,21 +9,27 @@ import numpy as np
 
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import RobotError
-from rack.levels.robot.linkage import tied_joints
-from rack.levels.robot.lookup import below, geoms_of
-from rack.levels.robot.model import add_motor, driven_by, listed, remove, stated_torque
+from rack.levels.robot.linkage import find_tied_joints
+from rack.levels.robot.lookup import list_geoms, mark_descendants
+from rack.levels.robot.model import (
+    add_motor,
+    find_driven_joints,
+    find_torque_limit,
+    format_names,
+    remove_actuators,
+)
 from rack.levels.tables import FollowConfig, GripperConfig
 from rack.tools.robot.arm import ArmParts
 
-MOTOR = "gripper"
+MOTOR_NAME = "gripper"
 """Name of the motor of a gripper that has none."""
-FORCE_N = 20.0
+DEFAULT_FORCE_N = 20.0
 """Force at the fingers of a gripper whose model states none."""
-MOST_FORCE_N = 40.0
+MAX_FORCE_N = 40.0
 """Upper bound for the force at the fingers beyond friction. More would push out a light block."""
-LEAST_LEVER_M = 0.02
+MIN_LEVER_M = 0.02
 """Lower bound for the lever arm of a finger that turns."""
-SIDEWAYS = 0.5
+MIN_CLOSING_COSINE = 0.5
 """A finger does not close if the cosine between its motion and the way to the others is below this.
 """
 
@@ -37,7 +43,7 @@ class _Finger(NamedTuple):
     sideways: bool  # True if it spreads the fingers instead of closing them
 
 
-def fit_fingers(
+def fit_gripper(
     spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, wanted: str
 ) -> tuple[GripperConfig, str]:
     """Give a gripper one drive, which all joints follow that nothing couples to it.
@@ -54,21 +60,25 @@ def fit_fingers(
     Raises:
         RobotError: A joint of the gripper has no range.
     """
-    fingers = {name: _finger(spec, model, arm, name) for name in arm.fingers}
+    fingers = {name: _measure_finger(spec, model, arm, name) for name in arm.fingers}
     drives = [
         (actuator, driven_fingers[0])
         for actuator in spec.actuators
-        if (driven_fingers := [joint for joint in driven_by(spec, actuator) if joint in fingers])
+        if (
+            driven_fingers := [
+                joint for joint in find_driven_joints(spec, actuator) if joint in fingers
+            ]
+        )
     ]
     drives.sort(key=lambda drive: (drive[1] != wanted, fingers[drive[1]].sideways))
     driven = drives[0][1] if drives else wanted or arm.fingers[0]
     driven_finger = fingers[driven]
     preferred = [joint for _, joint in drives] + list(arm.fingers)
-    groups = [group for group in _groups(model, arm) if driven not in group]
+    groups = [group for group in _group_coupled_joints(model, arm) if driven not in group]
     leaders = [min(group, key=preferred.index) for group in groups]
     follow = tuple(
         FollowConfig(
-            joint=name, ratio=_ratio(model, (driven, driven_finger), (name, fingers[name]))
+            joint=name, ratio=_compute_ratio(model, (driven, driven_finger), (name, fingers[name]))
         )
         for name in leaders
         if name in preferred[: len(drives)] or not model.jnt_stiffness[model.joint(name).id]
@@ -76,22 +86,22 @@ def fit_fingers(
     # The one drive gives the sum of the forces of all drives that it replaces.
     moving_joints = [driven, *(follower.joint for follower in follow if follower.ratio)]
     actuators = [actuator for actuator, _ in drives]
-    stated = [stated_torque(spec, name, actuators) for name in moving_joints]
+    stated = [find_torque_limit(spec, name, actuators) for name in moving_joints]
     levers = [fingers[name].lever for name in moving_joints]
     dry_friction = model.dof_frictionloss[
         [model.joint(name).dofadr[0] for name in moving_joints]
     ].tolist()
     forces = [
-        min(stated_force or FORCE_N * lever + friction, MOST_FORCE_N * lever + friction)
+        min(stated_force or DEFAULT_FORCE_N * lever + friction, MAX_FORCE_N * lever + friction)
         for stated_force, lever, friction in zip(stated, levers, dry_friction, strict=True)
     ]
     force = sum(forces)
-    remove(spec, actuators[1:])
+    remove_actuators(spec, actuators[1:])
     if drives:
         motor = actuators[0].name
     else:
-        motor = MOTOR
-        add_motor(spec, MOTOR, mujoco.mjtTrn.mjTRN_JOINT, driven, force)
+        motor = MOTOR_NAME
+        add_motor(spec, MOTOR_NAME, mujoco.mjtTrn.mjTRN_JOINT, driven, force)
     config = GripperConfig(
         actuator=motor,
         joint=driven,
@@ -101,11 +111,15 @@ def fit_fingers(
         follow=follow,
     )
     guesses = [] if forces == stated else ["force"]
-    guesses += [f"that {listed([follower.joint for follower in follow])} follow"] if follow else []
+    guesses += (
+        [f"that {format_names([follower.joint for follower in follow])} follow"] if follow else []
+    )
     return config, ", ".join(guesses)
 
 
-def _finger(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str) -> _Finger:
+def _measure_finger(
+    spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str
+) -> _Finger:
     """Measure one joint of a gripper.
 
     The closed end is the one nearer to the middle of all fingers, or to the hand for a single
@@ -126,36 +140,38 @@ def _finger(spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, name: str
     mujoco.mj_comPos(model, data)
     hand = model.body(arm.tip).id
     bodies = {int(model.jnt_bodyid[k]) for k in ids}
-    depth = np.sum([below(model, np.array([body])) for body in bodies], axis=0)
+    depth = np.sum([mark_descendants(model, np.array([body])) for body in bodies], axis=0)
     tops = [body for body in bodies if depth[body] == 1]
-    centres = [_centre(model, data, body) for body in tops]
-    middle = np.mean(centres, axis=0) if len(tops) > 1 else _centre(model, data, hand)
+    centres = [_compute_centre(model, data, body) for body in tops]
+    middle = np.mean(centres, axis=0) if len(tops) > 1 else _compute_centre(model, data, hand)
     moved = int(model.jnt_bodyid[joint])
-    centre = _centre(model, data, moved)
+    centre = _compute_centre(model, data, moved)
     jacobian = np.zeros((3, model.nv))
     mujoco.mj_jac(model, data, jacobian, None, centre, moved)
     motion = jacobian[:, model.jnt_dofadr[joint]]
     inward = float(motion @ (middle - centre))
     is_slide = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-    lever = 1.0 if is_slide else max(LEAST_LEVER_M, norm(centre - data.xanchor[joint]))
-    sideways = abs(inward) < SIDEWAYS * norm(motion) * norm(middle - centre)
+    lever = 1.0 if is_slide else max(MIN_LEVER_M, norm(centre - data.xanchor[joint]))
+    sideways = abs(inward) < MIN_CLOSING_COSINE * norm(motion) * norm(middle - centre)
     ends = (low, high) if inward > 0.0 else (high, low)
     return _Finger(*ends, lever, sideways)
 
 
-def _centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
+def _compute_centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
     """Compute the centre of the geoms of a body and those it carries, (3,), m."""
-    geoms = geoms_of(model, below(model, np.array([body])))
+    geoms = list_geoms(model, mark_descendants(model, np.array([body])))
     if not len(geoms):
         return np.asarray(data.xipos[body])
     return np.asarray(data.geom_xpos[geoms].mean(axis=0))
 
 
-def _groups(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:
+def _group_coupled_joints(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:
     """Group the joints of the gripper such that equalities couple all joints of a group."""
     groups = [{name} for name in arm.fingers]
     for equality in range(model.neq):
-        tied = {model.joint(joint).name for joint in tied_joints(model, equality)} & {*arm.fingers}
+        tied = {model.joint(joint).name for joint in find_tied_joints(model, equality)} & {
+            *arm.fingers
+        }
         together = [group for group in groups if group & tied]
         groups = [group for group in groups if not group & tied]
         if together:
@@ -163,7 +179,7 @@ def _groups(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:
     return groups
 
 
-def _ratio(
+def _compute_ratio(
     model: mujoco.MjModel, leader: tuple[str, _Finger], follower: tuple[str, _Finger]
 ) -> float:
     """Compute the ratio between the motions of a follower and of the driven joint.

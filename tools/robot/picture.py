@@ -12,20 +12,20 @@ from rack.levels.robot.cell import Cell
 
 WIDTH = 960
 HEIGHT = 600
-MOST_SHAPES = 5000
+MAX_SHAPES = 5000
 """Upper bound for the number of shapes in a picture."""
-SHOWN = (mujoco.mjtVisFlag.mjVIS_JOINT, mujoco.mjtVisFlag.mjVIS_CONTACTPOINT)
+VISUAL_FLAGS = (mujoco.mjtVisFlag.mjVIS_JOINT, mujoco.mjtVisFlag.mjVIS_CONTACTPOINT)
 NO_PICTURE = "no picture: it needs OpenGL (EGL); on Debian: libegl1 libgl1-mesa-dri"
 
 
-def draw(cell: Cell, path: Path) -> str:
+def draw_arm(cell: Cell, path: Path) -> str:
     """Draw the arm of a cell at home to a PNG file.
 
     Returns:
         The path as text, or `NO_PICTURE` without OpenGL.
     """
     model = cell.model
-    data = cell.start()
+    data = cell.build_start_data()
     model.vis.global_.offwidth = WIDTH
     model.vis.global_.offheight = HEIGHT
     model.vis.headlight.ambient = [0.35, 0.35, 0.35]
@@ -40,7 +40,7 @@ def draw(cell: Cell, path: Path) -> str:
         return NO_PICTURE
     mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, renderer)
     option = mujoco.MjvOption()
-    option.flags[np.array(SHOWN, dtype=int)] = True
+    option.flags[np.array(VISUAL_FLAGS, dtype=int)] = True
     option.frame = mujoco.mjtFrame.mjFRAME_SITE
     option.label = mujoco.mjtLabel.mjLABEL_JOINT
     camera = mujoco.MjvCamera()
@@ -50,7 +50,7 @@ def draw(cell: Cell, path: Path) -> str:
     camera.distance = 2.2 * float(np.linalg.norm(np.ptp(arm, axis=0))) + 0.2
     camera.azimuth = 135.0
     camera.elevation = -25.0
-    scene = mujoco.MjvScene(model, MOST_SHAPES)
+    scene = mujoco.MjvScene(model, MAX_SHAPES)
     categories = mujoco.mjtCatBit.mjCAT_ALL
     mujoco.mjv_updateScene(model, data, option, None, camera, categories, scene)
     pixels = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)

@@ -17,10 +17,10 @@ PIECE_M = 0.008
 """Length of a piece along the jaws. A slice across a jaw is nearly convex."""
 DIRECTIONS = 100
 """Number of directions in which extreme points are kept. They span about the same hull as all."""
-LEAST_M = 2e-4
+MIN_THICKNESS_M = 2e-4
 """Thinner pieces are dropped, because they have no hull."""
-KEPT = ("contype", "conaffinity", "condim", "priority", "group", "solmix")
-KEPT_ROWS = ("friction", "solref", "solimp", "rgba")
+INHERITED = ("contype", "conaffinity", "condim", "priority", "group", "solmix")
+INHERITED_ARRAYS = ("friction", "solref", "solimp", "rgba")
 """Properties that a piece inherits from its geom."""
 
 
@@ -35,9 +35,9 @@ def cut_meshes(spec: mujoco.MjSpec, cell: Cell, out: Array) -> int:
     Returns:
         The number of pieces.
     """
-    data = cell.start()
+    data = cell.build_start_data()
     assert cell.gripper is not None, "it has meshes"
-    cell.gripper.linkage.set(data.qpos, cell.gripper.closed)
+    cell.gripper.linkage.set_opening(data.qpos, cell.gripper.closed)
     mujoco.mj_kinematics(cell.model, data)
     count = 0
     # Take the ids of the geoms first, because adding geoms changes them.
@@ -47,22 +47,22 @@ def cut_meshes(spec: mujoco.MjSpec, cell: Cell, out: Array) -> int:
         if not (is_solid and is_mesh and geom_id in cell.geoms.gripper):
             continue
         body_axes = data.xmat[cell.model.geom_bodyid[geom_id]].reshape(3, 3)
-        corners, faces = _surface(cell.model, data, geom_id)
-        for piece in _pieces(corners, faces, body_axes.T @ out):
+        corners, faces = _read_surface(cell.model, data, geom_id)
+        for piece in _slice_mesh(corners, faces, body_axes.T @ out):
             name = f"piece {len(spec.meshes)}"
             spec.add_mesh(name=name, uservert=piece.ravel())
             count += 1
             mesh_type = mujoco.mjtGeom.mjGEOM_MESH
             added = geom.parent.add_geom(type=mesh_type, meshname=name, mass=0.0)
-            for key in KEPT:
+            for key in INHERITED:
                 setattr(added, key, getattr(geom, key))
-            for key in KEPT_ROWS:
+            for key in INHERITED_ARRAYS:
                 getattr(added, key)[:] = getattr(geom, key)
         geom.contype = geom.conaffinity = 0
     return count
 
 
-def _surface(
+def _read_surface(
     model: mujoco.MjModel, data: mujoco.MjData, geom: int
 ) -> tuple[Array, NDArray[np.int32]]:
     """Return the surface of a mesh in the frame of its body.
@@ -82,7 +82,7 @@ def _surface(
     return corners @ rotation.T + offset, faces
 
 
-def _pieces(corners: Array, faces: NDArray[np.int32], out: Array) -> list[Array]:
+def _slice_mesh(corners: Array, faces: NDArray[np.int32], out: Array) -> list[Array]:
     """Cut a mesh into slices and return the vertices of each, (n, 3), m."""
     along = corners @ out
     edges = np.vstack((faces[:, :2], faces[:, 1:], faces[:, ::2]))
@@ -102,6 +102,6 @@ def _pieces(corners: Array, faces: NDArray[np.int32], out: Array) -> list[Array]
             continue
         points = points[np.unique((points @ directions).argmax(axis=0))]
         sizes = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if len(points) > 3 and sizes[-1] > LEAST_M:
+        if len(points) > 3 and sizes[-1] > MIN_THICKNESS_M:
             pieces.append(points)
     return pieces

@@ -12,19 +12,19 @@ from xml.etree import ElementTree
 import mujoco
 
 from rack.levels.errors import RobotError
-from rack.levels.robot.model import compile_spec, listed, load_spec, one_line
+from rack.levels.robot.model import compile_spec, format_names, format_one_line, load_spec
 from rack.levels.robot.model_file import ModelReader, check_asset, find_file
 
-READ = (".stl", ".obj", ".msh")
+MESH_FORMATS = (".stl", ".obj", ".msh")
 """Formats of meshes that MuJoCo reads."""
-COMPILER = {"strippath": "false", "fusestatic": "false", "discardvisual": "true"}
+URDF_COMPILER = {"strippath": "false", "fusestatic": "false", "discardvisual": "true"}
 """Compiler settings for a URDF.
 
 Paths are absolute, and a fixed frame, such as the tool's, stays a body.
 """
 UNBALANCED = "balanceinertia"
 """Part of MuJoCo's error message for an impossible inertia. It names the setting that helps."""
-SLACK_S = 0.02
+DEFAULT_FRICTION_TIME_S = 0.02
 """MuJoCo's default time constant of dry friction.
 
 It makes a damper of dry friction: a light link behind a large gear hardly ever meets all of it.
@@ -45,7 +45,7 @@ class Source:
     velocity: Mapping[str, float]  # rad/s, of the joints for which a URDF states it
     notes: list[str] = field(default_factory=list)  # changes that were made, one sentence each
 
-    def compiled(self) -> mujoco.MjModel:
+    def compile_model(self) -> mujoco.MjModel:
         """Compile the model in its current state. Raises `RobotError`."""
         return compile_spec(self.spec, self.path)
 
@@ -56,7 +56,7 @@ def read_source(path: Path) -> Source:
     if root.tag == "mujoco":
         source = Source(path, load_spec(path), {})
     elif root.tag == "robot":
-        source = _urdf(path, root)
+        source = _convert_urdf(path, root)
     else:
         raise RobotError(f"model '{path}': <{root.tag}>; valid: <mujoco> (MJCF), <robot> (URDF)")
     # A config refers to bodies, joints and actuators by name, so give a name to all of them.
@@ -70,27 +70,27 @@ def read_source(path: Path) -> Source:
             element.name = element.name or f"{kind} {number}"
     # Let dry friction act at once, unless the model states a time constant.
     dry = [joint for joint in source.spec.joints if joint.frictionloss > 0.0]
-    slack = [joint for joint in dry if joint.solref_friction[0] == SLACK_S]
+    slack = [joint for joint in dry if joint.solref_friction[0] == DEFAULT_FRICTION_TIME_S]
     for joint in slack:
         joint.solref_friction[:] = DRY_SOLREF
         joint.solimp_friction[:2] = DRY_SOLIMP
     if slack:
         source.notes.append(f"dry friction acts within {1e3 * DRY_SOLREF[0]:g} ms")
     try:
-        model = source.compiled()
+        model = source.compile_model()
     except RobotError as error:
         if UNBALANCED not in str(error):
             raise
         source.spec.compiler.balanceinertia = True
         source.notes.append("physically impossible inertias were balanced")
-        model = source.compiled()
+        model = source.compile_model()
     size = max(model.geom_rbound.max(initial=0.0), abs(model.body_pos).max())
     if size > LARGE_M:
         source.notes.append(f"parts are {size:.4g} m apart: is the model in millimetres?")
     return source
 
 
-def _urdf(path: Path, root: ElementTree.Element) -> Source:
+def _convert_urdf(path: Path, root: ElementTree.Element) -> Source:
     """Convert a URDF, fixing its planar joints. Raises `RobotError`."""
     _check_tree(path, root)
     notes = _find_shapes(path, root)
@@ -99,11 +99,11 @@ def _urdf(path: Path, root: ElementTree.Element) -> Source:
         notes.append(f"planar joint '{joint.get('name')}' is fixed: a mobile base does not move")
     for extension in root.findall("mujoco"):
         root.remove(extension)
-    ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", COMPILER)
+    ElementTree.SubElement(ElementTree.SubElement(root, "mujoco"), "compiler", URDF_COMPILER)
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
     except ValueError as problem:
-        raise RobotError(f"model '{path}': {one_line(problem)}") from None
+        raise RobotError(f"model '{path}': {format_one_line(problem)}") from None
     limits = {joint.get("name", ""): joint.find("limit") for joint in root.findall("joint")}
     stated = {
         name: float(limit.get("velocity", 0)) for name, limit in limits.items() if limit is not None
@@ -122,9 +122,9 @@ def _check_tree(path: Path, root: ElementTree.Element) -> None:
     if unknown := [name for name in parents + children if name not in links]:
         why = f"no link '{unknown[0]}', to which a joint refers; add <link name=\"{unknown[0]}\"/>"
     elif twice:
-        why = f"named twice: {listed(twice)}; one of each is valid"
+        why = f"named twice: {format_names(twice)}; one of each is valid"
     elif len(roots) != 1:
-        why = f"roots: {listed(roots)}; one is valid"
+        why = f"roots: {format_names(roots)}; one is valid"
     else:
         return
     raise RobotError(f"model '{path}': {why}")
@@ -160,7 +160,7 @@ def _find_shapes(path: Path, root: ElementTree.Element) -> list[str]:
             and link.find("inertial") is None
         ],
     }
-    return [f"{why}: {listed(names)}" for why, names in notes.items() if names]
+    return [f"{why}: {format_names(names)}" for why, names in notes.items() if names]
 
 
 def _is_only_visible(link: ElementTree.Element) -> bool:
@@ -188,7 +188,7 @@ def _find_shape(path: Path, link: ElementTree.Element, folder: str) -> RobotErro
             link.remove(visual)
     try:
         for mesh in link.iter("mesh"):
-            mesh.set("filename", str(_mesh(path, mesh.get("filename", ""), folder)))
+            mesh.set("filename", str(_find_mesh(path, mesh.get("filename", ""), folder)))
     except RobotError as problem:
         if not is_only_visible:
             raise
@@ -200,7 +200,7 @@ def _find_shape(path: Path, link: ElementTree.Element, folder: str) -> RobotErro
     return None
 
 
-def _mesh(path: Path, name: str, meshes: str) -> Path:
+def _find_mesh(path: Path, name: str, meshes: str) -> Path:
     """Find the file of a mesh. Raises `RobotError`.
 
     Packages are searched for in all folders above the model. For a mesh in a format that MuJoCo
@@ -216,16 +216,18 @@ def _mesh(path: Path, name: str, meshes: str) -> Path:
     files = [
         file.with_suffix(suffix)
         for file in tried
-        for suffix in (file.suffix, *READ)
-        if suffix.lower() in READ
+        for suffix in (file.suffix, *MESH_FORMATS)
+        if suffix.lower() in MESH_FORMATS
     ]
     mesh_file = find_file(files)
     if mesh_file is None:
         other = find_file(tried)
-        why = f"looked for as {listed([*dict.fromkeys(map(str, tried))], most=6)}"
+        why = f"looked for as {format_names([*dict.fromkeys(map(str, tried))], most=6)}"
         if other is not None:
             why = f"convert '{other}', in its folder, as Collada and the like are not read"
-        raise RobotError(f"model '{path}': no mesh '{name}': {why}; valid: {', '.join(READ)}")
+        raise RobotError(
+            f"model '{path}': no mesh '{name}': {why}; valid: {', '.join(MESH_FORMATS)}"
+        )
     check_asset(mesh_file, path)
     return mesh_file
 

@@ -18,21 +18,21 @@ from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
-from rack.boards.crate.alarm_events import AlarmWatch
+from rack.boards.crate.alarm_events import AlarmReader
 from rack.boards.events import Event
-from rack.tools.console.answer import Document, Failure, as_failure
+from rack.tools.console.answer import Document, Failure, convert_errors
 from rack.tools.faults.live import LiveRack
-from rack.tools.launch.folder import folder_of
+from rack.tools.launch.folder import choose_run_folder
 from rack.tools.monitor import pausing
-from rack.tools.monitor.desk import LiveDesk
+from rack.tools.monitor.desk import LevelCommander
 from rack.tools.monitor.replies import Reply
-from rack.tools.monitor.signals import SignalTap
+from rack.tools.monitor.signals import SignalReader
 from rack.tools.monitor.snapshot import RackMonitor, Snapshot
 from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.recorder.process import RecorderProcess
-from rack.tools.recording.signal import Signal, Trigger, mailbox_of
+from rack.tools.recording.signal import Signal, Trigger, find_mailbox
 
-LOOK_S = 0.001
+READ_INTERVAL_S = 0.001
 """Time between two readings of the rack."""
 
 
@@ -47,16 +47,16 @@ class AttachedRack:
     Every error is a `Failure` with the text that the command would print.
     """
 
-    @as_failure()
+    @convert_errors()
     def __init__(self, rack: str) -> None:
         segment = self._segment = Segment.attach(rack)
         self._closing = ExitStack()
         self._closing.enter_context(closing(segment))
         self._boxes = segment.layout.mailboxes
-        self._desk = LiveDesk(segment)
+        self._desk = LevelCommander(segment)
         self._monitor = RackMonitor(segment)
-        self._alarms = AlarmWatch(segment)
-        self._alarms.drain()
+        self._alarms = AlarmReader(segment)
+        self._alarms.read_alarms()
         # Events since the rack was attached, without those that `wait_for` has returned.
         self._events: list[Event] = []
 
@@ -74,29 +74,29 @@ class AttachedRack:
         """Detach from the rack, which continues to run, and finish its recording."""
         self._closing.close()
 
-    @as_failure()
+    @convert_errors()
     def status(self) -> Snapshot:
         """Take a snapshot of the rack."""
-        return self._monitor.look()
+        return self._monitor.take_snapshot()
 
-    @as_failure()
+    @convert_errors()
     def read(self, mailbox: str) -> Reading[AnyMessage]:
         """Read a copy of the newest message of a mailbox. This costs no board anything."""
-        return open_observer(self._segment, mailbox_of(mailbox, self._boxes).name).peek()
+        return open_observer(self._segment, find_mailbox(mailbox, self._boxes).name).peek()
 
-    @as_failure()
+    @convert_errors()
     def __getitem__(self, name: str) -> Any:
         """Return the newest value of a signal, as in `servo.status.position`.
 
         The value is an array or a number, or the name of a state.
         """
-        signal = Signal.of(name, self._boxes)
+        signal = Signal.parse(name, self._boxes)
         reading = self.read(signal.mailbox)
-        if not reading.is_there:
+        if not reading.has_message:
             raise Failure(f"mailbox '{signal.mailbox}' has no message yet")
-        return signal.in_message(reading.message.record)
+        return signal.read_message(reading.message.record)
 
-    @as_failure()
+    @convert_errors()
     def command(self, level: str, what: str, wait_s: float | None = None, **goal: Any) -> Reply:
         """Command a level, as in `command("servo", "setpoint", joints=(...), wait_s=10)`.
 
@@ -115,14 +115,14 @@ class AttachedRack:
             key: v.tolist() if isinstance(v, np.ndarray) else v for key, v in goal.items()
         }
         request = {"level": level, "what": what, **goal_values}
-        return _accepted(self._desk.give(request, wait_s is not None, wait_s))
+        return _check_reply(self._desk.give_command(request, wait_s is not None, wait_s))
 
-    @as_failure()
+    @convert_errors()
     def set(self, key: str, value: object) -> Reply:
         """Set a live parameter, as in `set("board.servo.params.bandwidth", 80)`."""
-        return _accepted(self._desk.set_param(f"{key}={value}"))
+        return _check_reply(self._desk.set_param(f"{key}={value}"))
 
-    @as_failure()
+    @convert_errors()
     def inject(self, board: str, kind: str, wait_s: float | None = None, **fields: Any) -> Document:
         """Inject a fault, as in `inject("servo", "sensor-bias", joint=2, size=0.05, lasts=0.2)`.
 
@@ -140,25 +140,25 @@ class AttachedRack:
         if "lasts" in fields:
             fields["for"] = fields.pop("lasts")
         fault = {"board": board, "kind": kind, **fields}
-        return LiveRack(self._segment).inject(fault, wait_s is not None, wait_s)
+        return LiveRack(self._segment).inject_fault(fault, wait_s is not None, wait_s)
 
-    @as_failure()
+    @convert_errors()
     def pause(self) -> pausing.Pause:
         """Pause the rack: in lockstep between two ticks, in real time with the arm at rest."""
-        return pausing.pause(self._segment)
+        return pausing.pause_rack(self._segment)
 
-    @as_failure()
+    @convert_errors()
     def resume(self) -> None:
         """Let the paused rack continue."""
-        pausing.resume(self._segment)
+        pausing.resume_rack(self._segment)
 
-    @as_failure()
+    @convert_errors()
     def estop(self, reset: bool = False) -> None:
         """Engage the brakes from the next tick on, or with `reset` let the arm move again."""
         lines = UtilityLines(self._segment)
         lines.reset_emergency_stop() if reset else lines.latch_emergency_stop()
 
-    @as_failure()
+    @convert_errors()
     def wait_until(self, condition: str, timeout_s: float) -> int:
         """Wait until a condition holds, as in `servo.status.position[2] > 1.2`.
 
@@ -169,18 +169,20 @@ class AttachedRack:
         Returns:
             Tick of the first message, the newest one or a later one, for which it holds.
         """
-        trigger = Trigger.of(condition, self._boxes)
-        tap = SignalTap(self._segment, [trigger.signal])
+        trigger = Trigger.parse(condition, self._boxes)
+        tap = SignalReader(self._segment, [trigger.signal])
         newest = slice(-1, None)
-        for _ in self._looks(timeout_s):
-            for written in tap.take():
-                holding_ticks = written.ticks[newest][trigger.holds(written.messages[newest])]
+        for _ in self._poll_rack(timeout_s):
+            for written in tap.read_new():
+                holding_ticks = written.ticks[newest][
+                    trigger.evaluate_messages(written.messages[newest])
+                ]
                 if len(holding_ticks):
                     return int(holding_ticks[0])
             newest = slice(None)
-        raise self._in_vain(condition, timeout_s)
+        raise self._build_timeout(condition, timeout_s)
 
-    @as_failure()
+    @convert_errors()
     def wait_for(self, event: str, timeout_s: float) -> Event:
         """Wait for an event since the rack was attached. Each event is returned once.
 
@@ -192,16 +194,16 @@ class AttachedRack:
             event: Kind or code, as in `detection` or `rejoined`.
             timeout_s: Longest wait, wall-clock time.
         """
-        for _ in self._looks(timeout_s):
-            self._events += [alarm.event for alarm in self._alarms.drain()]
+        for _ in self._poll_rack(timeout_s):
+            self._events += [alarm.event for alarm in self._alarms.read_alarms()]
             for seen_event in self._events:
                 if event in (seen_event.kind, seen_event.code):
                     self._events.remove(seen_event)
                     return seen_event
         lost = f" ({self._alarms.lost} events were overwritten)" if self._alarms.lost else ""
-        raise self._in_vain(f"{event}{lost}", timeout_s)
+        raise self._build_timeout(f"{event}{lost}", timeout_s)
 
-    def _looks(self, timeout_s: float) -> Iterator[None]:
+    def _poll_rack(self, timeout_s: float) -> Iterator[None]:
         """Yield at each reading of the rack, until the time or the run is over."""
         deadline = time.monotonic() + timeout_s
         is_last = False
@@ -209,14 +211,14 @@ class AttachedRack:
             # Read this before the caller reads the rack, so that it sees all up to the end.
             is_last = self._segment.run_is_over or time.monotonic() > deadline
             yield
-            time.sleep(LOOK_S)
+            time.sleep(READ_INTERVAL_S)
 
-    def _in_vain(self, awaited: str, timeout_s: float) -> Failure:
+    def _build_timeout(self, awaited: str, timeout_s: float) -> Failure:
         """Return the failure of a wait."""
         why = "the run is over" if self._segment.run_is_over else f"not within {timeout_s:g} s"
         return Failure(f"rack '{self._segment.rack}', {awaited}: {why}")
 
-    @as_failure()
+    @convert_errors()
     def record(self, folder: str | Path | None = None) -> Path:
         """Record the rack until it is closed, from the two seconds that its rings still hold.
 
@@ -227,7 +229,7 @@ class AttachedRack:
             The folder.
         """
         wanted = None if folder is None else Path(folder)
-        path = folder_of(wanted, self._segment.rack)
+        path = choose_run_folder(wanted, self._segment.rack)
         path.mkdir(parents=True, exist_ok=True)
         (path / CONFIG).write_text(self._segment.config)
         recorder = RecorderProcess(path)
@@ -237,7 +239,7 @@ class AttachedRack:
         return path
 
 
-def _accepted(reply: Reply) -> Reply:
+def _check_reply(reply: Reply) -> Reply:
     """Return a reply. Raises `Failure` if the level refused the command."""
     if not reply.worked:
         raise Failure(reply.line)

@@ -14,12 +14,12 @@ from rack.boards import Rack as CrateRack
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event
-from rack.tools.launch.folder import EventLog, folder_of
-from rack.tools.launch.launch import NO_RECORDER, begin_folder, compare_recording, result_of
+from rack.tools.launch.folder import EventLog, choose_run_folder
+from rack.tools.launch.launch import NO_RECORDER, build_result, compare_recording, create_run_folder
 from rack.tools.monitor.display import Display
-from rack.tools.monitor.holds import Standstill
+from rack.tools.monitor.holds import StandstillDetector
 from rack.tools.recording.recorder.process import RecorderProcess
-from rack.tools.scripting.settings import settings_of
+from rack.tools.scripting.settings import list_settings
 
 
 class LaunchedRack(CrateRack):
@@ -58,13 +58,13 @@ class LaunchedRack(CrateRack):
             ConfigError: The config, a setting or a fault has mistakes: all of them.
             Failure: `out` is not empty.
         """
-        overrides = [*settings_of(settings), *["clock.mode=lockstep"] * lockstep]
+        overrides = [*list_settings(settings), *["clock.mode=lockstep"] * lockstep]
         if not isinstance(config, RackConfig):
             config = load(config, overrides, faults)
         elif overrides or faults is not None:
             raise TypeError("a loaded config takes no settings and no faults")
-        super().__init__(config, self._note)
-        self.folder = None if out is None else folder_of(Path(out), config.name)
+        super().__init__(config, self._handle_event)
+        self.folder = None if out is None else choose_run_folder(Path(out), config.name)
         self._on_event = on_event
         self._record: RunRecord | None = None
 
@@ -73,10 +73,10 @@ class LaunchedRack(CrateRack):
         where = "not recorded" if self.folder is None else f"recorded into {self.folder}"
         return f"<rack '{self.config.name}': {end}, {where}>"
 
-    def _note(self, event: Event) -> None:
+    def _handle_event(self, event: Event) -> None:
         """Log an event, and pass it to the program."""
         if self._record is not None:
-            self._record.log.add(event)
+            self._record.log.add_event(event)
         if self._on_event is not None:
             self._on_event(event)
 
@@ -90,7 +90,7 @@ class LaunchedRack(CrateRack):
         super().launch()
         if self._record is not None:
             try:
-                self._record.begin(self)
+                self._record.attach_recorder(self)
             except BaseException:
                 self.close()
                 raise
@@ -106,7 +106,7 @@ class LaunchedRack(CrateRack):
         """
         is_running = super().watch(timeout_s)
         if self._record is not None:
-            self._record.look()
+            self._record.log_news()
         return is_running
 
     def close(self) -> None:
@@ -117,7 +117,7 @@ class LaunchedRack(CrateRack):
         super().close()
         self._record = None
         if record is not None:
-            record.finish(self)
+            record.finish_files(self)
 
 
 Rack = LaunchedRack
@@ -133,41 +133,41 @@ class RunRecord:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._recorder = RecorderProcess(folder)
-        self._standstill: Standstill | None = None
+        self._standstill: StandstillDetector | None = None
         self._began_s = 0.0
         self.log = EventLog(Display())
 
-    def begin(self, rack: LaunchedRack) -> None:
+    def attach_recorder(self, rack: LaunchedRack) -> None:
         """Record a rack that has been launched. Raises `Failure`."""
-        begin_folder(self._folder, rack.config, self.log)
+        create_run_folder(self._folder, rack.config, self.log)
         if not self._recorder.attach(rack.config.name, None, rack.segment.words):
-            self._add(NO_RECORDER)
-        self._standstill = Standstill(rack.segment)
+            self._log_text(NO_RECORDER)
+        self._standstill = StandstillDetector(rack.segment)
         self._began_s = time.monotonic()
 
-    def look(self) -> None:
+    def log_news(self) -> None:
         """Log news of the recorder, and standstills.
 
         Raises `Failure` if the recorder cannot write.
         """
-        for text in self._recorder.news():
-            self._add(text)
-        for event in () if self._standstill is None else self._standstill.look():
-            self.log.add(event)
+        for text in self._recorder.read_news():
+            self._log_text(text)
+        for event in () if self._standstill is None else self._standstill.list_events():
+            self.log.add_event(event)
 
     def await_begun(self) -> None:
         """Wait until the recorder has begun, because it could not attach to a closed rack."""
-        self._recorder.await_begun()
+        self._recorder.wait_until_attached()
 
-    def finish(self, rack: LaunchedRack) -> None:
+    def finish_files(self, rack: LaunchedRack) -> None:
         """Finish the files of a closed rack, with its outcome if the run is over."""
         wall_s = time.monotonic() - self._began_s
         with closing(self.log):
             why = self._recorder.finish()
             if rack.outcome is not None:
                 comparison = compare_recording(self._folder, rack.segment, why, rack.outcome.ticks)
-                result = result_of(rack.segment, rack.config, rack.outcome, wall_s, *comparison)
-                self.log.end(asdict(result))
+                result = build_result(rack.segment, rack.config, rack.outcome, wall_s, *comparison)
+                self.log.write_outcome(asdict(result))
 
-    def _add(self, text: str) -> None:
-        self.log.add(Event(time.time_ns(), -1, "recorder", "", text))
+    def _log_text(self, text: str) -> None:
+        self.log.add_event(Event(time.time_ns(), -1, "recorder", "", text))

@@ -6,11 +6,11 @@ from typing import Any
 
 from rack.backplane.message import AnyMessage
 from rack.boards import Rack
-from rack.tools.console.answer import Document, Failure, as_failure
-from rack.tools.launch.continued import RunAgain, branched
-from rack.tools.recording.in_force import InForce
+from rack.tools.console.answer import Document, Failure, convert_errors
+from rack.tools.launch.continued import RepeatedRun, load_branch_config
+from rack.tools.recording.in_force import VisibleMessages
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.signal import Signal, mailbox_of
+from rack.tools.recording.signal import Signal, find_mailbox
 
 
 class RecordedMoment:
@@ -21,7 +21,7 @@ class RecordedMoment:
     rack that continues from this tick, the run is repeated up to it.
     """
 
-    def __init__(self, recording: Recording, in_force: InForce, tick: int) -> None:
+    def __init__(self, recording: Recording, in_force: VisibleMessages, tick: int) -> None:
         self.tick = tick
         self._recording = recording
         self._in_force = in_force
@@ -36,12 +36,12 @@ class RecordedMoment:
 
     def read(self, mailbox: str) -> AnyMessage:
         """Return the message in force, as a task released at this tick would read it."""
-        content = self.row(mailbox_of(mailbox, self._recording.layout.timed).name)["message"]
+        content = self.row(find_mailbox(mailbox, self._recording.layout.timed).name)["message"]
         return AnyMessage(content.dtype, memoryview(bytearray(content.tobytes())))
 
     def row(self, mailbox: str) -> Any:
         """Return the message in force with its header, as a row of the ring. Raises `Failure`."""
-        row = self._in_force.row(mailbox, self.tick)
+        row = self._in_force.find_row(mailbox, self.tick)
         if row is None:
             raise Failure(f"{mailbox}: no message yet at {self.time_s:g} s", 2)
         return row
@@ -51,8 +51,8 @@ class RecordedMoment:
 
         The value is an array or a number, or the name of a state.
         """
-        signal = Signal.of(name, self._recording.layout.timed)
-        return signal.in_message(self.read(signal.mailbox).record)
+        signal = Signal.parse(name, self._recording.layout.timed)
+        return signal.read_message(self.read(signal.mailbox).record)
 
     @property
     def mailboxes(self) -> dict[str, AnyMessage]:
@@ -61,7 +61,7 @@ class RecordedMoment:
         return {
             name: self.read(name)
             for name in names
-            if self._in_force.row(name, self.tick) is not None
+            if self._in_force.find_row(name, self.tick) is not None
         }
 
     def levels(self, anyway: bool = False) -> dict[str, Document]:
@@ -70,8 +70,8 @@ class RecordedMoment:
         Args:
             anyway: True to repeat the run even if its code or files have changed since.
         """
-        with as_failure(), RunAgain(self._recording, anyway=anyway) as again:
-            return again.levels(self.tick)
+        with convert_errors(), RepeatedRun(self._recording, anyway=anyway) as again:
+            return again.read_levels(self.tick)
 
     def resume(
         self,
@@ -89,18 +89,18 @@ class RecordedMoment:
             seconds: Simulated time from the beginning of the recorded run. None to run to the end.
             anyway: True to repeat the run even if its code or files have changed since.
         """
-        with as_failure():
-            config = branched(self._recording, settings, faults)
-            again = RunAgain(self._recording, anyway=anyway)
+        with convert_errors():
+            config = load_branch_config(self._recording, settings, faults)
+            again = RepeatedRun(self._recording, anyway=anyway)
             try:
-                begins = again.beginning(self.tick)
+                begins = again.continue_at(self.tick)
                 rack = Rack(
                     config, crate=again.crate, entries=begins.entries, continues=begins.continues
                 )
                 rack.launch()
                 rack.run_in_background(seconds)
             except BaseException:
-                again.crate.end()
+                again.crate.end_crate()
                 raise
             again.crate.is_last = True
         return rack

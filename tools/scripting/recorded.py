@@ -12,18 +12,18 @@ import numpy as np
 from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.pictures import NO_PICTURES, can_draw
-from rack.tools.launch.continued import tick_in
-from rack.tools.recording.in_force import InForce
+from rack.tools.launch.continued import parse_tick
+from rack.tools.recording.in_force import VisibleMessages
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.signal import Signal, mailbox_of, signals_of
-from rack.tools.report.stored import newest_report
+from rack.tools.recording.signal import Signal, find_mailbox, list_signals
+from rack.tools.report.stored import load_report
 from rack.tools.scripting.moment import RecordedMoment
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pandas import DataFrame
 
-MOST_NAMED = 12
+MAX_LEGEND_ENTRIES = 12
 """Largest number of curves and marks that the legend of a plot lists."""
 
 
@@ -45,33 +45,33 @@ class RecordedRun:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._recording = Recording(folder)
-        self._in_force = InForce(self._recording)
+        self._in_force = VisibleMessages(self._recording)
         self.signals = RecordedSignals(self._recording)
 
     def __repr__(self) -> str:
-        end = self._recording.ended.get("outcome", {}).get("cause", "no outcome")
+        end = self._recording.end_counts.get("outcome", {}).get("cause", "no outcome")
         rack = self._recording.layout.rack
         return f"<run {self.folder} of rack '{rack}': {end}, {len(self.signals)} signals>"
 
     def at(self, time_s: float) -> RecordedMoment:
         """Return the run at a simulated time, s. Raises `Failure` for a time outside the run."""
-        tick = tick_in(self._recording, str(time_s))
+        tick = parse_tick(self._recording, str(time_s))
         return RecordedMoment(self._recording, self._in_force, tick)
 
     @cached_property
     def events(self) -> list[Event]:
         """Events of the run, oldest first. Empty in a recording by `rack record`."""
-        return _events(self._recording)
+        return _list_events(self._recording)
 
     @cached_property
     def report(self) -> Document:
         """The content of report.json, which is updated if it is missing or older than the run."""
-        return newest_report(self.folder)[0]
+        return load_report(self.folder)[0]
 
     def to_pandas(self, mailbox: str) -> DataFrame:
         """Return a table of all messages of a mailbox, as `RecordedSignal.to_pandas` does."""
-        box = mailbox_of(mailbox, self._recording.layout.mailboxes)
-        return _table([self.signals[signal.name] for signal in signals_of(box)])
+        box = find_mailbox(mailbox, self._recording.layout.mailboxes)
+        return _build_table([self.signals[signal.name] for signal in list_signals(box)])
 
 
 class RecordedSignals(dict[str, "RecordedSignal"]):
@@ -80,7 +80,7 @@ class RecordedSignals(dict[str, "RecordedSignal"]):
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._boxes = recording.layout.mailboxes
-        for name, signal in Signal.all(self._boxes).items():
+        for name, signal in Signal.build_by_name(self._boxes).items():
             self[name] = RecordedSignal(recording, signal)
 
     def __repr__(self) -> str:
@@ -88,7 +88,7 @@ class RecordedSignals(dict[str, "RecordedSignal"]):
         return f"<{len(self)} signals of {len(self._boxes)} mailboxes: {names}, ...>"
 
     def __missing__(self, name: str) -> RecordedSignal:
-        return RecordedSignal(self._recording, Signal.of(name, self._boxes))
+        return RecordedSignal(self._recording, Signal.parse(name, self._boxes))
 
 
 class RecordedSignal:
@@ -117,12 +117,12 @@ class RecordedSignal:
     def values(self) -> np.ndarray:
         """Values in all messages, (messages, *shape), in `unit`. States are numbers."""
         signal = self.signal
-        return signal.part(self._recording.signal(signal.mailbox, signal.label))
+        return signal.select_part(self._recording.read_signal(signal.mailbox, signal.label))
 
     @cached_property
     def ticks(self) -> np.ndarray:
         """Ticks at which the messages were released, (messages,)."""
-        return self._recording.signal(self.signal.mailbox, "tick")
+        return self._recording.read_signal(self.signal.mailbox, "tick")
 
     @property
     def time_s(self) -> np.ndarray:
@@ -136,7 +136,7 @@ class RecordedSignal:
         without
         pandas.
         """
-        return _table([self])
+        return _build_table([self])
 
     def plot(self, axes: Axes | None = None) -> Axes:
         """Plot the signal over simulated time, with marks at the beginning of faults and at deaths.
@@ -155,29 +155,29 @@ class RecordedSignal:
 
         axes = axes or pyplot.figure(layout="constrained").add_subplot()
         curves = self.values.reshape(len(self.values), -1)
-        places = [_place(index) or self.name for index in np.ndindex(self.shape)]
+        places = [_format_index(index) or self.name for index in np.ndindex(self.shape)]
         axes.step(self.time_s, curves, where="post", label=places)
         axes.set_xlabel("simulated time, s")
-        axes.set_ylabel(self.signal.head)
+        axes.set_ylabel(self.signal.heading)
         if self.signal.spec.values:
             names, numbers = zip(*self.signal.spec.values, strict=True)
             axes.set_yticks(numbers, names)
         tick_s = self._recording.layout.clock_ns * 1e-9
-        marks = self._marks()
+        marks = self._list_marks()
         for tick, text in marks.items():
             label = f"{tick * tick_s:g} s: {text}"
             axes.axvline(tick * tick_s, color="tab:red", linestyle="--", label=label)
-        if 1 < len(places) + len(marks) <= MOST_NAMED:
+        if 1 < len(places) + len(marks) <= MAX_LEGEND_ENTRIES:
             axes.legend(fontsize="small")
         return axes
 
-    def _marks(self) -> dict[int, str]:
+    def _list_marks(self) -> dict[int, str]:
         """Return the texts that a plot marks, by tick.
 
         A death replaces the fault at the same tick.
         """
         marks: dict[int, str] = {}
-        for event in _events(self._recording):
+        for event in _list_events(self._recording):
             if event.kind == "fault" and event.code == "begins":
                 marks[event.tick] = f"{event.board}: {event.text}"
             elif event.kind == "died":
@@ -185,17 +185,17 @@ class RecordedSignal:
         return marks
 
 
-def _events(recording: Recording) -> list[Event]:
+def _list_events(recording: Recording) -> list[Event]:
     """Return the events of a run, without its outcome."""
     return [Event(**event) for event in recording.events if event["kind"] != "outcome"]
 
 
-def _place(index: Sequence[int]) -> str:
+def _format_index(index: Sequence[int]) -> str:
     """Format an index, as in `[2][0]`."""
     return "".join(f"[{number}]" for number in index)
 
 
-def _table(signals: Sequence[RecordedSignal]) -> DataFrame:
+def _build_table(signals: Sequence[RecordedSignal]) -> DataFrame:
     """Return the signals of one mailbox as a table. Raises `Failure` without pandas."""
     try:
         from pandas import DataFrame, Index
@@ -203,7 +203,7 @@ def _table(signals: Sequence[RecordedSignal]) -> DataFrame:
         raise Failure("tables need pandas: pip install 'nasrem-rack[notebook]'") from None
     columns = {"tick": signals[0].ticks}
     for signal in signals:
-        values = signal.signal.named(signal.values)
+        values = signal.signal.replace_numbers(signal.values)
         for index in np.ndindex(values.shape[1:]):
-            columns[f"{signal.name}{_place(index)}"] = values[(slice(None), *index)]
+            columns[f"{signal.name}{_format_index(index)}"] = values[(slice(None), *index)]
     return DataFrame(columns, index=Index(signals[0].time_s, name="time_s"))

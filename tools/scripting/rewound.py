@@ -15,25 +15,25 @@ from pathlib import Path
 from typing import Any, Self
 
 from rack.boards.events import Event
-from rack.tools.console.answer import Document, Failure, as_failure
-from rack.tools.console.tables import fitted
-from rack.tools.launch.continued import RunAgain, branched, tick_in
-from rack.tools.launch.folder import folder_of
+from rack.tools.console.answer import Document, Failure, convert_errors
+from rack.tools.console.tables import format_fitted_table
+from rack.tools.launch.continued import RepeatedRun, load_branch_config, parse_tick
+from rack.tools.launch.folder import choose_run_folder
 from rack.tools.launch.launch import run_rack
-from rack.tools.monitor.display import Display, event_text
-from rack.tools.monitor.message_text import MessageText
-from rack.tools.monitor.signals import cell
-from rack.tools.recording.divergence import first_difference, ticks_of
-from rack.tools.recording.in_force import InForce
+from rack.tools.monitor.display import Display, format_event
+from rack.tools.monitor.message_text import MessageFormatter
+from rack.tools.monitor.signals import format_value
+from rack.tools.recording.divergence import find_first_difference, find_tick_range
+from rack.tools.recording.in_force import VisibleMessages
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.signal import NEAREST, Signal, Trigger
+from rack.tools.recording.signal import MAX_SUGGESTIONS, Signal, Trigger
 from rack.tools.report.report import write_report
-from rack.tools.report.report_markdown import summary
+from rack.tools.report.report_markdown import format_summary
 from rack.tools.scripting.moment import RecordedMoment
 
 
 @dataclass(frozen=True)
-class Glance:
+class RewindAnswer:
     """The answer to one step of the navigation, as plain data and as lines for people."""
 
     document: Document
@@ -50,30 +50,30 @@ class RewoundRun:
         self._anyway = anyway
         self.recording = Recording(folder)
         self._layout = self.recording.layout
-        self._first, self._end = ticks_of(self.recording)
+        self._first, self._end = find_tick_range(self.recording)
         self.tick = self._first
-        self._in_force = InForce(self.recording)
-        self._signals = Signal.all(self._layout.timed)
+        self._in_force = VisibleMessages(self.recording)
+        self._signals = Signal.build_by_name(self._layout.timed)
         self._boxes = {box.name: box for box in self._layout.timed}
         self._tasks = [task.name for task in self._layout.tasks]
         self._levels: tuple[int, Mapping[str, Document]] = -1, {}
-        self._again: RunAgain | None = None
+        self._again: RepeatedRun | None = None
 
     def __enter__(self) -> Self:
         # Start the crate early, so that it imports while the user types. If the run cannot be
         # repeated, the user is told when a command needs that.
         with suppress(Failure):
-            self._ready()
+            self._prepare_repeated_run()
         return self
 
     def __exit__(self, *error: object) -> None:
         if self._again is not None:
-            self._again.crate.end()
+            self._again.crate.end_crate()
 
-    def _ready(self) -> RunAgain:
+    def _prepare_repeated_run(self) -> RepeatedRun:
         """Return the repeated run, which is started again if its crate was lost."""
         if self._again is None or self._again.crate.is_over:
-            self._again = RunAgain(self.recording, anyway=self._anyway)
+            self._again = RepeatedRun(self.recording, anyway=self._anyway)
         return self._again
 
     @property
@@ -81,58 +81,62 @@ class RewoundRun:
         """Names that can be shown: tasks, mailboxes and signals."""
         return [*self._tasks, *self._boxes, *self._signals]
 
-    def time_s(self, tick: int) -> float:
+    def to_time_s(self, tick: int) -> float:
         """Convert a tick to simulated time, s."""
         return round(tick * self._layout.clock_ns * 1e-9, 9)
 
-    def goto(self, time_s: str) -> Glance:
+    def go_to_time(self, time_s: str) -> RewindAnswer:
         """Go to a simulated time, s. Raises `Failure` if it was not recorded."""
-        return self._go(tick_in(self.recording, time_s))
+        return self._go_to_tick(parse_tick(self.recording, time_s))
 
-    def step(self, ticks: int) -> Glance:
+    def step(self, ticks: int) -> RewindAnswer:
         """Go forward by some ticks, or back if the number is negative."""
-        return self._go(tick_in(self.recording, str(self.time_s(self.tick + ticks))))
+        return self._go_to_tick(parse_tick(self.recording, str(self.to_time_s(self.tick + ticks))))
 
-    def goto_when(self, condition: str, back: bool = False) -> Glance:
+    def go_to_condition(self, condition: str, back: bool = False) -> RewindAnswer:
         """Go to the next tick at which a condition begins to hold, or back to the previous one.
 
         Raises `Failure` if there is no such tick.
         """
-        begin_ticks = self._in_force.begins(Trigger.of(condition, self._layout.timed))
+        begin_ticks = self._in_force.find_trigger_ticks(
+            Trigger.parse(condition, self._layout.timed)
+        )
         before = begin_ticks[(begin_ticks >= self._first) & (begin_ticks < self.tick)][-1:]
         after = begin_ticks[(begin_ticks > self.tick) & (begin_ticks < self._end)][:1]
         for tick in before if back else after:
-            return self._go(int(tick))
+            return self._go_to_tick(int(tick))
         where = "before" if back else "after"
-        raise Failure(f'"{condition}": does not begin to hold {where} {self._now}', 2)
+        raise Failure(f'"{condition}": does not begin to hold {where} {self._time_text}', 2)
 
     @property
     def _moment(self) -> RecordedMoment:
         return RecordedMoment(self.recording, self._in_force, self.tick)
 
     @property
-    def _now(self) -> str:
-        return f"{self.time_s(self.tick):g} s, tick {self.tick}"
+    def _time_text(self) -> str:
+        return f"{self.to_time_s(self.tick):g} s, tick {self.tick}"
 
-    def _go(self, tick: int) -> Glance:
+    def _go_to_tick(self, tick: int) -> RewindAnswer:
         self.tick = tick
-        return Glance({"tick": tick, "time_s": self.time_s(tick)}, [self._now])
+        return RewindAnswer({"tick": tick, "time_s": self.to_time_s(tick)}, [self._time_text])
 
-    def show(self, name: str) -> Glance:
+    def show_name(self, name: str) -> RewindAnswer:
         """Show the attributes of a level, the message in force in a mailbox, or a signal.
 
         Raises `Failure` with the nearest names for an unknown one.
         """
         whole = name.partition("[")[0]
         if name in self._tasks:
-            return self._level(name)
+            return self._show_level(name)
         if name in self._boxes:
-            return self._message(name)
+            return self._show_message(name)
         if whole in self._signals:
-            signal = Signal.of(name, self._layout.timed)
-            value = signal.plain(self._moment.row(signal.mailbox)["message"][None])[0]
-            return self._shown(name, value, [f"{name} = {cell(value)} {signal.unit}".rstrip()])
-        nearest_names = get_close_matches(whole, self.names, NEAREST) or [
+            signal = Signal.parse(name, self._layout.timed)
+            value = signal.extract_plain(self._moment.row(signal.mailbox)["message"][None])[0]
+            return self._build_answer(
+                name, value, [f"{name} = {format_value(value)} {signal.unit}".rstrip()]
+            )
+        nearest_names = get_close_matches(whole, self.names, MAX_SUGGESTIONS) or [
             *self._tasks,
             *self._boxes,
         ]
@@ -140,46 +144,48 @@ class RewoundRun:
             f"{name}: no such level, mailbox or signal; nearest: {', '.join(nearest_names)}", 2
         )
 
-    def _shown(self, name: str, value: Any, lines: Iterable[str]) -> Glance:
+    def _build_answer(self, name: str, value: Any, lines: Iterable[str]) -> RewindAnswer:
         """Build the answer of `show_name`."""
-        where = {"tick": self.tick, "time_s": self.time_s(self.tick)}
-        return Glance({**where, "name": name, "value": value}, lines)
+        where = {"tick": self.tick, "time_s": self.to_time_s(self.tick)}
+        return RewindAnswer({**where, "name": name, "value": value}, lines)
 
-    def _message(self, mailbox: str) -> Glance:
-        text = MessageText(self._boxes[mailbox], self._layout.clock_ns)
-        document = text.document(self._moment.row(mailbox), self.tick)
-        return self._shown(mailbox, document, text.lines(document))
+    def _show_message(self, mailbox: str) -> RewindAnswer:
+        text = MessageFormatter(self._boxes[mailbox], self._layout.clock_ns)
+        document = text.to_document(self._moment.row(mailbox), self.tick)
+        return self._build_answer(mailbox, document, text.format_lines(document))
 
-    def _level(self, task: str) -> Glance:
+    def _show_level(self, task: str) -> RewindAnswer:
         """Show the attributes of a level. They are read once for each tick."""
         tick, levels = self._levels
         if tick != self.tick:
-            with as_failure():
-                levels = self._ready().levels(self.tick)
+            with convert_errors():
+                levels = self._prepare_repeated_run().read_levels(self.tick)
             self._levels = self.tick, levels
-        rows = [[name, cell(value)] for name, value in _flat(levels[task])]
-        return self._shown(task, levels[task], fitted(("attribute", "value"), rows))
+        rows = [[name, format_value(value)] for name, value in _flatten_attributes(levels[task])]
+        return self._build_answer(
+            task, levels[task], format_fitted_table(("attribute", "value"), rows)
+        )
 
-    def events(self, around_s: float) -> Glance:
+    def list_events(self, around_s: float) -> RewindAnswer:
         """Show the events within a time before and after this tick."""
         span = around_s * 1e9 / self._layout.clock_ns
         events = (event for event in self.recording.events if event.get("tick", -1) >= 0)
         nearby_events = [event for event in events if abs(event["tick"] - self.tick) <= span]
         lines = [
-            f"{self.time_s(near['tick']):g} s  {event_text(Event(**near))}"
+            f"{self.to_time_s(near['tick']):g} s  {format_event(Event(**near))}"
             for near in nearby_events
         ]
-        nothing = f"no events within {around_s:g} s of {self._now}"
-        return Glance({"tick": self.tick, "events": nearby_events}, lines or [nothing])
+        nothing = f"no events within {around_s:g} s of {self._time_text}"
+        return RewindAnswer({"tick": self.tick, "events": nearby_events}, lines or [nothing])
 
-    def branch(
+    def run_branch(
         self,
         settings: Sequence[str],
         faults: str | None,
         out: Path | None,
         seconds: float | None,
         display: Display,
-    ) -> Glance:
+    ) -> RewindAnswer:
         """Run the rack from this tick with other settings or faults, and record that.
 
         Args:
@@ -195,18 +201,18 @@ class RewoundRun:
             ConfigError: The changed config has mistakes.
             Failure: The run cannot be repeated, or the branch cannot be recorded.
         """
-        config = branched(self.recording, settings, faults)
-        outcome = self.recording.ended.get("outcome", {})
+        config = load_branch_config(self.recording, settings, faults)
+        outcome = self.recording.end_counts.get("outcome", {})
         if seconds is None and outcome.get("cause") == "time over":
-            seconds = self.time_s(self._end)
-        folder = folder_of(out, config.name)
-        begins = self._ready().beginning(self.tick)
-        result = run_rack(config, seconds, folder, display, begins=begins)
+            seconds = self.to_time_s(self._end)
+        folder = choose_run_folder(out, config.name)
+        begins = self._prepare_repeated_run().continue_at(self.tick)
+        result = run_rack(config, seconds, folder, display, beginning=begins)
         report, _ = write_report(folder)
-        difference = first_difference(self.recording, Recording(folder))
+        difference = find_first_difference(self.recording, Recording(folder))
         where = "all messages that both runs wrote are equal"
         if difference is not None:
-            place = f"{self.time_s(difference.tick):g} s, tick {difference.tick}, in"
+            place = f"{self.to_time_s(difference.tick):g} s, tick {difference.tick}, in"
             where = f"differs from {self.recording.folder} first at {place} {difference.mailbox}"
         document = {
             "folder": str(folder),
@@ -214,13 +220,15 @@ class RewoundRun:
             "outcome": asdict(result.outcome),
             "first_difference": None if difference is None else asdict(difference),
         }
-        return Glance(document, [*summary(report), where, f"recorded into {folder}"])
+        return RewindAnswer(document, [*format_summary(report), where, f"recorded into {folder}"])
 
 
-def _flat(attributes: Mapping[str, Any], outer: str = "") -> Iterable[tuple[str, Any]]:
+def _flatten_attributes(
+    attributes: Mapping[str, Any], outer: str = ""
+) -> Iterable[tuple[str, Any]]:
     """Yield attributes by dotted names, including the attributes of nested objects."""
     for name, value in attributes.items():
         if isinstance(value, dict):
-            yield from _flat(value, f"{outer}{name}.")
+            yield from _flatten_attributes(value, f"{outer}{name}.")
         else:
             yield f"{outer}{name}", value

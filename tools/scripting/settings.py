@@ -12,7 +12,7 @@ import tomli_w
 from rack.boards.errors import ConfigError, Mistake
 
 
-def settings_of(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
+def list_settings(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
     """Yield the settings in tables of Python values, in the form that --set takes.
 
     Args:
@@ -24,21 +24,23 @@ def settings_of(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
     """
     for key, value in tables.items():
         if isinstance(value, Mapping) and value:
-            yield from settings_of(value, f"{outer}{key}.")
+            yield from list_settings(value, f"{outer}{key}.")
         else:
             try:
-                yield f"{outer}{key}={_inline(value)}"
+                yield f"{outer}{key}={_format_inline(value)}"
             except TypeError as error:
                 raise ConfigError([Mistake("settings", f"{outer}{key}", str(error))]) from None
 
 
-def _inline(value: Any) -> str:
+def _format_inline(value: Any) -> str:
     """Format a Python value as TOML on one line. Numpy arrays become lists, and paths texts."""
     if isinstance(value, Mapping):
-        items = (f"{_inline(str(key))} = {_inline(item)}" for key, item in value.items())
+        items = (
+            f"{_format_inline(str(key))} = {_format_inline(item)}" for key, item in value.items()
+        )
         return f"{{{', '.join(items)}}}"
     if isinstance(value, np.ndarray | list | tuple):
-        return f"[{', '.join(map(_inline, value))}]"
+        return f"[{', '.join(map(_format_inline, value))}]"
     plain = str(value) if isinstance(value, Path) else value
     plain = plain.item() if isinstance(plain, np.generic) else plain
     return tomli_w.dumps({"value": plain}).partition("=")[2].strip()

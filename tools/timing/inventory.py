@@ -11,26 +11,26 @@ from collections.abc import Iterator, Sequence
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
 from rack.boards.classes import find_class
-from rack.boards.config.cell import built_cell
+from rack.boards.config.cell import build_rack_cell
 from rack.boards.config.schema import CLOCK_SLOT, LAN, RackConfig
-from rack.boards.timing.chains import spanned
+from rack.boards.timing.chains import format_names
 from rack.levels.level import Executor
 from rack.levels.tables import read_params
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks, TextTable
 
-PATIENCE = (
+PATIENCE_LINE = (
     "patience: '{board}' keeps its last torque for {ms:g} ms ({cycles} cycles; at most"
     " {permitted_ms} ms). In this time joints at full speed turn {angle_mrad} mrad, and all motors"
     " at full torque add {energy_j} J"
 )
-MONITORS = (
+MONITORS_LINE = (
     "monitors: '{board}' accepts samples with errors of {position_mrad} mrad,"
     " {velocity_mrad_s} mrad/s; or, at full speed, {jitter_ms} ms early or late"
 )
 
 
-def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
+def build_inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
     """Return the inventory of a config as plain data.
 
     Addresses and sizes are in bytes. `slice_ms` of a task and `delay_ms` of a mailbox are the time
@@ -93,19 +93,19 @@ def inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Document:
             }
             for name, host in config.host.items()
         ],
-        "network": _network(config),
-        "patience": list(_patience(config, layout)),
-        "monitors": list(_monitors(config)),
+        "network": _describe_network(config),
+        "patience": list(_describe_patience(config, layout)),
+        "monitors": list(_describe_monitors(config)),
         "mailboxes": mailboxes,
         "notes": notes,
     }
 
 
-def _patience(config: RackConfig, layout: Layout) -> Iterator[Document]:
+def _describe_patience(config: RackConfig, layout: Layout) -> Iterator[Document]:
     """Yield how long each arm or hand continues without a new torque, and how far it moves."""
     for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
-        cell = built_cell(config)
-        every = config.every(board)
+        cell = build_rack_cell(config)
+        every = config.find_period(board)
         tick_ms = layout.clock_ns * 1e-6
         ticks = cell.patience.ticks(every, tick_ms * 1e-3)
         angle_mrad = ticks * tick_ms * cell.bounds.velocity
@@ -119,24 +119,24 @@ def _patience(config: RackConfig, layout: Layout) -> Iterator[Document]:
         }
 
 
-def _monitors(config: RackConfig) -> Iterator[Document]:
+def _describe_monitors(config: RackConfig) -> Iterator[Document]:
     """Yield the largest sensor errors that an arm accepts before it is braked, for each joint."""
     robot = config.robot
     if robot is None:
         return
     # MuJoCo takes 0.5 s to import, therefore import it only for racks with an arm.
     from rack.levels.arm import find_arm
-    from rack.levels.robot.cell import sensed_by
+    from rack.levels.robot.cell import replace_encoders
     from rack.levels.servo.control import ArmParams
-    from rack.levels.servo.sensor_monitor import tolerance
+    from rack.levels.servo.sensor_monitor import compute_tolerance
 
     for board, table in config.board.items():
         kind = find_class(table.executor, Executor).params
         if kind is None or not issubclass(kind, ArmParams):
             continue
         sensors = find_arm(read_params(kind, table.params).arm).sensors
-        cell = built_cell(config)
-        limits = tolerance(sensed_by(cell, robot, sensors))
+        cell = build_rack_cell(config)
+        limits = compute_tolerance(replace_encoders(cell, robot, sensors))
         yield {
             "board": board,
             "position_mrad": (1e3 * limits.position).round(3).tolist(),
@@ -145,7 +145,7 @@ def _monitors(config: RackConfig) -> Iterator[Document]:
         }
 
 
-def _network(config: RackConfig) -> Document | None:
+def _describe_network(config: RackConfig) -> Document | None:
     """Return the exchanges of a rack with others as plain data. None without a network."""
     table = config.adapter.lan
     if table is None:
@@ -159,7 +159,7 @@ def _network(config: RackConfig) -> Document | None:
     return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
 
 
-def inventory_blocks(data: Document) -> Blocks:
+def format_inventory(data: Document) -> Blocks:
     """Yield an inventory as text for the terminal."""
     boards = len({task["slot"] for task in data["tasks"]})
     crate = f"{boards} board{'s' * (boards > 1)} and the clock"
@@ -176,7 +176,7 @@ def inventory_blocks(data: Document) -> Blocks:
             "ticks": task["every_ticks"],
             **({"phase": task["phase_ticks"]} if has_phases else {}),
             "slice, ms": task["slice_ms"],
-            "trace at": _hex(task["trace_address"]),
+            "trace at": _format_address(task["trace_address"]),
         }
         for task in data["tasks"]
     ]
@@ -189,12 +189,12 @@ def inventory_blocks(data: Document) -> Blocks:
     }
     yield ""
     yield TextTable([clock, *rows], ("trace at", "slice, ms"))
-    yield from _host_blocks(data["hosts"])
-    yield from _network_blocks(data["network"])
+    yield from _format_hosts(data["hosts"])
+    yield from _format_network(data["network"])
     yield ""
     mailboxes = [
         {
-            "bus address": _hex(mailbox["address"]),
+            "bus address": _format_address(mailbox["address"]),
             "mailbox": mailbox["mailbox"],
             "message": mailbox["message"],
             "bytes": mailbox["size"],
@@ -205,18 +205,20 @@ def inventory_blocks(data: Document) -> Blocks:
             else mailbox["protocol"],
             "delay, ms": mailbox["delay_ms"],
             "written by > read by": (
-                f"{mailbox['writer']} > {spanned(mailbox['readers']) or '(nobody)'}"
+                f"{mailbox['writer']} > {format_names(mailbox['readers']) or '(nobody)'}"
             ),
         }
         for mailbox in data["mailboxes"]
     ]
     yield TextTable(mailboxes, ("slots", "bytes", "message", "protocol"))
     yield ""
-    windows = ", ".join(f"{board} {_hex(address)}" for board, address in data["windows"].items())
+    windows = ", ".join(
+        f"{board} {_format_address(address)}" for board, address in data["windows"].items()
+    )
     yield f"segment: {data['segment_bytes']} bytes; board windows: {windows}"
 
 
-def _host_blocks(hosts: Sequence[Document]) -> Blocks:
+def _format_hosts(hosts: Sequence[Document]) -> Blocks:
     """Yield a table of the host boards, which have no rate and no place in the timing model."""
     if hosts:
         rows = [
@@ -232,7 +234,7 @@ def _host_blocks(hosts: Sequence[Document]) -> Blocks:
         yield TextTable(rows, ("program",))
 
 
-def _network_blocks(network: Document | None) -> Blocks:
+def _format_network(network: Document | None) -> Blocks:
     """Yield the peers and exchanges of a rack, and its reaction to a lost peer."""
     if network is None:
         return
@@ -253,11 +255,11 @@ def _network_blocks(network: Document | None) -> Blocks:
     yield TextTable(rows)
 
 
-def arm_lines(data: Document) -> Iterator[str]:
+def format_arm_lines(data: Document) -> Iterator[str]:
     """Yield the lines on the behaviour of an arm without torques and on its monitors."""
-    yield from (PATIENCE.format(**each) for each in data["patience"])
-    yield from (MONITORS.format(**each) for each in data["monitors"])
+    yield from (PATIENCE_LINE.format(**each) for each in data["patience"])
+    yield from (MONITORS_LINE.format(**each) for each in data["monitors"])
 
 
-def _hex(address: int) -> str:
+def _format_address(address: int) -> str:
     return f"0x{address:06x}"

@@ -8,19 +8,19 @@ from itertools import chain
 from typing import Any
 
 from rack.backplane.layout import Layout, Protocol
-from rack.boards.config import RackConfig, loads, rack_timing, resolve
-from rack.boards.config.layout import obtained_core
+from rack.boards.config import RackConfig, build_rack_timing, load_text, resolve
+from rack.boards.config.layout import find_core
 from rack.boards.errors import ConfigError
 from rack.boards.timing.level import LevelTiming
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.system_response import predict
+from rack.boards.timing.system_response import predict_response
 from rack.boards.timing.tasks import Budget
 from rack.boards.timing.verdicts import (
     LOAD,
     EquationVerdict,
-    level_verdicts,
-    system_verdicts,
-    verdicts,
+    judge_level,
+    judge_rack,
+    judge_system,
 )
 from rack.tools.console.answer import Document
 
@@ -38,11 +38,11 @@ class JudgedConfig:
     verdicts: tuple[EquationVerdict, ...]
 
     @classmethod
-    def of(cls, config: RackConfig, budgets: Mapping[str, Budget] | None = None) -> JudgedConfig:
+    def judge(cls, config: RackConfig, budgets: Mapping[str, Budget] | None = None) -> JudgedConfig:
         """Wire a config and judge it by `budgets`, or by its own budgets. Raises `ConfigError`."""
         layout = resolve(config).layout
-        timing = rack_timing(config, layout, budgets)
-        return cls(config, layout, timing, tuple(verdicts(timing)))
+        timing = build_rack_timing(config, layout, budgets)
+        return cls(config, layout, timing, tuple(judge_rack(timing)))
 
     @property
     def budgets(self) -> dict[str, Budget]:
@@ -53,7 +53,7 @@ class JudgedConfig:
             if board.budget is not None
         }
 
-    def change(self, board: str, settings: Settings) -> Change | None:
+    def try_change(self, board: str, settings: Settings) -> Change | None:
         """Change the settings of a board, and load and judge the new config.
 
         Returns:
@@ -71,43 +71,45 @@ class JudgedConfig:
             update["protocol"] = config.protocol.model_copy(update={"mailbox": mailboxes})
         try:
             # Copying does not validate. Only the loader finds mistakes.
-            after = JudgedConfig.of(loads(config.model_copy(update=update).text()), self.budgets)
+            after = JudgedConfig.judge(
+                load_text(config.model_copy(update=update).to_toml_text()), self.budgets
+            )
         except ConfigError:
             return None
         changed = {key: value for key, value in settings.items() if value != getattr(table, key)}
         return Change(board, changed, protocols, self, after)
 
     @property
-    def failing(self) -> tuple[EquationVerdict, ...]:
+    def failures(self) -> tuple[EquationVerdict, ...]:
         """Verdicts that fail."""
         return tuple(verdict for verdict in self.verdicts if not verdict.holds)
 
-    def failing_of(self, board: str) -> set[tuple[str, str, str]]:
+    def find_failures(self, board: str) -> set[tuple[str, str, str]]:
         """Return the keys of the failures of a board's tasks.
 
         If they have none, return the keys of overloads of the board's cores.
         """
         names = {board, f"{board}.planner"}
-        own = {verdict.key for verdict in self.failing if verdict.subject in names}
-        cores = {f"core {core}" for core in self.timing.cores_of(board)}
-        return own or {v.key for v in self.failing if v.equation == LOAD and v.subject in cores}
+        own = {verdict.key for verdict in self.failures if verdict.subject in names}
+        cores = {f"core {core}" for core in self.timing.find_cores(board)}
+        return own or {v.key for v in self.failures if v.equation == LOAD and v.subject in cores}
 
-    def cures(self, board: str, before: JudgedConfig) -> bool:
+    def cures_board(self, board: str, before: JudgedConfig) -> bool:
         """Return True if no failure of a board in `before` is left and no new one has appeared."""
-        failing = {verdict.key for verdict in self.failing}
-        old = {verdict.key for verdict in before.failing}
-        return failing < old and not failing & before.failing_of(board)
+        failing = {verdict.key for verdict in self.failures}
+        old = {verdict.key for verdict in before.failures}
+        return failing < old and not failing & before.find_failures(board)
 
     def is_sound(self, changed: RackTiming, board: str) -> bool:
         """Return True if one changed board satisfies its equations without slowing the system.
 
         This check is quick and ignores the effect on other tasks of the core.
         """
-        old = {verdict.key for verdict in self.failing}
-        system = (verdict for verdict in system_verdicts(changed) if verdict.key not in old)
+        old = {verdict.key for verdict in self.failures}
+        system = (verdict for verdict in judge_system(changed) if verdict.key not in old)
         return all(
             verdict.holds
-            for verdict in chain(level_verdicts(changed, changed.level(board)), system)
+            for verdict in chain(judge_level(changed, changed.build_level(board)), system)
         )
 
 
@@ -130,9 +132,9 @@ class Change:
     after: JudgedConfig
 
     @property
-    def _levels(self) -> tuple[LevelTiming, LevelTiming]:
+    def _level_timings(self) -> tuple[LevelTiming, LevelTiming]:
         """Timing of the board's level before and after the change."""
-        return self.before.timing.level(self.board), self.after.timing.level(self.board)
+        return self.before.timing.build_level(self.board), self.after.timing.build_level(self.board)
 
     @property
     def cost(self) -> tuple[bool, float, int, int]:
@@ -143,8 +145,8 @@ class Change:
         older, therefore both factors count.
         """
         cores = {*self.after.timing.cores.values()} - {*self.before.timing.cores.values()}
-        is_core_missing = any(obtained_core(core) != core for core in cores)
-        old, new = self._levels
+        is_core_missing = any(find_core(core) != core for core in cores)
+        old, new = self._level_timings
         factor = new.cycle_ns / old.cycle_ns
         if old.slice_ns is not None and new.slice_ns is not None:
             factor *= max(new.slice_ns / old.slice_ns, 1.0)
@@ -154,9 +156,9 @@ class Change:
     @property
     def text(self) -> str:
         """The change with its numbers in one line."""
-        return f"board '{self.board}': {', '.join(self._parts())}"
+        return f"board '{self.board}': {', '.join(self._list_parts())}"
 
-    def document(self) -> Document:
+    def to_document(self) -> Document:
         """Convert the change to plain data."""
         return {
             "board": self.board,
@@ -165,7 +167,7 @@ class Change:
             "protocols": self.protocols,
         }
 
-    def _parts(self) -> Iterator[str]:
+    def _list_parts(self) -> Iterator[str]:
         """Yield a text for each part of the change."""
         old, new = (rack.config.board[self.board] for rack in (self.before, self.after))
         changed = self.settings
@@ -177,19 +179,21 @@ class Change:
         for key in ("planner_core", "core"):
             if (core := changed.get(key)) is not None:
                 before = "" if getattr(old, key) is None else f"{getattr(old, key)} -> "
-                yield f"{key} {before}{core} ({self._sharing(core)})"
+                yield f"{key} {before}{core} ({self._describe_sharing(core)})"
         yield from (f"{mailbox} by {protocol}" for mailbox, protocol in self.protocols.items())
-        yield from self._cycles()
-        if changed.get("coupling") == "loose" and not self._levels[1].exchange_ns:
+        yield from self._describe_cycles()
+        if changed.get("coupling") == "loose" and not self._level_timings[1].exchange_ns:
             yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
 
-    def _cycles(self) -> Iterator[str]:
+    def _describe_cycles(self) -> Iterator[str]:
         """Yield the changes of the cycle, of the system's response, and of the age of plans."""
-        old, new = self._levels
+        old, new = self._level_timings
         if new.cycle_ns != old.cycle_ns:
             ticks = [rack.timing.boards[self.board].every for rack in (self.before, self.after)]
             cycles = f"cycle {old.cycle_ns * 1e-6:g} -> {new.cycle_ns * 1e-6:g} ms"
-            responses = [predict(rack.timing).command_ms for rack in (self.before, self.after)]
+            responses = [
+                predict_response(rack.timing).command_ms for rack in (self.before, self.after)
+            ]
             if responses[0] != responses[1]:
                 cycles += f"; R_s {responses[0]:g} -> {responses[1]:g} ms"
             yield f"every {ticks[0]} -> {ticks[1]} ({cycles})"
@@ -200,7 +204,7 @@ class Change:
             age = f"within_cycles {old.within_cycles} -> {new.within_cycles} ({age})"
         yield age
 
-    def _sharing(self, core: int) -> str:
+    def _describe_sharing(self, core: int) -> str:
         """Return which other tasks are on a core, and whether this machine has the core."""
         own_tasks = (self.board, f"{self.board}.planner")
         others = [
@@ -209,7 +213,7 @@ class Change:
             if task_core == core and name not in own_tasks
         ]
         sharing = f"shared with {', '.join(others)}" if others else "not shared"
-        obtained = obtained_core(core)
+        obtained = find_core(core)
         if obtained == core:
             return sharing
         return f"{sharing}; this machine has no core {core}, uses core {obtained}"

@@ -12,21 +12,21 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
-from rack.boards.config import rack_timing
+from rack.boards.config import build_rack_timing
 from rack.boards.timing.chains import ParallelChains
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.system_response import mailboxes_along
-from rack.boards.timing.trace_times import counts, distribution
-from rack.boards.timing.verdicts import response_subject
+from rack.boards.timing.system_response import find_path_mailboxes
+from rack.boards.timing.trace_times import compute_distribution, count_misses_and_skips
+from rack.boards.timing.verdicts import name_response_subject
 from rack.tools.console.answer import Document
-from rack.tools.monitor.network import exchanged
+from rack.tools.monitor.network import read_entries
 from rack.tools.recording.recording import Recording
 
-LOSSES = ("died", "hang")
+LOSS_CODES = ("died", "hang")
 """Event codes of a lost board."""
 
 
-def system_response(recording: Recording) -> Document | None:
+def measure_system_response(recording: Recording) -> Document | None:
     """Return the response of commands downward and of statuses upward, in ticks and ms.
 
     The main figures belong to the chains with the longest response; `others` contains the same
@@ -38,36 +38,38 @@ def system_response(recording: Recording) -> Document | None:
     Returns:
         The response as plain data. None without a hierarchy.
     """
-    rack = rack_timing(recording.rack_config, recording.layout)
+    rack = build_rack_timing(recording.rack_config, recording.layout)
     first = rack.hierarchy
     if not first.chains:
         return None
-    imported = exchanged(recording.config)
+    imported = read_entries(recording.config)
     return {
-        **_response(recording, rack, first),
+        **_measure_response(recording, rack, first),
         "crosses_racks": imported is not None and bool(imported.imports),
         "others": [
-            _response(recording, rack, chains) for chains in rack.parallel if chains != first
+            _measure_response(recording, rack, chains)
+            for chains in rack.chain_groups
+            if chains != first
         ],
     }
 
 
-def _response(recording: Recording, rack: RackTiming, chains: ParallelChains) -> Document:
+def _measure_response(recording: Recording, rack: RackTiming, chains: ParallelChains) -> Document:
     """Return the response along parallel chains in both directions as plain data."""
     tick_ms = rack.clock_ns * 1e-6
     return {
-        "subject": response_subject(rack, chains),
+        "subject": name_response_subject(rack, chains),
         "levels": list(chains.levels),
         "bound_eq_3_2_ms": chains.bound * tick_ms,
         "sum_eq_3_3_ms": sum(chains.cycles) * tick_ms,
-        "command": _way(recording, rack, chains.chains, chains.levels),
-        "status": _way(
+        "command": _judge_direction(recording, rack, chains.chains, chains.levels),
+        "status": _judge_direction(
             recording, rack, [boards[::-1] for boards in chains.chains], chains.levels[::-1]
         ),
     }
 
 
-def _way(
+def _judge_direction(
     recording: Recording, rack: RackTiming, chains: Sequence[Sequence[str]], levels: Sequence[str]
 ) -> Document:
     """Judge the response along chains, from the first board's release to the last one's cycle.
@@ -80,14 +82,16 @@ def _way(
             information on.
     """
     layout = recording.layout
-    paths = [(boards, mailboxes_along(layout, boards)) for boards in chains]
+    paths = [(boards, find_path_mailboxes(layout, boards)) for boards in chains]
     hop_count = min(len(mailboxes) for _, mailboxes in paths)
     start = len(levels) - hop_count - 1 if hop_count else len(levels)
     bound_ms = (
-        max(rack.response_ticks(boards[start:]) for boards in chains) * layout.clock_ns * 1e-6
+        max(rack.compute_response_ticks(boards[start:]) for boards in chains)
+        * layout.clock_ns
+        * 1e-6
     )
     measurements = [
-        _along(recording, boards[start:], boxes[-hop_count:], bound_ms)
+        _measure_chain(recording, boards[start:], boxes[-hop_count:], bound_ms)
         for boards, boxes in paths
         if hop_count and {box.name for box in boxes} <= set(recording.mailboxes)
     ]
@@ -95,7 +99,7 @@ def _way(
     beyond = [each for _, late, _ in measurements for each in late]
     return {
         "levels": list(levels[start:]),
-        "measured_ms": distribution(responses_ms),
+        "measured_ms": compute_distribution(responses_ms),
         "bound_ms": bound_ms,
         "holds": not beyond if len(responses_ms) else None,
         "beyond": beyond,
@@ -103,7 +107,7 @@ def _way(
     }
 
 
-def _along(
+def _measure_chain(
     recording: Recording, boards: Sequence[str], boxes: Sequence[MailboxSpec], bound_ms: float
 ) -> tuple[np.ndarray, list[Document], int]:
     """Measure the responses along one chain.
@@ -122,37 +126,39 @@ def _along(
     """
     layout = recording.layout
     mailbox = boxes[-1].name
-    first, last = (layout.task(boards[at]).every for at in (0, -1))
+    first, last = (layout.find_task(boards[at]).every for at in (0, -1))
     tick_ms = layout.clock_ns * 1e-6
-    basis = recording.signal(mailbox, "basis")
-    visible_at = recording.signal(mailbox, "visible_at")
+    basis = recording.read_signal(mailbox, "basis")
+    visible_at = recording.read_signal(mailbox, "visible_at")
     # The first messages rest only on their own ticks, because no information had arrived when they
     # were written. They do not count.
-    first_basis = max(int(recording.signal(box.name, "visible_at")[0]) for box in boxes)
+    first_basis = max(int(recording.read_signal(box.name, "visible_at")[0]) for box in boxes)
     valid_rows = np.flatnonzero(basis >= first_basis)
     arrived, at = np.unique(basis[valid_rows], return_index=True)
     at = valid_rows[at]
     visible = visible_at[at[1:]]
-    read = layout.read_grid(boxes[-1], boards[-1])
+    read = layout.find_read_grid(boxes[-1], boards[-1])
     acts = visible + (read.phase - visible) % read.every + last
     ms = (acts - arrived[:-1] - first) * tick_ms
     is_seen = np.ones(len(ms), bool)
-    if recording.lost.get(mailbox) or recording.kept:
+    if recording.lost_rows.get(mailbox) or recording.kept:
         # The first message with the information may be among the unrecorded ones.
-        gaps = np.cumsum(np.diff(recording.signal(mailbox, "serial"), prepend=0) > 1)
+        gaps = np.cumsum(np.diff(recording.read_signal(mailbox, "serial"), prepend=0) > 1)
         is_seen = gaps[at[1:]] == gaps[at[:-1]]
     beyond = [
         {
             "tick": int(arrived[k]),
             "ms": round(float(ms[k]), 6),
-            "delayed_by": list(_delays(recording, boards, int(arrived[k]), int(acts[k]))),
+            "delayed_by": list(_list_delays(recording, boards, int(arrived[k]), int(acts[k]))),
         }
         for k in np.flatnonzero(is_seen & (ms > bound_ms + tick_ms / 2))
     ]
     return ms[is_seen], beyond, int(np.count_nonzero(~is_seen))
 
 
-def _delays(recording: Recording, levels: Sequence[str], since: int, until: int) -> Iterator[str]:
+def _list_delays(
+    recording: Recording, levels: Sequence[str], since: int, until: int
+) -> Iterator[str]:
     """Yield the faults, losses and misses of some boards between two ticks.
 
     Args:
@@ -161,18 +167,20 @@ def _delays(recording: Recording, levels: Sequence[str], since: int, until: int)
         since: First tick.
         until: Tick after the last.
     """
-    for fault in recording.ended.get("faults", ()):
+    for fault in recording.end_counts.get("faults", ()):
         if 0 <= fault["began"] < until and not 0 <= fault["ends"] <= since:
             yield f"fault: {fault['kind']} of {fault['board']}"
     lost = [
         e["subject"] or e["board"]
         for e in recording.events
-        if e.get("code") in LOSSES and since <= e["tick"] < until
+        if e.get("code") in LOSS_CODES and since <= e["tick"] < until
     ]
     yield from (f"{board} was lost" for board in dict.fromkeys(lost))
     for name in levels:
-        rows = recording.trace(name)
-        last_tick = until + recording.layout.task(name).every
-        missed, skipped = counts(rows[(rows["tick"] >= since) & (rows["tick"] < last_tick)])
+        rows = recording.read_trace(name)
+        last_tick = until + recording.layout.find_task(name).every
+        missed, skipped = count_misses_and_skips(
+            rows[(rows["tick"] >= since) & (rows["tick"] < last_tick)]
+        )
         if missed or skipped:
             yield f"{name}: {missed} missed, {skipped} skipped"

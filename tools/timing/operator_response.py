@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from rack.boards.config import rack_timing
-from rack.boards.timing.command_path import CommandPath, command_paths
-from rack.boards.timing.trace_times import distribution
+from rack.boards.config import build_rack_timing
+from rack.boards.timing.command_path import CommandPath, find_command_paths
+from rack.boards.timing.trace_times import compute_distribution
 from rack.levels.operator import Answer, Operation
 from rack.tools.console.answer import Document, Failure, print_json, write_json
-from rack.tools.console.pictures import NO_PICTURES, can_draw, paths_of, picture
-from rack.tools.console.tables import Blocks, TextTable, decimal, print_blocks
+from rack.tools.console.pictures import NO_PICTURES, can_draw, list_picture_paths, open_figure
+from rack.tools.console.tables import Blocks, TextTable, format_decimal, print_blocks
 from rack.tools.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ MEASURED = "#0072b2"
 GRID = "#009e73"
 SUM = "#e69f00"
 BOUND = "#d55e00"
-FIGURES = {
+TABLE_COLUMNS = {
     "min": "min_ms",
     "median": "median_ms",
     "max": "max_ms",
@@ -41,7 +41,7 @@ FIGURES = {
     "bound, eq. 3.2": "bound_eq_3_2_ms",
 }
 """Columns of the table, and the figure of a level that each of them shows."""
-BINS = 20
+HISTOGRAM_BARS = 20
 """Number of histogram bars up to the longest response on the grid."""
 ROUNDING = 1e-9
 
@@ -92,87 +92,88 @@ class OperatorResponse:
     commands: tuple[AnsweredCommand, ...]
 
     @property
-    def measured(self) -> list[AnsweredCommand]:
+    def measured_commands(self) -> list[AnsweredCommand]:
         """Commands on which a torque rests."""
         return [command for command in self.commands if command.acts is not None]
 
-    def ticks(self, command: AnsweredCommand) -> int:
+    def compute_response_ticks(self, command: AnsweredCommand) -> int:
         """Return the response to one of the measured commands, ticks."""
         assert command.acts is not None, "it was acted on"
-        return self.paths[command.level].response(command.given, command.acts)
+        return self.paths[command.level].compute_response(command.given, command.acts)
 
     @property
-    def beyond(self) -> list[AnsweredCommand]:
+    def commands_beyond_bound(self) -> list[AnsweredCommand]:
         """Commands whose response exceeded a bound.
 
         The bounds are the longest response on the grid, and equation 3.2 from the release on.
         """
-        return [command for command in self.measured if self._is_beyond(command)]
+        return [command for command in self.measured_commands if self._is_beyond_bound(command)]
 
-    def _is_beyond(self, command: AnsweredCommand) -> bool:
+    def _is_beyond_bound(self, command: AnsweredCommand) -> bool:
         path = self.paths[command.level]
-        ticks = self.ticks(command)
+        ticks = self.compute_response_ticks(command)
         # R_s of eq. 3.2 begins with the release that reads the command.
         return ticks > path.longest or ticks - (command.sampled - command.given) > path.bound_eq_3_2
 
     @property
-    def off(self) -> list[AnsweredCommand]:
+    def mispredicted_commands(self) -> list[AnsweredCommand]:
         """Commands that took effect at another tick than predicted.
 
         Only exact paths are compared.
         """
-        exact = [c for c in self.measured if self.paths[c.level].is_exact]
+        exact = [c for c in self.measured_commands if self.paths[c.level].is_exact]
         return [command for command in exact if command.acts != command.predicted]
 
     @property
-    def held(self) -> bool:
+    def is_within_bounds(self) -> bool:
         """Whether all responses are within bounds and, in lockstep, at the predicted ticks."""
-        return not self.beyond and not (self.lockstep and self.off)
+        return not self.commands_beyond_bound and not (self.lockstep and self.mispredicted_commands)
 
-    def rows(self) -> list[Document]:
+    def build_rows(self) -> list[Document]:
         """Return the figures of every level that was commanded, ms of simulated time."""
-        return [self._row(level, path) for level, path in self.paths.items()]
+        return [self._build_row(level, path) for level, path in self.paths.items()]
 
-    def _row(self, level: str, path: CommandPath) -> Document:
+    def _build_row(self, level: str, path: CommandPath) -> Document:
         """Return the figures of one level, ms of simulated time."""
-        commands = [c for c in self.measured if c.level == level]
-        ms = np.array([self.ticks(c) for c in commands]) * self.tick_ms
+        commands = [c for c in self.measured_commands if c.level == level]
+        ms = np.array([self.compute_response_ticks(c) for c in commands]) * self.tick_ms
         waits_ms = np.array([c.sampled - c.given for c in commands]) * self.tick_ms
-        stats = distribution(ms) or {}
+        stats = compute_distribution(ms) or {}
         return {
             "level": level,
             "commands": len(commands),
             "min_ms": stats.get("min"),
             "median_ms": stats.get("p50"),
             "max_ms": stats.get("max"),
-            "max_from_reading_ms": (distribution(ms - waits_ms) or {}).get("max"),
+            "max_from_reading_ms": (compute_distribution(ms - waits_ms) or {}).get("max"),
             "longest_ms": path.longest * self.tick_ms,
             "sum_eq_3_3_ms": path.sum_eq_3_3 * self.tick_ms,
             "bound_eq_3_2_ms": path.bound_eq_3_2 * self.tick_ms,
-            "beyond": sum(c.level == level for c in self.beyond),
-            "off_prediction": sum(c.level == level for c in self.off),
+            "beyond": sum(c.level == level for c in self.commands_beyond_bound),
+            "off_prediction": sum(c.level == level for c in self.mispredicted_commands),
         }
 
-    def document(self) -> Document:
+    def to_document(self) -> Document:
         """Convert the response to plain data."""
         return {
             "lockstep": self.lockstep,
             "tick_ms": self.tick_ms,
             "commands": len(self.commands),
-            "measured": len(self.measured),
-            "beyond": len(self.beyond),
-            "off_prediction": len(self.off),
-            "levels": self.rows(),
+            "measured": len(self.measured_commands),
+            "beyond": len(self.commands_beyond_bound),
+            "off_prediction": len(self.mispredicted_commands),
+            "levels": self.build_rows(),
             "each": [
-                asdict(c) | {"ticks": self.ticks(c) if c.acts is not None else None}
+                asdict(c)
+                | {"ticks": self.compute_response_ticks(c) if c.acts is not None else None}
                 for c in self.commands
             ],
         }
 
-    def blocks(self) -> Blocks:
+    def format_blocks(self) -> Blocks:
         """Yield the figures as text for the terminal."""
         yield (
-            f"response to {len(self.measured)} operator commands, ms of simulated time:"
+            f"response to {len(self.measured_commands)} operator commands, ms of simulated time:"
             " from giving a command, and"
         )
         yield "from the release that reads it, to the end of the cycle whose torque rests on it"
@@ -180,18 +181,18 @@ class OperatorResponse:
             {
                 "given to": row["level"],
                 "commands": row["commands"],
-                **{head: decimal(row[key], 1) for head, key in FIGURES.items()},
+                **{head: format_decimal(row[key], 1) for head, key in TABLE_COLUMNS.items()},
                 "beyond": row["beyond"],
                 "off prediction": row["off_prediction"],
             }
-            for row in self.rows()
+            for row in self.build_rows()
         ]
         yield TextTable(rows, ("min", "sum, eq. 3.3", "median"))
         if others := [command for command in self.commands if command.acts is None]:
             yield (
                 f"not measured: {', '.join(f'{c.serial} to {c.level} ({c.fate})' for c in others)}"
             )
-        for command in self.off:
+        for command in self.mispredicted_commands:
             late = (command.acts or 0) - command.predicted
             yield (
                 f"command {command.serial} to {command.level}, given at tick {command.given}:"
@@ -199,11 +200,11 @@ class OperatorResponse:
             )
 
 
-def response_of(recording: Recording) -> OperatorResponse | None:
+def measure_response(recording: Recording) -> OperatorResponse | None:
     """Measure the response of a run. None if no operator commanded a level of its hierarchy."""
     config = recording.rack_config
     layout = recording.layout
-    known = command_paths(rack_timing(config, layout), layout)
+    known = find_command_paths(build_rack_timing(config, layout), layout)
     paths = {
         level: path for level, path in known.items() if f"{level}.operator" in recording.mailboxes
     }
@@ -213,13 +214,13 @@ def response_of(recording: Recording) -> OperatorResponse | None:
     answered = [
         command
         for level, path in paths.items()
-        for command in _answered(recording, level, path, lockstep)
+        for command in _find_answers(recording, level, path, lockstep)
     ]
     answered.sort(key=lambda command: command.serial)
     return OperatorResponse(layout.clock_ns * 1e-6, lockstep, paths, tuple(answered))
 
 
-def _answered(
+def _find_answers(
     recording: Recording, level: str, path: CommandPath, lockstep: bool
 ) -> Iterator[AnsweredCommand]:
     """Yield the commands given to a level.
@@ -234,14 +235,15 @@ def _answered(
     """
     box = f"{level}.operator"
     # A clock that died while giving a command has given it twice. The first one counts.
-    serials, rows = np.unique(recording.signal(box, "id"), return_index=True)
+    serials, rows = np.unique(recording.read_signal(box, "id"), return_index=True)
     whats, given, visible, stamps = (
-        recording.signal(box, n)[rows] for n in ("what", "tick", "visible_at", "stamp_ns")
+        recording.read_signal(box, n)[rows] for n in ("what", "tick", "visible_at", "stamp_ns")
     )
-    orders, answers = (recording.signal(f"{level}.status", n) for n in ("order", "answer"))
+    orders, answers = (recording.read_signal(f"{level}.status", n) for n in ("order", "answer"))
     refused = set(orders[answers == Answer.REFUSED].tolist())
     basis, ticks, written = (
-        recording.signal(f"{path.levels[-1]}.status", n) for n in ("operator", "tick", "stamp_ns")
+        recording.read_signal(f"{path.levels[-1]}.status", n)
+        for n in ("operator", "tick", "stamp_ns")
     )
     for serial, what, tick, seen, stamp in zip(serials, whats, given, visible, stamps, strict=True):
         resting_rows = np.flatnonzero(basis >= serial)
@@ -260,15 +262,15 @@ def _answered(
             level=level,
             what=Operation(int(what)).name.lower(),
             given=int(tick),
-            sampled=path.samples_at(int(seen)),
-            predicted=path.acts_at(int(seen)),
+            sampled=path.find_reading_release(int(seen)),
+            predicted=path.find_acting_release(int(seen)),
             acts=acts,
             fate=fate,
             wall_ms=None if lockstep else wall_ms,
         )
 
 
-def show(recording: Recording, folder: Path, as_json: bool) -> bool:
+def show_response(recording: Recording, folder: Path, as_json: bool) -> bool:
     """Print the response of a run, and write response.json and its pictures.
 
     Args:
@@ -282,7 +284,7 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
     Raises:
         Failure: If no operator commanded a level.
     """
-    response = response_of(recording)
+    response = measure_response(recording)
     if response is None:
         raise Failure(
             f"{recording.folder}: no operator commanded a level of its hierarchy;"
@@ -290,29 +292,33 @@ def show(recording: Recording, folder: Path, as_json: bool) -> bool:
             2,
         )
     folder.mkdir(parents=True, exist_ok=True)
-    document = response.document()
+    document = response.to_document()
     write_json(folder / "response.json", document)
     files = f"{folder}/response.json"
     if can_draw():
-        files += "".join(f", {path.name}" for path in plot(response, folder))
+        files += "".join(f", {path.name}" for path in plot_response(response, folder))
     else:
         files += f"; {NO_PICTURES}"
     if as_json:
         print_json(document)
     else:
-        print_blocks((*response.blocks(), "", files))
-    return response.held
+        print_blocks((*response.format_blocks(), "", files))
+    return response.is_within_bounds
 
 
-def plot(response: OperatorResponse, folder: Path) -> list[Path]:
+def plot_response(response: OperatorResponse, folder: Path) -> list[Path]:
     """Write a histogram per level with its bounds to response.png and response.svg.
 
     Returns:
         Paths of the pictures.
     """
-    levels = [level for level in response.paths if any(c.level == level for c in response.measured)]
-    paths = paths_of(folder / "response")
-    with picture(paths, 8.0, 0.8 + 1.7 * len(levels), layout="constrained") as figure:
+    levels = [
+        level
+        for level in response.paths
+        if any(c.level == level for c in response.measured_commands)
+    ]
+    paths = list_picture_paths(folder / "response")
+    with open_figure(paths, 8.0, 0.8 + 1.7 * len(levels), layout="constrained") as figure:
         axes = figure.subplots(len(levels), 1, squeeze=False)
         for axis, level in zip(axes[:, 0], levels, strict=True):
             _plot_level(axis, response, level)
@@ -332,7 +338,7 @@ def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
 
     path = response.paths[level]
     tick_ms = response.tick_ms
-    own = [command for command in response.measured if command.level == level]
+    own = [command for command in response.measured_commands if command.level == level]
     wait = path.delay + path.reads[0].every - 1
     lines = (
         ((wait + path.sum_eq_3_3) * tick_ms, SUM, "-.", "longest wait to be read + sum, eq. 3.3"),
@@ -344,10 +350,13 @@ def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
             "longest wait to be read + bound, eq. 3.2",
         ),
     )
-    values = [response.ticks(c) * tick_ms if c.wall_ms is None else c.wall_ms for c in own]
+    values = [
+        response.compute_response_ticks(c) * tick_ms if c.wall_ms is None else c.wall_ms
+        for c in own
+    ]
     end_ms = max(lines[2][0], *values)
     # Draw a value equal to the longest on the grid to the left of its line, despite rounding.
-    width_ms = path.longest * tick_ms / BINS
+    width_ms = path.longest * tick_ms / HISTOGRAM_BARS
     edges = np.arange(0.0, end_ms + width_ms, width_ms) * (1.0 + ROUNDING)
     axis.hist(values, bins=edges.tolist(), color=MEASURED, label="measured")
     for at_ms, colour, style, label in lines:

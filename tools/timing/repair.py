@@ -27,7 +27,7 @@ MAX_CYCLES_TRIED = 400
 """Number of longer cycles that are tried for one board. A long cycle skips some ticks."""
 MAX_OTHERS = 3
 """Number of other boards on the same core that are changed, beginning with the highest load."""
-HIGHEST = 99
+MAX_PRIORITY = 99
 """Highest SCHED_FIFO priority."""
 
 T = TypeVar("T")
@@ -48,11 +48,11 @@ class Repair:
     end: JudgedConfig
 
     @property
-    def left(self) -> tuple[EquationVerdict, ...]:
+    def remaining_failures(self) -> tuple[EquationVerdict, ...]:
         """Failures that remain after the last step."""
-        return self.end.failing
+        return self.end.failures
 
-    def lines(self) -> list[str]:
+    def format_lines(self) -> list[str]:
         """Format every step, with one line per change, and the failures that remain."""
         lines: list[str] = []
         for changes in self.steps:
@@ -61,9 +61,12 @@ class Repair:
                 start += ", one of these, cheapest first"
             lines.append(f"{start}:")
             lines += [f"  {change.text}" for change in changes]
-        if self.left:
+        if self.remaining_failures:
             failing = ", ".join(
-                dict.fromkeys(f"{verdict.equation} of {verdict.subject}" for verdict in self.left)
+                dict.fromkeys(
+                    f"{verdict.equation} of {verdict.subject}"
+                    for verdict in self.remaining_failures
+                )
             )
             lines.append(
                 f"no change helps with {failing}; tried: other priorities and cores, cycles and"
@@ -71,23 +74,27 @@ class Repair:
             )
         return lines
 
-    def document(self) -> Document:
+    def to_document(self) -> Document:
         """Convert the repair to plain data."""
         return {
-            "steps": [[change.document() for change in changes] for changes in self.steps],
-            "fits": not self.left,
+            "steps": [[change.to_document() for change in changes] for changes in self.steps],
+            "fits": not self.remaining_failures,
         }
 
 
-def repair(rack: JudgedConfig) -> Repair:
+def find_repair(rack: JudgedConfig) -> Repair:
     """Find the changes that make a rack fit.
 
     They are found for one board and then, with the cheapest of them applied, for the next.
     """
     steps: list[tuple[Change, ...]] = []
-    while rack.failing:
+    while rack.failures:
         best = next(
-            (changes for board in _failing_boards(rack) if (changes := changes_for(rack, board))),
+            (
+                changes
+                for board in _list_failing_boards(rack)
+                if (changes := find_changes(rack, board))
+            ),
             None,
         )
         if best is None:
@@ -97,58 +104,58 @@ def repair(rack: JudgedConfig) -> Repair:
     return Repair(tuple(steps), rack)
 
 
-def _failing_boards(rack: JudgedConfig) -> list[str]:
+def _list_failing_boards(rack: JudgedConfig) -> list[str]:
     """Return the boards with failures, beginning with the boards for which others wait."""
-    failing = [name for name in rack.timing.levels if rack.failing_of(name)]
-    own = {verdict.subject.partition(".")[0] for verdict in rack.failing}
+    failing = [name for name in rack.timing.levels if rack.find_failures(name)]
+    own = {verdict.subject.partition(".")[0] for verdict in rack.failures}
     # An overloaded core affects all its boards. Boards with failing tasks come first.
     return sorted(failing, key=lambda name: (name not in own, -rack.config.board[name].priority))
 
 
-def changes_for(rack: JudgedConfig, board: str) -> list[Change]:
+def find_changes(rack: JudgedConfig, board: str) -> list[Change]:
     """Return the smallest change of each kind that makes a board fit, sorted by `Change.cost`.
 
     Another priority, or a core already in use, costs nothing. The next are a slot and a new core,
     then older plans and longer cycles, of the board or of one that shares its core, by their
     factor. If none of these helps alone, moving the planner and lengthening the cycle are combined.
     """
-    changes = [*_own_changes(rack, board), *_changes_of_others(rack, board)]
+    changes = [*_find_own_changes(rack, board), *_find_changes_of_others(rack, board)]
     if not changes:
         combined = (
-            _first(rack, board, _longer_cycles(rack, board, place))
-            for place in _places(rack, board)
+            _search_first(rack, board, _list_longer_cycles(rack, board, place))
+            for place in _list_planner_places(rack, board)
         )
         changes = [change for change in combined if change is not None][:1]
     return sorted(changes, key=lambda change: change.cost)
 
 
-def _own_changes(rack: JudgedConfig, board: str) -> Iterator[Change]:
+def _find_own_changes(rack: JudgedConfig, board: str) -> Iterator[Change]:
     """Yield the smallest helpful change of each kind to the board itself."""
-    older = [{"within_cycles": d} for d in _cycles(rack.timing.level(board))]
-    cores = [{"core": core} for core in _other_cores(rack, rack.config.board[board].core)]
-    places = list(_places(rack, board))
-    planner = _any(rack, board, places)
+    older = [{"within_cycles": d} for d in _list_plan_cycles(rack.timing.build_level(board))]
+    cores = [{"core": core} for core in _list_other_cores(rack, rack.config.board[board].core)]
+    places = list(_list_planner_places(rack, board))
+    planner = _try_each(rack, board, places)
     if planner is None:
         # Another place alone is not enough. Try it with more cycles for a plan.
-        moves = (_first(rack, board, [{**d, **place} for d in older]) for place in places)
-        planner = _cheapest(moves)
+        moves = (_search_first(rack, board, [{**d, **place} for d in older]) for place in places)
+        planner = _find_cheapest(moves)
     kinds = (
-        _any(rack, board, _priorities(rack, board)),
-        _any(rack, board, cores),
+        _try_each(rack, board, _list_priorities(rack, board)),
+        _try_each(rack, board, cores),
         planner,
-        _first(rack, board, older),
-        _first(rack, board, _longer_cycles(rack, board)),
+        _search_first(rack, board, older),
+        _search_first(rack, board, _list_longer_cycles(rack, board)),
     )
     yield from (change for change in kinds if change is not None)
 
 
-def _priorities(rack: JudgedConfig, board: str) -> Iterator[Settings]:
+def _list_priorities(rack: JudgedConfig, board: str) -> Iterator[Settings]:
     """Yield higher priorities for a board's executor or planner, the smallest rise first.
 
     Each of them is just above another task on the same core.
     """
     table = rack.config.board[board]
-    limit = rack.config.clock.priority or HIGHEST + 1
+    limit = rack.config.clock.priority or MAX_PRIORITY + 1
     for key, task in (("priority", board), ("planner_priority", f"{board}.planner")):
         core = rack.timing.cores.get(task)
         present = getattr(table, key)
@@ -160,13 +167,13 @@ def _priorities(rack: JudgedConfig, board: str) -> Iterator[Settings]:
         yield from ({key: priority} for priority in sorted(higher) if present < priority < limit)
 
 
-def _changes_of_others(rack: JudgedConfig, board: str) -> Iterator[Change]:
+def _find_changes_of_others(rack: JudgedConfig, board: str) -> Iterator[Change]:
     """Yield the cheapest change of each board that shares a core with this one.
 
     It is another core, for the board or only for its loose planner, or a longer cycle.
     """
     timing = rack.timing
-    cores = timing.cores_of(board)
+    cores = timing.find_cores(board)
     loads = {task.board: 0.0 for task in timing.tasks}
     for task in timing.tasks:
         loads[task.board] += task.cost_ns / task.period_ns if task.core in cores else 0.0
@@ -174,24 +181,28 @@ def _changes_of_others(rack: JudgedConfig, board: str) -> Iterator[Change]:
     for other in sorted(others, key=lambda name: -loads[name])[:MAX_OTHERS]:
         table = rack.config.board[other]
         keys = ["core"] if table.planner_core is None else ["planner_core", "core"]
-        moves = ({key: core} for key in keys for core in _other_cores(rack, getattr(table, key)))
-        change = _cheapest(
+        moves = (
+            {key: core} for key in keys for core in _list_other_cores(rack, getattr(table, key))
+        )
+        change = _find_cheapest(
             (
-                _any(rack, other, moves, board),
-                _first(rack, other, _longer_cycles(rack, other), board),
+                _try_each(rack, other, moves, board),
+                _search_first(rack, other, _list_longer_cycles(rack, other), board),
             )
         )
         if change is not None:
             yield change
 
 
-def _cheapest(changes: Iterable[Change | None]) -> Change | None:
+def _find_cheapest(changes: Iterable[Change | None]) -> Change | None:
     """Return the change with the lowest cost. None if there is none."""
     candidates = (change for change in changes if change is not None)
     return min(candidates, key=lambda change: change.cost, default=None)
 
 
-def _longer_cycles(rack: JudgedConfig, board: str, place: Settings | None = None) -> list[Settings]:
+def _list_longer_cycles(
+    rack: JudgedConfig, board: str, place: Settings | None = None
+) -> list[Settings]:
     """Return settings with longer cycles for a board.
 
     With a limit on the age of plans, a plan may then get fewer cycles.
@@ -202,8 +213,8 @@ def _longer_cycles(rack: JudgedConfig, board: str, place: Settings | None = None
         place: Settings for another place of its planner. None to keep the place.
     """
     every = rack.timing.boards[board].every
-    timing = rack.timing if place is None else rack.timing.changed(board, coupling="loose")
-    level = timing.level(board)
+    timing = rack.timing if place is None else rack.timing.replace_board(board, coupling="loose")
+    level = timing.build_level(board)
     step = max(1, every * (MAX_FACTOR - 1) // MAX_CYCLES_TRIED)
     longest_every = min(MAX_FACTOR * every, LONGEST_EVERY)
     longer_settings: list[Settings] = []
@@ -215,12 +226,12 @@ def _longer_cycles(rack: JudgedConfig, board: str, place: Settings | None = None
             changed = {"within_cycles": cycles}
         # Filter before the search, because soundness is not monotonic: a longer cycle may fit the
         # grid of the other levels less well, or leave too few cycles for plans.
-        if rack.is_sound(timing.changed(board, every=longer, within_cycles=cycles), board):
+        if rack.is_sound(timing.replace_board(board, every=longer, within_cycles=cycles), board):
             longer_settings.append({**changed, **(place or {}), "every": longer, "rate_hz": None})
     return longer_settings
 
 
-def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
+def _list_planner_places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
     """Yield the settings of each place where the board's planner could be loosely coupled."""
     slot = rack.config.board[board].planner_slot
     if slot is None:
@@ -228,12 +239,12 @@ def _places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
         taken = {slot for table in tables for slot in (table.slot, table.planner_slot)}
         free = (slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken)
         slot = next(free, None)
-    if rack.timing.level(board).within_cycles is not None and slot is not None:
-        for core in _other_cores(rack, rack.timing.boards[board].planner_core):
+    if rack.timing.build_level(board).within_cycles is not None and slot is not None:
+        for core in _list_other_cores(rack, rack.timing.boards[board].planner_core):
             yield {"coupling": "loose", "planner_slot": slot, "planner_core": core}
 
 
-def _cycles(level: LevelTiming) -> range:
+def _list_plan_cycles(level: LevelTiming) -> range:
     """Return the longer times that a plan may take, cycles. Empty without a planner."""
     if level.within_cycles is None:
         return range(0)
@@ -243,7 +254,7 @@ def _cycles(level: LevelTiming) -> range:
     return range(level.within_cycles + 1, longest + 1)
 
 
-def _other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
+def _list_other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
     """Yield the cores to which a task could move.
 
     Cores in use come first, the least loaded one at the beginning, then an unused one. The cores of
@@ -254,7 +265,7 @@ def _other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
     unknown = {
         core
         for name in timing.boards.keys() - timing.levels.keys()
-        for core in timing.cores_of(name)
+        for core in timing.find_cores(name)
     }
     yield from sorted(
         used - unknown - {core}, key=lambda other: (timing.loads.get(other, 0.0), other)
@@ -262,31 +273,32 @@ def _other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
     yield next(free for free in range(len(used) + 1) if free not in used)
 
 
-def _attempt(
+def _try_change(
     rack: JudgedConfig, board: str, settings: Settings, cures: str | None
 ) -> Change | None:
     """Return the change of a board if it cures that board, or the board `cures` if given."""
-    change = rack.change(board, settings)
-    return change if change is not None and change.after.cures(cures or board, rack) else None
+    change = rack.try_change(board, settings)
+    return change if change is not None and change.after.cures_board(cures or board, rack) else None
 
 
-def _any(
+def _try_each(
     rack: JudgedConfig, board: str, tried: Iterable[Settings], cures: str | None = None
 ) -> Change | None:
     """Return the first change that works, trying all of them in order."""
     return next(
-        (c for settings in tried if (c := _attempt(rack, board, settings, cures)) is not None), None
+        (c for settings in tried if (c := _try_change(rack, board, settings, cures)) is not None),
+        None,
     )
 
 
-def _first(
+def _search_first(
     rack: JudgedConfig, board: str, tried: Sequence[Settings], cures: str | None = None
 ) -> Change | None:
     """Return the first change that works, in few attempts; see `search_first`."""
-    return first_that(tried, lambda settings: _attempt(rack, board, settings, cures))
+    return search_first(tried, lambda settings: _try_change(rack, board, settings, cures))
 
 
-def first_that(items: Sequence[T], attempt: Callable[[T], R | None]) -> R | None:
+def search_first(items: Sequence[T], attempt: Callable[[T], R | None]) -> R | None:
     """Return the result of `attempt` for the first item for which it has one.
 
     The search needs few attempts, because all items after one that works must also work.

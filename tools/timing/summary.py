@@ -13,7 +13,7 @@ from rack.boards.timing.forecast import NO_BUDGET, Forecast
 from rack.boards.timing.verdicts import EQUATIONS, EquationVerdict
 from rack.tools.console.tables import Blocks
 from rack.tools.timing.repair import Repair
-from rack.tools.timing.tables import side_text, verdict_table
+from rack.tools.timing.tables import build_verdict_table, format_side
 
 if TYPE_CHECKING:
     # MuJoCo takes 0.5 s to import, therefore import it only for racks with an arm.
@@ -23,7 +23,7 @@ RESPONSES = "3.2", "3.3"
 """Equations of the response of the system."""
 
 
-def summary_blocks(
+def format_summary(
     forecast: Forecast,
     fitting: Repair,
     arm: Abilities | None,
@@ -39,9 +39,9 @@ def summary_blocks(
         joints: Names of the arm's joints.
         measuring: Command that measures budgets. Empty if they were measured.
     """
-    yield from _verdict(forecast, measuring)
+    yield from _format_verdict(forecast, measuring)
     failing = [verdict for verdict in forecast.verdicts if not verdict.holds]
-    yield from tightest(forecast.verdicts)
+    yield from find_tightest(forecast.verdicts)
     system = forecast.system
     if system.levels:
         yield (
@@ -51,19 +51,19 @@ def summary_blocks(
     if arm is not None:
         yield (
             f"arm: its tool reaches {arm.reach:.2f} m, holds {arm.payload:.1f} kg at rest; gravity"
-            f" leaves {arm.left:.0%} of the torque of {joints[arm.joint]}"
+            f" leaves {arm.torque_left:.0%} of the torque of {joints[arm.joint]}"
         )
     if failing:
         yield ""
-        yield verdict_table(("", verdict) for verdict in failing)
+        yield build_verdict_table(("", verdict) for verdict in failing)
         yield ""
-        yield from fitting.lines()
+        yield from fitting.format_lines()
     elif not forecast.uncounted:
         yield "to do: nothing"
     yield from forecast.notes
 
 
-def _verdict(forecast: Forecast, measuring: str) -> Iterator[str]:
+def _format_verdict(forecast: Forecast, measuring: str) -> Iterator[str]:
     """Yield whether the rack fits, and everything that was not counted."""
     names: dict[str, list[str]] = {}
     for name, why in forecast.uncounted.items():
@@ -88,7 +88,7 @@ def _verdict(forecast: Forecast, measuring: str) -> Iterator[str]:
         yield f"fits: {hold_text}"
 
 
-def tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
+def find_tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
     """Yield the verdict whose right side has the smallest fraction left.
 
     Equalities are left out because they have no margin, and the response of the system because it
@@ -100,18 +100,18 @@ def tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
         if verdict.sign != "=" and verdict.equation not in RESPONSES and verdict.right > 0.0
     ]
     if bounds:
-        yield f"tightest: {_margin(min(bounds, key=lambda each: each.margin / each.right))}"
+        yield f"tightest: {_format_margin(min(bounds, key=lambda each: each.margin / each.right))}"
 
 
-def _margin(verdict: EquationVerdict) -> str:
+def _format_margin(verdict: EquationVerdict) -> str:
     """Format the margin of a verdict, such as "servo, eq. 3.1: 1 of 2.5 ms, 60% left"."""
     if verdict.endless:
         return verdict.endless
     criterion = verdict.equation
     if criterion in EQUATIONS:
         criterion = f"eq. {criterion}".replace("eq. fig.", "fig.")
-    left_side = side_text(verdict.left, verdict.unit)
-    right_side = side_text(verdict.right, verdict.unit)
+    left_side = format_side(verdict.left, verdict.unit)
+    right_side = format_side(verdict.right, verdict.unit)
     unit = " ms" if verdict.unit == "ns" else ""
     fraction = verdict.margin / verdict.right
     remainder = f"{fraction:.0%} left" if fraction >= 0.0 else f"{-fraction:.0%} too much"

@@ -10,20 +10,20 @@ from itertools import pairwise
 from math import isinf
 from typing import Any
 
-from rack.boards.timing.chains import spanned
+from rack.boards.timing.chains import format_names
 from rack.boards.timing.forecast import Forecast
 from rack.boards.timing.level import LevelTiming
 from rack.boards.timing.response_time import TaskResponse
 from rack.boards.timing.verdicts import BEYOND, PLAN_WITHIN, EquationVerdict
-from rack.tools.console.tables import Blocks, Cell, TextTable, ms
+from rack.tools.console.tables import Blocks, Cell, TextTable, format_ms
 
-TABLED = {*BEYOND} - {PLAN_WITHIN}
+TABULATED = {*BEYOND} - {PLAN_WITHIN}
 """Criteria that have separate tables."""
 RESULTS = {True: "ok", False: "FAILS"}
 Row = dict[str, Cell]
 
 
-def forecast_blocks(forecast: Forecast) -> Blocks:
+def format_forecast(forecast: Forecast) -> Blocks:
     """Yield a forecast as text for the terminal."""
     rack = forecast.rack
     system = forecast.system
@@ -38,16 +38,18 @@ def forecast_blocks(forecast: Forecast) -> Blocks:
     if rack.levels:
         yield from (
             "",
-            f"worst case by the budgets, ms; t_cs is {ms(rack.context_switch_ns)} ms:",
+            f"worst case by the budgets, ms; t_cs is {format_ms(rack.context_switch_ns)} ms:",
             "",
         )
-        yield level_table(((level.coupling, level) for level in rack.levels.values()), "coupling")
-    if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in TABLED]:
+        yield build_level_table(
+            ((level.coupling, level) for level in rack.levels.values()), "coupling"
+        )
+    if paper := [verdict for verdict in forecast.verdicts if verdict.equation not in TABULATED]:
         yield ""
-        yield verdict_table(("", verdict) for verdict in paper)
+        yield build_verdict_table(("", verdict) for verdict in paper)
     if rack.responses:
         yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
-        yield _response_table(rack.responses)
+        yield _build_response_table(rack.responses)
         yield ""
         loads = (
             f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}"
@@ -56,30 +58,30 @@ def forecast_blocks(forecast: Forecast) -> Blocks:
         yield f"load: {', '.join(loads)}"
     if forecast.inboxes:
         yield from ("", "interrupts, served by the first task of the board, ms:", "")
-        yield _inbox_table(forecast.inboxes)
-    yield from _schedule_blocks(forecast)
+        yield _build_inbox_table(forecast.inboxes)
+    yield from _format_schedule(forecast)
     yield from forecast.notes
 
 
-def _schedule_blocks(forecast: Forecast) -> Blocks:
+def _format_schedule(forecast: Forecast) -> Blocks:
     """Yield a table of a static schedule, with a row per board of every distinct frame."""
     if forecast.rack.schedule is None:
         return
     minor, major = forecast.rack.schedule
     count = major // minor
     ticks = "a tick" if minor == 1 else f"{minor} ticks"
-    sizes = f"{count} frames of {ms(minor * forecast.rack.tick_ns)}, {ticks}"
+    sizes = f"{count} frames of {format_ms(minor * forecast.rack.tick_ns)}, {ticks}"
     yield ""
     yield f"static schedule, ms: {sizes}; every budget with two context switches:"
     yield ""
     rows: list[Row] = [
         {
             "core": alike.core,
-            "frames": _numbers(alike.frames, count),
+            "frames": _format_frame_numbers(alike.frames, count),
             "board": place.board,
-            "offset": ms(place.offset_ns),
-            "budget": ms(place.job_ns),
-            "slack": ms(place.slack_ns),
+            "offset": format_ms(place.offset_ns),
+            "budget": format_ms(place.job_ns),
+            "slack": format_ms(place.slack_ns),
             "until": place.until or "end of frame",
             "": RESULTS[place.slack_ns >= 0],
         }
@@ -89,7 +91,7 @@ def _schedule_blocks(forecast: Forecast) -> Blocks:
     yield TextTable(rows, ("until",))
 
 
-def _numbers(frames: Sequence[int], count: int) -> str:
+def _format_frame_numbers(frames: Sequence[int], count: int) -> str:
     """Format the numbers of frames. Equidistant ones are shortened to the first two and the last.
 
     Args:
@@ -106,7 +108,7 @@ def _numbers(frames: Sequence[int], count: int) -> str:
     return f"{first}, {second}, {third} ... {last}: {len(frames)}"
 
 
-def level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> TextTable:
+def build_level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> TextTable:
     """Build a table with a row per level: its cycle, the parts of it, and the residual, ms.
 
     Args:
@@ -117,25 +119,25 @@ def level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> TextTa
         {
             "level": level.board,
             about: word,
-            "R_i": ms(level.cycle_ns),
-            "t_exec": ms(level.execution_ns),
-            "t_comm": ms(level.communication_ns),
-            "R": ms(level.read_ns),
-            "W": ms(level.write_ns),
-            "C": ms(level.exchange_ns),
-            "t_residual": ms(level.residual_ns),
-            "t_plan": ms(level.planning_ns),
-            "P": ms(level.plan_ns),
-            "U": ms(None if level.plan_ns is None else level.update_ns),
+            "R_i": format_ms(level.cycle_ns),
+            "t_exec": format_ms(level.execution_ns),
+            "t_comm": format_ms(level.communication_ns),
+            "R": format_ms(level.read_ns),
+            "W": format_ms(level.write_ns),
+            "C": format_ms(level.exchange_ns),
+            "t_residual": format_ms(level.residual_ns),
+            "t_plan": format_ms(level.planning_ns),
+            "P": format_ms(level.plan_ns),
+            "U": format_ms(None if level.plan_ns is None else level.update_ns),
             "d": level.within_cycles,
-            "d R_i": ms(level.slice_ns),
+            "d R_i": format_ms(level.slice_ns),
         }
         for word, level in levels
     )
     return TextTable(merge_rows(rows, "level"), ("C", "R", "W", "U", "P", "d"))
 
 
-def verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> TextTable:
+def build_verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> TextTable:
     """Build a table with a row per verdict: both sides, the margin, and whether it holds.
 
     Args:
@@ -147,10 +149,10 @@ def verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> TextTable:
             "eq.": verdict.equation,
             "of": verdict.subject,
             **({"side": side} if side else {}),
-            "left": side_text(verdict.left, verdict.unit),
+            "left": format_side(verdict.left, verdict.unit),
             " ": verdict.sign,
-            "right": side_text(verdict.right, verdict.unit),
-            "margin": side_text(verdict.margin, verdict.unit),
+            "right": format_side(verdict.right, verdict.unit),
+            "margin": format_side(verdict.margin, verdict.unit),
             "": RESULTS[verdict.holds],
             "meaning": verdict.meaning,
         }
@@ -159,25 +161,25 @@ def verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> TextTable:
     return TextTable(merge_rows(rows, "of"), ("meaning", "margin"))
 
 
-def side_text(value: float, unit: str) -> str:
+def format_side(value: float, unit: str) -> str:
     """Format one side of an equation. A time is in ms, anything else has three digits."""
     if isinf(value):
         return "endless" if value > 0 else "-"
-    return ms(value) if unit == "ns" else f"{value:.3g}"
+    return format_ms(value) if unit == "ns" else f"{value:.3g}"
 
 
-def _response_table(responses: Iterable[TaskResponse]) -> TextTable:
+def _build_response_table(responses: Iterable[TaskResponse]) -> TextTable:
     """Build a table with a row per task that shares a core, with its worst case by priority."""
     rows: Iterable[Row] = (
         {
             "core": response.core,
             "task": response.task,
             "FIFO": response.priority or None,
-            "computes": ms(response.job_ns),
-            "blocked": ms(response.blocking_ns),
-            "response": ms(response.response_ns),
-            "deadline": ms(response.deadline_ns),
-            "margin": ms(
+            "computes": format_ms(response.job_ns),
+            "blocked": format_ms(response.blocking_ns),
+            "response": format_ms(response.response_ns),
+            "deadline": format_ms(response.deadline_ns),
+            "margin": format_ms(
                 None
                 if response.response_ns is None
                 else response.deadline_ns - response.response_ns
@@ -189,15 +191,15 @@ def _response_table(responses: Iterable[TaskResponse]) -> TextTable:
     return TextTable(merge_rows(rows, "task"), ("FIFO", "margin"))
 
 
-def _inbox_table(inboxes: Iterable[Mapping[str, Any]]) -> TextTable:
+def _build_inbox_table(inboxes: Iterable[Mapping[str, Any]]) -> TextTable:
     """Build a table with a row per interrupted board, with the cost and the worst burst."""
     rows: Iterable[Row] = (
         {
             "board": inbox["task"],
-            "interrupted by": spanned([name.partition(".")[0] for name in inbox["mailboxes"]]),
-            "in a cycle": ms(inbox["cycle_cost_ns"]),
+            "interrupted by": format_names([name.partition(".")[0] for name in inbox["mailboxes"]]),
+            "in a cycle": format_ms(inbox["cycle_cost_ns"]),
             "load": f"{inbox['load']:.3f}",
-            "longest": ms(inbox["longest_ns"]),
+            "longest": format_ms(inbox["longest_ns"]),
             "wait": inbox["waiting"],
             "of": inbox["depth"],
             "": RESULTS[inbox["fits"]],
@@ -215,4 +217,4 @@ def merge_rows(rows: Iterable[Mapping[str, Any]], name: str) -> list[dict[str, A
     names: dict[tuple[tuple[str, Any], ...], list[str]] = {}
     for row in rows:
         names.setdefault(tuple({**row, name: ""}.items()), []).append(str(row[name]))
-    return [{**dict(common), name: spanned(merged)} for common, merged in names.items()]
+    return [{**dict(common), name: format_names(merged)} for common, merged in names.items()]

@@ -12,14 +12,14 @@ from rerun.blueprint.components import PlayState
 from rerun.encodings import EntityPathLike
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.boards.config import RackConfig, rack_timing
+from rack.boards.config import RackConfig, build_rack_timing
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
 from rack.levels.systems.hand.messages import GraspStatus
 from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.viewer import timing
-from rack.tools.viewer.cell import CELL, COLLISION, FRAMES, extent_of, floor_of
+from rack.tools.viewer.cell import CELL, COLLISION, FRAMES, compute_extent, find_floor_height
 from rack.tools.viewer.curves import (
     ERROR,
     GRIP,
@@ -28,15 +28,15 @@ from rack.tools.viewer.curves import (
     OPENING,
     QUANTITIES,
     SIGNALS,
-    gripper_units,
+    find_gripper_units,
 )
 from rack.tools.viewer.events import EVENTS, RECORDER
 from rack.tools.viewer.forces import AXES, CONTACT, CONTACT_UNITS, FORCES, TASK
 from rack.tools.viewer.hand import BY_FINGER, HAND, TENSIONS, TIPS
-from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, positions
-from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, path
-from rack.tools.viewer.style import GRID, LEGEND, lanes_view, legend_view
-from rack.tools.viewer.timing import BOARDS, boards_of
+from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, compute_positions
+from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, build_path
+from rack.tools.viewer.style import GRID, LEGEND, build_lanes_view, build_legend_view
+from rack.tools.viewer.timing import BOARDS, list_boards
 
 CONFIG = "config"
 DIMMED = rr.SeriesLines(colors=[0x9A9A9AFF])
@@ -57,7 +57,7 @@ GRID_M = 0.25
 """Distance between lines of the grid."""
 
 
-def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
+def build_blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
     """Return the blueprint of a view. If `live`, it follows the newest data."""
     play = PlayState.Following if live else PlayState.Paused
     return rrb.Blueprint(
@@ -70,15 +70,15 @@ def blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
     )
 
 
-def together(racks: Mapping[str, RackViews]) -> rrb.Container:
+def build_common_view(racks: Mapping[str, RackViews]) -> rrb.Container:
     """Return the view of several racks, by name.
 
     The first tab shows all racks above a common log; further tabs show one rack each.
     """
-    return _all_and_each(racks, "all racks", _log(racks, "racks"), [4, 1])
+    return _build_tabs(racks, "all racks", _build_common_log(racks, "racks"), [4, 1])
 
 
-def side_by_side(runs: Mapping[str, RackViews]) -> rrb.Container:
+def build_comparison_view(runs: Mapping[str, RackViews]) -> rrb.Container:
     """Return the view of two runs of the same rack, by name.
 
     The first tab shows both runs and plots with the curves of both, the first run's in grey.
@@ -86,16 +86,18 @@ def side_by_side(runs: Mapping[str, RackViews]) -> rrb.Container:
     """
     first, other = runs.values()
     names = "{} in grey, {} in colour".format(*runs)
-    both = zip(first.main_curves().items(), other.main_curves().values(), strict=True)
+    both = zip(first.list_main_curves().items(), other.list_main_curves().values(), strict=True)
     plots = [
-        _curves(f"{title}: {names}", [*grey, *coloured], overrides=dict.fromkeys(grey, DIMMED))
+        _build_plot(f"{title}: {names}", [*grey, *coloured], overrides=dict.fromkeys(grey, DIMMED))
         for (title, grey), coloured in both
     ]
-    below = rrb.Horizontal(_log(runs, "runs"), rrb.Tabs(*plots, active_tab=0), column_shares=[2, 5])
-    return _all_and_each(runs, "both runs", below, [5, 3])
+    below = rrb.Horizontal(
+        _build_common_log(runs, "runs"), rrb.Tabs(*plots, active_tab=0), column_shares=[2, 5]
+    )
+    return _build_tabs(runs, "both runs", below, [5, 3])
 
 
-def _all_and_each(
+def _build_tabs(
     racks: Mapping[str, RackViews], name: str, below: rrb.Container | rrb.View, shares: list[float]
 ) -> rrb.Container:
     """Return a tab with all racks side by side, and further tabs with one rack each.
@@ -106,16 +108,16 @@ def _all_and_each(
         below: View below the racks in the first tab.
         shares: Heights of the racks and of that view.
     """
-    columns = rrb.Horizontal(*(views.column(rack) for rack, views in racks.items()))
+    columns = rrb.Horizontal(*(views.build_column(rack) for rack, views in racks.items()))
     first_tab = rrb.Vertical(columns, below, row_shares=shares, name=name)
     return rrb.Tabs(
-        first_tab, *(views.everything(rack) for rack, views in racks.items()), active_tab=0
+        first_tab, *(views.build_all_views(rack) for rack, views in racks.items()), active_tab=0
     )
 
 
-def _log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
+def _build_common_log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
     """Return a view with the log lines of all racks."""
-    logs = [f"{path(LOG)}/**", *(views.all(LOG) for views in racks.values())]
+    logs = [f"{build_path(LOG)}/**", *(views.build_query(LOG) for views in racks.values())]
     return rrb.TextLogView(
         origin="/", contents=logs, name=f"log of all {what}", columns=LOG_COLUMNS
     )
@@ -140,45 +142,45 @@ class RackViews:
         self._hand = None if cell is None else cell.hand
         self._joints = config.robot.joints if config.robot is not None and has_arm else ()
 
-    def path(self, *entity: str) -> str:
+    def build_path(self, *entity: str) -> str:
         """Return the path of an entity."""
-        return path(*self._root, *entity)
+        return build_path(*self._root, *entity)
 
-    def all(self, *entity: str) -> str:
+    def build_query(self, *entity: str) -> str:
         """Return the query for an entity and everything below it."""
-        return f"{self.path(*entity)}/**"
+        return f"{self.build_path(*entity)}/**"
 
-    def everything(self, name: str | None = None) -> rrb.Container:
+    def build_all_views(self, name: str | None = None) -> rrb.Container:
         """Return all views of the rack. `name` is the title of its tab."""
-        level_lanes = lanes_view(
-            "levels and events, whole run", [self.all(EVENTS), self.all(LEVELS)]
+        level_lanes = build_lanes_view(
+            "levels and events, whole run", [self.build_query(EVENTS), self.build_query(LEVELS)]
         )
-        below = rrb.Tabs(level_lanes, self._graph(), active_tab=0)
+        below = rrb.Tabs(level_lanes, self._build_graph(), active_tab=0)
         left: rrb.Container = below
         if self._cell is not None:
-            left = rrb.Vertical(self._scene(self._cell, "cell"), below, row_shares=[11, 9])
+            left = rrb.Vertical(self._build_scene(self._cell, "cell"), below, row_shares=[11, 9])
         curves: rrb.Container | rrb.View
         if self._hand is not None:
-            curves = self._fingers(self._hand)
+            curves = self._build_finger_plots(self._hand)
         elif self._joints:
-            curves = self._arm()
+            curves = self._build_arm_plots()
         else:
-            curves = self._signals()
+            curves = self._build_signal_plot()
         right = rrb.Vertical(
             curves,
-            lanes_view(CYCLES, [self.all(BOARDS)], CYCLES_S),
+            build_lanes_view(CYCLES, [self.build_query(BOARDS)], CYCLES_S),
             rrb.Horizontal(
-                self._load(),
-                self._ages(),
-                self._legend(timing.LOAD, "tasks", boards_of(self._layout)),
-                self._log(),
+                self._build_load_plots(),
+                self._build_age_plots(),
+                self._build_legend(timing.LOAD, "tasks", list_boards(self._layout)),
+                self._build_log_tabs(),
                 column_shares=[4, 4, 2, 6],
             ),
             row_shares=[4, 5, 3],
         )
         return rrb.Horizontal(left, right, column_shares=[2, 3], name=name)
 
-    def main_curves(self) -> dict[str, list[str]]:
+    def list_main_curves(self) -> dict[str, list[str]]:
         """Return the entities of the curves that describe a run, by title of their plot.
 
         They are the curves of the arm or, without an arm, all signals.
@@ -186,103 +188,118 @@ class RackViews:
         if not self._joints:
             boxes = self._layout.mailboxes
             fields = [(box.name, field.name) for box in boxes for field in box.fields]
-            return {"signals": [self.path(SIGNALS, *names) for names in fields]}
+            return {"signals": [self.build_path(SIGNALS, *names) for names in fields]}
         by_quantity = {
-            f"{quantity}, {unit}": [self.path(JOINTS, name, quantity) for name in self._joints]
+            f"{quantity}, {unit}": [
+                self.build_path(JOINTS, name, quantity) for name in self._joints
+            ]
             for quantity, unit in QUANTITIES.items()
         }
-        return {"tracking error, mrad": [self.path(ERROR)], **by_quantity}
+        return {"tracking error, mrad": [self.build_path(ERROR)], **by_quantity}
 
-    def column(self, name: str) -> rrb.Container | rrb.View:
+    def build_column(self, name: str) -> rrb.Container | rrb.View:
         """Return the cell, if there is one, above the lanes of the levels."""
-        levels = lanes_view(f"{name}: levels", [self.all(LEVELS)])
+        levels = build_lanes_view(f"{name}: levels", [self.build_query(LEVELS)])
         if self._cell is None:
             return levels
-        return rrb.Vertical(self._scene(self._cell, name), levels, row_shares=[5, 4])
+        return rrb.Vertical(self._build_scene(self._cell, name), levels, row_shares=[5, 4])
 
-    def _scene(self, cell: Cell, name: str) -> rrb.View:
+    def _build_scene(self, cell: Cell, name: str) -> rrb.View:
         """Return the view of the cell."""
         return rrb.Spatial3DView(
-            origin=self.path(CELL),
-            contents=[self.all(CELL), f"- {self.all(CELL, COLLISION)}", self.all(FRAMES)],
+            origin=self.build_path(CELL),
+            contents=[
+                self.build_query(CELL),
+                f"- {self.build_query(CELL, COLLISION)}",
+                self.build_query(FRAMES),
+            ],
             name=name,
-            eye_controls=eye_on(cell),
-            line_grid=grid_on(cell),
+            eye_controls=build_eye(cell),
+            line_grid=build_grid(cell),
         )
 
-    def _arm(self) -> rrb.Container:
+    def _build_arm_plots(self) -> rrb.Container:
         """Return plots of the arm.
 
         Each quantity has a plot of all joints, and in a second tab a plot of each joint with its
         limits.
         """
-        error, *plots = (_curves(*curves) for curves in self.main_curves().items())
+        error, *plots = (_build_plot(*curves) for curves in self.list_main_curves().items())
         views = [
             rrb.Tabs(
                 plot,
                 rrb.Grid(
-                    *(self._joint(name, quantity) for name in self._joints),
+                    *(self._build_joint_plot(name, quantity) for name in self._joints),
                     name="by joint, with limits",
                 ),
             )
             for plot, quantity in zip(plots, QUANTITIES, strict=True)
         ]
         other_plots = rrb.Tabs(
-            *self._requests(), *self._forces(), error, *self._gripper(), active_tab=0
+            *self._build_request_plots(),
+            *self._build_force_plots(),
+            error,
+            *self._build_gripper_plots(),
+            active_tab=0,
         )
-        legend = self._legend(JOINTS, "joints", self._joints)
+        legend = self._build_legend(JOINTS, "joints", self._joints)
         return rrb.Horizontal(
             rrb.Grid(*views, other_plots, grid_columns=2), legend, column_shares=[9, 1]
         )
 
-    def _requests(self) -> list[rrb.Container]:
+    def _build_request_plots(self) -> list[rrb.Container]:
         """Return plots of the queues of levels that follow motion requests, and of moving goals."""
         return [
             rrb.Horizontal(
-                _curves("taken and done", self._fields(box, "taken", "done")),
-                _curves("from moving goal, m", self._fields(box, "astray")),
+                _build_plot("taken and done", self._list_field_paths(box, "taken", "done")),
+                _build_plot("from moving goal, m", self._list_field_paths(box, "astray")),
                 name="queue and moving goal",
             )
             for box in self._layout.mailboxes
             if box.message == MotionStatus.message_type.name
         ]
 
-    def _gripper(self) -> list[rrb.View]:
+    def _build_gripper_plots(self) -> list[rrb.View]:
         """Return plots of the gripper's opening and force. Empty without a gripper."""
         if self._cell is None or self._cell.gripper is None:
             return []
-        units = zip((OPENING, GRIP), gripper_units(self._cell), strict=True)
+        units = zip((OPENING, GRIP), find_gripper_units(self._cell), strict=True)
         return [
-            _curves(f"gripper's {name}, {unit}", [self.path(GRIPPER, name)]) for name, unit in units
+            _build_plot(f"gripper's {name}, {unit}", [self.build_path(GRIPPER, name)])
+            for name, unit in units
         ]
 
-    def _fields(self, mailbox: MailboxSpec, *names: str) -> list[str]:
+    def _list_field_paths(self, mailbox: MailboxSpec, *names: str) -> list[str]:
         """Return the paths of fields of a mailbox."""
-        return [self.path(SIGNALS, mailbox.name, name) for name in names]
+        return [self.build_path(SIGNALS, mailbox.name, name) for name in names]
 
-    def _legend(self, what: str, name: str, names: Sequence[str]) -> rrb.View:
+    def _build_legend(self, what: str, name: str, names: Sequence[str]) -> rrb.View:
         """Return the view of a legend."""
-        return legend_view(self.path(LEGEND, what), name, names)
+        return build_legend_view(self.build_path(LEGEND, what), name, names)
 
-    def _forces(self) -> list[rrb.View]:
+    def _build_force_plots(self) -> list[rrb.View]:
         """Return plots of contact forces. Empty without a wrist sensor."""
         if self._cell is None or self._cell.wrist is None:
             return []
         views = [
-            _curves(
+            _build_plot(
                 f"{what} wanted and exerted, {unit}",
-                [self.path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit],
+                [self.build_path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit],
             )
             for what, unit in CONTACT_UNITS.items()
         ]
-        along = _curves("force along z, wanted and exerted, N", [self.path(FORCES, TASK, "z")])
+        along = _build_plot(
+            "force along z, wanted and exerted, N", [self.build_path(FORCES, TASK, "z")]
+        )
         contact = [
-            _curves(f"contact: {what}, with its limit, {unit}", [self.path(FORCES, CONTACT, what)])
+            _build_plot(
+                f"contact: {what}, with its limit, {unit}", [self.build_path(FORCES, CONTACT, what)]
+            )
             for what, unit in CONTACT_UNITS.items()
         ]
         return [along, *views, *contact]
 
-    def _fingers(self, hand: Hand) -> rrb.Container:
+    def _build_finger_plots(self, hand: Hand) -> rrb.Container:
         """Return plots of a hand.
 
         Tabs contain a plot of every finger for tensions, joints and forces; beside them are the
@@ -291,7 +308,7 @@ class RackViews:
         tabs = [
             rrb.Grid(
                 *(
-                    _curves(f"{finger}, {unit}", [self.path(HAND, finger, kind)])
+                    _build_plot(f"{finger}, {unit}", [self.build_path(HAND, finger, kind)])
                     for finger in hand.names
                 ),
                 grid_columns=2,
@@ -299,67 +316,74 @@ class RackViews:
             )
             for kind, unit in BY_FINGER.items()
         ]
-        tips = _curves("force on the tips, N", [self.path(*TIPS)])
+        tips = _build_plot("force on the tips, N", [self.build_path(*TIPS)])
         pulls = [
-            _curves("weight and pull, N", self._fields(box, "load"))
+            _build_plot("weight and pull, N", self._list_field_paths(box, "load"))
             for box in self._layout.mailboxes
             if box.message == GraspStatus.message_type.name
         ]
         return rrb.Horizontal(
             rrb.Tabs(*tabs, active_tab=0),
             rrb.Vertical(tips, *pulls),
-            self._legend(HAND, "fingers", hand.names),
+            self._build_legend(HAND, "fingers", hand.names),
             column_shares=[5, 4, 1],
         )
 
-    def _joint(self, name: str, quantity: str) -> rrb.View:
+    def _build_joint_plot(self, name: str, quantity: str) -> rrb.View:
         """Return a plot of one quantity of a joint, with its limits."""
-        entities = [self.path(JOINTS, name, quantity), self.path(JOINTS, name, quantity, "limits")]
-        return _curves(f"{name}, {QUANTITIES[quantity]}", entities)
+        entities = [
+            self.build_path(JOINTS, name, quantity),
+            self.build_path(JOINTS, name, quantity, "limits"),
+        ]
+        return _build_plot(f"{name}, {QUANTITIES[quantity]}", entities)
 
-    def _signals(self) -> rrb.View:
+    def _build_signal_plot(self) -> rrb.View:
         """Return a plot of all fields. Its legend contains their units."""
-        return _curves("signals", [self.all(SIGNALS)], True)
+        return _build_plot("signals", [self.build_query(SIGNALS)], True)
 
-    def _load(self) -> rrb.Container | rrb.View:
+    def _build_load_plots(self) -> rrb.Container | rrb.View:
         """Return plots of the use of the time slices and of execution times."""
-        times = self.all(timing.TIMES)
+        times = self.build_query(timing.TIMES)
         if self._config.clock.mode == "lockstep":
-            return _curves("execution, ms", [times])
-        use = _curves("use of the time slice, %", [self.all(timing.LOAD)])
-        return rrb.Tabs(use, _curves("late and execution, ms", [times]))
+            return _build_plot("execution, ms", [times])
+        use = _build_plot("use of the time slice, %", [self.build_query(timing.LOAD)])
+        return rrb.Tabs(use, _build_plot("late and execution, ms", [times]))
 
-    def _ages(self) -> rrb.Container:
+    def _build_age_plots(self) -> rrb.Container:
         """Return plots of ages. Plans have their own plot, because they may be much older."""
         boxes = [mailbox.name for mailbox in self._layout.mailboxes]
-        plans = [self.path(timing.AGES, name) for name in boxes if name.endswith(".plan")]
-        sampled = [self.all(timing.AGES), *(f"- {plan}" for plan in plans)]
+        plans = [self.build_path(timing.AGES, name) for name in boxes if name.endswith(".plan")]
+        sampled = [self.build_query(timing.AGES), *(f"- {plan}" for plan in plans)]
         return rrb.Tabs(
-            _curves("age of messages, ms", sampled),
-            _curves("age of plans, ms", plans),
-            self._signals(),
+            _build_plot("age of messages, ms", sampled),
+            _build_plot("age of plans, ms", plans),
+            self._build_signal_plot(),
         )
 
-    def _log(self) -> rrb.Container:
+    def _build_log_tabs(self) -> rrb.Container:
         """Return tabs with the log, the config, and the recorder's load and losses."""
-        log = rrb.TextLogView(origin=self.path(LOG), name="log", columns=LOG_COLUMNS)
-        config = rrb.TextDocumentView(origin=self.path(CONFIG), name="config")
-        load = _curves("recorder, % of a core", [self.path(RECORDER, "load")])
-        lost = _curves("rows lost", [self.path(RECORDER, "rows_lost")])
+        log = rrb.TextLogView(origin=self.build_path(LOG), name="log", columns=LOG_COLUMNS)
+        config = rrb.TextDocumentView(origin=self.build_path(CONFIG), name="config")
+        load = _build_plot("recorder, % of a core", [self.build_path(RECORDER, "load")])
+        lost = _build_plot("rows lost", [self.build_path(RECORDER, "rows_lost")])
         return rrb.Tabs(log, config, load, lost)
 
-    def _graph(self) -> rrb.View:
+    def _build_graph(self) -> rrb.View:
         """Return the view of the hierarchy."""
-        places = positions(self._layout, rack_timing(self._config, self._layout)).values()
+        places = compute_positions(
+            self._layout, build_rack_timing(self._config, self._layout)
+        ).values()
         columns, rows = zip(*places, strict=True)
         bounds = rrb.VisualBounds2D(
             x_range=(min(columns) - 0.6 * COLUMN, max(columns) + 0.6 * COLUMN),
             y_range=(min(rows) - ROW, max(rows) + ROW),
         )
-        return rrb.GraphView(origin=self.path(HIERARCHY), name="hierarchy", visual_bounds=bounds)
+        return rrb.GraphView(
+            origin=self.build_path(HIERARCHY), name="hierarchy", visual_bounds=bounds
+        )
 
 
-def _curves(
+def _build_plot(
     name: str,
     contents: list[str],
     legend: bool = False,
@@ -385,15 +409,15 @@ def _curves(
     )
 
 
-def grid_on(cell: Cell) -> rrb.LineGrid3D:
+def build_grid(cell: Cell) -> rrb.LineGrid3D:
     """Return a grid on the floor of a cell, or at the height of the origin without a floor."""
-    plane = rr.components.Plane3D((0.0, 0.0, 1.0), floor_of(cell) + ABOVE_M)
+    plane = rr.components.Plane3D((0.0, 0.0, 1.0), find_floor_height(cell) + ABOVE_M)
     return rrb.LineGrid3D(visible=True, plane=plane, spacing=GRID_M, color=GRID)
 
 
-def eye_on(cell: Cell) -> rrb.EyeControls3D:
+def build_eye(cell: Cell) -> rrb.EyeControls3D:
     """Return an eye position from which the arm and its objects fill the view at the start."""
-    centre, radius = extent_of(cell)
+    centre, radius = compute_extent(cell)
     position = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
     return rrb.EyeControls3D(
         position=position.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1)
@@ -409,7 +433,7 @@ def write_document(stream: Stream, text: str, config: RackConfig, layout: Layout
         config: The config.
         layout: Layout of the rack.
     """
-    stream.static((CONFIG,), rr.TextDocument(f"```toml\n{text}```", media_type="text/markdown"))
+    stream.log_static((CONFIG,), rr.TextDocument(f"```toml\n{text}```", media_type="text/markdown"))
     robot = config.robot.model.stem if config.robot else "none"
     values = rr.AnyValues(
         rack=layout.rack,
@@ -420,4 +444,4 @@ def write_document(stream: Stream, text: str, config: RackConfig, layout: Layout
         robot=robot,
         machine=platform.platform(),
     )
-    stream.property("run", values)
+    stream.log_property("run", values)

@@ -16,11 +16,18 @@ from rack.levels.algebra import Array, Ints
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import view_state
-from rack.tools.viewer.forces import contacts_of
-from rack.tools.viewer.levels import worded
-from rack.tools.viewer.shapes import shape_of, xyzw
-from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart, change_finder, row_sampler
-from rack.tools.viewer.style import CURRENT, FORCE, GOAL, LOST, PLANNED, packed
+from rack.tools.viewer.forces import list_contacts
+from rack.tools.viewer.levels import format_enum
+from rack.tools.viewer.shapes import build_shape, to_xyzw
+from rack.tools.viewer.stream import (
+    Moment,
+    RowBlock,
+    Stream,
+    ViewPart,
+    build_change_finder,
+    build_row_sampler,
+)
+from rack.tools.viewer.style import CURRENT, FORCE, GOAL, LOST, PLANNED, pack_colours
 
 CELL = "cell"
 COLLISION = "collision"
@@ -63,12 +70,12 @@ PUSH_RADIUS_M = 0.0015
 """Length of a push's arrow per newton, and its radius."""
 
 
-def frame_of(model: mujoco.MjModel, body: int) -> str:
+def name_frame(model: mujoco.MjModel, body: int) -> str:
     """Return the name of a body's frame."""
     return WORLD if body == 0 else f"body/{model.body(body).name or body}"
 
 
-def moving_bodies(model: mujoco.MjModel) -> Ints:
+def find_moving_bodies(model: mujoco.MjModel) -> Ints:
     """Return the bodies that joints or mocap poses move, including all bodies attached to them."""
     moves = np.zeros(model.nbody, dtype=bool)
     for body in range(1, model.nbody):  # parents come first
@@ -80,42 +87,42 @@ def moving_bodies(model: mujoco.MjModel) -> Ints:
 def write_geometry(stream: Stream, cell: Cell) -> None:
     """Log all geoms, the poses of frames that never move, and the directions of the axes."""
     model = cell.model
-    data = cell.start()
-    stream.static((CELL,), stream.within(WORLD))
-    centre, radius = extent_of(cell)
+    data = cell.build_start_data()
+    stream.log_static((CELL,), stream.build_frame(WORLD))
+    centre, radius = compute_extent(cell)
     begin = centre + radius * AXES_BESIDE
-    begin[2] = floor_of(cell)
+    begin[2] = find_floor_height(cell)
     axes = rr.Arrows3D(
         origins=[begin] * 3,
         vectors=AXES_PART * radius * np.eye(3),
         radii=AXES_RADIUS_PART * radius,
-        colors=packed(AXES_COLOURS),
+        colors=pack_colours(AXES_COLOURS),
         labels=["x", "y", "z"],
     )
-    stream.static(AXES, axes, stream.within(WORLD))
+    stream.log_static(AXES, axes, stream.build_frame(WORLD))
     is_shown = model.geom_group < SHOWN_GROUPS
     if not is_shown.any():
         is_shown[:] = True
     for geom in range(model.ngeom):
-        shape = shape_of(model, geom)
+        shape = build_shape(model, geom)
         if shape is not None:
             body = int(model.geom_bodyid[geom])
             name = model.geom(geom).name or f"geom {geom}"
             group = (CELL,) if is_shown[geom] else (CELL, COLLISION)
             entity = (*group, model.body(body).name or f"body {body}", name)
-            stream.static(entity, shape, stream.within(frame_of(model, body)))
-    for body in set(range(1, model.nbody)) - set(moving_bodies(model).tolist()):
-        name = frame_of(model, body)
+            stream.log_static(entity, shape, stream.build_frame(name_frame(model, body)))
+    for body in set(range(1, model.nbody)) - set(find_moving_bodies(model).tolist()):
+        name = name_frame(model, body)
         pose = rr.Transform3D(
             translation=data.xpos[body],
-            quaternion=rr.Quaternion(xyzw=xyzw(data.xquat[body])),
-            parent_frame=stream.frame(WORLD),
-            child_frame=stream.frame(name),
+            quaternion=rr.Quaternion(xyzw=to_xyzw(data.xquat[body])),
+            parent_frame=stream.format_frame(WORLD),
+            child_frame=stream.format_frame(name),
         )
-        stream.static((FRAMES, name), pose)
+        stream.log_static((FRAMES, name), pose)
 
 
-class Poses:
+class PoseWriter:
     """Writes an `ArmState` as poses of all moving bodies, and as the path of the tool.
 
     The poses come from MuJoCo's kinematics. With `has_pushes` the forces that the scene exerts on
@@ -125,20 +132,24 @@ class Poses:
     def __init__(self, stream: Stream, cell: Cell, has_pushes: bool) -> None:
         self._stream = stream
         self._cell = cell
-        self._data = cell.start()
-        self._bodies = moving_bodies(cell.model)
-        self._contacts = contacts_of(cell)
-        self._world = stream.frame(WORLD)
-        self._frames = [stream.frame(frame_of(cell.model, int(body))) for body in self._bodies]
-        self._frames += [stream.frame(contact.frame) for contact in self._contacts]
-        self._sampled_rows = row_sampler(stream.times.clock_ns)
+        self._data = cell.build_start_data()
+        self._bodies = find_moving_bodies(cell.model)
+        self._contacts = list_contacts(cell)
+        self._world = stream.format_frame(WORLD)
+        self._frames = [
+            stream.format_frame(name_frame(cell.model, int(body))) for body in self._bodies
+        ]
+        self._frames += [stream.format_frame(contact.frame) for contact in self._contacts]
+        self._sampled_rows = build_row_sampler(stream.times.clock_ns)
         self._has_pushes = has_pushes
         self._is_pushed = False
-        stream.static(
-            TOOL, rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]), stream.within(WORLD)
+        stream.log_static(
+            TOOL,
+            rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]),
+            stream.build_frame(WORLD),
         )
         if has_pushes:
-            stream.static(PUSHES, stream.within(WORLD))
+            stream.log_static(PUSHES, stream.build_frame(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write the poses, one every 20 ms of simulated time."""
@@ -157,20 +168,24 @@ class Poses:
             positions[row, : len(bodies)] = data.xpos[bodies]
             quaternions[row, : len(bodies)] = data.xquat[bodies]
             for index, contact in enumerate(self._contacts, len(bodies)):
-                positions[row, index], quaternions[row, index] = contact.pose(data)
+                positions[row, index], quaternions[row, index] = contact.compute_pose(data)
             tool[row] = data.site_xpos[self._cell.tool]
             if self._has_pushes:
-                self._push(block.when(chosen[row]))
-        self._stream.columns(TOOL, block.times_of(chosen), rr.Points3D.columns(positions=tool))
+                self._write_pushes(block.find_moment(chosen[row]))
+        self._stream.send_columns(
+            TOOL, block.build_time_columns(chosen), rr.Points3D.columns(positions=tool)
+        )
         poses = rr.Transform3D.columns(
             translation=positions.reshape(-1, 3),
-            quaternion=xyzw(quaternions).reshape(-1, 4),
+            quaternion=to_xyzw(quaternions).reshape(-1, 4),
             parent_frame=[self._world] * (len(chosen) * count),
             child_frame=self._frames * len(chosen),
         )
-        self._stream.columns((FRAMES,), block.times_of(np.repeat(chosen, count)), poses)
+        self._stream.send_columns(
+            (FRAMES,), block.build_time_columns(np.repeat(chosen, count)), poses
+        )
 
-    def _push(self, when: Moment) -> None:
+    def _write_pushes(self, when: Moment) -> None:
         """Write the forces that act on objects now, or that they have ended."""
         objects = self._cell.bodies
         forces = self._data.xfrc_applied[objects, :3]
@@ -183,23 +198,23 @@ class Poses:
                 radii=PUSH_RADIUS_M,
                 colors=[FORCE],
             )
-            self._stream.at(when, PUSHES, arrows)
+            self._stream.log_at(when, PUSHES, arrows)
 
 
-class Marks:
+class MarkWriter:
     """Marks in red why the arm does not move: engaged brakes, and faults while they act."""
 
     def __init__(self, stream: Stream, cell: Cell, joints: Sequence[str]) -> None:
         self._stream = stream
-        self._braking_rows = change_finder()
+        self._braking_rows = build_change_finder()
         # Joint and text of each acting fault, by entry of the fault table.
         self._faults: dict[int, tuple[str, str]] = {}
         self._joints = {name: cell.model.joint(name).pos for name in joints}
-        self._radius = MARK_PART * extent_of(cell)[1]
+        self._radius = MARK_PART * compute_extent(cell)[1]
         for name in joints:
             body = int(cell.model.joint(name).bodyid[0])
             for group in (BRAKES, FAULTS):
-                stream.static((*group, name), stream.within(frame_of(cell.model, body)))
+                stream.log_static((*group, name), stream.build_frame(name_frame(cell.model, body)))
 
     def write(self, block: RowBlock) -> None:
         """Mark every joint while the brakes are engaged."""
@@ -208,9 +223,9 @@ class Marks:
             texts = dict.fromkeys(self._joints, "") if braked[row] else {}
             if texts:
                 texts[list(texts)[-1]] = "brakes engaged"
-            self._mark(block.when(row), BRAKES, texts)
+            self._write_marks(block.find_moment(row), BRAKES, texts)
 
-    def fault(self, when: Moment, event: Event) -> None:
+    def mark_fault(self, when: Moment, event: Event) -> None:
         """Mark the joint of a fault while it acts. A fault of no joint marks the first joint."""
         joint = event.subject if event.subject in self._joints else next(iter(self._joints))
         if event.code == "begins":
@@ -218,21 +233,21 @@ class Marks:
             self._faults[event.fault] = joint, f"fault of {event.board}: {text}"
         else:
             self._faults.pop(event.fault, None)
-        self._mark(when, FAULTS, dict(self._faults.values()))
+        self._write_marks(when, FAULTS, dict(self._faults.values()))
 
-    def _mark(self, when: Moment, group: tuple[str, str], texts: dict[str, str]) -> None:
+    def _write_marks(self, when: Moment, group: tuple[str, str], texts: dict[str, str]) -> None:
         """Write a ball at each joint in `texts`, labelled with the text unless it is empty."""
         for name, place in self._joints.items():
             text = texts.get(name)
             places = [] if text is None else [place]
             labels = [text] if text else None
             balls = rr.Points3D(places, radii=self._radius, colors=[LOST], labels=labels)
-            self._stream.at(when, (*group, name), balls)
+            self._stream.log_at(when, (*group, name), balls)
 
 
-def extent_of(cell: Cell) -> tuple[Array, float]:
+def compute_extent(cell: Cell) -> tuple[Array, float]:
     """Return the centre of arm and objects at the start, (3,), m, and their radius, m."""
-    data = cell.start()
+    data = cell.build_start_data()
     model = cell.model
     geoms = np.union1d(
         cell.geoms.arm, np.flatnonzero(np.isin(model.geom_bodyid, cell.bodies))
@@ -245,20 +260,20 @@ def extent_of(cell: Cell) -> tuple[Array, float]:
     return (low + high) / 2, float(np.linalg.norm(high - low)) / 2
 
 
-def floor_of(cell: Cell) -> float:
+def find_floor_height(cell: Cell) -> float:
     """Return the height of the floor, m, or of the world's origin if the cell has no floor."""
     floors = np.flatnonzero(cell.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
-    return float(cell.start().geom_xpos[floors, 2].min(initial=0.0))
+    return float(cell.build_start_data().geom_xpos[floors, 2].min(initial=0.0))
 
 
-def planned_path(stream: Stream, cell: Cell) -> ViewPart:
+def build_path_part(stream: Stream, cell: Cell) -> ViewPart:
     """Return the part that shows a `MovePlan` as the path of the tool and its way points.
 
     It is drawn from the tick at which the plan is visible. A plan for the gripper clears it.
     """
-    data = cell.start()
+    data = cell.build_start_data()
     for entity in (PATH, WAYPOINTS):
-        stream.static(entity, stream.within(WORLD))
+        stream.log_static(entity, stream.build_frame(WORLD))
 
     def tool_at(joints: Array) -> Array:
         """Return the position of the tool at joint positions, (3,), m."""
@@ -273,15 +288,15 @@ def planned_path(stream: Stream, cell: Cell) -> ViewPart:
             if plan["kind"] != SegmentKind.PATH or plan["error"]:
                 way_points = way_points[:0]
             points = [tool_at(joints) for joints in way_points]
-            lines = [[tool_at(joints) for joints in in_pieces(way_points)]] if points else []
-            when = block.visible(row)
-            stream.at(when, PATH, rr.LineStrips3D(lines, radii=LINE_M, colors=[PLANNED]))
-            stream.at(when, WAYPOINTS, rr.Points3D(points, radii=POINT_M, colors=[PLANNED]))
+            lines = [[tool_at(joints) for joints in subdivide_path(way_points)]] if points else []
+            when = block.find_visible_moment(row)
+            stream.log_at(when, PATH, rr.LineStrips3D(lines, radii=LINE_M, colors=[PLANNED]))
+            stream.log_at(when, WAYPOINTS, rr.Points3D(points, radii=POINT_M, colors=[PLANNED]))
 
     return write
 
 
-def in_pieces(corners: Array) -> Array:
+def subdivide_path(corners: Array) -> Array:
     """Subdivide a joint path, (points, joints), so that no piece is longer than `STEP_RAD`."""
     longest = np.abs(np.diff(corners, axis=0)).max(axis=1)
     counts = np.maximum(np.ceil(longest / STEP_RAD), 1)
@@ -290,17 +305,17 @@ def in_pieces(corners: Array) -> Array:
     return np.column_stack([np.interp(points, numbers, joint) for joint in corners.T])
 
 
-class Goals:
+class GoalWriter:
     """Writes the places where a `TaskPlan` releases objects, and the goal of the current move."""
 
     def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
         self._stream = stream
         self._objects = objects
         self._goals: dict[int, tuple[list[float], str]] = {}  # position and label, by move
-        self._planned_rows = change_finder()
-        self._current_rows = change_finder()
+        self._planned_rows = build_change_finder()
+        self._current_rows = build_change_finder()
         for entity in (GOALS, CURRENT_GOAL):
-            stream.static(entity, stream.within(WORLD))
+            stream.log_static(entity, stream.build_frame(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write the goals of every new plan."""
@@ -308,17 +323,18 @@ class Goals:
             plan = block.messages[row]
             moves = plan["moves"][: plan["count"]]
             self._goals |= {
-                int(move["id"]): (move["position"].tolist(), self._name(move)) for move in moves
+                int(move["id"]): (move["position"].tolist(), self._format_label(move))
+                for move in moves
             }
             ends = [move for move in moves if move["verb"] == Verb.RELEASE]
             points = rr.Points3D(
                 [move["position"] for move in ends],
                 radii=POINT_M,
                 colors=[GOAL],
-                labels=[self._object(move) for move in ends],
+                labels=[self._find_object_name(move) for move in ends],
                 show_labels=False,
             )
-            self._stream.at(block.visible(row), GOALS, points)
+            self._stream.log_at(block.find_visible_moment(row), GOALS, points)
 
     def write_status(self, block: RowBlock) -> None:
         """Write the goal of the move that each `MoveStatus` names."""
@@ -331,13 +347,13 @@ class Goals:
                 colors=[CURRENT],
                 labels=[label for _, label in goals],
             )
-            self._stream.at(block.when(row), CURRENT_GOAL, point)
+            self._stream.log_at(block.find_moment(row), CURRENT_GOAL, point)
 
-    def _name(self, move: np.void) -> str:
+    def _format_label(self, move: np.void) -> str:
         """Return the label of a move: its verb and its object."""
-        return f"{worded(Verb, int(move['verb']))} {self._object(move)}".strip()
+        return f"{format_enum(Verb, int(move['verb']))} {self._find_object_name(move)}".strip()
 
-    def _object(self, move: np.void) -> str:
+    def _find_object_name(self, move: np.void) -> str:
         """Return the name of a move's object, or "" if it has none."""
         row = int(move["object"])
         return self._objects[row] if 0 <= row < len(self._objects) else ""

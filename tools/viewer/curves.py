@@ -17,8 +17,8 @@ from rack.tools.viewer.style import (
     COMMANDED,
     LIMIT,
     OVERLAID,
-    curves,
-    of_joints,
+    build_curves,
+    choose_joint_colours,
     style_curves,
     write_legend,
 )
@@ -41,7 +41,7 @@ FIELDS = {
 """Fields for the curves of a joint, by quantity and meaning."""
 
 
-def joint_curves(
+def build_joint_curves(
     stream: Stream, names: Sequence[str], cell: Cell, has_gripper: bool
 ) -> Iterator[ViewPart]:
     """Yield the parts that show the status of the board that drives the arm.
@@ -55,7 +55,7 @@ def joint_curves(
         cell: Cell of the arm.
         has_gripper: Whether the status contains the gripper.
     """
-    colours = of_joints(len(names))
+    colours = choose_joint_colours(len(names))
     write_legend(stream, JOINTS, names, colours)
     bounds = cell.bounds
     limits = {
@@ -66,16 +66,16 @@ def joint_curves(
     for index, name in enumerate(names):
         for quantity, fields in FIELDS.items():
             entity = (JOINTS, name, quantity)
-            yield _limits(stream, (*entity, "limits"), limits[quantity][index])
+            yield _build_limits(stream, (*entity, "limits"), limits[quantity][index])
             labels = [f"{name} {meaning}, {QUANTITIES[quantity]}" for meaning in fields]
-            values = partial(_of_joint, index, tuple(fields.values()))
+            values = partial(_select_joint, index, tuple(fields.values()))
             if len(fields) == 1:
-                yield curves(stream, entity, values, labels, [colours[index]])
+                yield build_curves(stream, entity, values, labels, [colours[index]])
             else:
                 shades = [COMMANDED, colours[index]]
-                yield curves(stream, entity, values, labels, shades, OVERLAID)
+                yield build_curves(stream, entity, values, labels, shades, OVERLAID)
     labels = [f"{name}, mrad" for name in names]
-    yield curves(
+    yield build_curves(
         stream,
         (ERROR,),
         lambda block: (block.messages["position"] - block.messages["target"]) * 1e3,
@@ -83,14 +83,14 @@ def joint_curves(
         colours,
     )
     if cell.gripper is not None and has_gripper:
-        opening, grip = gripper_units(cell)
-        yield curves(
+        opening, grip = find_gripper_units(cell)
+        yield build_curves(
             stream,
             (GRIPPER, OPENING),
             lambda block: block.messages["opening"] * 1e3,
             [f"{OPENING}, {opening}"],
         )
-        yield curves(
+        yield build_curves(
             stream,
             (GRIPPER, GRIP),
             lambda block: block.messages["grip_force"],
@@ -98,21 +98,23 @@ def joint_curves(
         )
 
 
-def _limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewPart:
+def _build_limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewPart:
     """Return the part that writes two limits, (2,), at the first and last row of each block.
 
     Straight lines need no other points.
     """
     style_curves(stream, entity, ["lower limit", "upper limit"], [LIMIT, LIMIT], [1.0, 1.0])
-    return lambda block: stream.scalars(entity, block.times_of([0, -1]), np.tile(limits, (2, 1)))
+    return lambda block: stream.send_curves(
+        entity, block.build_time_columns([0, -1]), np.tile(limits, (2, 1))
+    )
 
 
-def _of_joint(joint: int, fields: Sequence[str], block: RowBlock) -> Array:
+def _select_joint(joint: int, fields: Sequence[str], block: RowBlock) -> Array:
     """Return fields of one joint as columns, (rows, fields)."""
     return np.stack([block.messages[field][:, joint] for field in fields], axis=-1)
 
 
-def gripper_units(cell: Cell) -> tuple[str, str]:
+def find_gripper_units(cell: Cell) -> tuple[str, str]:
     """Return the units of the gripper's opening and force."""
     assert cell.gripper is not None, "there is a gripper"
     joint = cell.model.dof_jntid[cell.gripper.dof]
@@ -120,7 +122,7 @@ def gripper_units(cell: Cell) -> tuple[str, str]:
     return ("mrad", "N m") if is_hinge else ("mm", "N")
 
 
-def field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
+def build_field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
     """Yield the parts that show the numeric fields of a mailbox.
 
     A user's own messages are shown without any configuration.
@@ -132,9 +134,9 @@ def field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
         places = [f"[{position}]" for position in range(prod(field.shape))] if field.shape else [""]
         names = [f"{mailbox.name}.{field.name}{place}{unit}" for place in places]
         entity = (SIGNALS, mailbox.name, field.name)
-        yield curves(stream, entity, partial(_numbers, field.name), names)
+        yield build_curves(stream, entity, partial(_flatten_field, field.name), names)
 
 
-def _numbers(field: str, block: RowBlock) -> Array:
+def _flatten_field(field: str, block: RowBlock) -> Array:
     """Return a field as one column per number, (rows, numbers)."""
     return np.asarray(block.messages[field], float).reshape(len(block.rows), -1)

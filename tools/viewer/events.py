@@ -14,19 +14,19 @@ import numpy as np
 import rerun as rr
 
 from rack.boards.events import Event
-from rack.tools.recording.checksums import read_line
-from rack.tools.viewer.cell import Marks
+from rack.tools.recording.checksums import parse_checked_line
+from rack.tools.viewer.cell import MarkWriter
 from rack.tools.viewer.levels import Hierarchy
 from rack.tools.viewer.stream import Moment, Stream
 from rack.tools.viewer.style import EVENT_COLOURS, LOST, style_curves, style_lane, write_span
 
 EVENTS = "events"
 RECORDER = "recorder"
-UNSHOWN = ("printed", "miss")
+KINDS_WITHOUT_LANE = ("printed", "miss")
 """Events without a lane in this view. Misses have a lane beside their board's level."""
-RACK = "rack"
+RACK_LANE = "rack"
 """Lane of events that belong to no board."""
-LEVELS = {
+LOG_LEVELS = {
     "died": "ERROR",
     "detection": "ERROR",
     "fault": "WARN",
@@ -38,14 +38,14 @@ LEVELS = {
 """Log level by kind of event. Others are INFO."""
 
 
-class Events:
+class EventWriter:
     """Follows events.jsonl, which the launcher writes line by line.
 
     It shows faults in the hierarchy too, and with `marks` also in 3D.
     """
 
     def __init__(
-        self, stream: Stream, path: Path, hierarchy: Hierarchy, marks: Marks | None
+        self, stream: Stream, path: Path, hierarchy: Hierarchy, marks: MarkWriter | None
     ) -> None:
         self._stream = stream
         self._path = path
@@ -54,7 +54,7 @@ class Events:
         self._read = 0
         self._lanes: dict[str, str] = {}  # what each board's lane shows
 
-    def advance(self) -> None:
+    def write_new_events(self) -> None:
         """Write the events that were added since the last call."""
         if not self._path.is_file() or self._path.stat().st_size == self._read:
             return
@@ -64,7 +64,7 @@ class Events:
             lines = [line for line in file.read().splitlines(keepends=True) if line.endswith(b"\n")]
         self._read += sum(map(len, lines))
         for line in lines:
-            event = read_line(line.decode())
+            event = parse_checked_line(line.decode())
             # The last line is the outcome, not an event. Waits during the launch are no news to
             # somebody who already sees the run.
             if "tick" in event and not (event["kind"] == "waiting" and event["tick"] < 0):
@@ -72,22 +72,22 @@ class Events:
 
     def _write(self, event: Event) -> None:
         """Write an event to the log and to its lane. Faults and losses change other views, too."""
-        board = event.board or RACK
-        when = Moment(max(0, event.tick), self._stream.times.monotonic(event.time_ns))
+        board = event.board or RACK_LANE
+        when = Moment(max(0, event.tick), self._stream.times.to_monotonic(event.time_ns))
         text = f"{event.kind}: {board}: {event.text}"
-        self._stream.say(when, "events", text, LEVELS.get(event.kind, "INFO"))
-        if event.kind not in UNSHOWN:
-            self._show(when, board, event)
+        self._stream.log_line(when, "events", text, LOG_LEVELS.get(event.kind, "INFO"))
+        if event.kind not in KINDS_WITHOUT_LANE:
+            self._write_lane(when, board, event)
         if event.kind == "fault" and self._marks is not None:
-            self._marks.fault(when, event)
+            self._marks.mark_fault(when, event)
         if event.kind == "died":
-            self._hierarchy.lose(when, board)
+            self._hierarchy.mark_lost(when, board)
         elif event.code == "hang":
-            self._hierarchy.lose(when, event.subject)
+            self._hierarchy.mark_lost(when, event.subject)
         elif event.code == "rejoined":
-            self._hierarchy.recover(when, board)
+            self._hierarchy.mark_recovered(when, board)
 
-    def _show(self, when: Moment, board: str, event: Event) -> None:
+    def _write_lane(self, when: Moment, board: str, event: Event) -> None:
         """Write an event to the lane of its board."""
         if board not in self._lanes:
             style_lane(self._stream, (EVENTS, board), EVENT_COLOURS)
@@ -101,7 +101,7 @@ class Events:
         write_span(self._stream, when, (EVENTS, board), state)
 
 
-def row_losses(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
+def build_loss_writer(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
     """Return a function that writes the number of lost rows at a tick, and logs every new loss.
 
     It takes the tick, and the number of rows that were overwritten before the recorder took them,
@@ -114,17 +114,17 @@ def row_losses(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
     def write(tick: int, lost: Mapping[str, int]) -> None:
         """Write the total number of lost rows, and log the new losses."""
         nonlocal logged
-        when = stream.times.moment_of(tick)
+        when = stream.times.estimate_moment(tick)
         counts = Counter(lost)
         for ring, more in (counts - logged).items():
-            stream.say(when, "recorder", f"recorder: {more} rows of {ring} lost", "ERROR")
+            stream.log_line(when, "recorder", f"recorder: {more} rows of {ring} lost", "ERROR")
         logged = counts
-        stream.at(when, entity, rr.Scalars(counts.total()))
+        stream.log_at(when, entity, rr.Scalars(counts.total()))
 
     return write
 
 
-def recorder_load(stream: Stream) -> Callable[[int], None]:
+def build_load_writer(stream: Stream) -> Callable[[int], None]:
     """Return a function that writes the recorder's processor load since its last call, at a tick.
 
     It measures its own process, which must be the recorder.
@@ -140,6 +140,6 @@ def recorder_load(stream: Stream) -> Callable[[int], None]:
         cpu_s, wall_s = np.subtract(now, last)
         last = now
         load = rr.Scalars(100.0 * cpu_s / max(wall_s, 1e-9))
-        stream.at(stream.times.moment_of(tick), entity, load)
+        stream.log_at(stream.times.estimate_moment(tick), entity, load)
 
     return write

@@ -10,7 +10,14 @@ from rack.levels.algebra import Ints
 from rack.levels.robot.hand import Hand
 from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.tools.viewer.stream import RowBlock, Stream, ViewPart
-from rack.tools.viewer.style import COMMANDED, OVERLAID, curves, dimmed, of_joints, write_legend
+from rack.tools.viewer.style import (
+    COMMANDED,
+    OVERLAID,
+    build_curves,
+    choose_joint_colours,
+    dim_colour,
+    write_legend,
+)
 
 HAND = "hand"
 JOINTS = "joints"
@@ -21,19 +28,21 @@ BY_FINGER = {TENSIONS: "N", JOINTS: "rad", FORCES: "N"}
 TIPS = (HAND, "tip_forces")
 
 
-def hand_curves(stream: Stream, names: Sequence[str], hand: Hand) -> Iterator[ViewPart]:
+def build_hand_curves(stream: Stream, names: Sequence[str], hand: Hand) -> Iterator[ViewPart]:
     """Yield the parts that show a `HandStatus` of a hand whose joints have these names."""
-    colours = of_joints(len(hand.names))
+    colours = choose_joint_colours(len(hand.names))
     write_legend(stream, HAND, hand.names, colours)
     for index, finger in enumerate(hand.names):
-        yield from _finger_curves(stream, names, finger, index, np.flatnonzero(hand.fingers[index]))
+        yield from _build_finger_curves(
+            stream, names, finger, index, np.flatnonzero(hand.fingers[index])
+        )
     labels = [f"{finger}, N" for finger in hand.names]
-    yield curves(
+    yield build_curves(
         stream, TIPS, lambda block: np.linalg.norm(block.messages["force"], axis=2), labels, colours
     )
 
 
-def _finger_curves(
+def _build_finger_curves(
     stream: Stream, names: Sequence[str], finger: str, finger_index: int, joints: Ints
 ) -> Iterator[ViewPart]:
     """Yield the parts that show one finger: joints, sensed and commanded tensions, and tip force.
@@ -46,8 +55,8 @@ def _finger_curves(
         joints: Indices of its joints.
     """
     joint_names = [names[joint] for joint in joints]
-    colours = of_joints(len(joint_names))
-    yield curves(
+    colours = choose_joint_colours(len(joint_names))
+    yield build_curves(
         stream,
         (HAND, finger, JOINTS),
         lambda block: block.messages["position"][:, joints],
@@ -65,18 +74,18 @@ def _finger_curves(
         return np.hstack(columns)
 
     tendons = [f"{name} {row}" for row in ("flexor", "extensor") for name in joint_names]
-    yield curves(
+    yield build_curves(
         stream,
         (HAND, finger, TENSIONS),
         stack_tensions,
         [f"{tendon}{suffix}, N" for suffix in (" commanded", "") for tendon in tendons],
-        [COMMANDED] * len(tendons) + colours + [dimmed(colour) for colour in colours],
+        [COMMANDED] * len(tendons) + colours + [dim_colour(colour) for colour in colours],
         np.repeat(OVERLAID, len(tendons)).tolist(),
     )
-    yield curves(
+    yield build_curves(
         stream,
         (HAND, finger, FORCES),
         lambda block: block.messages["force"][:, finger_index],
         [f"{axis}, N" for axis in "xyz"],
-        of_joints(3),
+        choose_joint_colours(3),
     )

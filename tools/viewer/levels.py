@@ -11,26 +11,26 @@ import numpy as np
 import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.message import State, text_of
+from rack.backplane.message import State, decode_text
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.trace_times import is_missed
+from rack.boards.timing.trace_times import find_missed
 from rack.levels.messages import Verb
 from rack.levels.systems.hand.messages import GraspKind
-from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart, change_finder
-from rack.tools.viewer.style import STATES, packed, style_lane, write_spans
+from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart, build_change_finder
+from rack.tools.viewer.style import STATES, pack_colours, style_lane, write_spans
 
 LEVELS = "levels"
 HIERARCHY = "hierarchy"
 ROW = 45.0
 COLUMN = 110.0
 """Distance between nodes, in the graph's units. A letter is about 7 units wide."""
-WIDEST = 3
+MAX_ROW_BOARDS = 3
 """Number of boards per row of the graph, so that it stays large enough to read."""
 FIRED = ["table", "row", "fired", "in_state"]
 """Fields of a status that say which row of a state table fires."""
 
 
-def value_lane(
+def build_value_lane(
     stream: Stream, lane: tuple[str, str], fields: str | list[str], name: Callable[[Any], str]
 ) -> ViewPart:
     """Return the part that shows a value of a level's messages as a lane of names.
@@ -41,7 +41,7 @@ def value_lane(
         fields: The field with the value. Several fields give a tuple.
         name: Returns the name of a value.
     """
-    changed_rows = change_finder()
+    changed_rows = build_change_finder()
 
     def write(block: RowBlock) -> None:
         """Write the name of the value wherever it changes."""
@@ -49,56 +49,56 @@ def value_lane(
         rows = changed_rows(values)
         if len(rows):
             names = [name(value) for value in values[rows].tolist()]
-            write_spans(stream, (LEVELS, *lane), block.times_of(rows), names)
+            write_spans(stream, (LEVELS, *lane), block.build_time_columns(rows), names)
 
     return write
 
 
-def numbered(serial: int) -> str:
+def format_serial(serial: int) -> str:
     """Format the number of a command or motion request. Empty for 0, which means none."""
     return str(serial) if serial else ""
 
 
-def step_name(step: tuple[int, int]) -> str:
+def format_step(step: tuple[int, int]) -> str:
     """Format a step of a grasp, given the number of steps before it and its kind."""
-    return f"{step[0] + 1} {worded(GraspKind, step[1])}"
+    return f"{step[0] + 1} {format_enum(GraspKind, step[1])}"
 
 
-def move_name(move: tuple[int, int]) -> str:
+def format_move(move: tuple[int, int]) -> str:
     """Format the verb of a move, given its serial and verb. Empty without a move, serial 0."""
-    return worded(Verb, move[1]) if move[0] else ""
+    return format_enum(Verb, move[1]) if move[0] else ""
 
 
-def worded(kind: type[IntEnum], number: int) -> str:
+def format_enum(kind: type[IntEnum], number: int) -> str:
     """Return the name of an enum's number in words."""
     return kind(number).name.lower().replace("_", " ")
 
 
-def activity(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
+def build_state_lane(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
     """Yield the parts that show a level's state as a lane, and each of its errors as a log line."""
     board, _, port = mailbox.name.partition(".")
     # An adapter also writes the statuses of other racks' levels.
     lane = board, "state" if port == "status" else port
     style_lane(stream, (LEVELS, *lane), STATES)
-    yield value_lane(stream, lane, "state", partial(worded, State))
-    changed_rows = change_finder()
+    yield build_value_lane(stream, lane, "state", partial(format_enum, State))
+    changed_rows = build_change_finder()
 
     def write_errors(block: RowBlock) -> None:
         """Write a log line for each new error."""
         messages = block.messages
         for row in changed_rows(messages["error"]):
             if error := messages["error"][row]:
-                reason = text_of(messages["reason"][row])
+                reason = decode_text(messages["reason"][row])
                 text = f"{board}: {reason or f'error {error}'}"
-                stream.say(block.when(row), "levels", text, "ERROR")
+                stream.log_line(block.find_moment(row), "levels", text, "ERROR")
 
     yield write_errors
 
 
-def fired_rows(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
+def build_fired_lane(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
     """Return the part that shows which row of a state table fires, as a lane and as log lines."""
     board = mailbox.name.partition(".")[0]
-    changed_rows = change_finder()
+    changed_rows = build_change_finder()
 
     def write(block: RowBlock) -> None:
         """Write every change of the fired row to the lane and to the log."""
@@ -106,14 +106,14 @@ def fired_rows(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
         names = []
         for row_index in changed:
             table, row, fired, state = block.messages[FIRED][row_index]
-            names.append(f"{row} {text_of(fired)}")
-            now = f"now in '{text_of(state)}', table {text_of(table)}"
-            text = f"row {row} '{text_of(fired)}', {now}"
-            stream.say(
-                block.when(row_index), "rows", f"{board}: {text}", "INFO" if row else "ERROR"
+            names.append(f"{row} {decode_text(fired)}")
+            now = f"now in '{decode_text(state)}', table {decode_text(table)}"
+            text = f"row {row} '{decode_text(fired)}', {now}"
+            stream.log_line(
+                block.find_moment(row_index), "rows", f"{board}: {text}", "INFO" if row else "ERROR"
             )
         if names:
-            write_spans(stream, (LEVELS, board, "row"), block.times_of(changed), names)
+            write_spans(stream, (LEVELS, board, "row"), block.build_time_columns(changed), names)
 
     return write
 
@@ -130,62 +130,62 @@ class Hierarchy:
         self._tasks = [task.name for task in layout.tasks]
         self._states = dict.fromkeys(self._tasks, "idle")  # the newest states
         self._shown = dict(self._states)  # the states that the graph shows
-        self._positions = positions(layout, rack)
+        self._positions = compute_positions(layout, rack)
         self._changes: list[tuple[Moment, str, str]] = []
         downward = [(board.name, below) for board in rack.boards.values() for below in board.below]
         plans = [(task.name, task.board) for task in layout.tasks if task.role == "planner"]
-        stream.static((HIERARCHY,), rr.GraphEdges(downward + plans, graph_type="directed"))
-        self._log(stream.times.moment_of(0))
+        stream.log_static((HIERARCHY,), rr.GraphEdges(downward + plans, graph_type="directed"))
+        self._write_graph(stream.times.estimate_moment(0))
 
     def write(self, task: str, block: RowBlock) -> None:
         """Note the changes of a task's state."""
-        names = _names(block.rows)
+        names = _name_states(block.rows)
         before = np.concatenate(([self._states[task]], names[:-1]))
         for row in np.flatnonzero(names != before):
-            self._note(block.when(row), task, str(names[row]))
+            self._add_change(block.find_moment(row), task, str(names[row]))
 
-    def lose(self, when: Moment, board: str) -> None:
+    def mark_lost(self, when: Moment, board: str) -> None:
         """Note that a board died or stopped responding."""
         if board in self._states:
-            self._note(when, board, "lost")
+            self._add_change(when, board, "lost")
 
-    def recover(self, when: Moment, board: str) -> None:
+    def mark_recovered(self, when: Moment, board: str) -> None:
         """Note that a lost board is back. Its state follows from its next cycles."""
         if self._states.get(board) == "lost":
-            self._note(when, board, "idle")
+            self._add_change(when, board, "idle")
 
-    def _note(self, when: Moment, task: str, state: str) -> None:
+    def _add_change(self, when: Moment, task: str, state: str) -> None:
         """Add a change of state, to be written by `write_changes`."""
         self._changes.append((when, task, state))
         self._states[task] = state
 
-    def advance(self) -> None:
+    def write_changes(self) -> None:
         """Write the noted changes in the order of time."""
         for when, task, state in sorted(self._changes):
             self._shown[task] = state
-            self._log(when)
+            self._write_graph(when)
         self._changes.clear()
 
-    def _log(self, when: Moment) -> None:
+    def _write_graph(self, when: Moment) -> None:
         """Write the graph with the current colours."""
         nodes = rr.GraphNodes(
             self._tasks,
             positions=[self._positions[task] for task in self._tasks],
-            colors=packed(STATES[self._shown[task]] for task in self._tasks),
+            colors=pack_colours(STATES[self._shown[task]] for task in self._tasks),
             # A planner's node is next to its board's.
             labels=[task.partition(".")[2] or task for task in self._tasks],
         )
-        self._stream.at(when, (HIERARCHY,), nodes)
+        self._stream.log_at(when, (HIERARCHY,), nodes)
 
 
-def _names(rows: np.ndarray) -> np.ndarray:
+def _name_states(rows: np.ndarray) -> np.ndarray:
     """Return the state of the level in each trace record, or "missed"."""
     names = np.array([state.name.lower() for state in State] + ["missed"])
-    indices = np.where(is_missed(rows), len(names) - 1, rows["state"])
+    indices = np.where(find_missed(rows), len(names) - 1, rows["state"])
     return np.asarray(names[indices])
 
 
-def positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:
+def compute_positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:
     """Return the positions of the tasks in the graph.
 
     Each rank of levels is a row, or several if it has many boards. Planners are to the right of
@@ -196,8 +196,8 @@ def positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]
     for boards in rack.ranks:
         step = 1 + any(rack.boards[board].has_planner for board in boards)
         for index, board in enumerate(boards):
-            placed[board] = index % WIDEST * step, next_row + index // WIDEST
-        next_row += -(-len(boards) // WIDEST)
+            placed[board] = index % MAX_ROW_BOARDS * step, next_row + index // MAX_ROW_BOARDS
+        next_row += -(-len(boards) // MAX_ROW_BOARDS)
     others = [t.board for t in layout.tasks if t.role == "executor" and t.board not in placed]
     placed |= {board: (-1, row) for row, board in enumerate(others)}
     return {

@@ -9,9 +9,14 @@ import numpy as np
 
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import RackPlace
-from rack.tools.viewer.blueprint import RackViews, blueprint, side_by_side, together
-from rack.tools.viewer.sink import RackWriter, Ran, block_of
-from rack.tools.viewer.stream import Moment, Stream, Timelines, new_recording
+from rack.tools.viewer.blueprint import (
+    RackViews,
+    build_blueprint,
+    build_common_view,
+    build_comparison_view,
+)
+from rack.tools.viewer.sink import RackWriter, RunContext, compute_block_ticks
+from rack.tools.viewer.stream import Moment, Stream, Timelines, open_recording
 
 
 def write_merged(
@@ -36,41 +41,43 @@ def write_merged(
     for place in placed:
         run = place.own.recording
         rack = place.own.rack
-        ran[rack] = of = Ran.of(run.layout, run.config, run.folder)
+        ran[rack] = of = RunContext.from_config(run.layout, run.config, run.folder)
         roots[rack] = (rack,) if len(placed) > 1 else ()
         views[rack] = RackViews(of.layout, of.config, of.cell, roots[rack])
     name = ", ".join(ran)
     if placed[0].by_ticks:
-        root = side_by_side(views)
+        root = build_comparison_view(views)
     else:
-        root = together(views) if len(placed) > 1 else views[name].everything()
+        root = build_common_view(views) if len(placed) > 1 else views[name].build_all_views()
     launches = "-".join(str(place.own.launch.created_ns) for place in placed)
-    recording = new_recording(name, f"{name}-{launches}", file, blueprint(root))
+    recording = open_recording(name, f"{name}-{launches}", file, build_blueprint(root))
     first = placed[0].own
     log = Stream(recording, Timelines(first.clock_ns, first.launch))
     for place in placed:
         for tick, text in place.marks:
-            stamp_ns = int(first.stamp_ns(np.array([tick]))[0])
-            log.say(Moment(tick, stamp_ns), "time line", text, "INFO")
+            stamp_ns = int(first.convert_ticks(np.array([tick]))[0])
+            log.log_line(Moment(tick, stamp_ns), "time line", text, "INFO")
     for index, place in enumerate(placed):
         grid = place.own
         stream = Stream(recording, Timelines(grid.clock_ns, grid.launch, place), roots[grid.rack])
         writer = RackWriter(stream, ran[grid.rack])
         last = grid.ticks[1] + 1
         if kept_text := grid.recording.kept_text:
-            stream.say(Moment(0, grid.epoch_ns), "recorder", f"recorder: {kept_text}", "WARN")
-        for tick, rows in _blocks(grid.recording, last, block_of(grid.recording.layout)):
+            stream.log_line(Moment(0, grid.epoch_ns), "recorder", f"recorder: {kept_text}", "WARN")
+        for tick, rows in _split_blocks(
+            grid.recording, last, compute_block_ticks(grid.recording.layout)
+        ):
             if kept_text and not rows:
-                writer.skip(tick)
+                writer.skip_to(tick)
                 continue
-            lost = grid.recording.lost if tick == last else {}
+            lost = grid.recording.lost_rows if tick == last else {}
             writer.write(rows, tick, lost)
             stream.flush()
             show_progress((index + tick / last) / len(placed))
     recording.disconnect()
 
 
-def _blocks(
+def _split_blocks(
     recording: Recording, last: int, block: int
 ) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
     """Yield the rows of all rings in blocks: the tick at which a block ends, and rows by ring.
@@ -83,7 +90,7 @@ def _blocks(
     layout = recording.layout
     names = [*(task.name for task in layout.tasks), *(box.name for box in layout.timed)]
     recorded = {*recording.cycles, *recording.mailboxes}
-    rings = {name: recording.rows(name) for name in names if name in recorded}
+    rings = {name: recording.read_rows(name) for name in names if name in recorded}
     borders = list(range(block, last, block))
     # The last block contains all remaining rows, including messages that the clock and operators
     # wrote after the last cycle.

@@ -9,18 +9,18 @@ from pathlib import Path
 FILE = "run.rrd"
 
 
-def names(file: Path) -> Iterator[Path]:
+def list_part_names(file: Path) -> Iterator[Path]:
     """Yield the names of a file and of its parts without end: run.rrd, run-2.rrd and so on."""
     yield file
     for part in count(2):
         yield file.with_stem(f"{file.stem}-{part}")
 
 
-def next_file(folder: Path) -> Path:
+def find_next_file(folder: Path) -> Path:
     """Return the next unused file name, so that a restarted recorder overwrites nothing."""
-    return next(path for path in names(folder / FILE) if not path.is_file())
+    return next(path for path in list_part_names(folder / FILE) if not path.is_file())
 
 
-def parts_of(file: Path) -> list[Path]:
+def list_parts(file: Path) -> list[Path]:
     """Return the existing parts of a recording, oldest first."""
-    return [*takewhile(Path.is_file, names(file))]
+    return [*takewhile(Path.is_file, list_part_names(file))]

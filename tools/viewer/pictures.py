@@ -21,10 +21,10 @@ from rerun.experimental import ViewerClient
 
 from rack.tools.console.answer import Failure
 from rack.tools.viewer.stream import SIM_TIME
-from rack.tools.viewer.window import HOST, ViewerWindow, free_port, url
+from rack.tools.viewer.window import HOST, ViewerWindow, find_free_port, format_url
 
-PATIENCE_S = 30.0
-LOOK_S = 0.05
+TIMEOUT_S = 30.0
+POLL_S = 0.05
 DYING_S = 2.0
 """Time to wait for the end of a viewer. Without a graphics driver it listens first, then ends."""
 PAUSE_S = 0.4
@@ -51,7 +51,7 @@ class NoViewerError(Failure):
     """This machine cannot draw pictures. The message says why, and what to install."""
 
 
-class Look(NamedTuple):
+class Picture(NamedTuple):
     """A picture as PNG, and the complaints of the viewer.
 
     Attributes:
@@ -74,7 +74,7 @@ class Screen:
         """Ids of the open views, by name."""
         return {view.name: view.view_id for view in self._client.get_state().views}
 
-    def look(self, at_s: float, view: str | None = None) -> Look:
+    def take_picture(self, at_s: float, view: str | None = None) -> Picture:
         """Return the picture at a simulated time, once it no longer changes.
 
         Args:
@@ -89,16 +89,16 @@ class Screen:
             SIM_TIME, duration=np.timedelta64(round(at_s * 1e9), "ns"), play_state="paused"
         )
         drawn = b""
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while time.monotonic() < deadline:
             time.sleep(PAUSE_S)
             before = drawn
             drawn = bytes(self._client.take_screenshot(view_id))
             if drawn == before:
                 break
-        return Look(drawn, tuple(self._complaints()))
+        return Picture(drawn, tuple(self._list_complaints()))
 
-    def _complaints(self) -> Iterator[str]:
+    def _list_complaints(self) -> Iterator[str]:
         """Yield the reports of all views, and the viewer's log above the level of information."""
         for view in self._client.get_state().views:
             yield from (f"view '{view.name}': {report}" for report in view.reports)
@@ -108,44 +108,46 @@ class Screen:
 
 
 @contextmanager
-def opened(recording: Path) -> Iterator[Screen]:
+def open_screen(recording: Path) -> Iterator[Screen]:
     """Open a recording in a headless viewer.
 
     Raises:
         NoViewerError: The machine lacks the graphics libraries.
     """
-    port = free_port()
+    port = find_free_port()
     # `ViewerClient.spawn` would start a viewer that listens on every network.
     window = ViewerWindow(headless=True, port=port)
     try:
-        client = _connected(window, port)
+        client = _connect_client(window, port)
         try:
             client.open(str(recording.resolve()))
         except (ConnectionError, RuntimeError) as error:
-            raise NoViewerError(_why(window, error)) from None
+            raise NoViewerError(_explain_failure(window, error)) from None
         yield Screen(client)
     finally:
         window.close()
 
 
-def _connected(window: ViewerWindow, port: int) -> ViewerClient:
+def _connect_client(window: ViewerWindow, port: int) -> ViewerClient:
     """Connect to a viewer as soon as it listens. Raises `NoViewerError` if it never does."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + TIMEOUT_S
     while window.is_open and time.monotonic() < deadline:
         with socket.socket() as probe:
             if probe.connect_ex((HOST, port)) == 0:
-                return ViewerClient.connect(url(port))
-        time.sleep(LOOK_S)
-    raise NoViewerError(_why(window, f"the viewer did not listen within {PATIENCE_S:g} s"))
+                return ViewerClient.connect(format_url(port))
+        time.sleep(POLL_S)
+    raise NoViewerError(
+        _explain_failure(window, f"the viewer did not listen within {TIMEOUT_S:g} s")
+    )
 
 
-def _why(window: ViewerWindow, otherwise: object) -> str:
+def _explain_failure(window: ViewerWindow, otherwise: object) -> str:
     """Return the reason why there is no picture, and what to install."""
-    reason = window.wait() if window.ends_within(DYING_S) else otherwise
-    return f"{reason}; {packages_text()}"
+    reason = window.wait_until_closed() if window.wait_for_end(DYING_S) else otherwise
+    return f"{reason}; {describe_missing_packages()}"
 
 
-def packages_text() -> str:
+def describe_missing_packages() -> str:
     """Return which packages for drawing without a graphics card are missing."""
     if shutil.which("dpkg-query") is None:
         return f"without a graphics card, these Debian packages are needed: {' '.join(PACKAGES)}"
@@ -170,8 +172,8 @@ def main() -> int:
     parser.add_argument("--view", metavar="NAME", help="draw only the view with this title")
     options = parser.parse_args()
     try:
-        with opened(options.recording) as screen:
-            look = screen.look(options.at, options.view)
+        with open_screen(options.recording) as screen:
+            look = screen.take_picture(options.at, options.view)
     except Failure as failure:
         print(failure, file=sys.stderr)
         return failure.status

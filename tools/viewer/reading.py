@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from rerun.chunk import RrdReader
 
-from rack.tools.viewer.parts import parts_of
+from rack.tools.viewer.parts import list_parts
 from rack.tools.viewer.stream import TICK
 
 
-class Rows(NamedTuple):
+class EntityRows(NamedTuple):
     """Rows of one entity in the order of ticks.
 
     Attributes:
@@ -24,7 +24,7 @@ class Rows(NamedTuple):
     values: np.ndarray
 
 
-def read(file: Path, entity: str, component: str = "Scalars:scalars") -> Rows:
+def read_component(file: Path, entity: str, component: str = "Scalars:scalars") -> EntityRows:
     """Read one component of an entity, from a file and the parts that continue it.
 
     Args:
@@ -37,7 +37,7 @@ def read(file: Path, entity: str, component: str = "Scalars:scalars") -> Rows:
     """
     chunks = [
         chunk
-        for part in parts_of(file)
+        for part in list_parts(file)
         for chunk in RrdReader(str(part))
         .stream()
         .filter(content=entity, has_timeline=TICK, components=component)
@@ -53,4 +53,4 @@ def read(file: Path, entity: str, component: str = "Scalars:scalars") -> Rows:
         values = np.array(rows)
     except ValueError:  # rows of different lengths
         values = np.array(rows, dtype=object)
-    return Rows(ticks[order], values[order])
+    return EntityRows(ticks[order], values[order])

@@ -14,15 +14,15 @@ from rack.levels.algebra import Array
 Geom = mujoco.mjtGeom
 
 
-def shape_of(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
+def build_shape(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
     """Return the shape of a geom, or None if it is invisible."""
-    rgba = colour(model, geom)
+    rgba = read_colour(model, geom)
     if rgba[3] == 0:
         return None
     size = model.geom_size[geom]
     radius, half, _ = size
     solid: dict[str, Any] = {
-        "quaternions": [xyzw(model.geom_quat[geom])],
+        "quaternions": [to_xyzw(model.geom_quat[geom])],
         "colors": [rgba],
         "fill_mode": "solid",
     }
@@ -38,46 +38,48 @@ def shape_of(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
             return rr.Cylinders3D(lengths=[2 * half], radii=[radius], **centred)
         case Geom.mjGEOM_CAPSULE:
             # MuJoCo's capsule is centred on its origin; rerun's begins at its origin.
-            begin = placed(model, geom, np.array([[0.0, 0.0, -half]]))
+            begin = transform_to_body(model, geom, np.array([[0.0, 0.0, -half]]))
             return rr.Capsules3D(lengths=[2 * half], radii=[radius], translations=begin, **solid)
         case Geom.mjGEOM_PLANE:
-            return _plane(model, geom)
+            return _build_plane(model, geom)
         case Geom.mjGEOM_MESH | Geom.mjGEOM_SDF:
-            return _mesh(model, geom)
+            return _build_mesh(model, geom)
         case Geom.mjGEOM_HFIELD:
-            return _height_field(model, geom)
+            return _build_height_field(model, geom)
     return None
 
 
-def colour(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
+def read_colour(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
     """Return red, green, blue and alpha of a geom or of its material, 0 to 255."""
     material = model.geom_matid[geom]
     rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
     return np.asarray(np.round(rgba * 255), dtype=np.uint8)
 
 
-def xyzw(quaternions: Array) -> Array:
+def to_xyzw(quaternions: Array) -> Array:
     """Convert MuJoCo's quaternions, w first, to rerun's, w last; shape (..., 4)."""
     return np.roll(quaternions, -1, axis=-1)
 
 
-def _plane(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
+def _build_plane(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     """Return a plane as two triangles."""
     # A half size of zero means an infinite plane, which is drawn larger than the model.
     x, y = (half_size or 2 * model.stat.extent for half_size in model.geom_size[geom][:2])
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
-    return _surface(model, geom, corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    return _build_surface(model, geom, corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def _mesh(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
+def _build_mesh(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     """Return a mesh or signed distance field as triangles."""
     mesh = model.geom_dataid[geom]
     vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
     faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
-    return _surface(model, geom, model.mesh_vert[vertices].astype(float), model.mesh_face[faces])
+    return _build_surface(
+        model, geom, model.mesh_vert[vertices].astype(float), model.mesh_face[faces]
+    )
 
 
-def _height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
+def _build_height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     """Return a height field as triangles."""
     field = model.geom_dataid[geom]
     rows = model.hfield_nrow[field]
@@ -88,10 +90,12 @@ def _height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     z = model.hfield_data[start : start + rows * columns] * top
     first = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
     corners = first[:, None] + np.array([[0, 1, columns + 1, 0, columns + 1, columns]])
-    return _surface(model, geom, np.column_stack((x.ravel(), y.ravel(), z)), corners.reshape(-1, 3))
+    return _build_surface(
+        model, geom, np.column_stack((x.ravel(), y.ravel(), z)), corners.reshape(-1, 3)
+    )
 
 
-def _surface(
+def _build_surface(
     model: mujoco.MjModel, geom: int, vertices: Array, triangles: NDArray[np.integer]
 ) -> rr.AsComponents:
     """Return triangles as a mesh with flat shading.
@@ -103,7 +107,7 @@ def _surface(
         triangles: Indices of the vertices, shape (triangles, 3).
     """
     # Flat shading: triangles share no corners, so that edges stay sharp.
-    corners = placed(model, geom, vertices)[triangles]
+    corners = transform_to_body(model, geom, vertices)[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(length > 0, length, 1.0)
@@ -111,11 +115,11 @@ def _surface(
         vertex_positions=corners.reshape(-1, 3),
         triangle_indices=np.arange(3 * len(corners)).reshape(-1, 3),
         vertex_normals=np.repeat(normals, 3, axis=0),
-        albedo_factor=colour(model, geom),
+        albedo_factor=read_colour(model, geom),
     )
 
 
-def placed(model: mujoco.MjModel, geom: int, points: Array) -> Array:
+def transform_to_body(model: mujoco.MjModel, geom: int, points: Array) -> Array:
     """Transform points from the frame of a geom to the frame of its body, shape (points, 3), m."""
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])

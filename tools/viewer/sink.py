@@ -15,7 +15,7 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.config import RackConfig, rack_timing, read_stored
+from rack.boards.config import RackConfig, build_rack_timing, read_stored
 from rack.levels.messages import (
     ArmState,
     MovePlan,
@@ -30,45 +30,55 @@ from rack.levels.systems.hand.messages import STREAMED_DOWN, GraspStatus, HandSt
 from rack.levels.systems.joint_boards.messages import DRIVING, STREAMED, JointStatus, JointTorque
 from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.recording.occasions import Retention
-from rack.tools.viewer.blueprint import RackViews, blueprint, write_document
-from rack.tools.viewer.cell import Goals, Marks, Poses, planned_path, write_geometry
-from rack.tools.viewer.curves import field_curves, joint_curves
-from rack.tools.viewer.events import Events, recorder_load, row_losses
-from rack.tools.viewer.forces import contact_arrows, contact_forces, task_forces
-from rack.tools.viewer.hand import hand_curves
+from rack.tools.viewer.blueprint import RackViews, build_blueprint, write_document
+from rack.tools.viewer.cell import (
+    GoalWriter,
+    MarkWriter,
+    PoseWriter,
+    build_path_part,
+    write_geometry,
+)
+from rack.tools.viewer.curves import build_field_curves, build_joint_curves
+from rack.tools.viewer.events import EventWriter, build_load_writer, build_loss_writer
+from rack.tools.viewer.forces import (
+    build_contact_arrows,
+    build_contact_curves,
+    build_task_force_curves,
+)
+from rack.tools.viewer.hand import build_hand_curves
 from rack.tools.viewer.levels import (
     FIRED,
     Hierarchy,
-    activity,
-    fired_rows,
-    move_name,
-    numbered,
-    step_name,
-    value_lane,
-    worded,
+    build_fired_lane,
+    build_state_lane,
+    build_value_lane,
+    format_enum,
+    format_move,
+    format_serial,
+    format_step,
 )
-from rack.tools.viewer.parts import next_file
-from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, new_recording
+from rack.tools.viewer.parts import find_next_file
+from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, open_recording
 from rack.tools.viewer.style import write_legend
 from rack.tools.viewer.timing import (
     LOAD,
-    Age,
-    boards_of,
-    colours_of,
-    cycle_lane,
-    load_curves,
-    missed_cycles,
+    AgeWriter,
+    build_cycle_lane,
+    build_load_curves,
+    build_miss_lane,
+    choose_task_colours,
+    list_boards,
 )
 
-SHOWN_OTHERWISE = (ArmState, Scene, WorldState, JointTorque, JointStatus, HandStatus)
-UNCURVED = {*DRIVING, *(message.message_type.name for message in SHOWN_OTHERWISE)}
+SHOWN_IN_OTHER_VIEWS = (ArmState, Scene, WorldState, JointTorque, JointStatus, HandStatus)
+NOT_AS_CURVES = {*DRIVING, *(message.message_type.name for message in SHOWN_IN_OTHER_VIEWS)}
 """Message types whose fields are not shown as separate curves."""
 LANES: tuple[tuple[type[Message], str, str | list[str], Callable[[Any], str]], ...] = (
-    (MoveStatus, "move", ["current", "verb"], move_name),
-    (MotionStatus, "request", "current", numbered),
-    (ServerStatus, "request", "current", numbered),
-    (GraspStatus, "step", ["step", "kind"], step_name),
-    (ServerStatus, "mode", "mode", partial(worded, Mode)),
+    (MoveStatus, "move", ["current", "verb"], format_move),
+    (MotionStatus, "request", "current", format_serial),
+    (ServerStatus, "request", "current", format_serial),
+    (GraspStatus, "step", ["step", "kind"], format_step),
+    (ServerStatus, "mode", "mode", partial(format_enum, Mode)),
 )
 """Lanes of messages: message class, name of the lane, its fields, and the names of their values."""
 BLOCK_S = 1.0
@@ -82,7 +92,7 @@ Until a file is finished, its index is in memory, which takes 0.65 MB per second
 """
 
 
-class Ran(NamedTuple):
+class RunContext(NamedTuple):
     """Everything that the view needs to know of a run before its first row.
 
     Attributes:
@@ -100,7 +110,7 @@ class Ran(NamedTuple):
     events: Path
 
     @classmethod
-    def of(cls, layout: Layout, text: str, folder: Path) -> Self:
+    def from_config(cls, layout: Layout, text: str, folder: Path) -> Self:
         """Build the context of a run in `folder`, whose resolved config is `text`."""
         config = read_stored(text)
         robot = config.robot
@@ -111,37 +121,37 @@ class Ran(NamedTuple):
 class RackWriter:
     """Writes the rows of a rack's rings to a stream, in blocks."""
 
-    def __init__(self, stream: Stream, ran: Ran) -> None:
+    def __init__(self, stream: Stream, ran: RunContext) -> None:
         layout = ran.layout
         config = ran.config
         self._times = stream.times
         write_document(stream, ran.text, config, layout)
         parts_by_mailbox: dict[str, list[ViewPart]] = {
-            box.name: list(_of_any(stream, box)) for box in layout.mailboxes
+            box.name: list(_build_mailbox_parts(stream, box)) for box in layout.mailboxes
         }
         marks = None
         if ran.cell is not None:
             write_geometry(stream, ran.cell)
-            goals = Goals(stream, config.scene.bodies)
+            goals = GoalWriter(stream, config.scene.bodies)
             assert config.robot is not None, "there is an arm"
-            marks = Marks(stream, ran.cell, config.robot.joints)
+            marks = MarkWriter(stream, ran.cell, config.robot.joints)
             for box in layout.mailboxes:
                 if box.message in DRIVING:
                     parts_by_mailbox[box.name].append(marks.write)
-                parts_by_mailbox[box.name] += _of_arm(stream, box, config, ran.cell, goals)
+                parts_by_mailbox[box.name] += _build_arm_parts(stream, box, config, ran.cell, goals)
         lockstep = config.clock.mode == "lockstep"
         # Traces measure real time, in which a tick of lockstep has no fixed length.
         tick_ns = layout.clock_ns if lockstep else config.tick_ns
-        colours = colours_of(layout)
-        boards = boards_of(layout)
+        colours = choose_task_colours(layout)
+        boards = list_boards(layout)
         write_legend(stream, LOAD, boards, [colours[board] for board in boards])
-        self._hierarchy = Hierarchy(stream, layout, rack_timing(config, layout))
+        self._hierarchy = Hierarchy(stream, layout, build_rack_timing(config, layout))
         parts_by_task: dict[str, list[ViewPart]] = {
             task.name: [
                 partial(self._hierarchy.write, task.name),
-                cycle_lane(stream, task, layout.clock_ns / tick_ns, lockstep),
-                *load_curves(stream, task, colours[task.name], tick_ns, lockstep),
-                missed_cycles(stream, task),
+                build_cycle_lane(stream, task, layout.clock_ns / tick_ns, lockstep),
+                *build_load_curves(stream, task, colours[task.name], tick_ns, lockstep),
+                build_miss_lane(stream, task),
             ]
             for task in layout.tasks
         }
@@ -149,14 +159,14 @@ class RackWriter:
         # written periodically.
         periodic = [box for box in layout.timed if box.writer != CLOCK and box.protocol != "queue"]
         self._ages = {
-            mailbox.name: Age(stream, mailbox, layout, colours[mailbox.writer])
+            mailbox.name: AgeWriter(stream, mailbox, layout, colours[mailbox.writer])
             for mailbox in periodic
         }
         for mailbox, age in self._ages.items():
-            parts_by_mailbox[mailbox].append(age.write)
+            parts_by_mailbox[mailbox].append(age.add_messages)
         self._parts = parts_by_task | parts_by_mailbox
-        self._events = Events(stream, ran.events, self._hierarchy, marks)
-        self._write_losses = row_losses(stream)
+        self._events = EventWriter(stream, ran.events, self._hierarchy, marks)
+        self._write_losses = build_loss_writer(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 
     def write(
@@ -170,21 +180,21 @@ class RackWriter:
             lost: Number of lost rows, by ring.
         """
         if (fastest := rows_by_ring.get(self._fastest)) is not None:
-            self._times.learn(fastest["tick"], fastest["start_ns"])
+            self._times.add_stamps(fastest["tick"], fastest["start_ns"])
         for ring, rows in rows_by_ring.items():
             block = RowBlock(rows, self._times)
             for write in self._parts[ring]:
                 write(block)
         for age in self._ages.values():
-            age.advance(tick)
-        self._events.advance()
-        self._hierarchy.advance()
+            age.write_ages(tick)
+        self._events.write_new_events()
+        self._hierarchy.write_changes()
         self._write_losses(tick, lost)
 
-    def skip(self, tick: int) -> None:
+    def skip_to(self, tick: int) -> None:
         """Continue at a tick before which nothing is recorded."""
         for age in self._ages.values():
-            age.skip(tick)
+            age.skip_to(tick)
 
 
 class ViewSink:
@@ -197,18 +207,18 @@ class ViewSink:
     def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
         layout = segment.layout
         launch = segment.launch
-        ran = Ran.of(layout, segment.config, folder)
-        view = blueprint(
-            RackViews(layout, ran.config, ran.cell).everything(), live=port is not None
+        ran = RunContext.from_config(layout, segment.config, folder)
+        view = build_blueprint(
+            RackViews(layout, ran.config, ran.cell).build_all_views(), live=port is not None
         )
         run = f"{folder.name}-{launch.created_ns}"
-        file = next_file(folder) if Retention.of(segment) is None else None
-        recording = new_recording(folder.name, run, file, view, port)
+        file = find_next_file(folder) if Retention.from_config(segment) is None else None
+        recording = open_recording(folder.name, run, file, view, port)
         self._stream = Stream(recording, Timelines(layout.clock_ns, launch))
         self._writer = RackWriter(self._stream, ran)
-        self._write_load = recorder_load(self._stream)
+        self._write_load = build_load_writer(self._stream)
         self._waiting: dict[str, list[np.ndarray]] = defaultdict(list)
-        self._block = block_of(layout)
+        self._block = compute_block_ticks(layout)
         self._written = segment.words[System.TICK]
         self._folder = folder
         self._part = round(PART_S * 1e9 / layout.clock_ns)
@@ -229,7 +239,7 @@ class ViewSink:
             self._stream.flush()
             if self._part_ends is not None and tick >= self._part_ends:
                 self._part_ends = tick + self._part
-                self._stream.continue_in(next_file(self._folder))
+                self._stream.continue_in(find_next_file(self._folder))
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
         """Write the remaining rows and finish the file. Raises `RuntimeError` if that fails."""
@@ -248,31 +258,31 @@ class ViewSink:
         self._write_load(tick)
 
 
-def block_of(layout: Layout) -> int:
+def compute_block_ticks(layout: Layout) -> int:
     """Return the number of ticks in a block."""
     return max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
 
 
-def _of_any(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
+def _build_mailbox_parts(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
     """Yield the parts that show a mailbox of any rack, chosen by its fields and message type."""
     names = {field.name for field in mailbox.fields}
     board, _, port = mailbox.name.partition(".")
     kind = mailbox.message
     if {"state", "error", "reason"} <= names and kind != ArmState.message_type.name:
-        yield from activity(stream, mailbox)
+        yield from build_state_lane(stream, mailbox)
     elif port == "command" and "id" in names and kind not in (*STREAMED, *STREAMED_DOWN):
-        yield value_lane(stream, (board, port), "id", numbered)
+        yield build_value_lane(stream, (board, port), "id", format_serial)
     if names.issuperset(FIRED):
-        yield fired_rows(stream, mailbox)
+        yield build_fired_lane(stream, mailbox)
     for message, what, fields, name in LANES:
         if kind == message.message_type.name:
-            yield value_lane(stream, (board, what), fields, name)
-    if kind not in UNCURVED:
-        yield from field_curves(stream, mailbox)
+            yield build_value_lane(stream, (board, what), fields, name)
+    if kind not in NOT_AS_CURVES:
+        yield from build_field_curves(stream, mailbox)
 
 
-def _of_arm(
-    stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell, goals: Goals
+def _build_arm_parts(
+    stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell, goals: GoalWriter
 ) -> Iterator[ViewPart]:
     """Yield the parts that show a mailbox in the cell, or as curves of the arm.
 
@@ -287,19 +297,19 @@ def _of_arm(
     assert robot is not None, "there is an arm"
     match mailbox.message:
         case ArmState.message_type.name:
-            yield Poses(stream, cell, bool(config.scene.push)).write
+            yield PoseWriter(stream, cell, bool(config.scene.push)).write
         case HandStatus.message_type.name if cell.hand is not None:
-            yield from hand_curves(stream, robot.joints, cell.hand)
-            yield contact_arrows(stream, cell, "force")
+            yield from build_hand_curves(stream, robot.joints, cell.hand)
+            yield build_contact_arrows(stream, cell, "force")
         case driving if driving in DRIVING:
-            yield from joint_curves(stream, robot.joints, cell, robot.gripper is not None)
+            yield from build_joint_curves(stream, robot.joints, cell, robot.gripper is not None)
         case Wrench.message_type.name if cell.wrist is not None:
-            yield contact_arrows(stream, cell, "wrench")
-            yield from contact_forces(stream, cell.wrist.most)
+            yield build_contact_arrows(stream, cell, "wrench")
+            yield from build_contact_curves(stream, cell.wrist.contact_limits)
         case ForceStatus.message_type.name:
-            yield from task_forces(stream)
+            yield from build_task_force_curves(stream)
         case MovePlan.message_type.name:
-            yield planned_path(stream, cell)
+            yield build_path_part(stream, cell)
         case TaskPlan.message_type.name:
             yield goals.write
         case MoveStatus.message_type.name:

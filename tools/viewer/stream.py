@@ -24,7 +24,7 @@ Ints = NDArray[np.int64]
 SIM_TIME = "sim_time"
 TICK = "tick"
 WALL = "wall"
-KEPT = 4096
+REMEMBERED_TICKS = 4096
 """Number of remembered pairs of tick and time, which place events that have no time stamp."""
 APPLICATION = "rack"
 LOG = "log"
@@ -65,7 +65,7 @@ class Timelines:
         self._ticks: Ints = np.zeros(1, dtype=np.int64)
         self._stamps: Ints = np.array([launch.monotonic_ns])
 
-    def times(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> RowTimes:
+    def compute_times(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> RowTimes:
         """Return the times of rows.
 
         Args:
@@ -75,10 +75,14 @@ class Timelines:
         """
         if (placed := self._placed) is None:
             return RowTimes(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
-        released = placed.times_ns(ticks, 0) // placed.line.clock_ns
-        return RowTimes(placed.times_ns(ticks, within_ns), released, placed.wall_ns(stamps_ns))
+        released = placed.convert_ticks(ticks, 0) // placed.line.clock_ns
+        return RowTimes(
+            placed.convert_ticks(ticks, within_ns),
+            released,
+            placed.convert_to_wall_clock(stamps_ns),
+        )
 
-    def columns(
+    def build_columns(
         self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0
     ) -> list[rr.TimeColumn]:
         """Return the times of rows as columns of the recording.
@@ -88,20 +92,20 @@ class Timelines:
             stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
             within_ns: Simulated time after the release.
         """
-        times = self.times(ticks, stamps_ns, within_ns)
+        times = self.compute_times(ticks, stamps_ns, within_ns)
         return [
             rr.TimeColumn(SIM_TIME, duration=times.simulated_ns.astype("timedelta64[ns]")),
             rr.TimeColumn(TICK, sequence=times.ticks),
             rr.TimeColumn(WALL, timestamp=times.wall_ns.astype("datetime64[ns]")),
         ]
 
-    def learn(self, ticks: Ints, stamps_ns: Ints) -> None:
+    def add_stamps(self, ticks: Ints, stamps_ns: Ints) -> None:
         """Remember the time stamps of ticks. Both arrays are sorted."""
         new = ticks > self._ticks[-1]
-        self._ticks = np.concatenate((self._ticks, ticks[new]))[-KEPT:]
-        self._stamps = np.concatenate((self._stamps, stamps_ns[new]))[-KEPT:]
+        self._ticks = np.concatenate((self._ticks, ticks[new]))[-REMEMBERED_TICKS:]
+        self._stamps = np.concatenate((self._stamps, stamps_ns[new]))[-REMEMBERED_TICKS:]
 
-    def stamps_of(self, ticks: Ints) -> Ints:
+    def estimate_stamps(self, ticks: Ints) -> Ints:
         """Return the approximate CLOCK_MONOTONIC time of ticks, ns."""
         # Interpolate relative to the newest stamp, because floats have only 53 bits.
         last = self._stamps[-1]
@@ -109,11 +113,11 @@ class Timelines:
             last + np.interp(ticks, self._ticks, self._stamps - last).astype(np.int64)
         )
 
-    def moment_of(self, tick: int) -> Moment:
+    def estimate_moment(self, tick: int) -> Moment:
         """Return a tick with its approximate time."""
-        return Moment(tick, int(self.stamps_of(np.array([tick]))[0]))
+        return Moment(tick, int(self.estimate_stamps(np.array([tick]))[0]))
 
-    def monotonic(self, time_ns: int) -> int:
+    def to_monotonic(self, time_ns: int) -> int:
         """Convert a CLOCK_REALTIME stamp to CLOCK_MONOTONIC."""
         return time_ns - self._offset_ns
 
@@ -138,19 +142,19 @@ class RowBlock:
         self._timelines = timelines
 
     @cached_property
-    def times(self) -> list[rr.TimeColumn]:
+    def time_columns(self) -> list[rr.TimeColumn]:
         """Time columns of all rows, built once for all parts that write them."""
-        return self._timelines.columns(self.ticks, self.stamps_ns)
+        return self._timelines.build_columns(self.ticks, self.stamps_ns)
 
-    def times_of(self, rows: Ints | list[int]) -> list[rr.TimeColumn]:
+    def build_time_columns(self, rows: Ints | list[int]) -> list[rr.TimeColumn]:
         """Return the time columns of the rows with these indices."""
-        return self._timelines.columns(self.ticks[rows], self.stamps_ns[rows])
+        return self._timelines.build_columns(self.ticks[rows], self.stamps_ns[rows])
 
-    def when(self, row: SupportsIndex) -> Moment:
+    def find_moment(self, row: SupportsIndex) -> Moment:
         """Return the time at which a row was written."""
         return Moment(int(self.ticks[row]), int(self.stamps_ns[row]))
 
-    def visible(self, row: SupportsIndex) -> Moment:
+    def find_visible_moment(self, row: SupportsIndex) -> Moment:
         """Return the tick at which a mailbox's row is visible, with the row's time stamp."""
         return Moment(int(self.rows["visible_at"][row]), int(self.stamps_ns[row]))
 
@@ -164,7 +168,7 @@ ViewPart = Callable[[RowBlock], None]
 """A function that writes one aspect of a mailbox or task to the stream, block by block."""
 
 
-def change_finder() -> Callable[[np.ndarray], Ints]:
+def build_change_finder() -> Callable[[np.ndarray], Ints]:
     """Return a function that finds the rows that differ from the row before.
 
     It takes the values of consecutive blocks, of shape (rows,) or structured, and returns indices
@@ -187,7 +191,7 @@ SHOWN_S = 0.02
 """Time between two drawn rows: the rate of a screen."""
 
 
-def row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
+def build_row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
     """Return a function that chooses the rows to draw, the first of every 20 ms of simulated time.
 
     It takes the ticks of consecutive blocks, and returns indices of rows.
@@ -206,7 +210,7 @@ def row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
     return sampled_rows
 
 
-def new_recording(
+def open_recording(
     name: str, run: str, file: Path | None, blueprint: rrb.Blueprint, port: int | None = None
 ) -> rr.RecordingStream:
     """Open a recording that is written into a file, served on a port of this machine, or both.
@@ -248,23 +252,23 @@ class Stream:
         self.times = times
         self._root = root
 
-    def frame(self, name: str) -> str:
+    def format_frame(self, name: str) -> str:
         """Return the full name of a coordinate frame, since frames of a recording are global."""
         return "/".join((*self._root, name))
 
-    def within(self, frame: str) -> rr.CoordinateFrame:
+    def build_frame(self, frame: str) -> rr.CoordinateFrame:
         """Return the component that puts an entity into a frame."""
-        return rr.CoordinateFrame(self.frame(frame))
+        return rr.CoordinateFrame(self.format_frame(frame))
 
-    def _path(self, entity: Sequence[str]) -> str:
+    def _build_path(self, entity: Sequence[str]) -> str:
         """Return the path of an entity, below the root."""
-        return path(*self._root, *entity)
+        return build_path(*self._root, *entity)
 
-    def static(self, entity: Sequence[str], *archetypes: rr.AsComponents) -> None:
+    def log_static(self, entity: Sequence[str], *archetypes: rr.AsComponents) -> None:
         """Log data that hold at all times."""
-        self._recording.log(self._path(entity), *archetypes, static=True)
+        self._recording.log(self._build_path(entity), *archetypes, static=True)
 
-    def columns(
+    def send_columns(
         self, entity: Sequence[str], times: list[rr.TimeColumn], columns: rr.ComponentColumnList
     ) -> None:
         """Send a block of rows.
@@ -274,9 +278,9 @@ class Stream:
             times: Times of the rows.
             columns: Components of the rows.
         """
-        self._recording.send_columns(self._path(entity), times, columns)
+        self._recording.send_columns(self._build_path(entity), times, columns)
 
-    def scalars(
+    def send_curves(
         self, entity: Sequence[str], times: list[rr.TimeColumn], values: np.ndarray
     ) -> None:
         """Send a block of curves.
@@ -286,9 +290,9 @@ class Stream:
             times: Times of the rows.
             values: Values, shape (rows,) or (rows, curves).
         """
-        self.columns(entity, times, rr.Scalars.columns(scalars=values))
+        self.send_columns(entity, times, rr.Scalars.columns(scalars=values))
 
-    def at(self, when: Moment, entity: Sequence[str], archetype: rr.AsComponents) -> None:
+    def log_at(self, when: Moment, entity: Sequence[str], archetype: rr.AsComponents) -> None:
         """Log a single item.
 
         Args:
@@ -296,15 +300,15 @@ class Stream:
             entity: The entity.
             archetype: The item.
         """
-        times = self.times.times(np.array([when.tick]), np.array([when.stamp_ns]))
+        times = self.times.compute_times(np.array([when.tick]), np.array([when.stamp_ns]))
         self._recording.set_time(
             SIM_TIME, duration=np.timedelta64(int(times.simulated_ns[0]), "ns")
         )
         self._recording.set_time(TICK, sequence=int(times.ticks[0]))
         self._recording.set_time(WALL, timestamp=np.datetime64(int(times.wall_ns[0]), "ns"))
-        self._recording.log(self._path(entity), archetype)
+        self._recording.log(self._build_path(entity), archetype)
 
-    def say(self, when: Moment, source: str, text: str, level: str) -> None:
+    def log_line(self, when: Moment, source: str, text: str, level: str) -> None:
         """Write a line to the log. Of a rack among several, it begins with the rack's name.
 
         Args:
@@ -314,9 +318,9 @@ class Stream:
             level: Log level of rerun.
         """
         line = rr.TextLog(": ".join((*self._root, text)), level=level)
-        self.at(when, (LOG, source), line)
+        self.log_at(when, (LOG, source), line)
 
-    def property(self, name: str, values: rr.AsComponents) -> None:
+    def log_property(self, name: str, values: rr.AsComponents) -> None:
         """Log a property of the run."""
         self._recording.send_property(" ".join((*self._root, name)), values)
 
@@ -333,6 +337,6 @@ class Stream:
         self._recording.disconnect()
 
 
-def path(*parts: str) -> str:
+def build_path(*parts: str) -> str:
     """Return the path of an entity from its parts."""
     return rr.new_entity_path(list(parts))

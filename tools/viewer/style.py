@@ -81,22 +81,22 @@ LETTERS = {"wait": " ", "read": "R", "process": "X", "plan": "P", "write": "W", 
 """Labels of phases, as in the paper's figures, because words would not fit into their spans."""
 
 
-def of_joint(index: int) -> Colour:
+def choose_joint_colour(index: int) -> Colour:
     """Return the colour of a joint by its index, from base to tool."""
     return _JOINTS[index % len(_JOINTS)]
 
 
-def of_joints(count: int) -> list[Colour]:
+def choose_joint_colours(count: int) -> list[Colour]:
     """Return the colours of `count` joints, from base to tool."""
-    return [of_joint(index) for index in range(count)]
+    return [choose_joint_colour(index) for index in range(count)]
 
 
-def dimmed(colour: Colour) -> Colour:
+def dim_colour(colour: Colour) -> Colour:
     """Return a colour with reduced opacity."""
     return colour & ~0xFF | 110
 
 
-def packed(colours: Iterable[Colour]) -> np.ndarray:
+def pack_colours(colours: Iterable[Colour]) -> np.ndarray:
     """Pack colours into an array, since rerun takes three or four plain numbers as one colour."""
     return np.array(list(colours), np.uint32)
 
@@ -115,11 +115,11 @@ def style_lane(
         colours: Colour of each state.
         labels: Label of each state. Defaults to the names of the states.
     """
-    shades = packed(colours.values())
+    shades = pack_colours(colours.values())
     shown_labels = list(colours)
     if labels is not None:
         shown_labels = [labels[name] for name in colours]
-    stream.static(
+    stream.log_static(
         entity, rr.StateConfiguration(values=list(colours), labels=shown_labels, colors=shades)
     )
 
@@ -140,11 +140,11 @@ def style_curves(
         colours: Their colours. By default the viewer chooses them.
         widths: Their widths. By default the viewer's.
     """
-    shades = None if colours is None else packed(colours)
-    stream.static(entity, rr.SeriesLines(names=names, colors=shades, widths=widths))
+    shades = None if colours is None else pack_colours(colours)
+    stream.log_static(entity, rr.SeriesLines(names=names, colors=shades, widths=widths))
 
 
-def curves(
+def build_curves(
     stream: Stream,
     entity: Sequence[str],
     values: Callable[[RowBlock], np.ndarray],
@@ -163,7 +163,7 @@ def curves(
         widths: Their widths. By default the viewer's.
     """
     style_curves(stream, entity, names, colours, widths)
-    return lambda block: stream.scalars(entity, block.times, values(block))
+    return lambda block: stream.send_curves(entity, block.time_columns, values(block))
 
 
 def write_legend(stream: Stream, what: str, names: Sequence[str], colours: list[Colour]) -> None:
@@ -176,11 +176,11 @@ def write_legend(stream: Stream, what: str, names: Sequence[str], colours: list[
         colours: Their colours.
     """
     places = [(0.0, LEGEND_ROW * row) for row in range(len(names))]
-    nodes = rr.GraphNodes(names, labels=names, positions=places, colors=packed(colours))
-    stream.static((LEGEND, what), nodes)
+    nodes = rr.GraphNodes(names, labels=names, positions=places, colors=pack_colours(colours))
+    stream.log_static((LEGEND, what), nodes)
 
 
-def legend_view(origin: str, name: str, names: Sequence[str]) -> rrb.View:
+def build_legend_view(origin: str, name: str, names: Sequence[str]) -> rrb.View:
     """Return a view of a legend.
 
     Args:
@@ -205,7 +205,7 @@ def write_spans(
         times: Times at which the states begin.
         states: The states.
     """
-    stream.columns(entity, times, rr.StateChange.columns(state=states))
+    stream.send_columns(entity, times, rr.StateChange.columns(state=states))
 
 
 def write_span(stream: Stream, when: Moment, entity: Sequence[str], state: str) -> None:
@@ -217,10 +217,10 @@ def write_span(stream: Stream, when: Moment, entity: Sequence[str], state: str) 
         entity: The lane.
         state: The state, or "" for none.
     """
-    stream.at(when, entity, rr.StateChange(state=state))
+    stream.log_at(when, entity, rr.StateChange(state=state))
 
 
-def lanes_view(name: str, contents: Sequence[str], around_s: float | None = None) -> rrb.View:
+def build_lanes_view(name: str, contents: Sequence[str], around_s: float | None = None) -> rrb.View:
     """Return a view of lanes.
 
     Args:

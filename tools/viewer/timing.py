@@ -8,11 +8,11 @@ import numpy as np
 
 from rack.backplane.layout import Layout, MailboxSpec, TaskSpec, TickGrid
 from rack.boards.timing.trace_times import (
-    execution_ns,
-    is_missed,
-    lateness_ns,
-    newest_visible,
-    response_ns,
+    compute_execution_ns,
+    compute_lateness_ns,
+    compute_response_ns,
+    find_missed,
+    find_newest_visible,
 )
 from rack.tools.viewer.levels import LEVELS
 from rack.tools.viewer.stream import Ints, RowBlock, Stream, ViewPart
@@ -22,9 +22,9 @@ from rack.tools.viewer.style import (
     LIMIT,
     PHASES,
     Colour,
-    curves,
-    dimmed,
-    of_joint,
+    build_curves,
+    choose_joint_colour,
+    dim_colour,
     style_curves,
     style_lane,
     write_spans,
@@ -40,7 +40,7 @@ SPAN_S = 0.25
 """Time that is marked around a missed cycle, which itself would be too narrow to see."""
 
 
-def cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> ViewPart:
+def build_cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> ViewPart:
     """Return the part that shows each cycle as four spans: read, process or plan, write, wait.
 
     Missed cycles are red. In real time the spans have their position on the wall clock, scaled to
@@ -68,26 +68,26 @@ def cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> 
             within = np.minimum(within, last_ns + np.arange(len(MOMENTS)))
         ticks = np.repeat(block.ticks, len(MOMENTS))
         states = np.array([["read", work, "write", "wait"]] * len(rows))
-        states[is_missed(rows), :3] = MISSED
-        times = stream.times.columns(ticks, moments.ravel(), within.ravel())
+        states[find_missed(rows), :3] = MISSED
+        times = stream.times.build_columns(ticks, moments.ravel(), within.ravel())
         write_spans(stream, lane, times, states.ravel().tolist())
 
     return write
 
 
-def boards_of(layout: Layout) -> list[str]:
+def list_boards(layout: Layout) -> list[str]:
     """Return the boards in the order of their tasks."""
     return list(dict.fromkeys(task.board for task in layout.tasks))
 
 
-def colours_of(layout: Layout) -> dict[str, Colour]:
+def choose_task_colours(layout: Layout) -> dict[str, Colour]:
     """Return a colour for each task, by name. A planner has the dimmed colour of its board."""
-    boards = boards_of(layout)
-    by_task = {task.name: of_joint(boards.index(task.board)) for task in layout.tasks}
-    return {name: dimmed(colour) if "." in name else colour for name, colour in by_task.items()}
+    boards = list_boards(layout)
+    by_task = {task.name: choose_joint_colour(boards.index(task.board)) for task in layout.tasks}
+    return {name: dim_colour(colour) if "." in name else colour for name, colour in by_task.items()}
 
 
-def load_curves(
+def build_load_curves(
     stream: Stream, task: TaskSpec, colour: Colour, period_ns: int, is_lockstep: bool
 ) -> Iterator[ViewPart]:
     """Yield the parts that show the times of a task as curves.
@@ -109,25 +109,25 @@ def load_curves(
         """Return lateness, execution and deadline of each cycle, (rows, 3), ms."""
         rows = block.rows
         columns = np.full((len(rows), 3), np.nan)
-        columns[:, 1] = execution_ns(rows) * 1e-6
+        columns[:, 1] = compute_execution_ns(rows) * 1e-6
         if not is_lockstep:
-            columns[:, 0] = lateness_ns(rows) * 1e-6
+            columns[:, 0] = compute_lateness_ns(rows) * 1e-6
             columns[:, 2] = slice_ns * 1e-6
         return columns
 
     names = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
-    yield curves(stream, (TIMES, task.name), times_ms, names, [COMMANDED, colour, LIMIT])
+    yield build_curves(stream, (TIMES, task.name), times_ms, names, [COMMANDED, colour, LIMIT])
     if not is_lockstep:
-        yield curves(
+        yield build_curves(
             stream,
             (LOAD, task.name),
-            lambda block: response_ns(block.rows) * (100.0 / slice_ns),
+            lambda block: compute_response_ns(block.rows) * (100.0 / slice_ns),
             [f"{task.name}, %"],
             [colour],
         )
 
 
-def missed_cycles(stream: Stream, task: TaskSpec) -> ViewPart:
+def build_miss_lane(stream: Stream, task: TaskSpec) -> ViewPart:
     """Return the part that shows missed cycles as a lane, and as one log line per block.
 
     The lane is visible at any zoom. A task that never misses has no lane.
@@ -137,7 +137,7 @@ def missed_cycles(stream: Stream, task: TaskSpec) -> ViewPart:
 
     def write(block: RowBlock) -> None:
         """Mark the missed cycles of a block, and log them."""
-        missed = np.flatnonzero(is_missed(block.rows))
+        missed = np.flatnonzero(find_missed(block.rows))
         if not len(missed):
             return
         style_lane(stream, lane, {MISSED: PHASES[MISSED]})
@@ -145,17 +145,21 @@ def missed_cycles(stream: Stream, task: TaskSpec) -> ViewPart:
         which = f"tick {ticks[0]}"
         if len(ticks) > 1:
             which = f"{len(ticks)} cycles, ticks {ticks[0]} to {ticks[-1]}"
-        stream.say(block.when(missed[0]), "misses", f"missed: {task.name}: {which}", "WARN")
+        stream.log_line(
+            block.find_moment(missed[0]), "misses", f"missed: {task.name}: {which}", "WARN"
+        )
         marked = np.unique(ticks // span)
         moments = np.union1d(marked, marked + 1)
         states = np.where(np.isin(moments, marked), MISSED, "")
-        times = stream.times.columns(moments * span, stream.times.stamps_of(moments * span))
+        times = stream.times.build_columns(
+            moments * span, stream.times.estimate_stamps(moments * span)
+        )
         write_spans(stream, lane, times, states.tolist())
 
     return write
 
 
-class Age:
+class AgeWriter:
     """Writes the age of a mailbox's visible message, ms, at every release of its fastest reader."""
 
     def __init__(
@@ -165,38 +169,40 @@ class Age:
         self._lane = (AGES, mailbox.name)
         own_grid = TickGrid(mailbox.every, mailbox.phase)
         self._releases = min(
-            [layout.read_grid(mailbox, reader) for reader in mailbox.readers], default=own_grid
+            [layout.find_read_grid(mailbox, reader) for reader in mailbox.readers], default=own_grid
         )
         self._visible_at: Ints = np.empty(0, dtype=np.int64)
         self._made: Ints = np.empty(0, dtype=np.int64)
         self._upto = -1
         style_curves(stream, self._lane, [f"{mailbox.name}, ms"], [colour])
 
-    def write(self, block: RowBlock) -> None:
+    def add_messages(self, block: RowBlock) -> None:
         """Add messages. They count from the tick at which they become visible."""
         self._visible_at = np.concatenate((self._visible_at, block.rows["visible_at"]))
         self._made = np.concatenate((self._made, block.ticks))
 
-    def skip(self, tick: int) -> None:
+    def skip_to(self, tick: int) -> None:
         """Continue at a tick, without any message from before."""
         self._upto = tick - 1
         self._visible_at = self._visible_at[:0]
         self._made = self._made[:0]
 
-    def advance(self, tick: int) -> None:
+    def write_ages(self, tick: int) -> None:
         """Write the ages at all releases before `tick`.
 
         All messages that were visible before that tick must have been added.
         """
-        releases = np.arange(self._releases.since(self._upto + 1), tick, self._releases.every)
+        releases = np.arange(self._releases.find_tick(self._upto + 1), tick, self._releases.every)
         self._upto = max(self._upto, tick - 1)
-        newest = newest_visible(releases, self._visible_at)
+        newest = find_newest_visible(releases, self._visible_at)
         releases = releases[newest >= 0]
         newest = newest[newest >= 0]
         if not len(releases):
             return
         times = self._stream.times
         ages = (releases - self._made[newest]) * times.clock_ns * 1e-6
-        self._stream.scalars(self._lane, times.columns(releases, times.stamps_of(releases)), ages)
+        self._stream.send_curves(
+            self._lane, times.build_columns(releases, times.estimate_stamps(releases)), ages
+        )
         self._visible_at = self._visible_at[newest[-1] :]
         self._made = self._made[newest[-1] :]

@@ -18,7 +18,7 @@ from pathlib import Path
 from rack.tools.console.answer import Failure
 
 HOST = "127.0.0.1"
-PANIC = "panicked at "
+PANIC_TEXT = "panicked at "
 
 
 class ViewerWindow:
@@ -35,7 +35,7 @@ class ViewerWindow:
                 f" run: rerun {' '.join(sources)}"
             )
         # By default the viewer would listen on all network interfaces.
-        command = [executable(), "--bind", HOST, *sources]
+        command = [find_executable(), "--bind", HOST, *sources]
         if headless:
             command += ["--headless", "--hide-welcome-screen"]
         if port is not None:
@@ -52,24 +52,24 @@ class ViewerWindow:
         )
         self._is_reported = False
 
-    def news(self) -> list[str]:
+    def read_news(self) -> list[str]:
         """Return once how the window ended, and nothing while it is open."""
         if self._is_reported or self.is_open:
             return []
         self._is_reported = True
-        return [self.wait() or "the viewer was closed"]
+        return [self.wait_until_closed() or "the viewer was closed"]
 
-    def wait(self) -> str:
+    def wait_until_closed(self) -> str:
         """Wait until the window is closed. Returns the error, or "" if there was none."""
         if (status := self._process.wait()) == 0:
             return ""
         self._said.seek(0)
         lines = self._said.read().decode(errors="replace").strip().splitlines()
         # A panic prints its cause before the trace.
-        panic = [line.partition(PANIC)[2] for line in lines if PANIC in line]
+        panic = [line.partition(PANIC_TEXT)[2] for line in lines if PANIC_TEXT in line]
         return ": ".join([f"the viewer ended with status {status}", *(panic or lines[-1:])[:1]])
 
-    def ends_within(self, bound_s: float) -> bool:
+    def wait_for_end(self, bound_s: float) -> bool:
         """Wait at most `bound_s` for the window to end. Returns True if it has."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(bound_s)
@@ -95,7 +95,7 @@ def has_screen() -> bool:
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
-def executable() -> str:
+def find_executable() -> str:
     """Return the path of the installed viewer. Raises `Failure` if there is none."""
     beside_python = Path(sys.executable).with_name("rerun")
     path = str(beside_python) if beside_python.is_file() else shutil.which("rerun")
@@ -104,13 +104,13 @@ def executable() -> str:
     return path
 
 
-def free_port() -> int:
+def find_free_port() -> int:
     """Return a free port of this machine."""
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
 
 
-def url(port: int) -> str:
+def format_url(port: int) -> str:
     """Return the address of the stream that a recorder serves on a port."""
     return f"rerun+http://{HOST}:{port}/proxy"

@@ -20,63 +20,63 @@ NETWORK = "rack.boards.config.rules.lan"
 """Module with the rules of `[adapter.lan]`. Only a rack with a network loads it."""
 
 
-def network_rules(config: RackConfig) -> ModuleType | None:
+def load_network_rules(config: RackConfig) -> ModuleType | None:
     """Return the module with the network rules. None for a rack without a network."""
     return None if config.adapter.lan is None else import_module(NETWORK)
 
 
-def _network(wiring: Wiring) -> Mistakes:
-    if (rules := network_rules(wiring.config)) is not None:
+def _check_network(wiring: Wiring) -> Mistakes:
+    if (rules := load_network_rules(wiring.config)) is not None:
         yield from rules.check_network(wiring, wiring.config.adapter.lan)
 
 
 Rule = Callable[[Wiring], Mistakes]
 RULES: tuple[Rule, ...] = (
-    boards.boards,
-    boards.hosts,
-    boards.circles,
-    boards.slots,
-    boards.ends,
-    boards.record,
-    _network,
-    levels.scene,
-    levels.robot,
-    boards.clock,
-    boards.rates,
-    boards.polling,
-    boards.reservations,
-    boards.schedule,
-    mailboxes.strict,
-    mailboxes.ports,
-    mailboxes.exchange,
-    mailboxes.writers,
-    mailboxes.operated,
-    mailboxes.reads,
-    mailboxes.mailboxes,
-    mailboxes.statuses,
-    mailboxes.sides,
-    mailboxes.queues,
-    mailboxes.asynchronous,
-    mailboxes.interrupts,
-    levels.params,
-    levels.programs,
-    levels.cell,
+    boards.check_boards,
+    boards.check_hosts,
+    boards.check_circles,
+    boards.check_slots,
+    boards.check_ends,
+    boards.check_record,
+    _check_network,
+    levels.check_scene,
+    levels.check_robot,
+    boards.check_clock,
+    boards.check_rates,
+    boards.check_polling,
+    boards.check_reservations,
+    boards.check_schedule,
+    mailboxes.check_strict,
+    mailboxes.check_ports,
+    mailboxes.check_exchange,
+    mailboxes.check_writers,
+    mailboxes.check_operated,
+    mailboxes.check_reads,
+    mailboxes.check_protocols,
+    mailboxes.check_statuses,
+    mailboxes.check_sides,
+    mailboxes.check_queues,
+    mailboxes.check_asynchronous,
+    mailboxes.check_interrupts,
+    levels.check_params,
+    levels.check_programs,
+    levels.check_cell,
 )
 """All rules, in the order in which their mistakes are listed."""
 NEEDS: Mapping[Rule, set[str]] = {
-    levels.scene: {"scene"},
-    levels.robot: {"robot"},
-    boards.clock: {"clock"},
-    boards.rates: {"clock"},
-    boards.polling: {"clock"},
-    boards.reservations: {"clock"},
-    boards.schedule: {"clock"},
-    levels.programs: {"robot", "scene", "task"},
+    levels.check_scene: {"scene"},
+    levels.check_robot: {"robot"},
+    boards.check_clock: {"clock"},
+    boards.check_rates: {"clock"},
+    boards.check_polling: {"clock"},
+    boards.check_reservations: {"clock"},
+    boards.check_schedule: {"clock"},
+    levels.check_programs: {"robot", "scene", "task"},
 }
 """Tables that a rule depends on. The rule is skipped if one of them is broken."""
 
 
-def broken_rules(wiring: Wiring) -> list[Mistake]:
+def apply_rules(wiring: Wiring) -> list[Mistake]:
     """Return the mistakes that all applicable rules find in a wiring."""
     rules = (rule for rule in RULES if not wiring.broken & NEEDS.get(rule, set()))
     return [mistake for rule in rules for mistake in rule(wiring)]

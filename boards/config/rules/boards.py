@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.clock.system_clock import rate_text
+from rack.backplane.clock.system_clock import format_rate
 from rack.backplane.errors import ClockError
 from rack.boards.config.connections import Wiring
 from rack.boards.config.files import LAN_ADAPTER
-from rack.boards.config.mistakes import repeated
+from rack.boards.config.mistakes import report_repeated_names
 from rack.boards.config.record import RecordConfig
 from rack.boards.config.schema import (
     LAN,
@@ -21,7 +21,7 @@ from rack.boards.config.schema import (
     RackConfig,
     ScheduleConfig,
 )
-from rack.boards.config.timing import PLANNER_BUDGET, frames
+from rack.boards.config.timing import PLANNER_BUDGET, compute_frames
 from rack.boards.errors import Mistake, Mistakes
 
 RESERVED = (CLOCK, "above", "below", "own")
@@ -30,49 +30,51 @@ PLANNER_TRANSFER = ("exchange_ms", "update_ms")
 BOARD_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
 
 
-def boards(wiring: Wiring) -> Mistakes:
+def check_boards(wiring: Wiring) -> Mistakes:
     """Check names, neighbours and planners of the boards."""
     known = [*wiring.config.board, *wiring.broken_boards]
     for name, board in wiring.config.board.items():
         place = f"board.{name}"
-        yield from _name(place, name)
+        yield from _check_name(place, name)
         others = [other for other in known if other != name]
         for key, neighbours in (("above", board.above), ("below", board.below)):
-            yield from _neighbours(f"{place}.{key}", neighbours, others, "other board")
-        yield from _planner(place, board)
+            yield from _check_neighbours(f"{place}.{key}", neighbours, others, "other board")
+        yield from _check_planner(place, board)
         if board.executor == LAN_ADAPTER and (name != LAN or wiring.config.adapter.lan is None):
             why = "this class needs the table [adapter.lan], which adds its board"
             yield Mistake(f"{place}.executor", board.executor, why)
 
 
-def hosts(wiring: Wiring) -> Mistakes:
+def check_hosts(wiring: Wiring) -> Mistakes:
     """Check names and neighbours of the host boards."""
     known = [*wiring.config.board, *wiring.broken_boards]
     for name, host in wiring.config.host.items():
         place = f"host.{name}"
-        yield from _name(place, name)
+        yield from _check_name(place, name)
         if name in known:
             yield Mistake(place, None, f"board.{name} already has this name")
-        yield from _neighbours(f"{place}.below", host.below, known, "board")
+        yield from _check_neighbours(f"{place}.below", host.below, known, "board")
 
 
-def _neighbours(place: str, names: Sequence[str], boards: Sequence[str], noun: str) -> Mistakes:
+def _check_neighbours(
+    place: str, names: Sequence[str], boards: Sequence[str], noun: str
+) -> Mistakes:
     """Check that the neighbours listed at a place exist; `noun` says in a mistake what they are."""
     for name in names:
         if name not in boards:
             yield Mistake(
                 place, name, f"no {noun} has this name; boards: {', '.join(boards) or 'none'}"
             )
-    yield from repeated(place, names)
+    yield from report_repeated_names(place, names)
 
 
-def _name(place: str, name: str) -> Mistakes:
+def _check_name(place: str, name: str) -> Mistakes:
     if not BOARD_NAME.fullmatch(name) or name in RESERVED:
         why = f"valid: at most 31 of a-z, 0-9 and _, except {', '.join(RESERVED)}"
         yield Mistake(place, None, f"invalid name for a board; {why}")
 
 
-def _planner(place: str, board: BoardConfig) -> Mistakes:
+def _check_planner(place: str, board: BoardConfig) -> Mistakes:
     """Check that the keys for a planner fit its coupling, or are absent without a planner."""
     has_planner = board.planner is not None
     is_loose = board.coupling == "loose"
@@ -106,10 +108,10 @@ def _planner(place: str, board: BoardConfig) -> Mistakes:
                     )
 
 
-def circles(wiring: Wiring) -> Mistakes:
+def check_circles(wiring: Wiring) -> Mistakes:
     """Report a circle among the levels, which would have no highest or lowest level."""
     config = wiring.config
-    links = list(config.links())
+    links = list(config.list_links())
     try:
         TopologicalSorter(
             {name: [upper for upper, lower in links if lower == name] for name in config.board}
@@ -118,8 +120,8 @@ def circles(wiring: Wiring) -> Mistakes:
         circle = error.args[1][:-1]
         pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
         # The likely mistake is a link that only one of its two boards names.
-        upper, lower = min(reversed(pairs), key=lambda link: len(_named_by(config, *link)))
-        board, key, end = _named_by(config, upper, lower)[0]
+        upper, lower = min(reversed(pairs), key=lambda link: len(_find_declarations(config, *link)))
+        board, key, end = _find_declarations(config, upper, lower)[0]
         at = circle.index(lower)
         walk = " -> ".join([*circle[at:], *circle[:at], lower])
         why = f"the levels form a circle, {walk}; the {end} level has no {key}"
@@ -127,7 +129,7 @@ def circles(wiring: Wiring) -> Mistakes:
         yield Mistake(f"board.{board}.{key}", other, why)
 
 
-def _named_by(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
+def _find_declarations(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
     """Return where the config puts board `upper` above board `lower`.
 
     Returns:
@@ -142,7 +144,7 @@ def _named_by(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str
     ]
 
 
-def slots(wiring: Wiring) -> Mistakes:
+def check_slots(wiring: Wiring) -> Mistakes:
     """Check that no two boards have the same slot."""
     taken: dict[int, str] = {}
     for name, board in wiring.config.board.items():
@@ -154,7 +156,7 @@ def slots(wiring: Wiring) -> Mistakes:
                 taken[slot] = place
 
 
-def ends(wiring: Wiring) -> Mistakes:
+def check_ends(wiring: Wiring) -> Mistakes:
     """Check that at most one board ends the run."""
     ending = [name for name, board in wiring.config.board.items() if board.ends_run]
     for name in ending[1:]:
@@ -165,7 +167,7 @@ def ends(wiring: Wiring) -> Mistakes:
         )
 
 
-def record(wiring: Wiring) -> Mistakes:
+def check_record(wiring: Wiring) -> Mistakes:
     """Check that `before` and `after` are given only for a flight recorder."""
     table = wiring.config.record
     if table.keep is None:
@@ -180,7 +182,7 @@ LONGEST_MAJOR = 10_000
 """Longest major frame, ticks. The timing model simulates two major frames."""
 
 
-def clock(wiring: Wiring) -> Mistakes:
+def check_clock(wiring: Wiring) -> Mistakes:
     """Check the length of a tick in simulated time and in real time."""
     config = wiring.config
     clock = wiring.config.clock
@@ -201,7 +203,7 @@ def clock(wiring: Wiring) -> Mistakes:
         yield Mistake("clock.speed", clock.speed, why)
 
 
-def rates(wiring: Wiring) -> Mistakes:
+def check_rates(wiring: Wiring) -> Mistakes:
     """Check that each board's period is given once, is a multiple of ticks, and is not too long."""
     for name, board in wiring.config.board.items():
         place = f"board.{name}.rate_hz"
@@ -212,7 +214,7 @@ def rates(wiring: Wiring) -> Mistakes:
             yield Mistake(place, board.rate_hz, why)
             continue
         try:
-            every = wiring.config.every(name)
+            every = wiring.config.find_period(name)
         except ClockError as error:
             yield Mistake(place, None, str(error))
             continue
@@ -227,13 +229,13 @@ def rates(wiring: Wiring) -> Mistakes:
             yield Mistake(f"board.{name}.phase", board.phase, why)
 
 
-def polling(wiring: Wiring) -> Mistakes:
+def check_polling(wiring: Wiring) -> Mistakes:
     """Check that a board that busy-waits has a core to itself.
 
     At a real-time priority it would starve all other processes on its core.
     """
     config = wiring.config
-    cores = {CLOCK: config.clock.core} | {place.name: place.core for place in config.tasks()}
+    cores = {CLOCK: config.clock.core} | {place.name: place.core for place in config.list_tasks()}
     for name, board in config.board.items():
         others = [other for other, core in cores.items() if core == board.core and other != name]
         if (board.wake or config.clock.wake) == "poll" and others:
@@ -241,7 +243,7 @@ def polling(wiring: Wiring) -> Mistakes:
             yield Mistake(f"board.{name}.wake", "poll", why)
 
 
-def reservations(wiring: Wiring) -> Mistakes:
+def check_reservations(wiring: Wiring) -> Mistakes:
     """Check that each board can reserve processor time under earliest deadline first."""
     config = wiring.config
     if config.clock.scheduler == "fixed-priority":
@@ -262,25 +264,25 @@ def reservations(wiring: Wiring) -> Mistakes:
             yield Mistake("clock.scheduler", config.clock.scheduler, why)
 
 
-def schedule(wiring: Wiring) -> Mistakes:
+def check_schedule(wiring: Wiring) -> Mistakes:
     """Check the frames of a static schedule and, if they are valid, the cycles of the boards."""
     table = wiring.config.schedule
     if table is not None:
-        mistakes = list(_frames(table, wiring.config.clock_ns))
-        yield from mistakes or _cycles(wiring, table)
+        mistakes = list(_check_frames(table, wiring.config.clock_ns))
+        yield from mistakes or _check_cycles(wiring, table)
 
 
-def _frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
+def _check_frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
     tick_ms = clock_ns * 1e-6
-    minor, major = frames(table, clock_ns)
+    minor, major = compute_frames(table, clock_ns)
     if minor < 1 or abs(minor * tick_ms - table.minor_ms) > 1e-6 * tick_ms:
         why = (
             f"not a whole number of ticks of {tick_ms:g} ms; nearest:"
-            f" {_nearest(table.minor_ms, tick_ms)} ms"
+            f" {_format_nearest(table.minor_ms, tick_ms)} ms"
         )
         yield Mistake("schedule.minor_ms", table.minor_ms, why)
     elif major % minor or not major or abs(major * tick_ms - table.major_ms) > 1e-6 * tick_ms:
-        near = _nearest(table.major_ms, table.minor_ms)
+        near = _format_nearest(table.major_ms, table.minor_ms)
         why = f"not a multiple of minor_ms, {table.minor_ms:g} ms; nearest: {near} ms"
         yield Mistake("schedule.major_ms", table.major_ms, why)
     elif major > LONGEST_MAJOR:
@@ -291,16 +293,16 @@ def _frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
         yield Mistake("schedule.major_ms", table.major_ms, why)
 
 
-def _nearest(value: float, step: float) -> str:
+def _format_nearest(value: float, step: float) -> str:
     """Return the multiples of `step` next to a value that is not one, as text."""
     below = int(value / step)
     return " or ".join(f"{number * step:.12g}" for number in (below, below + 1) if number)
 
 
-def _cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
+def _check_cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
     """Check that the cycle of each board fits the frames."""
     clock_ns = wiring.config.clock_ns
-    minor, major = frames(table, clock_ns)
+    minor, major = compute_frames(table, clock_ns)
     tick_ms = clock_ns * 1e-6
     fitting = [
         minor * number for number in range(1, major // minor + 1) if major % (minor * number) == 0
@@ -314,7 +316,7 @@ def _cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
         above = [cycle for cycle in fitting if cycle > every]
         rates = " or ".join(
             f"{(ms := cycle * tick_ms):g} ms, "
-            + (f"{rate_text(1e3 / ms)} Hz" if key == "rate_hz" else f"every {cycle}")
+            + (f"{format_rate(1e3 / ms)} Hz" if key == "rate_hz" else f"every {cycle}")
             for cycle in (*below[-1:], *above[:1])
         )
         why = (

@@ -13,54 +13,54 @@ from datetime import UTC, datetime, timedelta
 from importlib.util import find_spec
 from pathlib import Path
 
-from rack.backplane.clock.system_clock import ticks_of
+from rack.backplane.clock.system_clock import compute_period_ticks
 from rack.backplane.errors import ClockError
-from rack.boards.config.connections import Wiring, is_taken
-from rack.boards.config.mistakes import repeats
+from rack.boards.config.connections import Wiring, is_adapter_name_taken
+from rack.boards.config.mistakes import count_repeated_names
 from rack.boards.config.schema import LAN, LanConfig, RackConfig
 from rack.boards.errors import Mistake, Mistakes
 from rack.boards.host.adapter import STATUS
 from rack.boards.lan.config import FASTEST_HZ, ExportConfig, ImportConfig, LanTable
-from rack.boards.lan.endpoint import Endpoint, endpoints_of, has_tls
-from rack.levels.peer import peer_port
+from rack.boards.lan.endpoint import Endpoint, has_tls, list_endpoints
+from rack.levels.peer import format_peer_port
 
 PLACE = "adapter.lan"
-ITSELF = f"board.{LAN}"
+BOARD_PLACE = f"board.{LAN}"
 INSTALL = "an exchange with other racks needs eclipse-zenoh: pip install 'nasrem-rack[lan]'"
 SLOWER = "export the slower mailboxes of the task and elemental-move levels"
-_OWN = re.compile(rf"\bboard\.{LAN}(\.params)?(?=[.\[]|\b)")
+_BOARD_PATTERN = re.compile(rf"\bboard\.{LAN}(\.params)?(?=[.\[]|\b)")
 _MAILBOX = f"mailbox {LAN}."
 
 
 def check_network(wiring: Wiring, table: LanConfig) -> Mistakes:
     """Check the table `[adapter.lan]` and everything that it names."""
-    yield from _endpoints(table)
-    if is_taken(wiring.config):
+    yield from _check_endpoints(table)
+    if is_adapter_name_taken(wiring.config):
         why = f"[{PLACE}] adds a board of this name; rename this board, or remove one of them"
-        yield Mistake(ITSELF, None, why)
+        yield Mistake(BOARD_PLACE, None, why)
     else:
-        yield from _board(wiring, table)
+        yield from _check_board(wiring, table)
     for port, export in table.exports.items():
-        for why in _export(wiring, export.source):
+        for why in _explain_export(wiring, export.source):
             yield Mistake(f"{PLACE}.export.{port}.from", export.source, why)
     for port, entry in table.imports.items():
         try:
-            entry.message_class()
+            entry.find_message_class()
         except LookupError as error:
             yield Mistake(f"{PLACE}.import.{port}.type", entry.type, str(error))
 
 
-def _board(wiring: Wiring, table: LanConfig) -> Mistakes:
+def _check_board(wiring: Wiring, table: LanConfig) -> Mistakes:
     """Check the rates, the priority and the names of the adapter's board."""
     config = wiring.config
-    yield from _names(table, config.name)
+    yield from _check_names(table, config.name)
     if LAN in wiring.every:
         cycle_ns = wiring.every[LAN] * config.clock_ns
         for key, entries in (("export", table.exports), ("import", table.imports)):
             for port, entry in entries.items():
-                yield from _rate(f"{PLACE}.{key}.{port}", entry, cycle_ns)
+                yield from _check_rate(f"{PLACE}.{key}.{port}", entry, cycle_ns)
     if not config.is_lockstep:
-        yield from _priority(config, table)
+        yield from _check_priority(config, table)
         if config.protocol.strict:
             why = (
                 "messages of other racks make a run depend on timing, which protocol.strict = true"
@@ -69,7 +69,7 @@ def _board(wiring: Wiring, table: LanConfig) -> Mistakes:
             yield Mistake(PLACE, None, why)
 
 
-def _names(table: LanTable, rack: str) -> Mistakes:
+def _check_names(table: LanTable, rack: str) -> Mistakes:
     """Check the names of racks and ports.
 
     No mailbox may be listed twice, no rack may be this one, and no port may have a name under
@@ -77,7 +77,7 @@ def _names(table: LanTable, rack: str) -> Mistakes:
     """
     taken = {
         STATUS: "its status",
-        **{peer_port(other): f"the state of rack '{other}'" for other in table.racks},
+        **{format_peer_port(other): f"the state of rack '{other}'" for other in table.racks},
     }
     for port, entry in table.imports.items():
         place = f"{PLACE}.import.{port}"
@@ -92,7 +92,7 @@ def _names(table: LanTable, rack: str) -> Mistakes:
                 "this mailbox belongs to this rack, whose levels can read it directly",
             )
     for key, entries in (("export", table.exports), ("import", table.imports)):
-        for source, count in repeats(entry.source for entry in entries.values()):
+        for source, count in count_repeated_names(entry.source for entry in entries.values()):
             ports = ", ".join(port for port, entry in entries.items() if entry.source == source)
             yield Mistake(
                 f"{PLACE}.{key}",
@@ -101,8 +101,8 @@ def _names(table: LanTable, rack: str) -> Mistakes:
             )
     if rack in table.peers:
         yield Mistake(f"{PLACE}.peers", rack, "this is the name of this rack itself")
-    for port, _ in repeats(map(peer_port, table.racks)):
-        equivalent = [other for other in table.racks if peer_port(other) == port]
+    for port, _ in count_repeated_names(map(format_peer_port, table.racks)):
+        equivalent = [other for other in table.racks if format_peer_port(other) == port]
         why = (
             f"these names differ only in '-' and '_', so they would share mailbox {LAN}.{port};"
             " rename a rack"
@@ -110,7 +110,7 @@ def _names(table: LanTable, rack: str) -> Mistakes:
         yield Mistake(f"{PLACE}.peers", equivalent, why)
 
 
-def _rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Mistakes:
+def _check_rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Mistakes:
     """Check the rate of an exchange and, for an import, the longest permitted age of a message.
 
     Args:
@@ -120,7 +120,7 @@ def _rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Mist
     """
     grid = ("of the adapter", "cycle")
     try:
-        every = ticks_of(entry.rate_hz, cycle_ns, "exchange", grid, FASTEST_HZ)
+        every = compute_period_ticks(entry.rate_hz, cycle_ns, "exchange", grid, FASTEST_HZ)
     except ClockError as error:
         yield Mistake(f"{place}.rate_hz", entry.rate_hz, str(error))
         return
@@ -134,12 +134,14 @@ def _rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Mist
             yield Mistake(f"{place}.max_age_ms", entry.max_age_ms, why)
 
 
-def _priority(config: RackConfig, table: LanConfig) -> Mistakes:
+def _check_priority(config: RackConfig, table: LanConfig) -> Mistakes:
     """Check that the adapter has a higher priority than real-time boards on its core.
 
     They could delay its signs of life, and other racks would take this one for lost.
     """
-    others = [place for place in config.tasks() if place.core == table.core and place.board != LAN]
+    others = [
+        place for place in config.list_tasks() if place.core == table.core and place.board != LAN
+    ]
     above = [
         f"{place.name} {place.priority}"
         for place in others
@@ -153,15 +155,15 @@ def _priority(config: RackConfig, table: LanConfig) -> Mistakes:
         yield Mistake(f"{PLACE}.priority", table.priority, why)
 
 
-def _export(wiring: Wiring, source: str) -> Iterator[str]:
+def _explain_export(wiring: Wiring, source: str) -> Iterator[str]:
     """Yield why a mailbox cannot be exported. The rule for queues reports exported queues."""
     board = source.partition(".")[0]
     if board == LAN:
         yield "the adapter itself writes it; only mailboxes of levels can be exported"
-    elif source in wiring.operated:
+    elif source in wiring.operator_mailboxes:
         yield "operator commands stay in their rack; only mailboxes of levels can be exported"
     elif not wiring.is_known(source):
-        yield f"no such mailbox; mailboxes: {wiring.names}"
+        yield f"no such mailbox; mailboxes: {wiring.mailbox_names}"
     elif source in wiring.writers and board in wiring.every:
         every = wiring.every[board] * wiring.writers[source][1].cycles
         rate_hz = 1e9 / (every * wiring.config.clock_ns)
@@ -173,32 +175,36 @@ def _export(wiring: Wiring, source: str) -> Iterator[str]:
 def move_to_adapter(mistake: Mistake, config: RackConfig) -> Mistake:
     """Return a mistake with places on the adapter's board changed to places in `[adapter.lan]`."""
     table = config.adapter.lan
-    if table is None or mistake.place == ITSELF:
+    if table is None or mistake.place == BOARD_PLACE:
         return mistake
-    if mistake.place == f"{ITSELF}.executor":
+    if mistake.place == f"{BOARD_PLACE}.executor":
         why = mistake.why if find_spec("zenoh") else INSTALL
         return Mistake(PLACE, None, why)
     port = mistake.place.removeprefix(_MAILBOX)
     if port != mistake.place and port in table.imports:
         return Mistake(f"{PLACE}.import.{port}.type", table.imports[port].type, mistake.why)
-    return replace(mistake, place=_OWN.sub(PLACE, mistake.place), why=_OWN.sub(PLACE, mistake.why))
+    return replace(
+        mistake,
+        place=_BOARD_PATTERN.sub(PLACE, mistake.place),
+        why=_BOARD_PATTERN.sub(PLACE, mistake.why),
+    )
 
 
-SOON = timedelta(days=30)
+EXPIRY_WARNING = timedelta(days=30)
 """A launch warns about certificates that expire within this time."""
 
 
-def _endpoints(table: LanTable) -> Mistakes:
+def _check_endpoints(table: LanTable) -> Mistakes:
     """Check endpoints and their protection as far as the config alone determines them."""
     for key in ("listen", "connect"):
         for at, text in enumerate(getattr(table, key)):
             try:
-                why = _why_not(Endpoint.of(text), table, connects=key == "connect")
+                why = _explain_endpoint(Endpoint.from_text(text), table, connects=key == "connect")
             except ValueError as error:
                 why = str(error)
             if why:
                 yield Mistake(f"{PLACE}.{key}[{at}]", text, why)
-    if table.estop_from and (exposed := _open(table)):
+    if table.estop_from and (exposed := _list_open_endpoints(table)):
         attack = "impersonate any of these racks"
         if table.certificates is not None:
             attack = "repeat an earlier request of one of these racks"
@@ -216,15 +222,15 @@ def _endpoints(table: LanTable) -> Mistakes:
         yield Mistake(f"{PLACE}.peers", None, why)
 
 
-def _open(table: LanTable) -> list[str]:
+def _list_open_endpoints(table: LanTable) -> list[str]:
     """Return the endpoints that others can reach without a certificate.
 
     These include loopback addresses, which every user of this machine can reach.
     """
-    return [str(end) for end in endpoints_of(table) if not (end.has_tls or end.is_private)]
+    return [str(end) for end in list_endpoints(table) if not (end.has_tls or end.is_private)]
 
 
-def _why_not(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
+def _explain_endpoint(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
     if endpoint.has_tls and connects and ":" in endpoint.host:
         return (
             "zenoh does not check certificates of IPv6 addresses; use a host name or an IPv4"
@@ -261,9 +267,9 @@ def check_credentials(config: RackConfig) -> Mistakes:
         why = "cannot be checked without 'cryptography': install nasrem-rack[lan]"
         yield Mistake(f"{PLACE}.certificates", table.certificates, why)
         return
-    heard = [end for end in endpoints_of(table) if str(end) in table.listen]
-    addresses = dict.fromkeys(e.host for e in heard if e.has_tls and not e.is_everywhere)
-    for flaw in Credentials(Path(table.certificates), config.name).flaws(addresses):
+    heard = [end for end in list_endpoints(table) if str(end) in table.listen]
+    addresses = dict.fromkeys(e.host for e in heard if e.has_tls and not e.is_wildcard)
+    for flaw in Credentials(Path(table.certificates), config.name).find_flaws(addresses):
         # The file name comes first, because long texts are cut off at the end.
         yield Mistake(
             f"{PLACE}.certificates", None, f"{flaw.path.name}: {flaw.why}; in {table.certificates}"
@@ -275,7 +281,7 @@ def list_network_notes(config: RackConfig) -> list[str]:
     table = config.adapter.lan
     if table is None:
         return []
-    exposed = _open(table)
+    exposed = _list_open_endpoints(table)
     attack = "read and forge messages"
     if table.certificates is not None:
         attack = "read messages, and pretend that racks come and go"
@@ -283,8 +289,8 @@ def list_network_notes(config: RackConfig) -> list[str]:
     if table.certificates is not None and has_tls(table):
         from rack.boards.lan.credentials import Credentials
 
-        expires = Credentials(Path(table.certificates), config.name).expires
-        if expires - datetime.now(UTC) < SOON:
+        expires = Credentials(Path(table.certificates), config.name).expiry_time
+        if expires - datetime.now(UTC) < EXPIRY_WARNING:
             notes.append(
                 f"certificates expire on {expires:%Y-%m-%d %H:%M} UTC; after that the other racks"
                 " are lost"

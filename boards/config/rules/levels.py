@@ -11,9 +11,9 @@ from rack.backplane.address_map import AddressMap
 from rack.backplane.errors import MailboxError
 from rack.backplane.layout import Layout
 from rack.backplane.regular_file import check_regular_file
-from rack.boards.config.cell import cell_sizes
+from rack.boards.config.cell import compute_cell_sizes
 from rack.boards.config.connections import Wiring
-from rack.boards.config.mistakes import mistakes_of, repeated
+from rack.boards.config.mistakes import convert_errors, report_repeated_names
 from rack.boards.errors import Mistake, Mistakes
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, LevelContext
@@ -22,7 +22,7 @@ MAX_SEGMENT_BYTES = 2**30
 MAX_MODEL_BYTES = 2**30
 
 
-def params(wiring: Wiring) -> Mistakes:
+def check_params(wiring: Wiring) -> Mistakes:
     """Check the parameters of each board against the declarations of its level's classes."""
     for table, kind in wiring.params:
         tables, _, board = table.partition(".")
@@ -30,23 +30,23 @@ def params(wiring: Wiring) -> Mistakes:
         try:
             kind.model_validate(values)
         except ValidationError as error:
-            yield from mistakes_of(error, kind, values, f"{table}.params")
+            yield from convert_errors(error, kind, values, f"{table}.params")
 
 
-def programs(wiring: Wiring) -> Mistakes:
+def check_programs(wiring: Wiring) -> Mistakes:
     """Check `[task]` against the program that each level's class declares."""
     config = wiring.config
     for kind in wiring.programs:
         try:
             program = kind.model_validate(config.task)
         except ValidationError as error:
-            yield from mistakes_of(error, kind, config.task, "task")
+            yield from convert_errors(error, kind, config.task, "task")
         else:
-            for key, value, why in program.misfits(config.robot, config.scene):
+            for key, value, why in program.find_mismatches(config.robot, config.scene):
                 yield Mistake(f"task.{key}", value, why)
 
 
-def sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Mistakes:
+def check_sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Mistakes:
     """Check that the rack defines every size that the fields of a message need.
 
     Args:
@@ -60,7 +60,7 @@ def sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Mistakes:
             yield Mistake(f"mailbox {mailbox}", ports.task, str(error))
 
 
-def memory(layout: Layout) -> Mistakes:
+def check_memory(layout: Layout) -> Mistakes:
     """Check that the segment is not too large. The mistake names the largest mailbox."""
     size = AddressMap(layout).size
     if size > MAX_SEGMENT_BYTES:
@@ -73,7 +73,7 @@ def memory(layout: Layout) -> Mistakes:
         yield Mistake(f"mailbox {box.name}", None, f"{why}; {advice}")
 
 
-def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mistakes:
+def check_neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mistakes:
     """Let each level check the boards above and below it.
 
     Args:
@@ -88,11 +88,11 @@ def neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mistakes
             above, below = (
                 [contexts[other] for other in others] for others in (board.above, board.below)
             )
-            for key, value, why in ports.kind.misfits(contexts[ports.task], above, below):
+            for key, value, why in ports.kind.find_mismatches(contexts[ports.task], above, below):
                 yield Mistake(f"board.{ports.task}.{key}", value, why)
 
 
-def scene(wiring: Wiring) -> Mistakes:
+def check_scene(wiring: Wiring) -> Mistakes:
     """Check that entries of the scene name existing bodies, and that names are unique."""
     scene = wiring.config.scene
     for kind, key, bodies in (
@@ -106,10 +106,10 @@ def scene(wiring: Wiring) -> Mistakes:
             if name not in known:
                 why = f"no such {bodies[:-1]}; scene.{bodies}: {', '.join(known) or 'none'}"
                 yield Mistake(f"scene.{kind}[{at}].{key}", name, why)
-    yield from repeated("scene.objects and scene.obstacles", scene.bodies)
+    yield from report_repeated_names("scene.objects and scene.obstacles", scene.bodies)
 
 
-def robot(wiring: Wiring) -> Mistakes:
+def check_robot(wiring: Wiring) -> Mistakes:
     """Check that the model file can be read and that each list has one value per joint."""
     robot = wiring.config.robot
     if robot is None:
@@ -118,15 +118,15 @@ def robot(wiring: Wiring) -> Mistakes:
         check_regular_file(robot.model, MAX_MODEL_BYTES)
     except OSError as error:
         yield Mistake("robot.model", str(robot.model), f"cannot be read: {error.strerror}")
-    for key, values, why in robot.misfits():
+    for key, values, why in robot.find_length_mismatches():
         yield Mistake(f"robot.{key}", values, why)
     if robot.hand is not None and robot.interface != "torque":
         why = 'tendons of a hand need tensions; must be "torque"'
         yield Mistake("robot.interface", robot.interface, why)
-    yield from repeated("robot.joints", robot.joints)
+    yield from report_repeated_names("robot.joints", robot.joints)
 
 
-def cell(wiring: Wiring) -> Mistakes:
+def check_cell(wiring: Wiring) -> Mistakes:
     """Check that arm and scene fit the model.
 
     If `[robot]` or `[scene]` has other mistakes, only names in the model are checked.
@@ -135,17 +135,17 @@ def cell(wiring: Wiring) -> Mistakes:
     reasons: list[str] = []
     if robot_table is None:
         return
-    if not wiring.broken & {"robot", "scene"} and not [*robot(wiring), *scene(wiring)]:
+    if not wiring.broken & {"robot", "scene"} and not [*check_robot(wiring), *check_scene(wiring)]:
         try:
-            cell_sizes(wiring.config)
+            compute_cell_sizes(wiring.config)
             return
         except RobotError as error:
             reasons = [str(error)]
-    from rack.levels.robot.lookup import unknown_names
+    from rack.levels.robot.lookup import find_unknown_names
 
     # List all names that the model lacks instead. If the model cannot be read, none are known.
     with suppress(RobotError):
-        reasons = [*unknown_names(robot_table, scene_table)] or reasons
+        reasons = [*find_unknown_names(robot_table, scene_table)] or reasons
     for reason in reasons:
         place, colon, why = reason.partition(": ")
         if colon and place.startswith(("robot", "scene")):

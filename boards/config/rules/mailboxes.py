@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from rack.backplane.layout import BY_TICKS
-from rack.backplane.mailbox.queue import taken_name
+from rack.backplane.layout import TICK_PROTOCOLS
+from rack.backplane.mailbox.queue import get_position_mailbox
 from rack.backplane.message import State
 from rack.boards.config.connections import TaskPorts, Wiring
 from rack.boards.config.schema import LAN
 from rack.boards.errors import Mistake, Mistakes
-from rack.boards.exchange import EXCHANGE, exchange_message
+from rack.boards.exchange import EXCHANGE_PORT, build_exchange_message
 from rack.boards.host.adapter import Adapter
 
 PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
 """Advice for a reader on the other side of the rack."""
 
 
-def ports(wiring: Wiring) -> Mistakes:
+def check_ports(wiring: Wiring) -> Mistakes:
     """Check that the levels' classes exist and that their inputs are connected as declared."""
     for place, why in wiring.missing.items():
         yield Mistake(f"{place.table}.{place.class_key}", place.target, why)
@@ -27,14 +27,14 @@ def ports(wiring: Wiring) -> Mistakes:
             if output.rests_on is not None and output.rests_on.name not in ports.inputs:
                 why = f"its output '{port}' rests on '{output.rests_on.name}'; inputs: {inputs}"
                 yield Mistake(f"{table}.{role}", place.target, why)
-        for port, sources in wiring.config.rewired(place).items():
+        for port, sources in wiring.config.get_rewired_ports(place).items():
             if port not in ports.kind.inputs:
                 why = f"the {role} has no such port; ports: {inputs}"
                 yield Mistake(f"{table}.{place.reads_key}.{port}", sources, why)
         yield from ports.mistakes
 
 
-def writers(wiring: Wiring) -> Mistakes:
+def check_writers(wiring: Wiring) -> Mistakes:
     """Check that no mailbox has two writers."""
     for ports in wiring.ports.values():
         for mailbox in ports.writes.values():
@@ -43,14 +43,16 @@ def writers(wiring: Wiring) -> Mistakes:
                 yield Mistake(f"mailbox {mailbox}", ports.task, f"{first.task} already writes it")
 
 
-def reads(wiring: Wiring) -> Mistakes:
+def check_reads(wiring: Wiring) -> Mistakes:
     """Check that every mailbox that is read exists and carries the port's type of message."""
     for ports in wiring.ports.values():
         for port, mailbox in ports.sources:
-            place = _wired_at(ports, port)
+            place = _find_place(ports, port)
             needed = ports.inputs[port].message.message_type
             if not wiring.is_known(mailbox):
-                yield Mistake(place, mailbox, f"no task writes it; mailboxes: {wiring.names}")
+                yield Mistake(
+                    place, mailbox, f"no task writes it; mailboxes: {wiring.mailbox_names}"
+                )
             elif (
                 ports.is_whole
                 and (carried := wiring.types.get(mailbox)) is not None
@@ -63,14 +65,14 @@ def reads(wiring: Wiring) -> Mistakes:
                 yield Mistake(place, mailbox, why)
 
 
-def _wired_at(ports: TaskPorts, port: str) -> str:
+def _find_place(ports: TaskPorts, port: str) -> str:
     """Return the place in the config where an input is wired: "board.servo.reads.command"."""
     place = ports.place
     key = ports.kind.wired_by if issubclass(ports.kind, Adapter) else place.reads_key
     return f"{place.table}.{key}.{port}"
 
 
-def statuses(wiring: Wiring) -> Mistakes:
+def check_statuses(wiring: Wiring) -> Mistakes:
     """Check that the board that ends the run writes a status with a state."""
     for name, board in wiring.config.board.items():
         if not board.ends_run:
@@ -85,17 +87,17 @@ def statuses(wiring: Wiring) -> Mistakes:
             )
 
 
-def sides(wiring: Wiring) -> Mistakes:
+def check_sides(wiring: Wiring) -> Mistakes:
     """Check that only bus adapters read mailboxes of both the real-time and the host side."""
     for task in wiring.ports.values():
         for port, mailbox in task.sources:
-            if mailbox.partition(".")[0] not in wiring.unknown and (
-                why := _reason(wiring, task, mailbox)
+            if mailbox.partition(".")[0] not in wiring.unknown_boards and (
+                why := _explain_side(wiring, task, mailbox)
             ):
-                yield Mistake(_wired_at(task, port), mailbox, why)
+                yield Mistake(_find_place(task, port), mailbox, why)
 
 
-def _reason(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
+def _explain_side(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
     """Return why a task or host board must not read a mailbox. Empty if it may."""
     is_host = task.place.role == "host"
     is_of_host = mailbox in wiring.of_host
@@ -103,7 +105,7 @@ def _reason(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
         return "it is already on the host side" if mailbox in wiring.to_host else ""
     if is_host == is_of_host:
         return ""
-    if (source := wiring.passed.get(mailbox)) is None:
+    if (source := wiring.passed_mailboxes.get(mailbox)) is None:
         side = "host" if is_of_host else "real-time"
         return f"it is on the {side} side; {PASS_IT}"
     writer = source.partition(".")[0]
@@ -122,18 +124,18 @@ NOT_OPERATED = {
 """Protocols that an operator's mailbox cannot have, with the reasons."""
 
 
-def strict(wiring: Wiring) -> Mistakes:
+def check_strict(wiring: Wiring) -> Mistakes:
     """If `protocol.strict` is set, report everything that makes a run depend on timing."""
     config = wiring.config
     if not config.protocol.strict:
         return
     why = "makes a run depend on timing, which protocol.strict = true refuses; must be"
-    if config.protocol.default not in BY_TICKS:
+    if config.protocol.default not in TICK_PROTOCOLS:
         yield Mistake("protocol.default", config.protocol.default, f"{why} time-slice or interrupt")
     for mailbox, protocol in config.protocol.mailbox.items():
-        if protocol not in BY_TICKS:
+        if protocol not in TICK_PROTOCOLS:
             yield Mistake(
-                f"protocol.mailbox.{mailbox}", protocol, f"{why} one of {', '.join(BY_TICKS)}"
+                f"protocol.mailbox.{mailbox}", protocol, f"{why} one of {', '.join(TICK_PROTOCOLS)}"
             )
     for name in config.host:
         yield Mistake(f"host.{name}", None, f"a board without real time {why} a board with a rate")
@@ -143,7 +145,7 @@ def strict(wiring: Wiring) -> Mistakes:
                 yield Mistake(f"board.{name}.exchange.{port}.asynchronous", True, f"{why} false")
 
 
-def exchange(wiring: Wiring) -> Mistakes:
+def check_exchange(wiring: Wiring) -> Mistakes:
     """Check the times at which executors read their ports, and the mailbox that records them."""
     for ports in wiring.tasks:
         if not ports.exchange or not ports.is_whole:
@@ -165,15 +167,15 @@ def exchange(wiring: Wiring) -> Mistakes:
             elif entry.phase >= entry.every:
                 why = f"must be less than every: 0 to {entry.every - 1} cycles"
                 yield Mistake(f"{place}.phase", entry.phase, why)
-        record_type = exchange_message(ports.reads).message_type
-        if ports.outputs[EXCHANGE].message.message_type != record_type:
+        record_type = build_exchange_message(ports.reads).message_type
+        if ports.outputs[EXCHANGE_PORT].message.message_type != record_type:
             why = "the executor itself writes a mailbox of this name; rename its output"
             yield Mistake(f"board.{ports.task}.exchange", None, why)
 
 
-def operated(wiring: Wiring) -> Mistakes:
+def check_operated(wiring: Wiring) -> Mistakes:
     """Check that only the clock writes operators' mailboxes, with a protocol that never waits."""
-    for mailbox in wiring.operated:
+    for mailbox in wiring.operator_mailboxes:
         if mailbox in wiring.writers:
             first = wiring.writers[mailbox][0].task
             yield Mistake(
@@ -188,21 +190,21 @@ def operated(wiring: Wiring) -> Mistakes:
             )
 
 
-def mailboxes(wiring: Wiring) -> Mistakes:
+def check_protocols(wiring: Wiring) -> Mistakes:
     """Check that every mailbox with a protocol in the config exists."""
     for mailbox in wiring.config.protocol.mailbox:
         if not wiring.is_known(mailbox):
             yield Mistake(
                 f"protocol.mailbox.{mailbox}",
                 None,
-                f"no such mailbox; mailboxes: {wiring.names}",
+                f"no such mailbox; mailboxes: {wiring.mailbox_names}",
             )
 
 
-def queues(wiring: Wiring) -> Mistakes:
+def check_queues(wiring: Wiring) -> Mistakes:
     """Check which mailboxes are queues, how many readers they have, and their depths."""
     # A task that reads from the wrong side is reported by `check_sides` alone.
-    if any(sides(wiring)):
+    if any(check_sides(wiring)):
         return
     table = wiring.config.protocol
     for mailbox, (ports, output) in wiring.writers.items():
@@ -210,29 +212,29 @@ def queues(wiring: Wiring) -> Mistakes:
         if output.queued and protocol != "queue":
             why = f"'{ports.task}' sends any number of messages in a cycle; must be queue"
             yield Mistake(f"protocol.mailbox.{mailbox}", protocol, why)
-        elif wiring.protocol(mailbox) == "queue":
-            yield from _queue(wiring, mailbox)
+        elif wiring.find_protocol(mailbox) == "queue":
+            yield from _check_queue(wiring, mailbox)
     for mailbox, depth in table.depth.items():
         if not wiring.is_known(mailbox):
             yield Mistake(
                 f"protocol.depth.{mailbox}",
                 depth,
-                f"no such mailbox; mailboxes: {wiring.names}",
+                f"no such mailbox; mailboxes: {wiring.mailbox_names}",
             )
-        elif wiring.protocol(mailbox) != "queue":
-            queues = [name for name in wiring.writers if wiring.protocol(name) == "queue"]
+        elif wiring.find_protocol(mailbox) != "queue":
+            queues = [name for name in wiring.writers if wiring.find_protocol(name) == "queue"]
             why = f"it is not a queue and holds one message; queues: {', '.join(queues) or 'none'}"
             yield Mistake(f"protocol.depth.{mailbox}", depth, why)
 
 
-def _queue(wiring: Wiring, mailbox: str) -> Mistakes:
+def _check_queue(wiring: Wiring, mailbox: str) -> Mistakes:
     """Check that exactly one port reads a queue, and that its reader's position has a free name."""
-    if taken_name(mailbox) in wiring.writers:
+    if get_position_mailbox(mailbox) in wiring.writers:
         why = (
             f"the reader of the queue '{mailbox}' writes its position under this name; rename the"
             " port"
         )
-        yield Mistake(f"mailbox {taken_name(mailbox)}", None, why)
+        yield Mistake(f"mailbox {get_position_mailbox(mailbox)}", None, why)
     reading = [
         (task.task, port)
         for task, port in wiring.reading.get(mailbox, ())
@@ -252,12 +254,12 @@ def _queue(wiring: Wiring, mailbox: str) -> Mistakes:
             f" {', '.join(readers)}"
         )
         yield Mistake(f"mailbox {mailbox}", None, why)
-    elif not readers and not wiring.unknown:
+    elif not readers and not wiring.unknown_boards:
         why = "no task reads this queue, so it would stay full; it needs one reader"
         yield Mistake(f"mailbox {mailbox}", None, why)
 
 
-def asynchronous(wiring: Wiring) -> Mistakes:
+def check_asynchronous(wiring: Wiring) -> Mistakes:
     """Check that the messages of asynchronous ports can be read as soon as they are written."""
     for ports in wiring.tasks:
         for port, mailbox in ports.sources:
@@ -268,12 +270,12 @@ def asynchronous(wiring: Wiring) -> Mistakes:
                 "interrupt": (
                     f"the messages of '{mailbox}' already interrupt the board; must be false"
                 ),
-            }.get(wiring.protocol(mailbox))
+            }.get(wiring.find_protocol(mailbox))
             if port in ports.exchange and ports.exchange[port].asynchronous and why is not None:
                 yield Mistake(f"board.{ports.task}.exchange.{port}.asynchronous", True, why)
 
 
-def interrupts(wiring: Wiring) -> Mistakes:
+def check_interrupts(wiring: Wiring) -> Mistakes:
     """Check that the messages of mailboxes with protocol interrupt can interrupt a board."""
     for mailbox, protocol in wiring.config.protocol.mailbox.items():
         if protocol != "interrupt":

@@ -30,7 +30,7 @@ def main(seconds: float | None = None) -> int:
         rack.start(seconds)
         seen = 0
         while rack.watch(timeout_s=0.5):
-            if (newest := servo.peek()).is_there:
+            if (newest := servo.peek()).has_message:
                 joints = ", ".join(f"{q:6.3f}" for q in newest.message.position)
                 print(f"tick {rack.segment.words[System.TICK]:6}  joints {joints} rad")
             for event in rack.events[seen:]:
@@ -39,7 +39,7 @@ def main(seconds: float | None = None) -> int:
             seen = len(rack.events)
         outcome = rack.outcome
     print(f"{outcome.cause} after {outcome.ticks} ticks, digest {outcome.digest}")
-    return 0 if outcome.worked else 1
+    return 0 if outcome.is_success else 1
 
 
 if __name__ == "__main__":

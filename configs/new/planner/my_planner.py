@@ -37,7 +37,7 @@ class MyPlannerLevel(Executor):
     def process(self, tick: int) -> None:
         """Run one cycle: read the inputs and the newest plan, and fill the outputs."""
         self.status.state = State.EXECUTING
-        if self.plan.is_there:
+        if self.plan.has_message:
             spent = self.servo.message.torque - self.plan.message.gravity
             self.status.moving = float(abs(spent).max())
 

@@ -11,7 +11,7 @@ from rack.levels.errors import ProgramError
 from rack.levels.level import LevelContext
 from rack.levels.operator import Goal
 from rack.levels.systems.coordination.messages import CellAction, OrderAction
-from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, misfits
+from rack.levels.task.program import DOWN, AnyAction, Goto, Home, Transfer, find_mismatches
 
 _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
 
@@ -59,19 +59,21 @@ def read_action(message: CellAction, context: LevelContext) -> AnyAction:
         ProgramError: The action is malformed, or does not suit the arm or the scene.
     """
     try:
-        action: AnyAction = _ACTION.validate_python({**_table(message), "by": message.by or None})
+        action: AnyAction = _ACTION.validate_python(
+            {**_to_table(message), "by": message.by or None}
+        )
     except ValidationError as error:
         lines = [f"{'.'.join(map(str, entry['loc']))}: {entry['msg']}" for entry in error.errors()]
         raise ProgramError("\n".join(lines)) from error
     if mistakes := [
         f"{key} = {value!r}: {why}"
-        for key, value, why in misfits(action, context.robot, context.scene)
+        for key, value, why in find_mismatches(action, context.robot, context.scene)
     ]:
         raise ProgramError("\n".join(mistakes))
     return action
 
 
-def _table(message: CellAction) -> dict[str, Any]:
+def _to_table(message: CellAction) -> dict[str, Any]:
     """Return the action as a table of a program, without its `by`."""
     position = message.position.tolist()
     match message.action, message.goal:

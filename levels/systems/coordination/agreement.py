@@ -37,12 +37,12 @@ ATTEMPTS = 1000
 """Number of order ids reserved for one step."""
 MAX_ATTEMPTS = 10
 """Number of attempts after which the program ends."""
-NO = (Response.REFUSED, Response.FAILED)
-BROKEN_OFF = (Response.CANCELLED, Response.STOPPED, Response.ENDED)
+NEGATIVE = (Response.REFUSED, Response.FAILED)
+INTERRUPTED = (Response.CANCELLED, Response.STOPPED, Response.ENDED)
 BEGUN = (Response.DOING, Response.DONE)
 VERBS = {Phase.ASKING: OrderVerb.ASK, Phase.DOING: OrderVerb.DO, Phase.CANCELLING: OrderVerb.CANCEL}
 """Verb of the orders to the arms of the step, by phase."""
-KEPT = ("phase", "step", "attempt", "error", "reason", "ending", "begun")
+SAVED_ATTRIBUTES = ("phase", "step", "attempt", "error", "reason", "ending", "begun")
 """Attributes of an agreement that are saved in `CellProgress`."""
 
 
@@ -88,18 +88,18 @@ class Agreement:
         self.begun = 0.0
         self.ending = 0.0
 
-    def recall(self, last: CellProgress) -> None:
+    def restore_progress(self, last: CellProgress) -> None:
         """Continue from a saved state."""
-        for name in KEPT:
+        for name in SAVED_ATTRIBUTES:
             setattr(self, name, getattr(last, name))
 
-    def write_to(self, progress: CellProgress) -> None:
+    def save_progress(self, progress: CellProgress) -> None:
         """Save the state in a `CellProgress`. Its count of moves is not written."""
-        for name in KEPT:
+        for name in SAVED_ATTRIBUTES:
             setattr(progress, name, getattr(self, name))
 
     @property
-    def order(self) -> int:
+    def order_id(self) -> int:
         """Id of the present order."""
         return (self.step + 1) * ATTEMPTS + self.attempt
 
@@ -110,13 +110,13 @@ class Agreement:
             return ()
         return self._steps[self.step]
 
-    def verb(self, arm: str) -> OrderVerb:
+    def choose_verb(self, arm: str) -> OrderVerb:
         """Return the verb of the present order to an arm."""
         if self.phase in (Phase.ENDING, Phase.OVER):
             return OrderVerb.END
         return VERBS[self.phase] if arm in self.partners else OrderVerb.NONE
 
-    def advance(self, answers: Mapping[str, Reading[CellReport]], now_s: float) -> None:
+    def advance_program(self, answers: Mapping[str, Reading[CellReport]], now_s: float) -> None:
         """Advance the program if the answers allow it.
 
         The program is over once every arm has confirmed the end, or was given enough time for it.
@@ -128,34 +128,34 @@ class Agreement:
         self._answers = answers
         self._now_s = now_s
         if self.phase is Phase.AWAITING:
-            self._await()
+            self._await_reports()
         elif self.phase is Phase.ASKING:
-            self._ask()
+            self._evaluate_answers()
         elif self.phase is Phase.DOING:
-            self._follow()
+            self._await_done()
         elif self.phase is Phase.CANCELLING:
-            self._cancel()
+            self._await_cancelled()
         if self.phase is Phase.ENDING:
-            responses = self._said(self._arms)
+            responses = self._read_responses(self._arms)
             is_confirmed = all(response is Response.ENDED for response in responses.values())
             if is_confirmed or now_s - self.ending > self._farewell_s:
                 self.phase = Phase.OVER
 
-    def _said(self, arms: Collection[str]) -> dict[str, Response]:
+    def _read_responses(self, arms: Collection[str]) -> dict[str, Response]:
         """Return the responses of these arms to the present order."""
         responses = dict.fromkeys(arms, Response.NONE)
         for arm in arms:
             answer = self._answers[arm].message
-            if (answer.program, answer.echo) == (self.program, self.order):
+            if (answer.program, answer.echo) == (self.program, self.order_id):
                 responses[arm] = Response(answer.response)
         return responses
 
-    def _are_there(self, arms: Collection[str]) -> bool:
+    def _are_present(self, arms: Collection[str]) -> bool:
         """Return True if all these arms report and none is lost."""
         answers = [self._answers[arm] for arm in arms]
-        return all(answer.is_there and not answer.is_lost for answer in answers)
+        return all(answer.has_message and not answer.is_lost for answer in answers)
 
-    def _await(self) -> None:
+    def _await_reports(self) -> None:
         """Wait until every arm reports, then continue at the step that the reports show.
 
         If a report shows that the program has ended, end it here too.
@@ -168,69 +168,69 @@ class Agreement:
             self.step = newest // ATTEMPTS - 1
             self.attempt = newest % ATTEMPTS
         if ended_reports:
-            self.end(Error(ended_reports[0].error), ended_reports[0].reason)
-        elif self._are_there(self._arms):
+            self.end_program(Error(ended_reports[0].error), ended_reports[0].reason)
+        elif self._are_present(self._arms):
             self.begun = self._now_s
-            self._go_on()
+            self._start_next_step()
         if self.phase is Phase.ASKING:
             # Evaluate the reports in this cycle already, so that an arm that has forgotten its
             # promise is not asked again.
-            self._ask()
+            self._evaluate_answers()
 
-    def _go_on(self) -> None:
+    def _start_next_step(self) -> None:
         """Start the next step, or end the program after the last one."""
         if self.step < len(self._steps):
             self.phase = Phase.ASKING
         else:
-            self.end(Error.NONE, "")
+            self.end_program(Error.NONE, "")
 
-    def _ask(self) -> None:
+    def _evaluate_answers(self) -> None:
         """Evaluate the answers to a question: do the step, cancel it, or end the program."""
-        responses = self._said(self.partners)
-        if self._ends_by(responses, NO):
+        responses = self._read_responses(self.partners)
+        if self._end_if_any(responses, NEGATIVE):
             return
-        if any(response in BROKEN_OFF for response in responses.values()):
+        if any(response in INTERRUPTED for response in responses.values()):
             self.phase = Phase.CANCELLING
         elif any(response in BEGUN for response in responses.values()):
             # An earlier launch of this rack has told them to begin.
             self.phase = Phase.DOING
         elif all(
             response is Response.POSSIBLE for response in responses.values()
-        ) and self._are_there(responses):
+        ) and self._are_present(responses):
             arrives_s = self._now_s + self._margin_s
             times = [self._answers[arm].message.until for arm in responses]
             in_time = all(arrives_s <= until_s for until_s in times if until_s)
             self.phase = Phase.DOING if in_time else Phase.CANCELLING
 
-    def _follow(self) -> None:
+    def _await_done(self) -> None:
         """Wait until all arms have done the step."""
-        responses = self._said(self.partners)
-        if self._ends_by(responses, (*NO, *BROKEN_OFF)):
+        responses = self._read_responses(self.partners)
+        if self._end_if_any(responses, (*NEGATIVE, *INTERRUPTED)):
             return
         if all(response is Response.DONE for response in responses.values()):
             self.step += 1
             self.attempt = 0
-            self._go_on()
+            self._start_next_step()
 
-    def _cancel(self) -> None:
+    def _await_cancelled(self) -> None:
         """Wait until all arms have cancelled the step, then ask again or end the program."""
-        responses = self._said(self.partners)
-        if self._ends_by(responses, NO):
+        responses = self._read_responses(self.partners)
+        if self._end_if_any(responses, NEGATIVE):
             return
-        if any(response not in (*BROKEN_OFF, Response.DONE) for response in responses.values()):
+        if any(response not in (*INTERRUPTED, Response.DONE) for response in responses.values()):
             return
         begun = [arm for arm, response in responses.items() if response is not Response.CANCELLED]
         self.attempt += 1
         if begun:
             why = f"step {self.step}: {begun[0]} had begun when it was cancelled"
-            self.end(Error.GIVEN_UP, why)
+            self.end_program(Error.GIVEN_UP, why)
         elif self.attempt == MAX_ATTEMPTS:
             why = f"step {self.step}: {MAX_ATTEMPTS} promises expired before all arms had answered"
-            self.end(Error.TOO_LATE, why)
+            self.end_program(Error.TOO_LATE, why)
         else:
             self.phase = Phase.ASKING
 
-    def _ends_by(
+    def _end_if_any(
         self, responses: Mapping[str, Response], fatal_responses: Collection[Response]
     ) -> bool:
         """End the program and return True if an arm has given one of these responses."""
@@ -239,11 +239,11 @@ class Agreement:
                 answer = self._answers[arm].message
                 event = f"step {self.step} {response.name.lower()}: {arm}"
                 reason = f"{event}: {answer.reason}".removesuffix(": ")
-                self.end(Error(answer.error) or Error.GIVEN_UP, reason)
+                self.end_program(Error(answer.error) or Error.GIVEN_UP, reason)
                 return True
         return False
 
-    def end(self, error: Error, reason: str) -> None:
+    def end_program(self, error: Error, reason: str) -> None:
         """End the program, and with it the runs of the arms."""
         if self.phase not in (Phase.ENDING, Phase.OVER):
             self.phase = Phase.ENDING
@@ -252,7 +252,7 @@ class Agreement:
             self.ending = self._now_s
 
 
-TAKEN = {
+FIRST_RESPONSES = {
     OrderVerb.ASK: Response.NONE,
     OrderVerb.DO: Response.FAILED,
     OrderVerb.CANCEL: Response.CANCELLED,
@@ -300,42 +300,44 @@ class TakenOrder:
         """Whether the arm is carrying out the order."""
         return self.response is Response.DOING
 
-    def hear(self, program: int, order: int, what: int, reason: str = "") -> None:
+    def process_order(self, program: int, order: int, verb: int, reason: str = "") -> None:
         """Process the order in the newest message.
 
         Args:
             program: Checksum of the program.
             order: Id of the order. 0 if there is none.
-            what: An `OrderVerb`.
+            verb: An `OrderVerb`.
             reason: Why the program ends early. Used with END only.
         """
-        if not order or what not in TAKEN or self.response is Response.ENDED:
+        if not order or verb not in FIRST_RESPONSES or self.response is Response.ENDED:
             return
-        if what != OrderVerb.END:
+        if verb != OrderVerb.END:
             reason = ""
         is_same = (program, order) == (self.program, self.order)
         if self.is_under_way:
-            self.stops = self.stops or not is_same or what in (OrderVerb.CANCEL, OrderVerb.END)
-        elif what == OrderVerb.END or not is_same:
+            self.stops = self.stops or not is_same or verb in (OrderVerb.CANCEL, OrderVerb.END)
+        elif verb == OrderVerb.END or not is_same:
             self.program = program
             self.order = order
-            self.answer(TAKEN[OrderVerb(what)], reason)
-        elif what == OrderVerb.CANCEL and self.response in (Response.NONE, Response.POSSIBLE):
-            self.answer(Response.CANCELLED)
-        elif what == OrderVerb.DO and self.response is Response.POSSIBLE:
-            self.answer(Response.DOING)
-        elif what == OrderVerb.DO and self.is_asked:
-            self.answer(Response.FAILED)
+            self.set_response(FIRST_RESPONSES[OrderVerb(verb)], reason)
+        elif verb == OrderVerb.CANCEL and self.response in (Response.NONE, Response.POSSIBLE):
+            self.set_response(Response.CANCELLED)
+        elif verb == OrderVerb.DO and self.response is Response.POSSIBLE:
+            self.set_response(Response.DOING)
+        elif verb == OrderVerb.DO and self.is_asked:
+            self.set_response(Response.FAILED)
         if self.response is Response.FAILED and not self.error:
             self.error = Error.GIVEN_UP
             self.reason = NOT_PROMISED
 
-    def fail(self, error: Error, reason: str) -> None:
+    def fail_order(self, error: Error, reason: str) -> None:
         """Refuse the order if it needs an answer, or let it fail if it is being carried out."""
         response = Response.REFUSED if self.is_asked else Response.FAILED
-        self.answer(response, reason, error)
+        self.set_response(response, reason, error)
 
-    def answer(self, response: Response, reason: str = "", error: Error = Error.GIVEN_UP) -> None:
+    def set_response(
+        self, response: Response, reason: str = "", error: Error = Error.GIVEN_UP
+    ) -> None:
         """Set the response to the order.
 
         Args:

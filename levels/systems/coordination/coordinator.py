@@ -13,17 +13,17 @@ from pydantic import Field, StringConstraints, ValidationError
 
 from rack.backplane.message import Message, State, fill_counts
 from rack.levels.level import (
+    ConfiguredPorts,
     Executor,
     Input,
     LevelContext,
-    MadePorts,
-    Misfits,
+    Mismatches,
     Output,
     Program,
     Reading,
 )
 from rack.levels.messages import Error, TaskStatus
-from rack.levels.operator import HOLDABLE, MAX_JOINTS, OperatorCommand, Orders
+from rack.levels.operator import HOLD_COMMANDS, MAX_JOINTS, OperatorCommand, Orders
 from rack.levels.systems.coordination.actions import write_action
 from rack.levels.systems.coordination.agreement import Agreement
 from rack.levels.systems.coordination.messages import (
@@ -90,7 +90,7 @@ class CellProgram(Program):
         """Positive number that differs, almost certainly, between two programs."""
         return zlib.crc32(self.model_dump_json().encode()) or 1
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
+    def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
         """Yield key, value and reason of each mistake.
 
         Mistakes are steps without actions or with two actions of one arm, times that do not rise,
@@ -160,7 +160,7 @@ class Coordinator(Executor):
     # write them after its restart.
     progress = Output(CellProgress)
     status = Output(TaskStatus)
-    commands = HOLDABLE
+    commands = HOLD_COMMANDS
     params = CoordinatorParams
     program = CellProgram
 
@@ -182,19 +182,21 @@ class Coordinator(Executor):
         self._moved_at = 0
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
+    def build_ports(
+        cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
+    ) -> ConfiguredPorts:
         """Return the ports for the orders to each arm and for its reports."""
         try:
             arms = CoordinatorParams.model_validate(params).arms
         except ValidationError:
-            return MadePorts(is_whole=False)
+            return ConfiguredPorts(is_whole=False)
         reports = {f"report_{arm}": Input(CellReport, mailbox) for arm, mailbox in arms.items()}
-        return MadePorts(reports, {f"order_{arm}": Output(CellOrder) for arm in arms})
+        return ConfiguredPorts(reports, {f"order_{arm}": Output(CellOrder) for arm in arms})
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield arms of the program that the parameters lack.
 
         Args:
@@ -214,33 +216,33 @@ class Coordinator(Executor):
         if not self._started:
             # After a restart of the board, continue from the last progress in the mailbox.
             self._started = True
-            if self.last_progress.is_there:
-                self._agreement.recall(self.last_progress.message)
+            if self.last_progress.has_message:
+                self._agreement.restore_progress(self.last_progress.message)
                 self._moves = self.last_progress.message.moves
-        self._operated.take(self.operator)
+        self._operated.take_commands(self.operator)
         self._readings = {arm: self.ports[f"report_{arm}"] for arm in self._table.arms}
         hold_reason = self._reason_to_hold()
         if self._steps:
             agreement = self._agreement
             step = agreement.step
-            moves = self._moves_of_step()[1]
-            agreement.advance(self._readings, tick * self.context.tick_s)
+            moves = self._count_moves()[1]
+            agreement.advance_program(self._readings, tick * self.context.tick_s)
             if agreement.step > step:
                 self._moves += moves
         wait_reason = hold_reason or self._reason_to_wait()
         if self._steps:
             self._check_progress(wait_reason, tick)
         for arm in self._table.arms:
-            self._order(arm, hold_reason, self.ports[f"order_{arm}"])
-        self._agreement.write_to(self.progress)
+            self._write_order(arm, hold_reason, self.ports[f"order_{arm}"])
+        self._agreement.save_progress(self.progress)
         fill_counts(self.progress.record[["moves"]], (self._moves,))
-        self._report(wait_reason, self.status)
+        self._write_status(wait_reason, self.status)
 
-    def _moves_of_step(self) -> tuple[int, int]:
+    def _count_moves(self) -> tuple[int, int]:
         """Return how many moves of the present step are done, and how many it has."""
         agreement = self._agreement
         reports = [self._readings[arm].message for arm in agreement.partners]
-        present = agreement.program, agreement.order
+        present = agreement.program, agreement.order_id
         own_reports = [report for report in reports if (report.program, report.echo) == present]
         return sum(report.moves_done for report in own_reports), sum(
             report.moves for report in own_reports
@@ -248,12 +250,12 @@ class Coordinator(Executor):
 
     def _reason_to_hold(self) -> str:
         """Return why the arms must rest on their paths, or an empty string."""
-        if self._operated.holds:
-            return self._operated.keeps(self.context.board)
+        if self._operated.is_holding:
+            return self._operated.format_reason(self.context.board)
         if self._agreement.phase in (Phase.ENDING, Phase.OVER):
             return ""
         for arm, reading in self._readings.items():
-            if reading.is_there and reading.is_lost:
+            if reading.has_message and reading.is_lost:
                 return f"{arm} is lost: the program waits until it is back"
         return ""
 
@@ -264,7 +266,7 @@ class Coordinator(Executor):
             return agreement.reason
         if agreement.phase is Phase.AWAITING:
             for arm, reading in self._readings.items():
-                if not reading.is_there:
+                if not reading.has_message:
                     return f"no report from {arm} yet"
         for arm in agreement.partners:
             report = self._readings[arm].message
@@ -279,10 +281,10 @@ class Coordinator(Executor):
         """
         agreement = self._agreement
         reports = [reading.message for reading in self._readings.values()]
-        operated = self._operated.stands or any(report.operated for report in reports)
+        operated = self._operated.is_in_force or any(report.operated for report in reports)
         stage = (
             agreement.phase,
-            agreement.order,
+            agreement.order_id,
             *(
                 (report.echo, report.response, report.moves_done, report.moves)
                 for report in reports
@@ -294,24 +296,24 @@ class Coordinator(Executor):
         elif (tick - self._moved_at) * self.context.tick_s > self._table.stalled_s:
             awaited = wait_reason or f"step {agreement.step}: {', '.join(agreement.partners)}"
             reason = f"nothing has happened for {self._table.stalled_s:g} s: {awaited}"
-            agreement.end(Error.STALLED, reason)
+            agreement.end_program(Error.STALLED, reason)
 
-    def _order(self, arm: str, hold_reason: str, order: CellOrder) -> None:
+    def _write_order(self, arm: str, hold_reason: str, order: CellOrder) -> None:
         """Write the order for one arm."""
         agreement = self._agreement
-        verb = agreement.verb(arm)
+        verb = agreement.choose_verb(arm)
         if verb in (OrderVerb.ASK, OrderVerb.DO, OrderVerb.CANCEL):
             write_action(self._steps[agreement.step][arm], order)
             if order.by:
                 order.by += agreement.begun
         has_order = verb is not OrderVerb.NONE
-        order.id = agreement.order if has_order else 0
+        order.id = agreement.order_id if has_order else 0
         order.program = agreement.program if has_order else 0
         order.what = verb
         order.hold = bool(hold_reason)
         order.reason = agreement.reason if verb is OrderVerb.END else hold_reason
 
-    def _report(self, wait_reason: str, status: TaskStatus) -> None:
+    def _write_status(self, wait_reason: str, status: TaskStatus) -> None:
         """Write the status of this level."""
         agreement = self._agreement
         status.state = State.IDLE
@@ -326,10 +328,10 @@ class Coordinator(Executor):
             status.reason = wait_reason
         status.action = agreement.step
         status.actions = len(self._steps)
-        done, moves = self._moves_of_step()
+        done, moves = self._count_moves()
         fill_counts(
             status.record[["moves_done", "moves"]], (self._moves + done, self._moves + moves)
         )
-        if self._operated.holds:
-            self._operated.done()
-        self._operated.report(status)
+        if self._operated.is_holding:
+            self._operated.report_done()
+        self._operated.fill_status(status)

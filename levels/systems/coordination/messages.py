@@ -13,8 +13,8 @@ from typing import Annotated
 from numpy import ndarray
 from pydantic import StringConstraints
 
-from rack.backplane.message import Command, Message, Status, field, integer
-from rack.levels.messages import OPERATED, Error, per_joint
+from rack.backplane.message import Command, Message, Status, field, integer_field
+from rack.levels.messages import OPERATED, Error, joint_field
 from rack.levels.operator import MAX_JOINTS, Goal
 
 MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
@@ -82,7 +82,7 @@ class CellAction(Message):
     direction: ndarray = field(
         unit="1", doc="direction of the tool's z axis, for goal direction", shape=3
     )
-    count: int = integer("number of values in `joints`", "u1")
+    count: int = integer_field("number of values in `joints`", "u1")
     joints: ndarray = field(unit="rad", doc="joint positions, for goal joints", shape=MAX_JOINTS)
     by: float = field(unit="s", doc="simulated time by which it must be done, 0 for any time")
 
@@ -90,7 +90,7 @@ class CellAction(Message):
 class OrderHead(Command):
     """Head of an order, without its action."""
 
-    program: int = integer("checksum of the program to which the order belongs")
+    program: int = integer_field("checksum of the program to which the order belongs")
     what: OrderVerb = field(doc="what to do with the order `id`, or the end of the program")
     hold: bool = field(doc="whether the arm must rest on its path while it carries out an order")
     reason: str = field(
@@ -106,7 +106,7 @@ class CellReport(Status, version=1):
     """Report of a task level to the rack that orders its actions."""
 
     error: Error = field("u2", doc="error code of the level, 0 if there is none")
-    program: int = integer("checksum of the program of the echoed order")
+    program: int = integer_field("checksum of the program of the echoed order")
     response: Response = field(
         doc="answer to the echoed order; `reason` says why it is refused, has failed or waits"
     )
@@ -118,8 +118,8 @@ class CellReport(Status, version=1):
         unit="s",
         doc="latest time, on the same clock, to read DO after POSSIBLE, 0 for any time",
     )
-    moves_done: int = integer("elemental moves of the order done", "u2")
-    moves: int = integer("elemental moves of the order; 0 before it begins", "u2")
+    moves_done: int = integer_field("elemental moves of the order done", "u2")
+    moves: int = integer_field("elemental moves of the order; 0 before it begins", "u2")
     halted: bool = field(
         doc="whether moves were withdrawn, so that the arm is held until it begins another order"
     )
@@ -129,9 +129,9 @@ class CellReport(Status, version=1):
 class RequestHead(Message):
     """Head of a request for a plan, without its action."""
 
-    id: int = integer("serial of the plan wanted, 0 if there is none")
-    program: int = integer("checksum of the program of the order")
-    order: int = integer("id of the order")
+    id: int = integer_field("serial of the plan wanted, 0 if there is none")
+    program: int = integer_field("checksum of the program of the order")
+    order: int = integer_field("id of the order")
     begin: float = field(
         unit="s", doc="simulated time at which it must be possible to begin, 0 for at once"
     )
@@ -139,8 +139,8 @@ class RequestHead(Message):
         unit="s",
         doc="time of the rack that gave the order, to which `by` refers, minus the time here",
     )
-    revision: int = integer("revision of the world model at the request")
-    start: ndarray = per_joint("rad", "where the arm rested at the request")
+    revision: int = integer_field("revision of the world model at the request")
+    start: ndarray = joint_field("rad", "where the arm rested at the request")
 
 
 class CellRequest(RequestHead, CellAction, version=1):
@@ -151,12 +151,12 @@ class CellProgress(Message, version=2):
     """State of a coordinator, from which it continues after a restart of its board."""
 
     phase: Phase = field(doc="activity in the present step")
-    step: int = integer("steps done", "u2")
-    attempt: int = integer("number of earlier attempts at the present step", "u2")
+    step: int = integer_field("steps done", "u2")
+    attempt: int = integer_field("number of earlier attempts at the present step", "u2")
     error: Error = field("u2", doc="why the program ends early, 0 if it does not")
     reason: str = field(doc="the error as text")
     ending: float = field(
         unit="s", doc="simulated time since when the arms are being ended, 0 before that"
     )
     begun: float = field(unit="s", doc="simulated time from which `by` counts, 0 before that")
-    moves: int = integer("elemental moves of the steps done", "u2")
+    moves: int = integer_field("elemental moves of the steps done", "u2")

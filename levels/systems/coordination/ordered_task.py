@@ -14,9 +14,9 @@ from pydantic import StringConstraints, ValidationError
 from rack.backplane.message import Message, State, fill_counts
 from rack.backplane.rack_name import RACK_NAME
 from rack.levels.errors import ProgramError, Refused
-from rack.levels.level import Input, LevelContext, MadePorts, Output, Reading
+from rack.levels.level import ConfiguredPorts, Input, LevelContext, Output, Reading
 from rack.levels.messages import Error, MoveStatus, TaskPlan, WorldState
-from rack.levels.peer import PeerPresence, peer_port
+from rack.levels.peer import PeerPresence, format_peer_port
 from rack.levels.systems.coordination.actions import copy_action, read_action
 from rack.levels.systems.coordination.agreement import TakenOrder
 from rack.levels.systems.coordination.messages import (
@@ -30,7 +30,7 @@ from rack.levels.tables import Positive, read_params
 from rack.levels.task.executor import TaskExecutor
 from rack.levels.task.planner import TaskPlanner
 from rack.levels.task.program import AnyAction, TaskConfig, TaskParams
-from rack.levels.task.rehearsal import Rehearsed, finish_times
+from rack.levels.task.rehearsal import Rehearsed, compute_finish_times
 
 RackName = Annotated[str, StringConstraints(pattern=f"^({RACK_NAME})?$")]
 PLANNED = (Response.POSSIBLE, Response.DOING, Response.REFUSED)
@@ -93,29 +93,31 @@ class OrderedTaskExecutor(TaskExecutor):
         self._nothing = TaskPlan.zeros(context.sizes)
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
+    def build_ports(
+        cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
+    ) -> ConfiguredPorts:
         """Return the port for orders and, over a network, the one for the other rack's clock."""
         try:
             table = OrderedTaskParams.model_validate(params)
         except ValidationError:
-            return MadePorts(is_whole=False)
+            return ConfiguredPorts(is_whole=False)
         ports: dict[str, Input[Any]] = {"order": Input(CellOrder, table.orders)}
         if table.coordinator:
-            ports["peer"] = Input(PeerPresence, f"lan.{peer_port(table.coordinator)}")
-        return MadePorts(ports)
+            ports["peer"] = Input(PeerPresence, f"lan.{format_peer_port(table.coordinator)}")
+        return ConfiguredPorts(ports)
 
-    def _first_actions(self) -> tuple[AnyAction, ...]:
+    def _read_first_actions(self) -> tuple[AnyAction, ...]:
         """Return no actions, because all of them come as orders."""
         return ()
 
-    def _recall(self) -> None:
+    def _restore_state(self) -> None:
         """Continue from the last status, report and request after a restart of the board."""
-        super()._recall()
+        super()._restore_state()
         last = self.last_status.message
         self._orders_begun = last.actions
         self._orders_done = last.action
         self._moves = last.moves_done, last.moves
-        if not self.last_report.is_there:
+        if not self.last_report.has_message:
             return
         report = self.last_report.message
         self.report.copy_from(report)
@@ -127,9 +129,9 @@ class OrderedTaskExecutor(TaskExecutor):
             self._begun = self.request.id
             self._take_action(self.request)
 
-    def _plan_to_follow(self, tick: int) -> TaskPlan:
+    def _find_plan(self, tick: int) -> TaskPlan:
         """Process the orders and return the plan of the one that is being carried out."""
-        self._listen(self.ports["order"])
+        self._read_order(self.ports["order"])
         self._waits = ""
         taken = self._taken
         request = self.request
@@ -137,7 +139,7 @@ class OrderedTaskExecutor(TaskExecutor):
         if taken.is_asked:
             self._answer_order(request, tick)
         elif taken.is_under_way and not self._begun:
-            self._begin(request)
+            self._begin_plan(request)
         self.status.echo = plan.id if plan.id == request.id else 0
         # Report the earliest end, and how long the promise is valid, in the coordinator's time.
         report = self.report
@@ -149,19 +151,19 @@ class OrderedTaskExecutor(TaskExecutor):
         if response is Response.POSSIBLE and request.by:
             report.until = request.begin + request.ahead + request.by - plan.earliest
         below = self.below.message
-        self.report.operated = below.operated or self._orders.stands
+        self.report.operated = below.operated or self._orders.is_in_force
         return plan if self._begun and self._begun == plan.id else self._nothing
 
-    def _listen(self, reading: Reading[CellOrder]) -> None:
+    def _read_order(self, reading: Reading[CellOrder]) -> None:
         """Process the newest order, or note why there is none."""
         order = reading.message
         self._held = self._absent = ""
-        if not reading.is_there:
+        if not reading.has_message:
             self._absent = f"no orders from {self._source} yet"
         elif reading.is_lost:
             self._absent = f"{self._source} is lost: held until it is back"
         else:
-            self._taken.hear(order.program, order.id, order.what, order.reason)
+            self._taken.process_order(order.program, order.id, order.what, order.reason)
             if order.hold and self._taken.is_under_way:
                 self._held = order.reason
         if self._taken.response is Response.ENDED:
@@ -176,11 +178,11 @@ class OrderedTaskExecutor(TaskExecutor):
         taken = self._taken
         if (request.program, request.order) == (taken.program, taken.order):
             if plan.id == request.id and not plan.error:
-                taken.answer(Response.POSSIBLE)
+                taken.set_response(Response.POSSIBLE)
             elif plan.id == request.id:
-                taken.fail(plan.error, plan.reason)
+                taken.fail_order(plan.error, plan.reason)
             return
-        self._waits = self._not_ready()
+        self._waits = self._reason_not_to_plan()
         if self._waits:
             return
         order: CellOrder = self.ports["order"].message
@@ -190,29 +192,29 @@ class OrderedTaskExecutor(TaskExecutor):
         try:
             action = read_action(order, self.context)
         except ProgramError as error:
-            taken.fail(Error.UNREACHABLE, str(error))
+            taken.fail_order(Error.UNREACHABLE, str(error))
             return
         if action.by is not None and action.by - ahead_s <= now_s:
             why = f"{action}, by {action.by:g} s: it is {now_s + ahead_s:.2f} s already"
-            taken.fail(Error.TOO_LATE, why)
+            taken.fail_order(Error.TOO_LATE, why)
             return
         request.program = taken.program
         request.order = taken.order
         request.ahead = ahead_s
         copy_action(order, request)
         planned_s = (self.context.within_cycles + 1) * self.context.period_s
-        self._request(request, now_s + planned_s + self._table.decision)
+        self._request_plan(request, now_s + planned_s + self._table.decision)
 
-    def _request(self, request: CellRequest, begin_s: float) -> None:
+    def _request_plan(self, request: CellRequest, begin_s: float) -> None:
         """Request a plan for the action in `request` that can begin at simulated time `begin_s`."""
         request.id += 1
         request.begin = begin_s
         request.revision = self.world.message.revision
         request.start = self.below.message.start
 
-    def _not_ready(self) -> str:
+    def _reason_not_to_plan(self) -> str:
         """Return why nothing can be planned at present, or an empty string."""
-        if self._orders.stands or not self.below.message.resting:
+        if self._orders.is_in_force or not self.below.message.resting:
             return "the arm does not rest yet"
         if not self.world.message.revision:
             return "the world model knows nothing yet"
@@ -222,20 +224,20 @@ class OrderedTaskExecutor(TaskExecutor):
                 return f"the clock of {self._source} has not been compared yet"
         return ""
 
-    def _begin(self, request: CellRequest) -> None:
+    def _begin_plan(self, request: CellRequest) -> None:
         """Begin the promised plan, or request another one if the world has changed since."""
         if not self._actions:
             self._take_action(request)
         has_strayed = float(np.abs(self.below.message.start - request.start).max()) > MAX_STRAY_RAD
         if request.begin and (has_strayed or self.world.message.revision != request.revision):
-            self._waits = self._not_ready()
+            self._waits = self._reason_not_to_plan()
             if not self._waits:
-                self._request(request, 0.0)
+                self._request_plan(request, 0.0)
         elif self.plan.message.id == request.id:
             self._begun = request.id
             self._done = 0
             self._halted = False
-            self._window.renumber(0)
+            self._window.renumber_plan(0)
             self._orders_begun += 1
 
     def _take_action(self, request: CellRequest) -> None:
@@ -243,31 +245,31 @@ class OrderedTaskExecutor(TaskExecutor):
         self._actions = (read_action(request, self.context),)
         self._ahead_s = request.ahead
 
-    def _step_aside(self, plan: TaskPlan, below: MoveStatus) -> int:
+    def _interrupt_program(self, plan: TaskPlan, below: MoveStatus) -> int:
         """Interrupt the order, for an operator or because it was stopped."""
-        done = super()._step_aside(plan, below)
+        done = super()._interrupt_program(plan, below)
         self._halted = self._halted and not self._detour.move
         self._breaking_off = None
         has_rested = self._rests
         self._rests = False
         if self._taken.stops and self._detour.move:
-            self._taken.answer(Response.STOPPED)
+            self._taken.set_response(Response.STOPPED)
         elif self._taken.stops:
-            self._breaking_off, self._rests = self._window.breaking_off(plan, done, below)
+            self._breaking_off, self._rests = self._window.find_interruption(plan, done, below)
             if has_rested and below.resting:
-                self._taken.answer(Response.STOPPED)
+                self._taken.set_response(Response.STOPPED)
                 self._halted = True
         return done
 
-    def _shown_until(self, plan: TaskPlan) -> int:
+    def _find_last_move(self, plan: TaskPlan) -> int:
         """Return the first move that must not be shown to the level below."""
-        until = super()._shown_until(plan)
+        until = super()._find_last_move(plan)
         return until if self._breaking_off is None else min(until, self._breaking_off)
 
-    def _reason_to_wait(self, below: Reading[MoveStatus]) -> str:
+    def _find_reason_to_wait(self, below: Reading[MoveStatus]) -> str:
         """Return why the arm waits: for an operator, for orders or for a plan."""
-        waits = super()._reason_to_wait(below)
-        if self._orders.stands:
+        waits = super()._find_reason_to_wait(below)
+        if self._orders.is_in_force:
             return waits
         return self._absent or self._held or waits or self._waits
 
@@ -279,16 +281,16 @@ class OrderedTaskExecutor(TaskExecutor):
         else:
             super()._check_progress(plan, waits, tick)
 
-    def _stage(self) -> tuple[int, ...]:
+    def _list_progress_values(self) -> tuple[int, ...]:
         """Return a tuple that changes whenever the orders make progress."""
         return self._taken.order, self._taken.response, self._begun, not self._absent
 
-    def _report(self, plan: TaskPlan, waits: str) -> None:
+    def _write_status(self, plan: TaskPlan, waits: str) -> None:
         """Write status and report, after ending an order that is done or has failed."""
         report = self.report
         status = self.status
         echo = self.status.echo
-        self._settle(plan)
+        self._end_order(plan)
         taken = self._taken
         if self._begun:
             self._moves = self._done, plan.count
@@ -296,7 +298,7 @@ class OrderedTaskExecutor(TaskExecutor):
         elif (report.program, report.echo) != (taken.program, taken.order):
             report.moves_done = 0
             report.moves = 0
-        super()._report(plan, waits)
+        super()._write_status(plan, waits)
         status.echo = echo
         fill_counts(status.record[["action", "actions"]], (self._orders_done, self._orders_begun))
         status.moves_done, status.moves = self._moves
@@ -312,11 +314,11 @@ class OrderedTaskExecutor(TaskExecutor):
             self._actions = ()
         self._is_end_reported = taken.response is Response.ENDED
 
-    def _about(self, action: int, why: str) -> str:
+    def _format_reason(self, action: int, why: str) -> str:
         """Return a reason without the number of the action, because an order is one action."""
         return why.lstrip(",: ")
 
-    def _settle(self, plan: TaskPlan) -> None:
+    def _end_order(self, plan: TaskPlan) -> None:
         """End an order that is done or has failed.
 
         An error that ends the whole run is kept. Any other error becomes the answer to the order.
@@ -325,22 +327,22 @@ class OrderedTaskExecutor(TaskExecutor):
         if self._error and (taken.is_asked or taken.is_under_way):
             if self._absent and self._error is Error.STALLED:
                 return
-            taken.fail(self._error, self._reason)
+            taken.fail_order(self._error, self._reason)
             self._halted = self._halted or self._begun > 0
             self._error = Error.NONE
             self._reason = ""
         elif taken.is_under_way and plan.count and self._done == plan.count:
-            taken.answer(Response.DONE)
+            taken.set_response(Response.DONE)
             self._orders_done += 1
 
-    def _answer(self, below: MoveStatus) -> None:
+    def _answer_operator(self, below: MoveStatus) -> None:
         """Write the command to the level below, with a hold if the arm must rest."""
-        super()._answer(below)
+        super()._answer_operator(below)
         is_held = self._taken.is_under_way and (self._absent or self._held)
         if not self._detour.move and (self._halted or self._rests or is_held):
             self.command.hold = True
 
-    def _state(self, plan: TaskPlan) -> State:
+    def _compute_state(self, plan: TaskPlan) -> State:
         """Return the state that the status shows."""
         if self._error:
             return State.ERROR
@@ -363,7 +365,7 @@ class OrderedTaskPlanner(TaskPlanner):
         # Simulated time before which the plan will not begin.
         self._begin_s = 0.0
 
-    def _first_program(self) -> TaskConfig:
+    def _read_first_program(self) -> TaskConfig:
         """Return an empty program, because actions come as requests."""
         return TaskConfig()
 
@@ -380,18 +382,19 @@ class OrderedTaskPlanner(TaskPlanner):
             self._ahead_s = request.ahead
         return super().wanted(tick)
 
-    def _reason(self, refused: Refused) -> str:
+    def _format_reason(self, refused: Refused) -> str:
         """Return why an order is refused, without the number of the action."""
         return str(refused)
 
-    def _visible_s(self, tick: int) -> float:
+    def _compute_visible_s(self, tick: int) -> float:
         """Return the earliest simulated time at which the plan can begin, s."""
-        return max(super()._visible_s(tick), self._begin_s + self.context.period_s)
+        return max(super()._compute_visible_s(tick), self._begin_s + self.context.period_s)
 
-    def _promise(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
+    def _check_times(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
         """Add the earliest end of the order to the plan, in the coordinator's time."""
-        super()._promise(moves, visible_s)
+        super()._check_times(moves, visible_s)
         unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
         self.output.earliest = (
-            finish_times(unhurried, visible_s, self.context, self._needs)[-1] + self._ahead_s
+            compute_finish_times(unhurried, visible_s, self.context, self._needs)[-1]
+            + self._ahead_s
         )

@@ -21,14 +21,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.message import Message, field, integer
+from rack.backplane.message import Message, field, integer_field
 from rack.levels.algebra import Array
 
-MOST_SHARED = 4
+MAX_SHARED = 4
 """Maximum number of bodies that a rack shares. The message has the same layout in every rack."""
 NAME_BYTES = 40
-MOST_CLAIMS = (1 << 32) - 1
-FARTHEST_M = 1e3
+MAX_CLAIM = (1 << 32) - 1
+MAX_DISTANCE_M = 1e3
 """Largest valid distance from the origin. The simulation gives up bodies much farther away."""
 
 
@@ -36,13 +36,15 @@ class SharedBodyEntry(Message, version=1, message="shared_body"):
     """One body that several racks share."""
 
     name: str = field(f"S{NAME_BYTES}", doc="name of the body in the model, empty if there is none")
-    claim: int = integer("number of the claim that this rack knows to be valid, 0 if there is none")
+    claim: int = integer_field(
+        "number of the claim that this rack knows to be valid, 0 if there is none"
+    )
     owner: str = field(
         f"S{NAME_BYTES}", doc="rack that made the claim, whose simulation moves the body"
     )
     touched: bool = field(doc="whether the gripper of this rack touches it")
     position: np.ndarray = field(
-        unit="m", doc="body origin in this rack's simulation", shape=3, length=(0.0, FARTHEST_M)
+        unit="m", doc="body origin in this rack's simulation", shape=3, length=(0.0, MAX_DISTANCE_M)
     )
     quaternion: np.ndarray = field(
         unit="1", doc="body orientation in this rack's simulation", shape=4, length=(0.999, 1.001)
@@ -53,7 +55,7 @@ class SharedBodies(Message, version=1):
     """The bodies that a rack shares with others."""
 
     rack: str = field(f"S{NAME_BYTES}", doc="rack that writes this")
-    bodies: np.ndarray = field(SharedBodyEntry, doc="the bodies that it shares", shape=MOST_SHARED)
+    bodies: np.ndarray = field(SharedBodyEntry, doc="the bodies that it shares", shape=MAX_SHARED)
 
 
 class Claim(NamedTuple):
@@ -83,17 +85,17 @@ class SharedBody:
     is_touched: bool = False
 
     @property
-    def is_elsewhere(self) -> bool:
+    def is_moved_elsewhere(self) -> bool:
         """Whether the simulation of another rack moves the body."""
         return self.claim.owner not in (b"", self.rack)
 
-    def touch(self, touches: bool) -> None:
+    def update_touch(self, touches: bool) -> None:
         """Note whether this rack's gripper touches the body. The first touch claims the body."""
         if touches and not self.is_touched and self.claim.owner != self.rack:
-            self.claim = Claim(min(self.claim.number + 1, MOST_CLAIMS), self.rack)
+            self.claim = Claim(min(self.claim.number + 1, MAX_CLAIM), self.rack)
         self.is_touched = touches
 
-    def hear(self, message: SharedBodies) -> Array | None:
+    def process_message(self, message: SharedBodies) -> Array | None:
         """Process a message of another rack.
 
         A greater claim is accepted from any rack. Otherwise only the owner's message counts.
@@ -104,19 +106,21 @@ class SharedBody:
         for entry in message.bodies[message.bodies["name"] == self.name]:
             claim = Claim(int(entry["claim"]), bytes(entry["owner"]))
             if claim > self.claim or (
-                claim == self.claim and self.is_elsewhere and message.record["rack"] == claim.owner
+                claim == self.claim
+                and self.is_moved_elsewhere
+                and message.record["rack"] == claim.owner
             ):
                 self.claim = claim
                 return np.concatenate((entry["position"], entry["quaternion"]))
         return None
 
-    def recall(self, message: SharedBodies) -> None:
+    def restore_state(self, message: SharedBodies) -> None:
         """Restore the state from this rack's own last message, after a restart of the board."""
         for entry in message.bodies[message.bodies["name"] == self.name]:
             self.claim = Claim(int(entry["claim"]), bytes(entry["owner"]))
             self.is_touched = bool(entry["touched"])
 
-    def show(self, record: np.void, pose: Array) -> None:
+    def write_entry(self, record: np.void, pose: Array) -> None:
         """Write the state into a `SharedBodyEntry`. `pose` is (7,), from this rack's simulation."""
         record["name"] = self.name
         record["touched"] = self.is_touched

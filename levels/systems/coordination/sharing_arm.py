@@ -36,14 +36,14 @@ class SharingArm(SimulatedArm):
 
     def is_touched(self, row: int) -> bool:
         """Return True if the gripper touches an object."""
-        return bool(self._held()[self.cell.parts(row)].any())
+        return bool(self._mark_held_geoms()[self.cell.list_geoms(row)].any())
 
-    def pose(self, row: int) -> Array:
+    def read_pose(self, row: int) -> Array:
         """Return the simulated pose of an object, (7,), m and quaternion."""
         qpos_index = self.cell.object_qpos[row]
         return np.array(self._data.qpos[qpos_index : qpos_index + POSE])
 
-    def place(self, row: int, pose: Array) -> None:
+    def place_object(self, row: int, pose: Array) -> None:
         """Move an object to a pose, (7,), m and quaternion, and set its velocity to zero."""
         model = self._model
         qpos_index = self.cell.object_qpos[row]
@@ -53,15 +53,15 @@ class SharingArm(SimulatedArm):
         if row in self._kept:
             self._kept[row] = pose
 
-    def keep(self, row: int, kept: bool) -> None:
+    def fix_object(self, row: int, is_fixed: bool) -> None:
         """Fix an object at its present pose, or let the simulation move it again."""
-        if not kept:
+        if not is_fixed:
             self._kept.pop(row, None)
         elif row not in self._kept:
-            self._kept[row] = self.pose(row)
+            self._kept[row] = self.read_pose(row)
 
-    def _simulate(self) -> None:
+    def _simulate_tick(self) -> None:
         """Simulate a tick, then return the fixed copies to their poses."""
-        super()._simulate()
+        super()._simulate_tick()
         for row, pose in self._kept.items():
-            self.place(row, pose)
+            self.place_object(row, pose)

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pydantic import Field, field_validator
 
 from rack.levels.arm import find_arm
-from rack.levels.level import Input, Inputs, LevelContext, Misfits, Output
+from rack.levels.level import Input, Inputs, LevelContext, Mismatches, Output
 from rack.levels.servo.control import ServoParams
 from rack.levels.servo.executor import ServoExecutor
 from rack.levels.systems.coordination.shared_bodies import (
-    MOST_SHARED,
+    MAX_SHARED,
     NAME_BYTES,
     SharedBodies,
     SharedBody,
@@ -25,14 +25,14 @@ SHARED = Output(SharedBodies, cycles=8)
 class SharingServoParams(ServoParams):
     """`[board.servo.params]` of a servo level that shares objects."""
 
-    shared: tuple[str, ...] = Field(min_length=1, max_length=MOST_SHARED)
+    shared: tuple[str, ...] = Field(min_length=1, max_length=MAX_SHARED)
     """objects of the scene that arms of other racks move too"""
     arm: str = "rack.levels.systems.coordination.sharing_arm:SharingArm"
     """class of the arm, package.module:Class; a SharingArm"""
 
     @field_validator("arm")
     @classmethod
-    def _shares(cls, reference: str) -> str:
+    def _check_arm(cls, reference: str) -> str:
         """Check that the arm can share objects."""
         if not issubclass(find_arm(reference), SharingArm):
             raise ValueError(
@@ -64,9 +64,9 @@ class SharingServoExecutor(ServoExecutor):
         }
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield mistakes in the list of shared objects, and the ones of any servo level.
 
         Args:
@@ -89,35 +89,35 @@ class SharingServoExecutor(ServoExecutor):
                 why = f"does not fit into a message: at most {NAME_BYTES} ASCII characters"
             if why:
                 yield "params.shared", name, why
-        yield from super().misfits(context, above, below)
+        yield from super().find_mismatches(context, above, below)
 
     def process(self, tick: int) -> None:
         """Do the cycle of a servo level, and write the shared objects when they are due."""
-        if not self.takeover.is_started and self.last.is_there:
+        if not self.takeover.is_started and self.last.has_message:
             for body in self._shared.values():
-                body.recall(self.last.message)
+                body.restore_state(self.last.message)
         super().process(tick)
         if SHARED.is_due(tick, self.context.every, self.context.phase):
             self.shared.rack = self.context.rack
             for slot, (row, body) in enumerate(self._shared.items()):
-                body.show(self.shared.bodies[slot], self.arm.pose(row))
+                body.write_entry(self.shared.bodies[slot], self.arm.read_pose(row))
 
-    def started(self) -> None:
+    def on_restored(self) -> None:
         """Keep the grip, and fix copies where the restored state has them."""
-        super().started()
-        self._keep()
+        super().on_restored()
+        self._fix_copies()
 
     def take_messages(self) -> None:
         """Read new messages, also from other racks, and update claims and copies."""
         super().take_messages()
         for row, body in self._shared.items():
             for other in self.others.values():
-                if other.is_new and (pose := body.hear(other.message)) is not None:
-                    self.arm.place(row, pose)
-            body.touch(self.arm.is_touched(row))
-        self._keep()
+                if other.is_new and (pose := body.process_message(other.message)) is not None:
+                    self.arm.place_object(row, pose)
+            body.update_touch(self.arm.is_touched(row))
+        self._fix_copies()
 
-    def _keep(self) -> None:
+    def _fix_copies(self) -> None:
         """Fix the copies of objects that other racks move, and release the rest."""
         for row, body in self._shared.items():
-            self.arm.keep(row, body.is_elsewhere)
+            self.arm.fix_object(row, body.is_moved_elsewhere)

@@ -21,7 +21,7 @@ from rack.levels.robot.wrist import Wrist
 from rack.levels.servo.control import ArmParams, Reacting
 from rack.levels.servo.stopping import Cause, Reaction
 from rack.levels.systems.force.contact import HALVES, WristLevel
-from rack.levels.systems.force.hybrid_law import turned
+from rack.levels.systems.force.hybrid_law import rotate_halves
 from rack.levels.systems.force.messages import AXES, Wrench
 from rack.levels.systems.joint_boards import ArmExecutor
 
@@ -59,7 +59,7 @@ class ContactWrench:
         self.torque = np.zeros(len(cell.dof))
         self.saturated = True
 
-    def take(self, raw: Array, state: Array, acceleration: Array) -> None:
+    def take_sample(self, raw: Array, state: Array, acceleration: Array) -> None:
         """Compute the contact from a sample.
 
         Args:
@@ -84,7 +84,7 @@ class ContactWrench:
         moment = np.zeros(3)
         mujoco.mju_cross(moment, place - data.subtree_com[model.body_rootid[body]], expected[:3])
         expected[3:] -= moment
-        self.wrench[:] = expected - turned(data.site_xmat[self._site].reshape(3, 3), raw)
+        self.wrench[:] = expected - rotate_halves(data.site_xmat[self._site].reshape(3, 3), raw)
         mujoco.mju_cross(moment, place - data.site_xpos[self._cell.tool], self.wrench[:3])
         self.wrench[3:] += moment
         jacobian = self._jacobian
@@ -124,10 +124,10 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         assert self.cell.wrist is not None, "`misfits` refuses an arm without a sensor"
-        self._most = self.cell.wrist.most
+        self._most = self.cell.wrist.contact_limits
         self._on_limit = Reaction[self.settings.on_force_limit.upper()]
         self.contact = ContactWrench(self.cell, self.cell.wrist, self.arm.dynamics)
-        self._exact = self.cell.encoders.exact
+        self._exact = self.cell.encoders.is_exact
         # (joints,), rad/s: velocities of the last sample.
         self._before = np.zeros(len(self.cell.dof))
         self._since: int | None = None  # tick of that sample, None if there is none
@@ -139,14 +139,14 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         Raises:
             LevelError: It has none.
         """
-        if self.arm.feel() is None:
+        if self.arm.sense_wrist() is None:
             raise LevelError(
                 f"params.arm: class '{type(self.arm).__name__}' gives no sample of a wrist sensor"
             )
 
     def process(self, tick: int) -> None:
         """Do the cycle of an arm, and write the wrench."""
-        if self._since is None and self.felt.is_there:
+        if self._since is None and self.felt.has_message:
             self._exceeded = self.felt.message.exceeded
         super().process(tick)
         wrench = self.wrench
@@ -157,19 +157,19 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         wrench.wrench = contact.wrench
         wrench.sample = contact.raw
 
-    def feel(self, tick: int) -> None:
+    def sense_contact(self, tick: int) -> None:
         """Sense the contact, and stop the arm if it is too strong."""
-        raw = self.arm.feel()
+        raw = self.arm.sense_wrist()
         velocity = self._velocity
         assert raw is not None, "the self-test refuses an arm without a sensor"
         acceleration = np.zeros(len(velocity))
         is_velocity_known = not self.sensors.faulty and (self._exact or not self.abandoned)
         if is_velocity_known and self._since is not None:
             acceleration = (velocity - self._before) / (self.context.tick_s * (tick - self._since))
-        self.contact.take(raw, self.sensors.state, acceleration)
+        self.contact.take_sample(raw, self.sensors.state, acceleration)
         self._before[:] = velocity
         self._since = tick
-        self._limit(tick)
+        self._check_limits(tick)
 
     @property
     def _velocity(self) -> Array:
@@ -177,28 +177,28 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         velocity: Array = self.sensors.velocity if self._exact else self._wanted[1]
         return velocity
 
-    def _limit(self, tick: int) -> None:
+    def _check_limits(self, tick: int) -> None:
         """Stop the arm if the contact is beyond a limit, or not known to be within it."""
         contact = self.contact
         if contact.saturated:
             finding = Finding(Alarm.FORCE_LIMIT, -1, norm(contact.raw[:3]))
             text = "contact too strong: the wrist sensor is at the end of its range"
-            self._stop(finding, text, tick)
+            self._stop_arm(finding, text, tick)
             return
         for (half, name, unit), limit, alarm in zip(HALVES, self._most, ALARMS, strict=True):
             strength = norm(contact.wrench[half])
             if strength > limit:
                 text = f"contact too strong: {name} of {strength:.3g} {unit}; permitted: {limit:g}"
-                self._stop(Finding(alarm, -1, strength), text, tick)
+                self._stop_arm(Finding(alarm, -1, strength), text, tick)
                 return
 
-    def _stop(self, finding: Finding, text: str, tick: int) -> None:
+    def _stop_arm(self, finding: Finding, text: str, tick: int) -> None:
         """Count the cycle, and register the contact as the cause of a stop."""
         self._exceeded += 1
         cause = Cause(Error.FORCE, text, value=finding.value)
-        self.stopping.stop_for(cause, finding, tick, self._on_limit)
+        self.stopping.register_blow(cause, finding, tick, self._on_limit)
 
-    def started(self) -> None:
+    def on_restored(self) -> None:
         """Continue from the restored state."""
         self._before[:] = self._velocity
         self._since = self.arm.tick

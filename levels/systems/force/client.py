@@ -26,8 +26,8 @@ from pydantic import ValidationError
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostReceiver, HostSender, ProgramInput, ProgramOutput
-from rack.levels.level import LevelContext, Misfits, Program
-from rack.levels.systems.force.contact import AXIS_NAMES, Axis, Wanted, misfit
+from rack.levels.level import LevelContext, Mismatches, Program
+from rack.levels.systems.force.contact import AXIS_NAMES, Axis, WantedContact, find_misfit
 from rack.levels.systems.force.messages import Mode, ServerRequest, ServerStatus
 from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
 from rack.levels.systems.trajectory.messages import MotionKind
@@ -47,7 +47,7 @@ class FrameConfig(Table):
     z: Vector
     """its z axis, at a right angle to x"""
 
-    def objection(self) -> str:
+    def find_objection(self) -> str:
         """Return why the axes do not define a frame, or an empty text."""
         lengths = norm(self.x) * norm(self.z)
         if not lengths > 0.0:
@@ -91,16 +91,18 @@ class ForceProgram(Program):
     contact: dict[str, ContactConfig] = {}
     """contacts, by name"""
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
+    def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
         """Yield invalid frames, and contacts in unknown frames or beyond the limits of the arm."""
-        bent = {name: reason for name, frame in self.frame.items() if (reason := frame.objection())}
+        bent = {
+            name: reason for name, frame in self.frame.items() if (reason := frame.find_objection())
+        }
         for name, reason in bent.items():
             yield f"frame.{name}", self.frame[name].model_dump(), reason
         for name, contact in self.contact.items():
-            if contact.frame not in bent and (reason := self.objection(contact, robot)):
+            if contact.frame not in bent and (reason := self.find_objection(contact, robot)):
                 yield f"contact.{name}", contact.model_dump(exclude_defaults=True), reason
 
-    def objection(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
+    def find_objection(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
         """Return why a contact is impossible, or an empty text."""
         if contact.frame not in self.frame:
             return (
@@ -114,25 +116,25 @@ class ForceProgram(Program):
                 f"axis {idle[0]} has a speed and no force; axes of force:"
                 f" {', '.join(contact.wrench) or 'none'}"
             )
-        wanted = self.wanted(contact)
-        return misfit(
+        wanted = self.build_contact(contact)
+        return find_misfit(
             wanted.frame,
             (wanted.wrench, wanted.guard),
             (robot.wrist.most_force, robot.wrist.most_torque),
         )
 
-    def wanted(self, contact: ContactConfig) -> Wanted:
+    def build_contact(self, contact: ContactConfig) -> WantedContact:
         """Return a contact as the numbers of a request."""
-        return Wanted(
+        return WantedContact(
             frame=self.frame[contact.frame].quaternion,
             selected=np.array([name in contact.wrench for name in AXIS_NAMES]),
-            wrench=by_axis(contact.wrench),
-            speed=by_axis(contact.speed),
-            guard=by_axis(contact.guard),
+            wrench=to_vector(contact.wrench),
+            speed=to_vector(contact.speed),
+            guard=to_vector(contact.guard),
         )
 
 
-def by_axis(values: Mapping[Axis, float]) -> Array:
+def to_vector(values: Mapping[Axis, float]) -> Array:
     """Return values by axis as a vector, (6,), with 0 for axes without a value."""
     return np.array([values.get(name, 0.0) for name in AXIS_NAMES])
 
@@ -161,28 +163,28 @@ class ForceMotions(Motions):
 
         The request is done when the forces are as wanted. Keywords change entries of the contact.
         """
-        wanted = self._wanted("comply", contact, changes)
+        wanted = self._read_contact("comply", contact, changes)
         if not wanted.selected.any():
             raise LevelError(
                 f"comply: contact '{contact}' has no axis of force; free() ends compliance"
             )
         fields = wanted._asdict()
         del fields["guard"]
-        return self._request(kind=MotionKind.COMPLY, **fields)
+        return self._queue_request(kind=MotionKind.COMPLY, **fields)
 
     def guard(self, contact: str, **changes: Any) -> int:
         """Guard axes: the next wrench beyond a limit ends the motion under way.
 
         Keywords change entries of the contact.
         """
-        wanted = self._wanted("guard", contact, changes)
+        wanted = self._read_contact("guard", contact, changes)
         if not wanted.guard.any():
             raise LevelError(f"guard: contact '{contact}' guards no axis")
-        return self._request(kind=MotionKind.GUARD, frame=wanted.frame, guard=wanted.guard)
+        return self._queue_request(kind=MotionKind.GUARD, frame=wanted.frame, guard=wanted.guard)
 
     def free(self) -> int:
         """End compliance and guards. The request is done when the arm rests where it is."""
-        return self._request(kind=MotionKind.COMPLY)
+        return self._queue_request(kind=MotionKind.COMPLY)
 
     @property
     def _status(self) -> ServerStatus:
@@ -204,7 +206,7 @@ class ForceMotions(Motions):
         """Return the sensed position of the tool, m."""
         return [round(float(x), 4) for x in self._status.place]
 
-    def _wanted(self, call: str, name: str, changes: Mapping[str, Any]) -> Wanted:
+    def _read_contact(self, call: str, name: str, changes: Mapping[str, Any]) -> WantedContact:
         """Return a contact of the program with changes.
 
         Args:
@@ -229,16 +231,16 @@ class ForceMotions(Motions):
             raise LevelError(
                 f"{call}: {key} = {first['input']!r}: {first['msg'].lower()}"
             ) from error
-        if reason := self._program.objection(changed, self._robot):
+        if reason := self._program.find_objection(changed, self._robot):
             raise LevelError(f"{call}: contact '{name}': {reason}")
-        return self._program.wanted(changed)
+        return self._program.build_contact(changed)
 
-    def _look(self) -> None:
+    def _wait_and_resend(self) -> None:
         """Send a sign of life if one is due, besides what the base class does."""
         if self._bus.tick - self._signed >= self._sign_ticks:
             self._signed = self._bus.tick
-            self._send({"id": 0})
-        super()._look()
+            self._send_request({"id": 0})
+        super()._wait_and_resend()
 
 
 class ForceClient(CommandEnvironment):

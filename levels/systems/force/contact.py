@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple, Self, get_args
 import numpy as np
 
 from rack.levels.algebra import Array, Mask, norm
-from rack.levels.level import Executor, LevelContext, Misfits
+from rack.levels.level import Executor, LevelContext, Mismatches
 from rack.levels.systems.force.messages import AXES, Compliance
 
 Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
@@ -26,7 +26,7 @@ SAME = 1e-9
 """Largest difference between quaternions that count as the same."""
 
 
-class Wanted(NamedTuple):
+class WantedContact(NamedTuple):
     """The contact that a request asks for. The last four are (6,), by axis.
 
     See `ServerRequest`.
@@ -39,7 +39,7 @@ class Wanted(NamedTuple):
     guard: Array
 
     @classmethod
-    def of(cls, record: Any) -> Self:
+    def from_record(cls, record: Any) -> Self:
         """Return the contact of the record of a request."""
         wanted = cls(*(record[name] for name in cls._fields))
         return wanted._replace(selected=wanted.selected.astype(bool))
@@ -64,11 +64,11 @@ class Contact:
         self.wrench, self.speed, self.guard = np.zeros((3, AXES))
 
     @property
-    def complies(self) -> bool:
+    def is_compliant(self) -> bool:
         """True if any axis is an axis of force."""
         return bool(self.selected.any())
 
-    def comply(self, wanted: Wanted) -> bool:
+    def set_force_axes(self, wanted: WantedContact) -> bool:
         """Replace the axes of force, and drop the guards if the frame is another one.
 
         Returns:
@@ -76,7 +76,9 @@ class Contact:
         """
         selected = wanted.selected
         is_other_frame = not self._is_frame(wanted.frame)
-        must_restart = self.complies and (is_other_frame or bool((self.selected != selected).any()))
+        must_restart = self.is_compliant and (
+            is_other_frame or bool((self.selected != selected).any())
+        )
         if is_other_frame:
             self.guard[:] = 0.0
         self.id += 1
@@ -86,27 +88,27 @@ class Contact:
         self.wrench[:] = np.where(selected, wanted.wrench, 0.0)
         return must_restart
 
-    def watch(self, frame: Array, guard: Array) -> None:
+    def set_guards(self, frame: Array, guard: Array) -> None:
         """Replace the task frame and the guards."""
         self.id += 1
         self.frame[:] = frame / norm(frame)
         self.guard[:] = guard
 
-    def relax(self) -> None:
+    def clear_wrench(self) -> None:
         """Set the wanted forces to zero; the axes of force remain."""
         self.id += 1
         self.wrench[:] = 0.0
 
-    def release(self) -> None:
+    def release_axes(self) -> None:
         """Make all axes axes of motion without guards."""
         self.id += 1
         self.selected[:] = False
         self.wrench[:] = 0.0
         self.guard[:] = 0.0
 
-    def objection(self, frame: Array, guard: Array) -> str:
+    def find_objection(self, frame: Array, guard: Array) -> str:
         """Return why guards in a frame are impossible at present, or an empty text."""
-        if self.complies and guard.any() and not self._is_frame(frame):
+        if self.is_compliant and guard.any() and not self._is_frame(frame):
             return (
                 "the guard's frame is not that of the axes of force; permitted while complying: the"
                 " same"
@@ -117,21 +119,21 @@ class Contact:
         """Return True if `frame` is the present task frame; q and -q are the same orientation."""
         return bool(1.0 - abs(float((frame * self.frame).sum())) / norm(frame) < SAME)
 
-    def fill(self, compliance: Compliance) -> None:
+    def fill_message(self, compliance: Compliance) -> None:
         """Write the contact to a `Compliance`."""
         compliance.id = self.id
-        compliance.active = self.complies or bool(self.guard.any())
-        for name in Wanted._fields:
+        compliance.active = self.is_compliant or bool(self.guard.any())
+        for name in WantedContact._fields:
             setattr(compliance, name, getattr(self, name))
 
-    def recall(self, compliance: Compliance) -> None:
+    def restore_contact(self, compliance: Compliance) -> None:
         """Continue from the last message after a restart."""
         self.id = compliance.id
-        for name in Wanted._fields:
+        for name in WantedContact._fields:
             getattr(self, name)[:] = getattr(compliance, name)
 
 
-def misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) -> str:
+def find_misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) -> str:
     """Return why a task frame, or a wrench in it, is impossible, or an empty text.
 
     Args:
@@ -156,11 +158,11 @@ class WristLevel(Executor):
     """Base of executors for arms with a wrist sensor."""
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield an arm without a wrist sensor, and what the base class yields."""
-        yield from super().misfits(context, above, below)
+        yield from super().find_mismatches(context, above, below)
         if context.robot.wrist is None:
             yield (
                 "executor",

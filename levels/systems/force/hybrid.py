@@ -13,12 +13,12 @@ from rack.levels.algebra import Array, Mask, norm
 from rack.levels.level import Input, Inputs, LevelContext, Output, Reading
 from rack.levels.operator import ABOVE_LOST
 from rack.levels.robot import dynamics
-from rack.levels.robot.cell import cell_of
+from rack.levels.robot.cell import build_level_cell
 from rack.levels.robot.dynamics import Payload
 from rack.levels.servo import curves, reference
 from rack.levels.servo.reference import Reference
 from rack.levels.systems.force.contact import AXIS_NAMES, HALVES, WristLevel
-from rack.levels.systems.force.hybrid_law import ForceTask, HybridGains, HybridLaw, turned
+from rack.levels.systems.force.hybrid_law import ForceTask, HybridGains, HybridLaw, rotate_halves
 from rack.levels.systems.force.messages import AXES, Compliance, ForceStatus, Wrench
 from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.systems.trajectory.boards import JointBoards
@@ -26,9 +26,9 @@ from rack.levels.systems.trajectory.boards import JointBoards
 LEAD_CYCLES = 2
 """Cycles from the release that computes a reference to the tick at which it is due, so that the
 boards below have it in time."""
-PASSED = ("opening", "force", "payload_mass", "payload_offset", "operator")
+FORWARDED_FIELDS = ("opening", "force", "payload_mass", "payload_offset", "operator")
 """Fields of a reference that are passed down unchanged."""
-OLDEST_CYCLES = 2
+MAX_WRENCH_AGE_CYCLES = 2
 """Cycles of the level after which a wrench is too old."""
 NO_FORCE = np.zeros((2, AXES))
 """Wanted wrench and selected axes without axes of force."""
@@ -50,7 +50,7 @@ class ComplianceWatch:
     def __init__(self, most: tuple[float, float], every: int) -> None:
         """Limit contacts to `most`, N and N m. A cycle takes `every` ticks."""
         self._most = most
-        self._oldest = OLDEST_CYCLES * every
+        self._oldest = MAX_WRENCH_AGE_CYCLES * every
         self.task: ForceTask | None = None
         self.struck = 0
         self.axis = -1
@@ -59,13 +59,13 @@ class ComplianceWatch:
         self.rests = False
         self.reason = ""
 
-    def recall(self, last: Reading[ForceStatus]) -> None:
+    def restore_guard(self, last: Reading[ForceStatus]) -> None:
         """Continue after a restart from the last `ForceStatus`, because a guard acts only once."""
-        if last.is_there:
+        if last.has_message:
             self.struck = last.message.struck
             self.axis = last.message.axis
 
-    def look(
+    def judge_cycle(
         self,
         compliance: Reading[Compliance],
         wrench: Reading[Wrench],
@@ -84,43 +84,45 @@ class ComplianceWatch:
         self.task = None
         self.rests = False
         self.reason = ""
-        self.sensed = wrench.message.tick if wrench.is_there else -1
-        reason = objection(wanted) if wanted.active else ""
-        rotation = rotation_of(wanted.frame) if wanted.frame.any() and not reason else np.eye(3)
-        self.felt = turned(rotation.T, wrench.message.wrench)
+        self.sensed = wrench.message.tick if wrench.has_message else -1
+        reason = find_objection(wanted) if wanted.active else ""
+        rotation = (
+            compute_rotation(wanted.frame) if wanted.frame.any() and not reason else np.eye(3)
+        )
+        self.felt = rotate_halves(rotation.T, wrench.message.wrench)
         if reason:
-            self._rest(reason)
+            self._require_rest(reason)
         elif wanted.active:
             # Rest if the contact is not known or a level above is lost.
-            blind = self._blind(wrench, tick)
+            blind = self._explain_blindness(wrench, tick)
             if blind or above_is_lost or compliance.is_lost:
-                self._rest(blind or ABOVE_LOST)
-            self._take(wanted, rotation)
+                self._require_rest(blind or ABOVE_LOST)
+            self._take_force_axes(wanted, rotation)
             if not blind:
-                self._guard(wanted)
+                self._check_guards(wanted)
 
-    def _rest(self, reason: str) -> None:
+    def _require_rest(self, reason: str) -> None:
         """Require that the motion ends."""
         self.rests = True
         self.reason = reason
 
-    def _blind(self, wrench: Reading[Wrench], tick: int) -> str:
+    def _explain_blindness(self, wrench: Reading[Wrench], tick: int) -> str:
         """Return why the contact is not known, or an empty text."""
-        if not wrench.is_there or wrench.is_lost:
+        if not wrench.has_message or wrench.is_lost:
             return "no wrench from the board of the arm: waiting for it"
         if tick - self.sensed > self._oldest:
             return f"wrench is stale, {tick - self.sensed} ticks: waiting for the board of the arm"
         return "the wrist sensor is at the end of its range" if wrench.message.saturated else ""
 
-    def _take(self, compliance: Compliance, rotation: Array) -> None:
+    def _take_force_axes(self, compliance: Compliance, rotation: Array) -> None:
         """Set the axes of force. While the motion must end, they rest."""
         selected = compliance.selected.astype(bool)
         if selected.any():
-            wanted = self._permitted(np.where(selected, compliance.wrench, 0.0))
+            wanted = self._limit_wrench(np.where(selected, compliance.wrench, 0.0))
             exerted = None if self.rests else -self.felt
             self.task = ForceTask(rotation, selected, wanted, exerted, compliance.speed)
 
-    def _permitted(self, wanted: Array) -> Array:
+    def _limit_wrench(self, wanted: Array) -> Array:
         """Return the wanted wrench, reduced to the arm's limits on contacts."""
         for (half, name, unit), limit in zip(HALVES, self._most, strict=True):
             size = norm(wanted[half])
@@ -133,19 +135,19 @@ class ComplianceWatch:
                 self.reason = self.reason or text
         return wanted
 
-    def _guard(self, compliance: Compliance) -> None:
+    def _check_guards(self, compliance: Compliance) -> None:
         """End the motion if a guard is struck, once for each command."""
         beyond: Mask = (compliance.guard > 0.0) & (np.abs(self.felt) > compliance.guard)
         if beyond.any() and self.struck != compliance.id:
             self.struck = compliance.id
             self.axis = int(beyond.argmax())
         if self.struck == compliance.id:
-            self._rest(
+            self._require_rest(
                 f"guard of axis {AXIS_NAMES[self.axis]} was struck: held until another command"
             )
 
 
-def objection(compliance: Compliance) -> str:
+def find_objection(compliance: Compliance) -> str:
     """Return why a command is impossible, or an empty text."""
     numbers = np.concatenate(
         (compliance.frame, compliance.wrench, compliance.speed, compliance.guard)
@@ -158,7 +160,7 @@ def objection(compliance: Compliance) -> str:
     )
 
 
-def rotation_of(quaternion: Array) -> Array:
+def compute_rotation(quaternion: Array) -> Array:
     """Return the rotation matrix, (3, 3), of a quaternion of any length but 0."""
     unit = quaternion.copy()
     rotation = np.zeros(9)
@@ -193,9 +195,9 @@ class HybridExecutor(WristLevel):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        cell = cell_of(context)
+        cell = build_level_cell(context)
         assert cell.wrist is not None, "`misfits` refuses an arm without a sensor"
-        self._watch = ComplianceWatch(cell.wrist.most, context.every)
+        self._watch = ComplianceWatch(cell.wrist.contact_limits, context.every)
         self._law = HybridLaw(cell, self.settings)
         self._reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self._boards = JointBoards(context.robot.joints, cell.bounds.position)
@@ -208,24 +210,24 @@ class HybridExecutor(WristLevel):
     def process(self, tick: int) -> None:
         """Do one cycle: follow references and forces, and report."""
         if self._tick is None:
-            self._watch.recall(self.last_force)
+            self._watch.restore_guard(self.last_force)
             self._tick = tick - self.context.every
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
         if self._boards.update(self.statuses):
-            self._begin(self._boards.position, tick)
+            self._begin_at_rest(self._boards.position, tick)
         if self.above.is_new:
-            self._reference.take(self.above.message)
-        self._watch.look(self.compliance, self.wrench, self.above.is_lost, tick)
+            self._reference.take_command(self.above.message)
+        self._watch.judge_cycle(self.compliance, self.wrench, self.above.is_lost, tick)
         self.command.id = tick // self.context.every + 1
-        for name in PASSED:
+        for name in FORWARDED_FIELDS:
             setattr(self.command, name, getattr(self.above.message, name))
         if self._boards.in_step:
-            self._move(self.command, tick, passed_s)
+            self._write_reference(self.command, tick, passed_s)
         else:
             self.command.due = 0
             self._moving[:] = 0.0
-        self._report(self.status)
+        self._write_status(self.status)
         force = self.force
         watch = self._watch
         force.echo = self.compliance.message.id
@@ -241,17 +243,17 @@ class HybridExecutor(WristLevel):
         force.state = State.HOLDING if watch.reason else resting
         force.reason = watch.reason
 
-    def _begin(self, position: Array, tick: int) -> None:
+    def _begin_at_rest(self, position: Array, tick: int) -> None:
         """Start at rest at `position`, without a difference from the motion."""
-        self._law.begin()
+        self._law.reset_offset()
         self._target = position.copy()
         self._reference.start(position, self._still, tick)
 
-    def _move(self, command: JointReference, tick: int, passed_s: float) -> None:
+    def _write_reference(self, command: JointReference, tick: int, passed_s: float) -> None:
         """Write the reference that is due two cycles later."""
         watch = self._watch
         reference = self._reference
-        motion = reference.rest(tick) if watch.rests else reference.at(tick)
+        motion = reference.ramp_to_rest(tick) if watch.rests else reference.compute_motion(tick)
         payload = Payload(command.payload_mass, command.payload_offset)
         joints = self._law.step(motion, watch.task, passed_s, payload)
         command.due = tick + LEAD_CYCLES * self.context.every
@@ -259,10 +261,15 @@ class HybridExecutor(WristLevel):
             setattr(command, name, values)
         self._target = joints.position
         self._moving[:] = motion.velocity
-        if reference.holding and watch.task is None and self._law.rests and not self._moving.any():
-            self._begin(self._target, tick)
+        if (
+            reference.holding
+            and watch.task is None
+            and self._law.is_at_rest
+            and not self._moving.any()
+        ):
+            self._begin_at_rest(self._target, tick)
 
-    def _report(self, status: JointStatus) -> None:
+    def _write_status(self, status: JointStatus) -> None:
         """Report the boards below as one, with this level's set points."""
         values = [reading.message for reading in self.statuses.values()]
         status.position = values[0].position
@@ -276,7 +283,7 @@ class HybridExecutor(WristLevel):
         status.stopped = not self._boards.in_step
         status.due = self.above.message.due
         worst = max(values, key=lambda value: value.error)
-        waiting = self._watch.reason if self._boards.in_step else self._boards.awaited
+        waiting = self._watch.reason if self._boards.in_step else self._boards.wait_reason
         status.error = worst.error
         status.reason = worst.reason if worst.error else waiting
         if worst.error:

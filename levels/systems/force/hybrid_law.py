@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field
 
 from rack.levels.algebra import Array, Mask, gram, mat_vec, solve, transposed_mat_vec
-from rack.levels.planning.pose import site_pose
+from rack.levels.planning.pose import read_site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo.curves import Motion
@@ -88,7 +88,7 @@ class ToolKinematics:
         self._dynamics = Dynamics(cell)
         self._whole = np.zeros((AXES, cell.model.nv))
 
-    def look(self, position: Array, velocity: Array, payload: Payload | None = None) -> None:
+    def evaluate_at(self, position: Array, velocity: Array, payload: Payload | None = None) -> None:
         """Evaluate a state.
 
         Args:
@@ -101,7 +101,7 @@ class ToolKinematics:
         mujoco.mj_jacSite(model, data, self._whole[:3], self._whole[3:], self._cell.tool)
         # (6, joints), in the world's frame.
         self.jacobian: Array = np.take(self._whole, self._cell.dof, axis=1)
-        self.pose = site_pose(data, self._cell.tool)
+        self.pose = read_site_pose(data, self._cell.tool)
 
 
 class HybridLaw:
@@ -127,13 +127,13 @@ class HybridLaw:
         # (3,), m: offset of the tool from its place without force control.
         self.offset = np.zeros(3)
 
-    def begin(self) -> None:
+    def reset_offset(self) -> None:
         """Start at rest without a difference from the motion."""
         for numbers in (self._by_joint, self._by_axis, self.offset):
             numbers[:] = 0.0
 
     @property
-    def rests(self) -> bool:
+    def is_at_rest(self) -> bool:
         """True if the difference from the motion does not change."""
         return not self._speed.any()
 
@@ -150,7 +150,11 @@ class HybridLaw:
         """
         q = motion.position
         qd = motion.velocity
-        wanted = np.zeros(len(q)) if task is None else self._velocity(motion, task, passed_s) - qd
+        wanted = (
+            np.zeros(len(q))
+            if task is None
+            else self._compute_velocity(motion, task, passed_s) - qd
+        )
         change = wanted - self._speed
         max_change = self._limits.acceleration * passed_s
         excess = float((np.abs(change) / max_change).max())
@@ -168,13 +172,16 @@ class HybridLaw:
             self._base[:] = self._away
         gained = motion.acceleration + (self._speed - before) / passed_s
         return JointMotion(
-            position, velocity, gained, *self._loads(task, position, velocity, passed_s, payload)
+            position,
+            velocity,
+            gained,
+            *self._compute_loads(task, position, velocity, passed_s, payload),
         )
 
-    def _velocity(self, motion: Motion, task: ForceTask, passed_s: float) -> Array:
+    def _compute_velocity(self, motion: Motion, task: ForceTask, passed_s: float) -> Array:
         """Return the joint velocities that follow the motion and the wanted force, rad/s."""
-        self._there.look(motion.position + self._base, motion.velocity)
-        self._here.look(motion.position + self._away, motion.velocity + self._speed)
+        self._there.evaluate_at(motion.position + self._base, motion.velocity)
+        self._here.evaluate_at(motion.position + self._away, motion.velocity + self._speed)
         motion_pose = self._there.pose
         present_pose = self._here.pose
         turn = np.zeros(3)
@@ -184,19 +191,20 @@ class HybridLaw:
         mujoco.mju_subQuat(turn, motion_pose.quaternion, present_pose.quaternion)
         mujoco.mju_rotVecQuat(error[3:], turn, present_pose.quaternion)
         wanted = mat_vec(self._there.jacobian, motion.velocity) + CATCH_UP * error
-        twist = turned(task.rotation.T, wanted)
+        twist = rotate_halves(task.rotation.T, wanted)
         forced = np.zeros(AXES)
         if task.exerted is not None:
             forced = np.clip(self._gain * (task.wanted - task.exerted), -task.speed, task.speed)
         forced -= self._forced
         self._forced += min(passed_s / self._smoothing_s, 1.0) * forced
-        velocity = damped_inverse(
-            self._here.jacobian, turned(task.rotation, np.where(task.selected, self._forced, twist))
+        velocity = solve_damped(
+            self._here.jacobian,
+            rotate_halves(task.rotation, np.where(task.selected, self._forced, twist)),
         )
         excess = float((np.abs(velocity) / self._limits.velocity).max())
         return velocity / excess if excess > 1.0 else velocity
 
-    def _loads(
+    def _compute_loads(
         self,
         task: ForceTask | None,
         position: Array,
@@ -208,18 +216,18 @@ class HybridLaw:
 
         The force that is fed forward follows the wanted force with the bandwidth of the loop.
         """
-        self._here.look(position, velocity, payload)
+        self._here.evaluate_at(position, velocity, payload)
         forward = (
             np.zeros(AXES)
             if task is None
-            else turned(task.rotation, np.where(task.selected, task.wanted, 0.0))
+            else rotate_halves(task.rotation, np.where(task.selected, task.wanted, 0.0))
         )
         self._forward += min(self._pace * passed_s, 1.0) * (forward - self._forward)
         inertia, bias = self._here.terms
         return inertia.diagonal(), bias + transposed_mat_vec(self._here.jacobian, self._forward)
 
 
-def turned(rotation: Array, vector: Array) -> Array:
+def rotate_halves(rotation: Array, vector: Array) -> Array:
     """Rotate both halves of a vector.
 
     The vector is (6,), the rotation matrix (3, 3).
@@ -230,7 +238,7 @@ def turned(rotation: Array, vector: Array) -> Array:
     )
 
 
-def damped_inverse(jacobian: Array, twist: Array) -> Array:
+def solve_damped(jacobian: Array, twist: Array) -> Array:
     """Return the joint velocities J^T (J J^T + d)^-1 `twist`, finite near singularities.
 
     The twist is (6,), m/s, rad/s. See `DAMPING` for d.

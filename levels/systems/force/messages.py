@@ -13,9 +13,14 @@ from typing import Any
 
 from numpy import ndarray
 
-from rack.backplane.message import Message, field, integer
+from rack.backplane.message import Message, field, integer_field
 from rack.levels.operator import AnsweringStatus, RelayedCommand
-from rack.levels.systems.trajectory.messages import HELD, MotionRequest, MotionState, MotionStatus
+from rack.levels.systems.trajectory.messages import (
+    MAX_HELD_REQUESTS,
+    MotionRequest,
+    MotionState,
+    MotionStatus,
+)
 
 AXES = 6
 """Number of axes of a task frame: translations along x, y, z, then rotations about them."""
@@ -41,7 +46,7 @@ class Wrench(Message, version=1):
     )
     sample: ndarray = per_axis("N, N m", "as the sensor gives it, in the sensor's frame")
     saturated: bool = field(doc="1: the sensor is at the end of its range")
-    exceeded: int = integer("cycles in which the contact was beyond the arm's force limits")
+    exceeded: int = integer_field("cycles in which the contact was beyond the arm's force limits")
 
 
 class TaskContact(Message):
@@ -87,8 +92,8 @@ class ForceStatus(AnsweringStatus, version=1):
         doc="from where the motion alone would have the tool to where it is commanded",
         shape=3,
     )
-    struck: int = integer("id of the newest command whose guard was struck, or 0")
-    axis: int = integer("axis of that guard, or -1", "i2")
+    struck: int = integer_field("id of the newest command whose guard was struck, or 0")
+    axis: int = integer_field("axis of that guard, or -1", "i2")
 
 
 class ServerRequest(MotionRequest, TaskContact, version=1):
@@ -112,7 +117,9 @@ class ServerState(MotionState, version=1):
         ServerRequest,
         doc="the request at whose goal the arm is, or to which it goes; id 0: none",
     )
-    requests: ndarray = field(ServerRequest, doc="taken and not ended, oldest first", shape=HELD)
+    requests: ndarray = field(
+        ServerRequest, doc="taken and not ended, oldest first", shape=MAX_HELD_REQUESTS
+    )
 
 
 class Mode(IntEnum):
@@ -135,5 +142,5 @@ class ServerStatus(MotionStatus, version=1):
     wrench: ndarray = per_axis("N, N m", "of the tool on the surroundings, in the task frame")
     wanted: ndarray = per_axis("N, N m", "the same as wanted, on the axes of force; others 0")
     selected: ndarray = per_axis("1", "1: an axis of force", "u1")
-    guarded: int = integer("newest request that a guard has ended, or 0")
-    axis: int = integer("axis of that guard, or -1", "i2")
+    guarded: int = integer_field("newest request that a guard has ended, or 0")
+    axis: int = integer_field("axis of that guard, or -1", "i2")

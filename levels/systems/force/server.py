@@ -16,9 +16,9 @@ from rack.levels.systems.force.contact import (
     AXIS_NAMES,
     UNITS,
     Contact,
-    Wanted,
+    WantedContact,
     WristLevel,
-    misfit,
+    find_misfit,
 )
 from rack.levels.systems.force.messages import (
     AXES,
@@ -37,7 +37,7 @@ from rack.levels.systems.trajectory.request_work import MotionTools, RequestWork
 from rack.levels.systems.trajectory.requests import Agenda
 from rack.levels.tables import Positive
 
-LEAST = np.array([5.0] * 3 + [0.5] * 3)
+MIN_TOLERATED_WRENCH = np.array([5.0] * 3 + [0.5] * 3)
 """Wrench, N, N m, whose tolerance also applies to smaller wrenches, because dry friction and noise
 do not scale with the wrench."""
 
@@ -86,22 +86,22 @@ class ServerWork(RequestWork):
     def step(self, time_s: float, hold: bool) -> None:
         """Advance to the sample at `time_s`, and judge the contact. With `hold`, ramp to rest."""
         super().step(time_s, hold)
-        if self.contact.complies:
-            self._judge()
+        if self.contact.is_compliant:
+            self._judge_forces()
         else:
             self._on_s = self._off_s = 0.0
 
-    def strike(self, axis: int) -> None:
+    def strike_guard(self, axis: int) -> None:
         """End the request under way, because a guard was struck."""
         current = self.agenda.current
         if current is not None and current.kind != MotionKind.CANCEL:
             self.guarded = current.id
             self.axis = axis
-            self.agenda.end(RequestEnd.GUARDED)
-        self.contact.watch(self.contact.frame, np.zeros(AXES))
-        self._begin_anew(f"the arm comes to rest: guard of axis {AXIS_NAMES[axis]}")
+            self.agenda.end_first(RequestEnd.GUARDED)
+        self.contact.set_guards(self.contact.frame, np.zeros(AXES))
+        self._restart_motion(f"the arm comes to rest: guard of axis {AXIS_NAMES[axis]}")
 
-    def drop(self, how: RequestEnd, reason: str, code: Error) -> None:
+    def drop_requests(self, how: RequestEnd, reason: str, code: Error) -> None:
         """End all requests with an error. The arm ramps to rest on the axes of motion.
 
         Args:
@@ -109,17 +109,17 @@ class ServerWork(RequestWork):
             reason: Reason to report.
             code: Error code to report.
         """
-        self._fail(how, reason, code)
-        self.motion.stop()
+        self._fail_request(how, reason, code)
+        self.motion.ramp_to_rest()
 
-    def release(self) -> None:
+    def end_compliance(self) -> None:
         """End compliance and guards."""
-        complied = self.contact.complies
-        self.contact.release()
+        complied = self.contact.is_compliant
+        self.contact.release_axes()
         if complied:
-            self._begin_anew("the arm comes to rest: compliance ends")
+            self._restart_motion("the arm comes to rest: compliance ends")
 
-    def off(self) -> Array:
+    def compute_force_errors(self) -> Array:
         """Return the force errors as multiples of the tolerance, (6,), 0 on axes of motion."""
         contact = self.contact
         force = self.force
@@ -127,7 +127,9 @@ class ServerWork(RequestWork):
             return np.where(contact.selected, np.inf, 0.0)
         # The tool exerts the opposite of what it feels.
         error = np.abs(contact.wrench + force.wrench)
-        tolerated = self._params.tolerance * np.maximum(np.abs(contact.wrench), LEAST)
+        tolerated = self._params.tolerance * np.maximum(
+            np.abs(contact.wrench), MIN_TOLERATED_WRENCH
+        )
         return np.where(contact.selected, error / tolerated, 0.0)
 
     @property
@@ -137,9 +139,9 @@ class ServerWork(RequestWork):
         assert isinstance(params, ServerParams)
         return params
 
-    def _judge(self) -> None:
+    def _judge_forces(self) -> None:
         """Count how long forces have been as wanted. End compliance if they do not settle."""
-        errors = self.off()
+        errors = self.compute_force_errors()
         current = self.agenda.current
         params = self._params
         period_s = self._tools.period_s
@@ -154,57 +156,57 @@ class ServerWork(RequestWork):
                 f"axis {AXIS_NAMES[axis]} has not settled at {self.contact.wrench[axis]:g}"
                 f" {UNITS[axis]}"
             )
-            self.drop(
+            self.drop_requests(
                 RequestEnd.FAILED, f"{wanted} for {params.reach:g} s: {felt:.3g} now", Error.CONTACT
             )
-            self.release()
+            self.end_compliance()
 
-    def _begin_anew(self, reason: str) -> None:
+    def _restart_motion(self, reason: str) -> None:
         """Restart the motion from where the boards below come to rest."""
         self.agenda.goal = None  # the arm is not at the goal of a request
-        self.boards.leave(reason)
-        self.interrupt()
+        self.boards.leave_step(reason)
+        self.interrupt_motion()
 
-    def _misfit(self, request: MotionRequest) -> str:
+    def _find_request_error(self, request: MotionRequest) -> str:
         """Return why a request is impossible, or an empty text."""
-        wanted = Wanted.of(request.record)
+        wanted = WantedContact.from_record(request.record)
         frame = wanted.frame
         if request.kind == MotionKind.COMPLY:
-            return misfit(frame, (wanted.wrench,), self.most) if wanted.selected.any() else ""
+            return find_misfit(frame, (wanted.wrench,), self.most) if wanted.selected.any() else ""
         if request.kind == MotionKind.GUARD:
-            reason = misfit(frame, (wanted.guard,), self.most)
-            return reason or self.contact.objection(frame, wanted.guard)
-        return super()._misfit(request)
+            reason = find_misfit(frame, (wanted.guard,), self.most)
+            return reason or self.contact.find_objection(frame, wanted.guard)
+        return super()._find_request_error(request)
 
-    def _start(self, request: MotionRequest) -> None:
+    def _start_at_rest(self, request: MotionRequest) -> None:
         """Start a request: set guards or axes of force, or begin a motion."""
-        wanted = Wanted.of(request.record)
+        wanted = WantedContact.from_record(request.record)
         if request.kind == MotionKind.GUARD:
-            self.contact.watch(wanted.frame, wanted.guard)
+            self.contact.set_guards(wanted.frame, wanted.guard)
         elif request.kind == MotionKind.COMPLY and wanted.selected.any():
             default_speed = np.array([self._params.speed] * 3 + [self._params.turning] * 3)
             speed = np.where(wanted.speed > 0.0, wanted.speed, default_speed)
             self._on_s = self._off_s = 0.0
-            if self.contact.comply(wanted._replace(speed=speed)):
-                self._begin_anew("the arm comes to rest: other axes of force")
+            if self.contact.set_force_axes(wanted._replace(speed=speed)):
+                self._restart_motion("the arm comes to rest: other axes of force")
         elif request.kind == MotionKind.COMPLY:
-            self.release()
+            self.end_compliance()
         else:
-            super()._start(request)
+            super()._start_at_rest(request)
 
     def _is_done(self, current: MotionRequest) -> bool:
         """Return True if the current request is done. A COMPLY needs settled forces and rest."""
         if current.kind != MotionKind.COMPLY:
             return super()._is_done(current)
-        return self.motion.settled and (
-            not self.contact.complies or self.passed_s >= self._params.settle
+        return self.motion.is_settled and (
+            not self.contact.is_compliant or self.passed_s >= self._params.settle
         )
 
-    def _lasts_s(self, request: MotionRequest) -> float:
+    def _compute_duration_s(self, request: MotionRequest) -> float:
         """Return the expected duration of a request, s."""
-        if request.kind == MotionKind.COMPLY and self.contact.complies:
+        if request.kind == MotionKind.COMPLY and self.contact.is_compliant:
             return self._params.settle
-        return super()._lasts_s(request)
+        return super()._compute_duration_s(request)
 
 
 class ForceServer(WristLevel, TrajectoryExecutor):
@@ -225,7 +227,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
     compliance = Output(Compliance)
     params = ServerParams
     settings: ServerParams
-    work = ServerWork
+    work_class = ServerWork
     _work: ServerWork
 
     def __init__(self, context: LevelContext) -> None:
@@ -246,22 +248,22 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         if self._heard < 0 or self.requests.is_new:
             self._heard = tick
         super().process(tick)
-        self._work.contact.fill(self.compliance)
+        self._work.contact.fill_message(self.compliance)
         self.compliance.operator = self.command.operator
-        self._show(self.status)
+        self._write_server_status(self.status)
 
     @property
     def mode(self) -> Mode:
         """Present mode of the server."""
         if self._agenda.error is Error.CLIENT:
             return self._without
-        return Mode.FORCE if self._work.contact.complies else Mode.MOTION
+        return Mode.FORCE if self._work.contact.is_compliant else Mode.MOTION
 
-    def _recall(self) -> None:
+    def _restore_state(self) -> None:
         """Continue from the last messages after a restart, including the contact."""
-        super()._recall()
-        if self.last_compliance.is_there and self.last_status.is_there:
-            self._work.contact.recall(self.last_compliance.message)
+        super()._restore_state()
+        if self.last_compliance.has_message and self.last_status.has_message:
+            self._work.contact.restore_contact(self.last_compliance.message)
             status = self.last_status.message
             self._work.guarded = status.guarded
             self._work.axis = status.axis
@@ -272,62 +274,62 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         """Process the statuses of the boards below, the contact and the client."""
         super()._follow_boards()
         for below in self.boards.values():
-            if below.is_there:
+            if below.has_message:
                 self._sensed = below.message.position
         # Use the newest status of the contact. A guard that was struck ends the present request.
         status = self.force.message
         work = self._work
         answers = (
-            self.force.is_there
+            self.force.has_message
             and not self.force.is_lost
             and status.echo == work.contact.id
             and status.sensed >= 0
         )
         work.force = status if answers else None
         if answers and status.struck == work.contact.id and work.contact.guard.any():
-            work.strike(status.axis)
-        self._miss_client()
+            work.strike_guard(status.axis)
+        self._watch_client()
 
-    def _miss_client(self) -> None:
+    def _watch_client(self) -> None:
         """React to a client that is lost: hold, then release forces, then hold the position."""
         work = self._work
         params = self.settings
         agenda = self._agenda
         if agenda.error is not Error.CLIENT:
-            if self._passed_s(self._heard) > params.silence and (
-                agenda.held or work.contact.complies
+            if self._compute_passed_s(self._heard) > params.silence and (
+                agenda.held or work.contact.is_compliant
             ):
-                work.drop(RequestEnd.CANCELLED, "", Error.CLIENT)
-                if work.contact.complies:
-                    self._enter(Mode.HELD, f"forces are held for {params.hold:g} s")
+                work.drop_requests(RequestEnd.CANCELLED, "", Error.CLIENT)
+                if work.contact.is_compliant:
+                    self._enter_mode(Mode.HELD, f"forces are held for {params.hold:g} s")
                 else:
-                    self._enter(Mode.RELEASED, "the position is held")
-        elif self._without is Mode.HELD and self._passed_s(self._since) > params.hold:
-            work.contact.relax()
-            self._enter(Mode.RELEASING, "forces go to zero")
+                    self._enter_mode(Mode.RELEASED, "the position is held")
+        elif self._without is Mode.HELD and self._compute_passed_s(self._since) > params.hold:
+            work.contact.clear_wrench()
+            self._enter_mode(Mode.RELEASING, "forces go to zero")
         elif self._without is Mode.RELEASING:
-            is_over = self._passed_s(self._since) > params.reach
-            if is_over or (work.off() <= 1.0).all():
-                work.release()
-                self._enter(Mode.RELEASED, "forces released, the position is held")
+            is_over = self._compute_passed_s(self._since) > params.reach
+            if is_over or (work.compute_force_errors() <= 1.0).all():
+                work.end_compliance()
+                self._enter_mode(Mode.RELEASED, "forces released, the position is held")
 
-    def _enter(self, mode: Mode, description: str) -> None:
+    def _enter_mode(self, mode: Mode, description: str) -> None:
         """Enter a mode without a client; `description` describes it in the reason."""
         self._without = mode
         self._since = self._now
         silent = f"no sign of life from the client for {self.settings.silence:g} s"
         self._agenda.reason = f"{silent}: {description}; cancel, then go on"
 
-    def _passed_s(self, tick: int) -> float:
+    def _compute_passed_s(self, tick: int) -> float:
         """Return the time since `tick`, s."""
         return (self._now - tick) * self.context.tick_s
 
-    def _show(self, status: ServerStatus) -> None:
+    def _write_server_status(self, status: ServerStatus) -> None:
         """Fill the fields that a server's status has in addition to a trajectory level's."""
         work = self._work
         force = work.force
         status.mode = self.mode
-        (status.place, status.quaternion) = self._ik.tool_at(self._sensed)
+        (status.place, status.quaternion) = self._ik.compute_tool_pose(self._sensed)
         status.frame = work.contact.frame
         status.selected = work.contact.selected
         status.wanted = work.contact.wrench

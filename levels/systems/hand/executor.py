@@ -20,13 +20,13 @@ from rack.levels.level import (
     Input,
     Inputs,
     LevelContext,
-    Misfits,
+    Mismatches,
     Output,
     Reading,
 )
 from rack.levels.messages import ArmState, Error
-from rack.levels.operator import HOLDABLE, OperatorCommand, Orders
-from rack.levels.robot.cell import cell_of
+from rack.levels.operator import HOLD_COMMANDS, OperatorCommand, Orders
+from rack.levels.robot.cell import build_level_cell
 from rack.levels.robot.hand import Hand
 from rack.levels.robot.limits import MotorPatience
 from rack.levels.servo.driver import SCENES
@@ -56,14 +56,14 @@ class HandExecutor(Executor):
     status = Output(HandStatus)
     state = Output(ArmState)
     scene = SCENES
-    commands = HOLDABLE
+    commands = HOLD_COMMANDS
     params = Table
     faults = (TendonStep,)
     preloads = (substeps,)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        cell = cell_of(context)
+        cell = build_level_cell(context)
         assert cell.hand is not None, "`misfits` refuses a robot without a hand"
         self.hand = SimulatedHand(
             cell, context.scene, context.clock_ns, context.every, context.seed
@@ -79,9 +79,9 @@ class HandExecutor(Executor):
         self._torn: dict[int, bool] = {}  # injected faults that tore a tendon, as in `acted`
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield every joint that is not driven by exactly one board above.
 
         Args:
@@ -127,20 +127,20 @@ class HandExecutor(Executor):
         # Advance the hand to tick. A restarted board first restores it.
         if not self._started:
             self._started = True
-            if self.before.is_there:
+            if self.before.has_message:
                 self.hand.restore(self.before.message)
                 self._opened = True
             self._closed_at = tick
         self.hand.step(tick - self.hand.tick)
         if self.hand.braked and self._closed_at is None:  # no tensions came in time
             self._closed_at = tick
-        self.orders.take(self.operator)
+        self.orders.take_commands(self.operator)
         sample = hand.sense()
-        self.findings += self._slack.check_tensions(sample.tension, hand.wanted)
+        self.findings += self._slack.check_tensions(sample.tension, hand.commanded_tensions)
         self.acted |= self._torn
         self._command_valves(tick)
         self._fill_status(self.status, sample, tick)
-        self.orders.report(self.status, self.wanted_tensions.rests_on)
+        self.orders.fill_status(self.status, self.wanted_tensions.rests_on)
         hand.save(self.state)
         if SCENES.is_due(tick, self.context.every, self.context.phase):
             hand.look(self.scene)
@@ -148,13 +148,13 @@ class HandExecutor(Executor):
     def _command_valves(self, tick: int) -> None:
         """Apply the tensions of the boards above, or close the valves and note the reason."""
         since = self._closed_at if self._opened else 0
-        self._waiting = self.wanted_tensions.missing(self.tensions, tick, since or 0)
+        self._waiting = self.wanted_tensions.find_missing(self.tensions, tick, since or 0)
         if not self._waiting:
             self.wanted_tensions.merge_commands(self.tensions)
             found, self._waiting = self.wanted_tensions.limit_tensions()
             if found is not None:
-                self.hand.refuse(found)
-        held = self.orders.holds
+                self.hand.refuse_command(found)
+        held = self.orders.is_holding
         if held and not self._waiting:
             self._waiting = HELD
         if self.demand is not Demand.NONE:
@@ -164,7 +164,7 @@ class HandExecutor(Executor):
                 self._closed_at = tick
             self.hand.close_valves()
             if held:
-                self.orders.done()
+                self.orders.report_done()
         else:
             self._closed_at = None
             self._opened = True
@@ -176,7 +176,7 @@ class HandExecutor(Executor):
         status.tick = tick
         for name, value in sample._asdict().items():
             setattr(status, name, value)
-        status.wanted = hand.wanted
+        status.wanted = hand.commanded_tensions
         closed = bool(self._waiting)
         status.holding = closed
         status.stopped = closed and self._opened

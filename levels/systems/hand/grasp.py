@@ -10,11 +10,11 @@ import numpy as np
 from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
-from rack.levels.level import Executor, Input, Inputs, LevelContext, Misfits, Output, Reading
+from rack.levels.level import Executor, Input, Inputs, LevelContext, Mismatches, Output, Reading
 from rack.levels.messages import Error, WorldState
-from rack.levels.operator import HOLDABLE, OperatorCommand, Orders
+from rack.levels.operator import HOLD_COMMANDS, OperatorCommand, Orders
 from rack.levels.planning.pose import Pose
-from rack.levels.robot.cell import cell_of
+from rack.levels.robot.cell import build_level_cell
 from rack.levels.systems.hand.grasp_program import (
     CloseStep,
     GraspProgram,
@@ -60,13 +60,13 @@ class GraspExecutor(Executor):
     operator = Input(OperatorCommand, "own.operator")
     command = Output(GraspTarget, rests_on=fingers)
     status = Output(GraspStatus, rests_on=fingers)
-    commands = HOLDABLE
+    commands = HOLD_COMMANDS
     params = GraspParams
     program = GraspProgram
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        cell = cell_of(context)
+        cell = build_level_cell(context)
         assert cell.hand is not None, "checked with the config"
         self._program = GraspProgram.model_validate(dict(context.task))
         kinematics = FingerKinematics(cell, cell.hand)
@@ -97,9 +97,9 @@ class GraspExecutor(Executor):
         self._started = False  # whether the first cycle has begun
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield a robot without a hand, and fingers that are not driven by exactly one board below.
 
         Args:
@@ -128,7 +128,7 @@ class GraspExecutor(Executor):
     def process(self, tick: int) -> None:
         """Read fingers and object, continue the current step, write targets and status."""
         grasp = self._grasp
-        self._orders.take(self.operator)
+        self._orders.take_commands(self.operator)
         grasp.fingers.read_statuses(self.fingers)
         if self.world.message.revision:
             # Find the object in the world model.
@@ -141,9 +141,9 @@ class GraspExecutor(Executor):
         if not self._started:
             self._started = True
             self._restore_progress()
-        waits = self._waiting_reason()
+        waits = self._find_waiting_reason()
         # Fail if the program has been suspended for too long.
-        is_over = self._done == len(self._program.step) or self._orders.holds
+        is_over = self._done == len(self._program.step) or self._orders.is_holding
         self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
         if self._waited_s > self._grasp.params.stalled and not self._failed.code:
             self._failed = Refused(
@@ -176,13 +176,13 @@ class GraspExecutor(Executor):
         steps = self._program.step[: self._done + 1]
         return next((step for step in reversed(steps) if isinstance(step, CloseStep)), None)
 
-    def _waiting_reason(self) -> str:
+    def _find_waiting_reason(self) -> str:
         """Return the reason for which the current step is suspended, empty if it continues."""
         if self._grasp.fingers.awaited:
             return self._grasp.fingers.awaited
-        if self._orders.holds:
-            self._orders.done()
-            return self._orders.keeps(self.context.board)
+        if self._orders.is_holding:
+            self._orders.report_done()
+            return self._orders.format_reason(self.context.board)
         if self.world.is_lost or (
             self._find_close_step() is not None and self._grasp.object is None
         ):
@@ -266,7 +266,7 @@ class GraspExecutor(Executor):
 
     def _restore_progress(self) -> None:
         """Restore the state of the program from the level's own last messages, after a restart."""
-        if not (self.last_status.is_there and self.last_command.is_there):
+        if not (self.last_status.has_message and self.last_command.has_message):
             return
         status = self.last_status.message
         grasp = self._grasp
@@ -316,4 +316,4 @@ class GraspExecutor(Executor):
             status.state = State.DONE if steps else State.IDLE
         else:
             status.state = State.HOLDING if waits else State.EXECUTING
-        self._orders.report(status, grasp.fingers.rests_on)
+        self._orders.fill_status(status, grasp.fingers.rests_on)

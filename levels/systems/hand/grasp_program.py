@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from rack.levels.level import Misfits, Program
+from rack.levels.level import Mismatches, Program
 from rack.levels.tables import Finite, HandConfig, Positive, RobotConfig, SceneConfig, Table, Vector
 
 MAX_STEPS = 100
@@ -109,7 +109,7 @@ class GraspProgram(Program):
     step: tuple[Annotated[Step, Field(discriminator="do")], ...] = Field((), max_length=MAX_STEPS)
     """steps, executed in order"""
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
+    def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
         """Yield key, value and reason of mistakes in the program.
 
         These are parts that the hand or the scene lacks, and steps in the wrong order.
@@ -151,7 +151,7 @@ class GraspProgram(Program):
             gripped = isinstance(step, CloseStep) or (gripped and not isinstance(step, ReleaseStep))
 
 
-def _check_posture(key: str, posture: Posture, hand: HandConfig) -> Misfits:
+def _check_posture(key: str, posture: Posture, hand: HandConfig) -> Mismatches:
     names = {finger.name: len(finger.joints) for finger in hand.finger}
     for name, values in posture.items():
         if name not in names:
@@ -172,7 +172,7 @@ def _check_posture(key: str, posture: Posture, hand: HandConfig) -> Misfits:
 
 def _check_close_step(
     key: str, step: CloseStep, opposing: str, names: list[str], scene: SceneConfig
-) -> Misfits:
+) -> Mismatches:
     if step.object not in scene.objects:
         yield (
             f"{key}.object",

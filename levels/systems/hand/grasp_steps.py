@@ -65,7 +65,7 @@ class FingersBelow:
         self.error = Error.NONE
         for board, reading in statuses.items():
             status = reading.message
-            if reading.is_lost or not reading.is_there:
+            if reading.is_lost or not reading.has_message:
                 self.awaited = f"no status from '{board}': waiting for its board"
                 continue
             if status.stopped and not self.awaited:

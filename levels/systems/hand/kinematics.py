@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from rack.levels.algebra import Array, mat_vec, solve, transposed_mat_vec
-from rack.levels.planning.pose import site_pose
+from rack.levels.planning.pose import read_site_pose
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
 
@@ -36,7 +36,7 @@ class FingerKinematics:
         self._high = self.limits.position[:, 1] - MARGIN_RAD
         self._whole = np.zeros((3, cell.model.nv))
         mujoco.mj_kinematics(cell.model, d)
-        self.palm = site_pose(d, cell.tool)  # pose in the world
+        self.palm = read_site_pose(d, cell.tool)  # pose in the world
         # Rotates vectors from the frame of the palm into the world.
         self.rotation = d.site_xmat[cell.tool].reshape(3, 3).copy()
 

@@ -53,7 +53,7 @@ from rack.levels.level import LevelContext
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import FRICTION_SPEED, Dynamics
 from rack.levels.robot.hand import Hand
-from rack.levels.servo.arm_report import numbers
+from rack.levels.servo.arm_report import view_numbers
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.messages import FingerMode, FingerTarget, GraspTarget, HandStatus
 from rack.levels.tables import NotNegative, Positive, Table
@@ -194,7 +194,7 @@ class JointLaw:
         self._constants = np.array((self._dynamics.dry, viscous, cell.bounds.torque, driven))
         self._gains = gains.bandwidth**2, 2.0 * gains.damping * gains.bandwidth
         self._ahead = gains.ahead
-        self._set = set_joint_torques.load()
+        self._set = set_joint_torques.load_machine_code()
         self.clipped = 0  # cycles in which a torque was limited
 
     def set_torques(
@@ -214,8 +214,8 @@ class JointLaw:
             self._gains,
             (age_s + self._ahead, ahead_s),
             self._constants,
-            numbers(hand, "position", "velocity").reshape(2, -1),
-            numbers(target, "position", "torque").reshape(4, -1),
+            view_numbers(hand, "position", "velocity").reshape(2, -1),
+            view_numbers(target, "position", "torque").reshape(4, -1),
             target.spring,
             terms.inertia,
             terms.bias,
@@ -325,7 +325,7 @@ class TendonLaw:
         self._trim = gains.trim
         self._tick_s = context.tick_s
         self._valves = np.zeros((3, 2, joints))  # in the rows of `set_tensions`
-        self._set = set_tensions.load()
+        self._set = set_tensions.load_machine_code()
         self._sampled = 0  # tick of the last sample
         self.clipped = 0  # cycles in which a torque was limited
 
@@ -352,7 +352,7 @@ class TendonLaw:
             1.0 - math.exp(-elapsed_s / self._lag),
             min(self._trim * elapsed_s, MOST_LEARNED),
         )
-        sensed = numbers(status, "tension", "wanted")
+        sensed = view_numbers(status, "tension", "wanted")
         if self._set(self._numbers, shares, self._constants, self._valves, sensed, torque, out):
             self.clipped += 1
 

@@ -14,16 +14,16 @@ import numpy as np
 
 from rack.backplane.message import State
 from rack.levels.algebra import Mask
-from rack.levels.level import Executor, Input, LevelContext, Misfits, Output, Reading
+from rack.levels.level import Executor, Input, LevelContext, Mismatches, Output, Reading
 from rack.levels.operator import (
     BELOW_LOST,
-    HOLDABLE,
+    HOLD_COMMANDS,
     OperatorCommand,
     Orders,
     RelayedCommand,
 )
 from rack.levels.robot import dynamics
-from rack.levels.robot.cell import cell_of
+from rack.levels.robot.cell import build_level_cell
 from rack.levels.robot.hand import Hand
 from rack.levels.systems.hand import laws
 from rack.levels.systems.hand.kinematics import FingerKinematics
@@ -60,7 +60,7 @@ class HandLoop(Executor):
     "below".
     """
 
-    commands = HOLDABLE
+    commands = HOLD_COMMANDS
     above: Reading[RelayedCommand]
     below: Reading[LoopStatus]
     hand: Reading[HandStatus]
@@ -72,7 +72,7 @@ class HandLoop(Executor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self.cell = cell_of(context)
+        self.cell = build_level_cell(context)
         assert self.cell.hand is not None, "`misfits` refuses a robot without a hand"
         self.hand_model: Hand = self.cell.hand
         self.orders = Orders(self.commands)
@@ -94,9 +94,9 @@ class HandLoop(Executor):
         self._met = False  # whether a status of the hand has arrived
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield a robot without a hand, and missing neighbours.
 
         Args:
@@ -126,9 +126,9 @@ class HandLoop(Executor):
     def process(self, tick: int) -> None:
         """Follow the newest command and fill the status."""
         hand = self.hand
-        self.orders.take(self.operator)
+        self.orders.take_commands(self.operator)
         if not self._met:
-            if not hand.is_there:
+            if not hand.has_message:
                 status = self.status
                 status.driven = self.driven
                 status.sensed = -1
@@ -139,20 +139,20 @@ class HandLoop(Executor):
             self._met = True
             self.start_from(hand.message)
         self._take_command(self.above, tick)
-        kept = self._holding_reason(tick)
+        kept = self._find_holding_reason(tick)
         self.follow_command(hand.message, tick)
         self.command.id += 1
-        self.command.operator = self.orders.rests_on(self.followed.operator)
+        self.command.operator = self.orders.find_basis(self.followed.operator)
         self._fill_status(self.status, kept)
-        self.orders.report(self.status, self.followed.operator)
+        self.orders.fill_status(self.status, self.followed.operator)
 
-    def sample_age_s(self, hand: HandStatus, tick: int) -> float:
+    def compute_sample_age_s(self, hand: HandStatus, tick: int) -> float:
         """Return the age of the sample in a `HandStatus` when the command of this cycle acts, s."""
         return float(
             (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
         )
 
-    def command_age_s(self, tick: int) -> float:
+    def compute_command_age_s(self, tick: int) -> float:
         """Return the time by which the command is extrapolated, s.
 
         This is the age of the command, but at most a cycle of the level above.
@@ -162,13 +162,13 @@ class HandLoop(Executor):
     def _take_command(self, command: Reading[RelayedCommand], tick: int) -> None:
         """Accept a new command, unless an operator holds the loop."""
         released = self._held
-        self._held = self.orders.holds
+        self._held = self.orders.is_holding
         if self._held:
             for name in self._numbers:
                 if name.endswith("velocity"):  # the command stays in force at rest
                     setattr(self.followed, name, 0.0)
-            self.orders.done()
-        elif command.is_new or (released and command.is_there):
+            self.orders.report_done()
+        elif command.is_new or (released and command.has_message):
             wrong = [
                 name
                 for name in self._numbers
@@ -182,7 +182,7 @@ class HandLoop(Executor):
                 self.commanded = True
                 self._taken = tick
 
-    def _holding_reason(self, tick: int) -> str:
+    def _find_holding_reason(self, tick: int) -> str:
         """Return why the hand does not follow the level above, empty if it does."""
         hand = self.hand.message
         if self.hand.is_lost or tick - hand.tick > self._oldest:
@@ -191,11 +191,11 @@ class HandLoop(Executor):
             return f"hand: {hand.reason}"
         if "below" in self.inputs:
             below = self.below
-            if below.is_lost or not below.is_there:
+            if below.is_lost or not below.has_message:
                 return BELOW_LOST
             if below.message.stopped:
                 return below.message.reason
-        return self.orders.keeps(self.context.board)
+        return self.orders.format_reason(self.context.board)
 
     def _fill_status(self, status: LoopStatus | FingerStatus, kept: str) -> None:
         """Fill the status."""
@@ -245,7 +245,7 @@ class FingertipLoop(HandLoop):
     def start_from(self, hand: HandStatus) -> None:
         """Start at the current joint positions, or at the last targets."""
         last = self.last.message
-        begin = last if self.last.is_there and last.active else hand
+        begin = last if self.last.has_message and last.active else hand
         self._law.start(begin.position)
 
     def follow_command(self, hand: HandStatus, tick: int) -> None:
@@ -284,8 +284,8 @@ class JointLoop(HandLoop):
         self._law.set_torques(
             hand,
             self.followed,
-            self.sample_age_s(hand, tick),
-            self.command_age_s(tick),
+            self.compute_sample_age_s(hand, tick),
+            self.compute_command_age_s(tick),
             self.command.torque,
         )
         self.command.sampled = hand.tick
@@ -366,9 +366,9 @@ class FingerExecutor(HandLoop):
         self._torque = np.zeros(len(self._joints))
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield a finger that the hand lacks, and the mistakes that `HandLoop` reports.
 
         Args:
@@ -376,7 +376,7 @@ class FingerExecutor(HandLoop):
             above: Contexts of the boards above it.
             below: Contexts of the boards below it.
         """
-        yield from super().misfits(context, above, below)
+        yield from super().find_mismatches(context, above, below)
         hand = context.robot.hand
         name = read_params(FingerParams, context.params).finger
         if hand is not None and name not in (names := [finger.name for finger in hand.finger]):
@@ -393,7 +393,7 @@ class FingerExecutor(HandLoop):
         """Fill the tensions of the finger's tendons."""
         set_finger_targets(self, self._tip, hand, self._target, self.status, tick)
         self._servo.set_torques(
-            hand, self._target, self.sample_age_s(hand, tick), 0.0, self._torque
+            hand, self._target, self.compute_sample_age_s(hand, tick), 0.0, self._torque
         )
         self._tendons.set_tensions(hand, self._torque, self.command.tension)
         self.command.driven = self._joints
@@ -421,7 +421,7 @@ def set_finger_targets(
     status.tip = law.find_tips(hand.position)
     target.active = loop.followed.active
     if loop.followed.active:
-        law.set_targets(loop.followed, loop.command_age_s(tick), target)
+        law.set_targets(loop.followed, loop.compute_command_age_s(tick), target)
     status.position = hand.position
     status.target = law.wanted
     status.force[loop.driven] = hand.force[loop.driven]

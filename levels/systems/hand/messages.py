@@ -13,9 +13,9 @@ from enum import IntEnum
 
 from numpy import ndarray
 
-from rack.backplane.message import field, integer
+from rack.backplane.message import field, integer_field
 from rack.backplane.words import Demand
-from rack.levels.messages import per_joint
+from rack.levels.messages import joint_field
 from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 FLEXOR = 0
@@ -64,9 +64,9 @@ class HandStatus(AnsweringStatus, version=1):
     """From the board of the hand: 16 angles and 32 tensions of the Utah/MIT hand."""
 
     tick: int = field(unit="tick", doc="tick at which the hand was sensed")
-    position: ndarray = per_joint("rad", "joint positions")
-    velocity: ndarray = per_joint("rad/s", "joint velocities")
-    torque: ndarray = per_joint("N m", "torques of the tendons on the joints")
+    position: ndarray = joint_field("rad", "joint positions")
+    velocity: ndarray = joint_field("rad/s", "joint velocities")
+    torque: ndarray = joint_field("N m", "torques of the tendons on the joints")
     tension: ndarray = field(unit="N", doc="sensed tensions of the tendons", shape=(2, "joints"))
     wanted: ndarray = field(unit="N", doc="tensions commanded of the valves", shape=(2, "joints"))
     force: ndarray = field(
@@ -79,10 +79,10 @@ class HandStatus(AnsweringStatus, version=1):
         doc="1 if tensions are ignored because of a demand, an operator, or a lost board"
     )
     demand: Demand = field(doc="safety demand in this cycle")
-    clipped: int = integer("cycles in which a tension was limited")
-    touches: int = integer("unintended contacts, counted at every substep")
-    violations: int = integer("substeps in which a tendon drove a joint beyond a limit")
-    pushed: int = integer("substeps in which a blow pushed a joint beyond a limit")
+    clipped: int = integer_field("cycles in which a tension was limited")
+    touches: int = integer_field("unintended contacts, counted at every substep")
+    violations: int = integer_field("substeps in which a tendon drove a joint beyond a limit")
+    pushed: int = integer_field("substeps in which a blow pushed a joint beyond a limit")
 
 
 class TendonTorque(RelayedCommand, version=1):
@@ -91,19 +91,19 @@ class TendonTorque(RelayedCommand, version=1):
     sampled: int = field(
         unit="tick", doc="tick of the hand's status on which it depends, -1 without one"
     )
-    torque: ndarray = per_joint("N m", "torques of the joints")
+    torque: ndarray = joint_field("N m", "torques of the joints")
 
 
 class FingerTarget(RelayedCommand, version=1):
     """From the fingertip loop to the joint loop."""
 
     active: bool = field(doc="0 until there is a target")
-    position: ndarray = per_joint("rad", "joint positions")
-    velocity: ndarray = per_joint("rad/s", "joint velocities")
-    stiff: ndarray = per_joint(
+    position: ndarray = joint_field("rad", "joint positions")
+    velocity: ndarray = joint_field("rad/s", "joint velocities")
+    stiff: ndarray = joint_field(
         "1", "scale of the joint loop's stiffness, 0 to 1; its damping is not scaled"
     )
-    torque: ndarray = per_joint("N m", "additional torques, from forces of the tips")
+    torque: ndarray = joint_field("N m", "additional torques, from forces of the tips")
     spring: ndarray = field(
         unit="N m/rad",
         doc="additional joint stiffness, from springs at the tips",
@@ -116,8 +116,8 @@ class GraspTarget(RelayedCommand, version=1):
 
     active: bool = field(doc="0 until there is a target")
     mode: ndarray = field("u1", unit=FingerMode, doc="mode of each finger", shape="fingers")
-    position: ndarray = per_joint("rad", "joint positions in mode JOINTS")
-    velocity: ndarray = per_joint("rad/s", "joint velocities in mode JOINTS")
+    position: ndarray = joint_field("rad", "joint positions in mode JOINTS")
+    velocity: ndarray = joint_field("rad/s", "joint velocities in mode JOINTS")
     tip: ndarray = field(
         unit="m", doc="points of the tips in modes POINT and FORCE", shape=("fingers", 3)
     )
@@ -139,7 +139,9 @@ class LoopStatus(AnsweringStatus, version=1):
 
     driven: ndarray = DRIVEN
     sensed: int = SENSED
-    clipped: int = integer("cycles in which a torque was limited to what the tendons can exert")
+    clipped: int = integer_field(
+        "cycles in which a torque was limited to what the tendons can exert"
+    )
     holding: bool = field(doc="1 if the last command stays in force for lack of a fresh one")
     stopped: bool = field(
         doc="1 if commands are ignored because the hand is stopped or an operator holds the loop"
@@ -151,8 +153,8 @@ class FingerStatus(AnsweringStatus, version=1):
 
     driven: ndarray = field("u1", unit="1", doc="1 for fingers of this board", shape="fingers")
     sensed: int = SENSED
-    position: ndarray = per_joint("rad", "joint positions, from the hand's status")
-    target: ndarray = per_joint("rad", "joint targets")
+    position: ndarray = joint_field("rad", "joint positions, from the hand's status")
+    target: ndarray = joint_field("rad", "joint targets")
     tip: ndarray = field(unit="m", doc="positions of the tips", shape=("fingers", 3))
     force: ndarray = field(
         unit="N", doc="forces of the environment on the tips", shape=("fingers", 3)
@@ -166,11 +168,13 @@ class FingerStatus(AnsweringStatus, version=1):
 class GraspStatus(AnsweringStatus, version=1):
     """From the grasp loop. Points and forces are in the frame of the palm."""
 
-    step: int = integer("number of completed steps", "u2")
-    steps: int = integer("number of steps of the program", "u2")
+    step: int = integer_field("number of completed steps", "u2")
+    steps: int = integer_field("number of steps of the program", "u2")
     kind: GraspKind = field(doc="kind of the current step")
     passed: float = field(unit="s", doc="execution time of the current step")
-    object: int = integer("row of the gripped object in the world model, -1 without one", "i2")
+    object: int = integer_field(
+        "row of the gripped object in the world model, -1 without one", "i2"
+    )
     touching: ndarray = field(
         "u1", unit="1", doc="1 for fingers that touch the object", shape="fingers"
     )
@@ -179,7 +183,7 @@ class GraspStatus(AnsweringStatus, version=1):
     anchor: ndarray = field(unit="m", doc="target position of the object", shape=3)
     moved: float = field(unit="m", doc="distance of the object from its target position")
     farthest: float = field(unit="m", doc="largest such distance since the object was gripped")
-    plan: int = integer("id of the grasp plan in use, 0 without one")
+    plan: int = integer_field("id of the grasp plan in use, 0 without one")
 
 
 class GraspPlan(RelayedCommand, version=1):
@@ -189,9 +193,9 @@ class GraspPlan(RelayedCommand, version=1):
     message with an `id` above 0 is used.
     """
 
-    object: int = integer("row of the object in the world model", "i2")
+    object: int = integer_field("row of the object in the world model", "i2")
     sensed: int = field(unit="tick", doc="tick of the world model on which it depends")
-    posture: ndarray = per_joint("rad", "joint positions from which the fingers close")
+    posture: ndarray = joint_field("rad", "joint positions from which the fingers close")
     contact: ndarray = field(
         unit="m",
         doc="contact of each tip on the object's surface, in the object's frame",

@@ -64,10 +64,10 @@ class SimulatedHand(Simulation):
         self.waited = self.patience
         self._palm = np.array(self._data.site_xmat[cell.tool]).reshape(3, 3)
         self._set_initial_tensions(_find_carrying_tensions(cell, self._data))
-        self.begin(scene, clock_ns)
+        self.prepare_simulation(scene, clock_ns)
         pull = hand.closed * hand.arms
         self._spring = np.stack((-pull, pull))  # (2, joints), N/rad: of closed valves
-        self._coarse = None if cell.encoders.exact else CoarseSensors(cell.encoders, seed)
+        self._coarse = None if cell.encoders.is_exact else CoarseSensors(cell.encoders, seed)
         acts = cell.model.actuator_actadr[hand.actuators]
         # (2, joints): addresses of the states of valves with a lag. None without a lag.
         self._acts = acts if (acts >= 0).all() else None
@@ -88,7 +88,7 @@ class SimulatedHand(Simulation):
         mujoco.mj_forward(model, d)
 
     @property
-    def wanted(self) -> Array:
+    def commanded_tensions(self) -> Array:
         """Commanded tensions of open valves, or equilibrium tensions of closed ones.
 
         Its shape is (2, joints), its unit N.
@@ -132,23 +132,23 @@ class SimulatedHand(Simulation):
             self.braked = self.braked or self.waited >= self.patience
             self.waited += 1
             if not self.fault:
-                self._simulate()
+                self._simulate_tick()
             self.tick += 1
         if self.fault:
             self._data.time = self._now_s
 
-    def _simulate(self) -> None:
+    def _simulate_tick(self) -> None:
         """Simulate one tick. Tensions behind closed valves, and their controls, follow the joints.
 
         Controls may become negative, although MuJoCo limits them to 0: a slack tendon is then tight
         again at the position at which it became slack.
         """
         if not self.braked:
-            super()._simulate()
+            super()._simulate_tick()
             return
         position = self._state[0]
         before = position.copy()
-        super()._simulate()
+        super()._simulate_tick()
         drawn = self._spring * (position - before)
         self._data.ctrl[self.hand.actuators] += drawn
         if self._acts is not None:

@@ -29,7 +29,7 @@ from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
 from rack.levels.level import LevelContext
 from rack.levels.messages import WorldState
-from rack.levels.robot.cell import Cell, cell_of
+from rack.levels.robot.cell import Cell, build_level_cell
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.messages import GraspKind, GraspPlan, GraspStatus
 from rack.levels.tables import NotNegative, Positive, Table, read_params
@@ -92,7 +92,7 @@ class GraspPlanner:
         self._cell = cell
         self._rules = rules
         self._kinematics = FingerKinematics(cell, cell.hand)
-        self._data = cell.start()
+        self._data = cell.build_start_data()
         self._opposing = names.index(opposing)
         first = [own[0] for own in self._kinematics.joints]
         # (fingers, 3), m.
@@ -163,7 +163,7 @@ class GraspPlanner:
         centre = centre + float(((base - centre) * along).sum()) * along
         start = centre - OUTSIDE_M * way
         nearest = math.inf
-        for geom in self._object_geoms(row):
+        for geom in self._list_object_geoms(row):
             if not model.geom_contype[geom]:
                 continue
             size = model.geom_size[geom]
@@ -175,7 +175,7 @@ class GraspPlanner:
                 nearest = distance
         return None if nearest > OUTSIDE_M else start + nearest * way
 
-    def _object_geoms(self, row: int) -> Ints:
+    def _list_object_geoms(self, row: int) -> Ints:
         """Return the indices of the object's geoms."""
         return np.flatnonzero(self._cell.model.geom_bodyid == self._cell.bodies[row])
 
@@ -215,7 +215,7 @@ class GraspPlanner:
         """Return the force per finger, N, at which friction on both sides bears weight and pull."""
         model = self._cell.model
         body = self._cell.bodies[row]
-        friction = float(model.geom_friction[self._object_geoms(row), 0].max())
+        friction = float(model.geom_friction[self._list_object_geoms(row), 0].max())
         weight = float(model.body_subtreemass[body]) * norm(model.opt.gravity)
         load = self._rules.reserve * (weight + self._rules.pull)
         return load / (2.0 * friction * (len(self._bases) - 1))
@@ -254,7 +254,7 @@ class Workstation(HostProgram):
             known = ", ".join(context.scene.objects) or "none"
             raise LevelError(f"params.object = {p.object}: not in the scene; objects: {known}")
         self._row = context.scene.objects.index(p.object)
-        cell = cell_of(context)
+        cell = build_level_cell(context)
         self._planner = GraspPlanner(cell, p.opposing, p.rules)
         self._planned: PlannedGrasp | None = None
         self._at = np.full(3, np.inf)  # (3,), m: position of the object in the newest plan
@@ -269,7 +269,10 @@ class Workstation(HostProgram):
         """Plan and send a grasp if one is needed; return the newest grasp, None without one."""
         world = self.world.read()
         status = self.grasp.read()
-        if not (world.is_there and status.is_there) or status.message.kind > GraspKind.PRESHAPE:
+        if (
+            not (world.has_message and status.has_message)
+            or status.message.kind > GraspKind.PRESHAPE
+        ):
             return self._planned
         model = world.message
         position = model.position[self._row]
@@ -289,7 +292,7 @@ class Workstation(HostProgram):
             self.plan.send()
         return grasp
 
-    def names(self, bus: Bus) -> Mapping[str, Any]:
+    def list_prompt_names(self, bus: Bus) -> Mapping[str, Any]:
         """Return the functions that a prompt offers, by name."""
         return {
             "plan": self.plan_grasp,
@@ -299,8 +302,8 @@ class Workstation(HostProgram):
     def read_counts(self, bus: Bus) -> dict[str, dict[str, int]]:
         """Return the cycle counts of every task, read from its control block."""
         counts = {"cycles": Block.CYCLES, "missed": Block.MISSED, "skipped": Block.SKIPPED}
-        blocks = {task: bus.address(task) for task in bus.tasks}
+        blocks = {task: bus.find_address(task) for task in bus.tasks}
         return {
-            task: {name: bus.words(address + WORD * word)[0] for name, word in counts.items()}
+            task: {name: bus.read_words(address + WORD * word)[0] for name, word in counts.items()}
             for task, address in blocks.items()
         }

@@ -9,12 +9,12 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.arm.commands_above import CommandsAbove
-from rack.levels.level import Input, Inputs, LevelContext, Misfits, Output, Reading
+from rack.levels.level import Input, Inputs, LevelContext, Mismatches, Output, Reading
 from rack.levels.messages import ArmState
-from rack.levels.operator import DRIVES, HOLDABLE, OperatorCommand, Orders
+from rack.levels.operator import DRIVE_OPERATIONS, HOLD_COMMANDS, OperatorCommand, Orders
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Payload
-from rack.levels.servo.arm_report import SetPointStatus, numbers
+from rack.levels.servo.arm_report import SetPointStatus, view_numbers
 from rack.levels.servo.curves import Motion
 from rack.levels.servo.driver import SCENES, ArmDriver
 from rack.levels.servo.reference import ASTRAY_RAD
@@ -56,14 +56,14 @@ class JointTorques(CommandsAbove):
         """Payload in the gripper according to the boards."""
         return Payload(float(self._sum[-4]), self._sum[-3:])
 
-    def add_up(self, commands: Mapping[str, Reading[JointTorque]]) -> None:
+    def sum_commands(self, commands: Mapping[str, Reading[JointTorque]]) -> None:
         """Add up the commands of all boards. Only valid while none is `missing`."""
         self.rests_on = 0
         self._sum[:] = 0.0
         for board in self.oldest:
             value = commands[board].message
             self.rests_on = max(self.rests_on, value.operator)
-            self._sum += numbers(value, "torque", "payload_offset")
+            self._sum += view_numbers(value, "torque", "payload_offset")
         joints = len(self.torque)
         self.wanted.table[:2] = self._sum[joints : 3 * joints].reshape(2, joints)
         self.moves = bool(self.wanted.velocity.any())
@@ -84,7 +84,7 @@ class ArmExecutor(ArmDriver):
     status = Output(ArmStatus)
     state = Output(ArmState)
     scene = SCENES
-    commands = {**HOLDABLE, **dict.fromkeys(DRIVES, ())}
+    commands = {**HOLD_COMMANDS, **dict.fromkeys(DRIVE_OPERATIONS, ())}
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -102,14 +102,14 @@ class ArmExecutor(ArmDriver):
         self._waiting = ""  # why the boards above do not drive the arm
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield joints, and the gripper, that not exactly one board above drives.
 
         Yields what `ArmDriver` yields, too.
         """
-        yield from super().misfits(context, above, below)
+        yield from super().find_mismatches(context, above, below)
         everything = context.robot.joints
         wanted = {other.board: other.params.get("joints", everything) for other in above}
         for joint in everything:
@@ -118,14 +118,15 @@ class ArmExecutor(ArmDriver):
                 yield (
                     "above",
                     list(wanted),
-                    f"joint '{joint}' must be commanded by one board; {_by(boards)}",
+                    f"joint '{joint}' must be commanded by one board; "
+                    f"{_describe_commanders(boards)}",
                 )
         grips = [other.board for other in above if other.params.get("gripper", False)]
         if len(grips) != (context.robot.gripper is not None):
             text = "the gripper must be commanded by one board"
             if context.robot.gripper is None:
                 text = "the arm has no gripper"
-            yield "above", list(wanted), f"{text}; {_by(grips)}"
+            yield "above", list(wanted), f"{text}; {_describe_commanders(grips)}"
 
     def process(self, tick: int) -> None:
         """Do the cycle of an arm, and write its tick to the status."""
@@ -135,26 +136,26 @@ class ArmExecutor(ArmDriver):
     def take_messages(self) -> None:
         """Read the torques of the boards above and the commands of the operator."""
         self._torques = self.joint_torques
-        self.orders.take(self.operator, self._judge)
+        self.orders.take_commands(self.operator, self._judge_command)
 
-    def _judge(self, command: OperatorCommand) -> None:
+    def _judge_command(self, command: OperatorCommand) -> None:
         """Obey or refuse a command for the drives, which leaves the one in force unchanged."""
-        if command.what in DRIVES and (refusal := self.obey(command)):
-            self.orders.refuse(refusal)
+        if command.what in DRIVE_OPERATIONS and (refusal := self.obey_drive_command(command)):
+            self.orders.refuse_newest(refusal)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
         """Return the motion that the boards above want, or None if not all of them drive it."""
         if self.arm.braked and self._braked_at is None:
             self._waiting = "braked until the boards above have seen it"
             return None
-        stops = reaction > 0 or self.orders.holds
+        stops = reaction > 0 or self.orders.is_holding
         self._defied = self._defied and stops
         if self._defied or (reaction is Reaction.STOP and self.abandoned):
             return None
-        self._waiting = self.joints.missing(self._torques, tick, self._braked_at or 0)
+        self._waiting = self.joints.find_missing(self._torques, tick, self._braked_at or 0)
         if self._waiting:
             return None
-        self.joints.add_up(self._torques)
+        self.joints.sum_commands(self._torques)
         self.rests_on = self.joints.rests_on
         if self.abandoned and self._is_astray():
             return None
@@ -163,8 +164,8 @@ class ArmExecutor(ArmDriver):
             self._waiting = "braked: the boards above did not bring it to rest"
             return None
         self._braked_at = None
-        if self.orders.holds and not self.joints.moves:
-            self.orders.done()
+        if self.orders.is_holding and not self.joints.moves:
+            self.orders.report_done()
         return self.joints.wanted
 
     def _is_astray(self) -> bool:
@@ -191,14 +192,14 @@ class ArmExecutor(ArmDriver):
             self._rest_by = tick + self._rest_ticks
         return self._rest_by is not None and tick >= self._rest_by
 
-    def brake(self) -> None:
+    def brake_arm(self) -> None:
         """Brake, until the boards above have seen it."""
         if self._braked_at is None:
             self._braked_at = self.arm.tick
         self._rest_by = None
-        super().brake()
+        super().brake_arm()
 
-    def efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
+    def compute_efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
         """Return the torques of the boards above, N m, and their grip force, N."""
         return self.joints.torque, self.joints.grip_force
 
@@ -208,13 +209,13 @@ class ArmExecutor(ArmDriver):
         return self.joints.payload
 
     @property
-    def holds(self) -> bool:
+    def holds_part(self) -> bool:
         """True if the gripper holds a part according to the boards above."""
         return self.payload.mass > 0.0
 
-    def course(self, reaction: Reaction) -> SetPointStatus:
+    def report_set_points(self, reaction: Reaction) -> SetPointStatus:
         """Return how the arm follows the torques from above, for the status."""
-        is_held = self.orders.holds
+        is_held = self.orders.is_holding
         reason = self.stopping.reason or self._waiting
         if is_held and not reason:
             reason = HELD
@@ -223,7 +224,7 @@ class ArmExecutor(ArmDriver):
         return SetPointStatus(0, holding, stopped, 0, reason, has_work=True)
 
 
-def _by(boards: Sequence[str]) -> str:
+def _describe_commanders(boards: Sequence[str]) -> str:
     """Describe which boards command something."""
     named = ", ".join(f"'{board}'" for board in boards)
     return f"it is commanded by {named or 'none'}"

@@ -74,7 +74,7 @@ class JointGateway(Executor):
 
     def process(self, tick: int) -> None:
         """Pass references down and statuses up."""
-        self._take(self.above, tick)
+        self._take_reference(self.above, tick)
         newest = self._newest
         due = newest.due + self.latency if newest.due else 0
         if not due or due > max(self._due, tick):
@@ -82,19 +82,19 @@ class JointGateway(Executor):
             self._due = self.command.due = due
             self._frozen = False
         elif self._due and tick + LEAD_CYCLES * self.context.every > self._due:
-            self._extrapolate(self.command)
+            self._extrapolate_reference(self.command)
         # Put the status of the boards below on the link, and write the one that arrives.
-        self._merge(self.statuses)
+        self._merge_statuses(self.statuses)
         self._up.append((tick + self._delay, bytes(self._merged.raw)))
-        take_arrived(self._up, self.status, tick)
+        deliver_arrived(self._up, self.status, tick)
 
-    def _take(self, command: Reading[JointReference], tick: int) -> None:
+    def _take_reference(self, command: Reading[JointReference], tick: int) -> None:
         """Put a new reference on the link, and receive the one that arrives."""
         if command.is_new:
             self._down.append((tick + self._delay, bytes(command.message.raw)))
-        take_arrived(self._down, self._newest, tick)
+        deliver_arrived(self._down, self._newest, tick)
 
-    def _extrapolate(self, command: JointReference) -> None:
+    def _extrapolate_reference(self, command: JointReference) -> None:
         """Extrapolate the next reference, or give up if too many are missing."""
         newest = self._newest
         ahead_ticks = self._due + self._period - self.latency - newest.due  # ticks
@@ -110,7 +110,7 @@ class JointGateway(Executor):
         command.velocity[:] = newest.velocity
         command.acceleration[:] = 0.0
 
-    def _merge(self, statuses: Mapping[str, Reading[JointStatus]]) -> None:
+    def _merge_statuses(self, statuses: Mapping[str, Reading[JointStatus]]) -> None:
         """Combine the statuses of the boards below to one."""
         merged = self._merged
         values = [reading.message for reading in statuses.values()]
@@ -121,7 +121,9 @@ class JointGateway(Executor):
             for value in values:
                 field += getattr(value, name)
         silent = [
-            board for board, reading in statuses.items() if reading.is_lost or not reading.is_there
+            board
+            for board, reading in statuses.items()
+            if reading.is_lost or not reading.has_message
         ]
         worst = max(values, key=lambda value: (value.error > 0, value.stopped, value.holding))
         merged.holding = any(value.holding for value in values)
@@ -141,7 +143,7 @@ class JointGateway(Executor):
             merged.reason = f"{late}: held after {self._missing} extrapolated"
 
 
-def take_arrived(link: Link, message: Message, tick: int) -> None:
+def deliver_arrived(link: Link, message: Message, tick: int) -> None:
     """Copy the newest message that has arrived by `tick` to `message`, if any.
 
     Args:
@@ -203,7 +205,7 @@ class NetworkGateway(JointGateway):
     def process(self, tick: int) -> None:
         """Pass references down and statuses up; report the state of the other rack."""
         peer = self.peer.message
-        self._follow(peer.ahead)
+        self._follow_clock(peer.ahead)
         super().process(tick)
         if peer.presence != Presence.THERE or peer.uncertainty < 0.0:
             # Its references could not be followed, so its motion must not begin.
@@ -218,7 +220,7 @@ class NetworkGateway(JointGateway):
             self.status.error = program.error
             self.status.reason = program.reason
 
-    def _follow(self, ahead_s: float) -> None:
+    def _follow_clock(self, ahead_s: float) -> None:
         """Set the other rack's time while no reference is followed, else only approach it.
 
         The clocks of the two racks drift.
@@ -230,7 +232,7 @@ class NetworkGateway(JointGateway):
             step_s = self.context.tick_s / STATUS_CYCLES
             self._their_s += step_s if apart_s > 0.0 else -step_s
 
-    def _take(self, command: Reading[JointReference], tick: int) -> None:
+    def _take_reference(self, command: Reading[JointReference], tick: int) -> None:
         """Pass a new reference on when the boards below need it, with due ticks of this rack."""
         if command.is_new:
             arrived = self._arrived
@@ -246,4 +248,4 @@ class NetworkGateway(JointGateway):
                 arrived.due = round(due_s / self.context.tick_s)
             begins = arrived.due + self.latency - self._ahead if arrived.due else tick
             self._down.append((begins, bytes(arrived.raw)))
-        take_arrived(self._down, self._newest, tick)
+        deliver_arrived(self._down, self._newest, tick)

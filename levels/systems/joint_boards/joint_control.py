@@ -46,7 +46,7 @@ class JointLoads:
         # (joints,), rad. NaN if the loads come from a reference.
         self._computed_at = np.full(joints, np.nan)
 
-    def misfit(self, command: JointReference) -> str:
+    def find_misfit(self, command: JointReference) -> str:
         """Return the field of a `JointReference` that asks for more than the arm can do, or ""."""
         # Written so that NaN is rejected.
         within = {
@@ -66,20 +66,20 @@ class JointLoads:
         bias = self._dynamics.terms(self._home, self._still, Payload(mass, offset)).bias
         return bool(mass >= 0.0 and (np.abs(bias) <= self._most).all())
 
-    def take(self, command: JointReference, tick: int) -> None:
+    def take_reference(self, command: JointReference, tick: int) -> None:
         """Start an interval that ends with the loads of a `JointReference` when it is due."""
-        self.table[AT] += self.part(tick) * (self.table[DUE] - self.table[AT])
+        self.table[AT] += self.compute_passed_part(tick) * (self.table[DUE] - self.table[AT])
         self.table[DUE] = command.inertia, command.load
         self._begin = tick
         self._due = command.due
         self._payload = Payload(command.payload_mass, command.payload_offset.copy())
         self._computed_at[:] = np.nan
 
-    def part(self, tick: int) -> float:
+    def compute_passed_part(self, tick: int) -> float:
         """Return the part of the present interval that has passed, 0 to 1."""
         return 1.0 if tick >= self._due else (tick - self._begin) / (self._due - self._begin)
 
-    def hold(self, position: Array) -> None:
+    def compute_at_rest(self, position: Array) -> None:
         """Compute the loads of an arm at rest at `position`, (joints,), rad, if it has moved."""
         if (np.abs(position - self._computed_at) < MOVED_RAD).all():
             return

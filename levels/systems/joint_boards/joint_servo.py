@@ -10,16 +10,16 @@ import numpy as np
 
 from rack.backplane.message import State
 from rack.levels.algebra import Array
-from rack.levels.level import Executor, Input, LevelContext, Misfits, Output
+from rack.levels.level import Executor, Input, LevelContext, Mismatches, Output
 from rack.levels.messages import Error
-from rack.levels.operator import HOLDABLE, Goal, Operation, OperatorCommand
+from rack.levels.operator import HOLD_COMMANDS, Goal, Operation, OperatorCommand
 from rack.levels.robot import dynamics
-from rack.levels.robot.cell import cell_of
+from rack.levels.robot.cell import build_level_cell
 from rack.levels.servo import curves, reference
-from rack.levels.servo.arm_report import numbers
+from rack.levels.servo.arm_report import view_numbers
 from rack.levels.servo.control import Grip, LoopGains
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.modification import ModifiableParams, misfits_of, names_of
+from rack.levels.servo.modification import ModifiableParams, find_misfits, list_names
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
@@ -59,7 +59,7 @@ class JointServo(Executor):
     command = Output(JointTorque, rests_on=above)
     status = Output(JointStatus, rests_on=below)
     commands = {
-        **HOLDABLE,
+        **HOLD_COMMANDS,
         Operation.SETPOINT: (Goal.JOINTS,),
         Operation.MODIFY: (Goal.ON, Goal.OFF),
         Operation.SET: (),
@@ -72,20 +72,20 @@ class JointServo(Executor):
         super().__init__(context)
         params = self.settings
         robot = context.robot
-        cell = cell_of(context)
+        cell = build_level_cell(context)
         names = robot.joints if params.joints is None else params.joints
         self._driven = np.array([name in names for name in robot.joints])
         self._constants = constants = np.zeros((5, len(robot.joints)))  # rows of `servo_joints`
-        params.fill(constants)
+        params.fill_constants(constants)
         constants[2] = cell.model.dof_frictionloss[cell.dof]
         constants[3] = cell.bounds.torque
         constants[4] = self._driven
         self.reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self.loads = JointLoads(cell)
-        self._servo = partial(servo_joints.load(), constants, self.loads.table)
+        self._servo = partial(servo_joints.load_machine_code(), constants, self.loads.table)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         self.operator_control = OperatorControl(
-            self.commands, robot.joints, cell.limits.position, self._driven, obey=self._obey
+            self.commands, robot.joints, cell.limits.position, self._driven, obey=self._obey_command
         )
         # Output of the law when modifications call it.
         self._unmodified: Array = np.zeros(7 * len(robot.joints))
@@ -102,14 +102,14 @@ class JointServo(Executor):
         self._met = False  # a status of the arm has arrived
 
     @classmethod
-    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+    def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the names of the control modifications."""
-        return names_of(params)
+        return list_names(params)
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield invalid joints, a board without work, and modifications that do not suit it."""
         params = read_params(JointServoParams, context.params)
         known = context.robot.joints
@@ -125,12 +125,12 @@ class JointServo(Executor):
                 yield "params.joints", joint, "named twice"
         if not named and not params.gripper:
             yield "params.joints", [], "it drives no joint, and not the gripper"
-        yield from misfits_of(context)
+        yield from find_misfits(context)
 
     def process(self, tick: int) -> None:
         """Interpolate, and compute the torques that act from the next cycle on."""
         arm = self.below.message
-        if not self._met and not self._meet(self.below.is_there, arm):
+        if not self._met and not self._meet_arm(self.below.has_message, arm):
             return
         self._take_messages()
         sampled = arm.tick
@@ -141,42 +141,48 @@ class JointServo(Executor):
         stopped = is_silent or arm.stopped
         if is_silent or (stopped and arm.braked):
             reference.start(arm.position, arm.velocity, tick)
-            self._modified.interrupt()
+            self._modified.forget_torque()
         if stopped:
-            wanted = reference.rest(tick)
+            wanted = reference.ramp_to_rest(tick)
         else:
-            wanted = operator.wanted(reference, tick) if operator.stands else reference.at(tick)
+            wanted = (
+                operator.compute_motion(reference, tick)
+                if operator.stands
+                else reference.compute_motion(tick)
+            )
         # Use inertia and load of the reference that is followed. Compute them if there is none.
         if stopped or operator.stands or reference.holding:
-            self.loads.hold(arm.position)
+            self.loads.compute_at_rest(arm.position)
         elif self._offered is not None:
-            self.loads.take(self._offered, tick)
+            self.loads.take_reference(self._offered, tick)
             self._due = self._offered.due
             self._offered = None
         tick_s = self.context.tick_s
         age_s = min(tick + every - sampled, self._oldest + every) * tick_s
-        times = self.loads.part(tick), every * tick_s, age_s
+        times = self.loads.compute_passed_part(tick), every * tick_s, age_s
         self._servo(*times, self._sample, wanted.table, *self._shown_numbers)
         if self._modified.exists:
-            self._modify(times, wanted, tick)
+            self._apply_modifications(times, wanted, tick)
         torque = self.command
         torque.sampled = sampled
         torque.id += 1
         if self._grip is not None:
-            torque.grip_force = self._grip.force(arm.opening, arm.opening_velocity)
-        torque.operator = operator.orders.rests_on(self._rests_on)
-        self._report(self.status, arm, is_silent, stopped)
-        operator.orders.report(self.status, self._rests_on)
+            torque.grip_force = self._grip.compute_force(arm.opening, arm.opening_velocity)
+        torque.operator = operator.orders.find_basis(self._rests_on)
+        self._write_status(self.status, arm, is_silent, stopped)
+        operator.orders.fill_status(self.status, self._rests_on)
 
-    def _obey(self, command: OperatorCommand) -> str:
+    def _obey_command(self, command: OperatorCommand) -> str:
         """Switch a modification or set a parameter. Return why it is refused, or an empty text."""
         if command.what == Operation.MODIFY:
-            return self._modified.switch(command.name, command.goal == Goal.ON)
+            return self._modified.switch_modification(command.name, command.goal == Goal.ON)
         self.settings, refusal = set_live(self.settings, command.name)
-        self.settings.fill(self._constants)
+        self.settings.fill_constants(self._constants)
         return refusal
 
-    def _modify(self, times: tuple[float, float, float], wanted: Motion, tick: int) -> None:
+    def _apply_modifications(
+        self, times: tuple[float, float, float], wanted: Motion, tick: int
+    ) -> None:
         """Replace the torques just computed with the torques of the modified law.
 
         Args:
@@ -198,11 +204,11 @@ class JointServo(Executor):
 
         inertia, load = table[AT] + times[0] * (table[DUE] - table[AT])
         inputs = LawInputs(wanted, self._sample.reshape(2, joints), inertia, load, tick)
-        modified = self._modified.torque(compute_unmodified, inputs)
+        modified = self._modified.compute_torque(compute_unmodified, inputs)
         np.copyto(command[:joints], modified, where=self._driven)
         np.copyto(shown_status[3 * joints :], modified, where=self._driven)
 
-    def _meet(self, is_there: bool, arm: ArmStatus) -> bool:
+    def _meet_arm(self, is_there: bool, arm: ArmStatus) -> bool:
         """Prepare for the first status of the arm. Return False while there is none."""
         status = self.status
         torque = self.command
@@ -214,36 +220,38 @@ class JointServo(Executor):
             status.stopped = True
             return False
         if self._grip is not None and arm.grip_force:
-            self._grip.keep(arm.grip_force)
-        self._sample = numbers(arm, "position", "velocity")
+            self._grip.keep_force(arm.grip_force)
+        self._sample = view_numbers(arm, "position", "velocity")
         self._shown_numbers = (
-            numbers(torque, "torque", "target_velocity"),
-            numbers(status, "position", "torque"),
+            view_numbers(torque, "torque", "target_velocity"),
+            view_numbers(status, "position", "torque"),
         )
         return True
 
     def _take_messages(self) -> None:
         """Process a new command of the operator and a new reference."""
         if self.operator.is_new:
-            self.operator_control.take(self.operator, self.below.message.position)
+            self.operator_control.take_commands(self.operator, self.below.message.position)
         if self.above.is_new:
             command = self.above.message
             self._command = command.id
             self._rests_on = command.operator
             self._refused = ""
-            if misfit := self.loads.misfit(command):
+            if misfit := self.loads.find_misfit(command):
                 # Before the first set point all fields are zero, which is no mistake.
                 if command.due:
                     self._refused = f"rejected: a reference whose {misfit} is out of range"
                 return
-            self.reference.take(command)
+            self.reference.take_command(command)
             self._offered = command
             if self._grip is not None:
-                self._grip.take(command)
+                self._grip.take_command(command)
                 self.command.payload_mass = command.payload_mass
                 self.command.payload_offset = command.payload_offset
 
-    def _report(self, status: JointStatus, arm: ArmStatus, is_silent: bool, stopped: bool) -> None:
+    def _write_status(
+        self, status: JointStatus, arm: ArmStatus, is_silent: bool, stopped: bool
+    ) -> None:
         """Fill the fields of the status that the law does not set.
 
         Args:

@@ -23,7 +23,7 @@ from __future__ import annotations
 from numpy import ndarray
 
 from rack.backplane.message import field
-from rack.levels.messages import DrivenArm, JointCommand, ServoStatus, per_joint
+from rack.levels.messages import DrivenArm, JointCommand, ServoStatus, joint_field
 from rack.levels.operator import AnsweringStatus, RelayedCommand, SampledCommand
 
 
@@ -33,11 +33,11 @@ class JointReference(RelayedCommand, version=1):
     due: int = field(
         unit="tick", doc="tick at which the arm should be at the set point, or 0 to hold"
     )
-    position: ndarray = per_joint("rad", "joint positions")
-    velocity: ndarray = per_joint("rad/s", "joint velocities")
-    acceleration: ndarray = per_joint("rad/s2", "joint accelerations")
-    inertia: ndarray = per_joint("kg m2", "diagonal of the joint-space inertia there")
-    load: ndarray = per_joint("N m", "torques of gravity and motion there, without acceleration")
+    position: ndarray = joint_field("rad", "joint positions")
+    velocity: ndarray = joint_field("rad/s", "joint velocities")
+    acceleration: ndarray = joint_field("rad/s2", "joint accelerations")
+    inertia: ndarray = joint_field("kg m2", "diagonal of the joint-space inertia there")
+    load: ndarray = joint_field("N m", "torques of gravity and motion there, without acceleration")
     opening: float = field(unit="m", doc="gripper joint position to go to")
     force: float = field(unit="N", doc="largest gripper force")
     payload_mass: float = field(
@@ -56,11 +56,11 @@ class JointTorque(SampledCommand, version=1):
         unit="tick",
         doc="tick of the arm's status on which the torque is based, or -1 before the first",
     )
-    torque: ndarray = per_joint("N m", "of the board's own joints; others 0")
-    target: ndarray = per_joint(
+    torque: ndarray = joint_field("N m", "of the board's own joints; others 0")
+    target: ndarray = joint_field(
         "rad", "where the board wants its own joints when the torque acts; others 0"
     )
-    target_velocity: ndarray = per_joint("rad/s", "likewise")
+    target_velocity: ndarray = joint_field("rad/s", "likewise")
     grip_force: float = field(
         unit="N", doc="of the gripper, from the board that drives it; others 0"
     )
@@ -73,12 +73,12 @@ class JointTorque(SampledCommand, version=1):
 class JointStatus(AnsweringStatus, version=1):
     """Sent by a board that servoes joints to the trajectory level."""
 
-    position: ndarray = per_joint("rad", "joint positions, from the arm's status")
-    target: ndarray = per_joint(
+    position: ndarray = joint_field("rad", "joint positions, from the arm's status")
+    target: ndarray = joint_field(
         "rad", "set point of the board's own joints in this cycle; others 0"
     )
-    target_velocity: ndarray = per_joint("rad/s", "likewise")
-    torque: ndarray = per_joint("N m", "of the board's own joints; others 0")
+    target_velocity: ndarray = joint_field("rad/s", "likewise")
+    torque: ndarray = joint_field("N m", "of the board's own joints; others 0")
     driven: ndarray = field(
         "u1", unit="1", doc="1: the joint is one of this board's", shape="joints"
     )

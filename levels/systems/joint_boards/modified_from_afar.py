@@ -78,14 +78,14 @@ class ModificationSender(Executor):
         self._pending: list[int] = []  # serials of commands that not all boards have answered
 
     @classmethod
-    def names(cls, params: Mapping[str, Any]) -> Sequence[str]:
+    def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the names of the modifications."""
         known = params.get("known")
         return tuple(map(str, known)) if isinstance(known, Sequence) else ()
 
     def process(self, tick: int) -> None:
         """Send the modifications that must be active, and report whether they are."""
-        self._orders.take(self.operator, judge=self._obey)
+        self._orders.take_commands(self.operator, judge=self._obey_command)
         self.command.id = self._orders.serial
         self.command.wanted = " ".join(sorted(self._wanted))
         answers = self.modified.values()
@@ -94,24 +94,24 @@ class ModificationSender(Executor):
         silent = [box for box, answer in self.modified.items() if answer.is_lost]
         if not reasons and all(answer.message.echo == self._orders.serial for answer in answers):
             for serial in self._pending:
-                self._orders.drives_done(serial)
+                self._orders.report_drives_done(serial)
             self._pending.clear()
         status.echo = self._orders.serial
         status.reason = "; ".join([*reasons, *(f"no answer in {box}" for box in silent)])
         status.state = State.EXECUTING if self._pending else State.IDLE
         if status.reason:
             status.state = State.HOLDING
-        self._orders.report(status)
+        self._orders.fill_status(status)
 
-    def _obey(self, command: OperatorCommand) -> None:
+    def _obey_command(self, command: OperatorCommand) -> None:
         """Switch a modification, or refuse a name that is not known."""
         if command.name not in self._known:
-            self._orders.refuse(
+            self._orders.refuse_newest(
                 f"no modification '{command.name}'; permitted: {', '.join(self._known)}"
             )
             return
         (self._wanted.add if command.goal == Goal.ON else self._wanted.discard)(command.name)
-        self._orders.takes_time()
+        self._orders.report_setting_started()
         self._pending.append(self._orders.serial)
 
 
@@ -137,7 +137,7 @@ class ModifiedFromAfar(JointServo):
             refused = {
                 name: refusal
                 for name in sorted(wanted ^ self._asked)
-                if (refusal := self._modified.switch(name, name in wanted))
+                if (refusal := self._modified.switch_modification(name, name in wanted))
             }
             # Refused ones are requested in every message, and every answer reports the refusal.
             self._asked = wanted.difference(refused)

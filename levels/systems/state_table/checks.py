@@ -18,19 +18,19 @@ from rack.levels.systems.state_table.table import (
     RowConfig,
     StateTable,
     Vocabulary,
-    objection,
+    find_objection,
 )
-from rack.levels.tables import keys_of
+from rack.levels.tables import describe_keys
 
 Box = dict[str, frozenset[str]]
 """A set of cases: the permitted values of each condition."""
-REASONED = ("error", "holding")
+STATUSES_WITH_REASON = ("error", "holding")
 """Values of `status` for which a row must give a reason."""
-MAX_HOLES = 3
+MAX_REPORTED_HOLES = 3
 """Number of uncovered cases of one state that are listed individually."""
 
 
-def flaws(table: StateTable, vocabulary: Vocabulary, lexicon: Lexicon | None) -> list[str]:
+def find_flaws(table: StateTable, vocabulary: Vocabulary, lexicon: Lexicon | None) -> list[str]:
     """Return one line for every mistake in a table, with the number and name of the row.
 
     Args:
@@ -41,37 +41,47 @@ def flaws(table: StateTable, vocabulary: Vocabulary, lexicon: Lexicon | None) ->
     """
     lines = [*table.flaws]
     for number, row in table.configs.items():
-        lines += [f"{_named(number, row)}: {why}" for why in _words(row, vocabulary, lexicon)]
-    lines += _states(table)
+        lines += [
+            f"{_format_row_name(number, row)}: {why}"
+            for why in _find_row_flaws(row, vocabulary, lexicon)
+        ]
+    lines += _find_state_flaws(table)
     # Cases can be counted only once every condition and value is known, and every row is readable.
-    if not table.flaws and not any(_conditions(row, vocabulary) for row in table.configs.values()):
+    if not table.flaws and not any(
+        _find_condition_flaws(row, vocabulary) for row in table.configs.values()
+    ):
         for state in table.rows:
-            lines += _cases(state, table.rows[state], vocabulary)
+            lines += _find_case_flaws(state, table.rows[state], vocabulary)
     return lines
 
 
-def _named(number: int, row: RowConfig) -> str:
+def _format_row_name(number: int, row: RowConfig) -> str:
     return f"row {number} '{row.name}'"
 
 
-def _words(row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None) -> Iterator[str]:
+def _find_row_flaws(
+    row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None
+) -> Iterator[str]:
     """Yield unknown words of a row, and required keys that it lacks."""
-    yield from _conditions(row, vocabulary)
+    yield from _find_condition_flaws(row, vocabulary)
     for phrase in row.do:
-        if lexicon is not None and (why := objection(phrase, vocabulary.actions, lexicon)):
+        if lexicon is not None and (why := find_objection(phrase, vocabulary.actions, lexicon)):
             yield f"do: {why}"
     for key in ("next", "do", "status"):
         if key not in row.model_fields_set:
-            yield f"{key}: missing; {keys_of(RowConfig)[key].description}"
+            yield f"{key}: missing; {describe_keys(RowConfig)[key].description}"
     if row.status not in STATES:
         yield f"status: unknown '{row.status}'; known: {', '.join(STATES)}"
-    if row.status in REASONED and not row.reason and "status" in row.model_fields_set:
+    if row.status in STATUSES_WITH_REASON and not row.reason and "status" in row.model_fields_set:
         yield f"reason: missing; status {row.status} needs one, a line for the user"
-    if row.status not in REASONED and row.reason:
-        yield (f"reason: status {row.status} shows none; statuses that do: {', '.join(REASONED)}")
+    if row.status not in STATUSES_WITH_REASON and row.reason:
+        yield (
+            f"reason: status {row.status} shows none; statuses that do: "
+            f"{', '.join(STATUSES_WITH_REASON)}"
+        )
 
 
-def _conditions(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
+def _find_condition_flaws(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
     """Return a line for each unknown condition or value in a row."""
     lines = []
     for condition, values in row.when.items():
@@ -88,7 +98,7 @@ def _conditions(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
     return lines
 
 
-def _states(table: StateTable) -> Iterator[str]:
+def _find_state_flaws(table: StateTable) -> Iterator[str]:
     """Yield next states that do not exist, and states that are unreachable from the start."""
     names = [*table.rows]
     known = ", ".join(names)
@@ -99,7 +109,8 @@ def _states(table: StateTable) -> Iterator[str]:
     for number, row in table.configs.items():
         if row.next not in (*names, SAME):
             yield (
-                f"{_named(number, row)}: next: no row has the state '{row.next}'; states: {known}"
+                f"{_format_row_name(number, row)}: next: no row has the state "
+                f"'{row.next}'; states: {known}"
             )
     if table.start not in names:
         return
@@ -116,7 +127,9 @@ def _states(table: StateTable) -> Iterator[str]:
             )
 
 
-def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) -> Iterator[str]:
+def _find_case_flaws(
+    state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary
+) -> Iterator[str]:
     """Yield overlapping rows of a state, rows that never fire, and cases that no row takes.
 
     Args:
@@ -131,7 +144,7 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
     boxes: dict[int, Box] = {}  # earlier rows, by number
     uncovered = [all_cases]
     for number, row in rows.items():
-        row_name = _named(number, row)
+        row_name = _format_row_name(number, row)
         box = {**all_cases, **{name: frozenset(values) for name, values in row.when.items()}}
         for earlier_number, earlier_box in boxes.items():
             overlap = {name: values & earlier_box[name] for name, values in box.items()}
@@ -139,23 +152,24 @@ def _cases(state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary) ->
                 earlier = rows[earlier_number]
                 shared = {n: overlap[n] for n in conditions if n in row.when or n in earlier.when}
                 yield (
-                    f"{row_name}: overlaps {_named(earlier_number, earlier)} in '{state}'"
-                    f" when {_listed(shared)}; let them exclude each other, or give the later one"
+                    f"{row_name}: overlaps {_format_row_name(earlier_number, earlier)} in '{state}'"
+                    f" when {_format_box(shared)}; let them exclude each other, or give "
+                    "the later one"
                     " else = true"
                 )
-        rest = [piece for box_left in uncovered for piece in without(box_left, box)]
+        rest = [piece for box_left in uncovered for piece in subtract_box(box_left, box)]
         if row.otherwise and rest == uncovered:
             yield f"{row_name}: never fires in '{state}': the rows above it take every case of it"
         uncovered = rest
         boxes[number] = box
-    uncovered = joined(uncovered)
-    for box in uncovered[:MAX_HOLES]:
-        yield f"hole: no row of '{state}' takes {_described(box, vocabulary)}"
-    if len(uncovered) > MAX_HOLES:
-        yield f"hole: '{state}' has {len(uncovered) - MAX_HOLES} more"
+    uncovered = merge_boxes(uncovered)
+    for box in uncovered[:MAX_REPORTED_HOLES]:
+        yield f"hole: no row of '{state}' takes {_format_cases(box, vocabulary)}"
+    if len(uncovered) > MAX_REPORTED_HOLES:
+        yield f"hole: '{state}' has {len(uncovered) - MAX_REPORTED_HOLES} more"
 
 
-def without(box: Box, removed: Box) -> Sequence[Box]:
+def subtract_box(box: Box, removed: Box) -> Sequence[Box]:
     """Return the cases of `box` that are not in `removed`, as disjoint boxes.
 
     Both boxes must have the same conditions.
@@ -173,30 +187,30 @@ def without(box: Box, removed: Box) -> Sequence[Box]:
     return pieces
 
 
-def joined(boxes: Sequence[Box]) -> list[Box]:
+def merge_boxes(boxes: Sequence[Box]) -> list[Box]:
     """Return the same cases in fewer boxes.
 
     Two boxes that differ in a single condition are merged until no such pair is left.
     """
     merged = [*boxes]
-    while pair := next((p for p in combinations(merged, 2) if _differ_once(*p)), None):
+    while pair := next((p for p in combinations(merged, 2) if _differ_in_one_condition(*p)), None):
         first, second = pair
         merged[merged.index(first)] = {name: first[name] | second[name] for name in first}
         merged.remove(second)
     return merged
 
 
-def _differ_once(first: Box, second: Box) -> bool:
+def _differ_in_one_condition(first: Box, second: Box) -> bool:
     return sum(first[name] != second[name] for name in first) == 1
 
 
-def _described(box: Box, vocabulary: Vocabulary) -> str:
+def _format_cases(box: Box, vocabulary: Vocabulary) -> str:
     """Format the cases of a box, without conditions that may have any value."""
     narrow = {n: values for n, values in box.items() if len(values) < len(vocabulary.conditions[n])}
-    return _listed(narrow)
+    return _format_box(narrow)
 
 
-def _listed(box: Box) -> str:
+def _format_box(box: Box) -> str:
     return (
         ", ".join(f"{name} = {'|'.join(sorted(values))}" for name, values in box.items())
         or "any case"

@@ -12,22 +12,22 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import field, integer
+from rack.backplane.message import field, integer_field
 from rack.levels.algebra import Array, norm
 from rack.levels.level import Input, Inputs, LevelContext, Output
 from rack.levels.messages import WorldState
 from rack.levels.operator import OperatorCommand
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.planning.pose import Pose, pointing, yaw_of
-from rack.levels.robot.cell import cell_of
+from rack.levels.planning.pose import Pose, build_pointing_quaternion, compute_yaw
+from rack.levels.robot.cell import build_level_cell
 from rack.levels.systems.state_table.level import (
     BELOW,
     YES_NO,
     StateTableExecutor,
     TableCommand,
     TableStatus,
-    answer_of,
-    vocabulary,
+    build_vocabulary,
+    classify_answer,
 )
 from rack.levels.systems.state_table.primitive import JointMove, JointMoveStatus
 from rack.levels.systems.state_table.table import Lexicon, Name, Place
@@ -36,16 +36,16 @@ from rack.levels.tables import Finite, NotNegative, Positive, SceneConfig, Table
 DOWN = (0.0, 0.0, -1.0)
 HOME = "home"
 """Name of the pose in which the arm starts."""
-STILL_M_S = 0.005
+MAX_REST_SPEED_M_S = 0.005
 """An object slower than this is at rest."""
 
 
 class MoveTableStatus(TableStatus, version=1):
     """Status of the elemental move level of state tables."""
 
-    sent: int = integer("serial of the newest command sent down (0: none)")
+    sent: int = integer_field("serial of the newest command sent down (0: none)")
     reached: bool = field(doc="1: the newest pose has joint positions")
-    put: int = integer("row of the object put down last (-1: none)", "i2")
+    put: int = integer_field("row of the object put down last (-1: none)", "i2")
     resting: bool = field(doc="1: the arm rests")
 
 
@@ -82,7 +82,7 @@ class MoveTable(StateTableExecutor):
     operator = Input(OperatorCommand, "own.operator")
     command = Output(JointMove, rests_on=above)
     status = Output(MoveTableStatus, rests_on=below)
-    vocabulary = vocabulary(
+    vocabulary = build_vocabulary(
         conditions={
             "below": BELOW,
             # Whether the objects are sensed.
@@ -112,12 +112,12 @@ class MoveTable(StateTableExecutor):
         plan=MovePlanConfig,
     )
     # Both as read in this cycle.
-    _below: JointMoveStatus
+    _below_status: JointMoveStatus
     _world: WorldState
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._cell = cell_of(context)
+        self._cell = build_level_cell(context)
         self._ik = InverseKinematics(self._cell, context.seed)
         # Newest command sent down. It aims at a place if `object` is -1.
         self._command = JointMove.zeros(context.sizes)
@@ -125,53 +125,53 @@ class MoveTable(StateTableExecutor):
         self._command.speed = 1.0
         self._command.object = -1
         self._reached = True
-        self._put = -1  # row of the object put down last, -1 if there is none
+        self._put_row = -1  # row of the object put down last, -1 if there is none
 
     @classmethod
-    def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
+    def build_lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
         """Return the names of the objects, places and poses."""
         return {"object": scene.objects, "place": tuple(plan.place), "pose": (*plan.pose, HOME)}
 
-    def recall(self) -> None:
+    def restore_state(self) -> None:
         """Continue with the command that was sent down last."""
-        super().recall()
-        if self.last_status.is_there and self.last_command.is_there:
+        super().restore_state()
+        if self.last_status.has_message and self.last_command.has_message:
             last = self.last_status.message
             self._command.copy_from(self.last_command.message)
             self._command.id = last.sent
             self._reached = last.reached
-            self._put = last.put
+            self._put_row = last.put
 
-    def look(self, tick: int) -> dict[str, str]:
+    def evaluate_conditions(self, tick: int) -> dict[str, str]:
         """Return the conditions of the level below, the objects and the gripper."""
-        self._below = self.below.message
+        self._below_status = self.below.message
         self._world = self.world.message
-        self.detail = self._below.reason
-        self.resting = not self._below.moving
+        self.detail = self._below_status.reason
+        self.resting = not self._below_status.moving
         is_seen = not self.world.is_lost and self._world.revision > 0
         target = "moving"
         is_elsewhere = False
         if is_seen:
-            target = self._target(self._command.object)
-            is_elsewhere = self._put >= 0 and not self._is_at(self._put)
+            target = self._classify_target(self._command.object)
+            is_elsewhere = self._put_row >= 0 and not self._is_at_aim(self._put_row)
         return {
-            "below": answer_of(self.below, self._command.id),
+            "below": classify_answer(self.below, self._command.id),
             "world": ("unseen", "seen")[is_seen],
             "target": target,
             "support": ("there", "elsewhere")[is_elsewhere],
-            "gripper": ("free", "holds")[self._below.held],
+            "gripper": ("free", "holds")[self._below_status.held],
             "reach": YES_NO[self._reached],
         }
 
-    def _target(self, row: int) -> str:
+    def _classify_target(self, row: int) -> str:
         """Return the value of the condition `target` for an object's row; -1 means a place."""
         if row < 0:
             return "there"
-        if norm(self._world.velocity[row]) > STILL_M_S:
+        if norm(self._world.velocity[row]) > MAX_REST_SPEED_M_S:
             return "moving"
-        return "there" if self._is_at(row) else "displaced"
+        return "there" if self._is_at_aim(row) else "displaced"
 
-    def _is_at(self, row: int) -> bool:
+    def _is_at_aim(self, row: int) -> bool:
         """Return True if an object is where the newest motion aims."""
         distance = norm(self._world.position[row] - self._command.aim)
         return bool(distance <= self.table.plan.moved)
@@ -179,26 +179,26 @@ class MoveTable(StateTableExecutor):
     def do_move(self, pose: str) -> None:
         """Send the arm to a taught pose, or home."""
         if pose == HOME:
-            self._send("move", self._cell.home, self.table.plan.home_speed)
+            self._send_command("move", self._cell.home, self.table.plan.home_speed)
             self._command.object = -1
             return
         taught = self.table.plan.pose[pose]
-        goal = self._tool_at(taught.height)
-        joints = None if goal is None else self._solve(goal)
+        goal = self._find_tool_goal(taught.height)
+        joints = None if goal is None else self._solve_joints(goal)
         self._reached = joints is not None
         if joints is not None:
-            self._send("move", joints, taught.speed)
+            self._send_command("move", joints, taught.speed)
 
     def do_open(self) -> None:
         """Open the gripper."""
-        self._put = self._below.object if self._below.held else -1
-        self._send("open", self._command.joints, 1.0)
+        self._put_row = self._below_status.object if self._below_status.held else -1
+        self._send_command("open", self._command.joints, 1.0)
 
     def do_close(self) -> None:
         """Close the gripper."""
-        self._send("close", self._command.joints, 1.0)
+        self._send_command("close", self._command.joints, 1.0)
 
-    def _tool_at(self, height: float) -> Pose | None:
+    def _find_tool_goal(self, height: float) -> Pose | None:
         """Return the goal of the tool for the command in force, with the tool pointing down.
 
         Args:
@@ -218,40 +218,47 @@ class MoveTable(StateTableExecutor):
         else:
             row = command.object = self.context.scene.objects.index(name)
             # A held object moves with the arm, so the aim stays at its position before the grasp.
-            if not self._below.held:
+            if not self._below_status.held:
                 command.aim = self._world.position[row]
-                command.yaw = yaw_of(self._world.quaternion[row])
-        tool_now = self._ik.tool_at(command.joints)
+                command.yaw = compute_yaw(self._world.quaternion[row])
+        tool_now = self._ik.compute_tool_pose(command.joints)
         # The gripper must be aligned with the object's faces. Of the four possible turns, take the
         # one nearest to the present orientation.
-        turns = [pointing(DOWN, -(command.yaw + quarter * 0.5 * math.pi)) for quarter in range(4)]
-        goals = [Pose(command.aim, turn).raised(height) for turn in turns]
-        return min(goals, key=tool_now.angle_to)
+        turns = [
+            build_pointing_quaternion(DOWN, -(command.yaw + quarter * 0.5 * math.pi))
+            for quarter in range(4)
+        ]
+        goals = [Pose(command.aim, turn).raise_by(height) for turn in turns]
+        return min(goals, key=tool_now.compute_angle)
 
-    def _solve(self, goal: Pose) -> Array | None:
+    def _solve_joints(self, goal: Pose) -> Array | None:
         """Return joint positions that reach a pose, rad. None if none are found.
 
         The branch of the arm's present configuration is preferred. At most three descents are
         tried.
         """
-        joints = self._ik.nearby(goal, self._command.joints)
+        joints = self._ik.find_nearby(goal, self._command.joints)
         if joints is None:
-            joints = self._ik.reach(goal, self._cell.home)
-        return joints if joints is not None else self._ik.reach(goal, self._command.joints)
+            joints = self._ik.find_configuration(goal, self._cell.home)
+        return (
+            joints
+            if joints is not None
+            else self._ik.find_configuration(goal, self._command.joints)
+        )
 
-    def _send(self, words: str, joints: Array, speed: float) -> None:
+    def _send_command(self, words: str, joints: Array, speed: float) -> None:
         """Change the command for the level below and give it a new serial."""
         self._command.id += 1
         self._command.words = words
         self._command.speed = speed
         self._command.joints = joints
 
-    def give(self, tick: int) -> None:
+    def write_outputs(self, tick: int) -> None:
         """Write the command, and the status fields that a restarted board needs."""
         status = self.status
-        self._command.hold = self.holds
+        self._command.hold = self.is_held
         self.command.copy_from(self._command)
         status.sent = self._command.id
         status.reached = self._reached
         status.resting = self.resting
-        status.put = self._put
+        status.put = self._put_row

@@ -15,27 +15,27 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 
 from pydantic import Field as Key
 
-from rack.backplane.message import State, field, integer
-from rack.levels.level import Executor, Input, Inputs, LevelContext, Misfits, Output, Reading
+from rack.backplane.message import State, field, integer_field
+from rack.levels.level import Executor, Input, Inputs, LevelContext, Mismatches, Output, Reading
 from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
     HELD_FROM_ABOVE,
-    HOLDABLE,
+    HOLD_COMMANDS,
     AnsweringStatus,
     Commands,
     Operation,
     OperatorCommand,
     Orders,
     RelayedCommand,
-    answered,
+    find_answered_serial,
 )
-from rack.levels.systems.state_table.checks import flaws
+from rack.levels.systems.state_table.checks import find_flaws
 from rack.levels.systems.state_table.table import (
     LATE,
-    NAME_BYTES,
-    PHRASE_BYTES,
-    ROW_NAME_BYTES,
+    MAX_NAME_BYTES,
+    MAX_PHRASE_BYTES,
+    MAX_ROW_NAME_BYTES,
     SAME,
     STATES,
     TAKE,
@@ -47,8 +47,8 @@ from rack.levels.systems.state_table.table import (
     TableError,
     Values,
     Vocabulary,
-    objection,
-    phrases,
+    find_objection,
+    list_phrases,
     read_table,
 )
 from rack.levels.tables import SceneConfig, Table, read_params
@@ -59,7 +59,7 @@ class TableCommand(RelayedCommand, version=1, message="word_command"):
 
     hold: bool = field(doc="1: come to rest and stay, whatever is under way")
     words: str = field(
-        f"S{PHRASE_BYTES}", doc="the command with its parameters, as in 'pick block1'"
+        f"S{MAX_PHRASE_BYTES}", doc="the command with its parameters, as in 'pick block1'"
     )
 
 
@@ -69,16 +69,16 @@ class TableStatus(AnsweringStatus, version=1):
     A restarted board continues from them.
     """
 
-    table: str = field(f"S{NAME_BYTES}", doc="state table in force")
-    checksum: int = integer("CRC-32 of its file")
-    in_state: str = field(f"S{NAME_BYTES}", doc="state after this cycle")
-    row: int = integer("row that fired in this cycle, counted from 1 (0: none)", "u2")
-    fired: str = field(f"S{ROW_NAME_BYTES}", doc="its name")
-    words: str = field(f"S{PHRASE_BYTES}", doc="command in force (empty: none)")
-    ordered: int = integer(
+    table: str = field(f"S{MAX_NAME_BYTES}", doc="state table in force")
+    checksum: int = integer_field("CRC-32 of its file")
+    in_state: str = field(f"S{MAX_NAME_BYTES}", doc="state after this cycle")
+    row: int = integer_field("row that fired in this cycle, counted from 1 (0: none)", "u2")
+    fired: str = field(f"S{MAX_ROW_NAME_BYTES}", doc="its name")
+    words: str = field(f"S{MAX_PHRASE_BYTES}", doc="command in force (empty: none)")
+    ordered: int = integer_field(
         "serial of the operator's command in force (0: the level above commands)"
     )
-    done: int = integer("newest completed command of the level above (0: none)")
+    done: int = integer_field("newest completed command of the level above (0: none)")
 
 
 YES_NO = ("no", "yes")
@@ -98,7 +98,7 @@ class StateTableParams(Table):
     """TOML files by name, relative to the config; the first is in force at the start"""
 
 
-def vocabulary(
+def build_vocabulary(
     conditions: Mapping[str, Values],
     actions: Phrases,
     commands: Phrases | None = None,
@@ -125,12 +125,12 @@ def vocabulary(
 class WordCommand(NamedTuple):
     """A command to the level, from an operator or from the level above."""
 
-    is_operators: bool
+    is_from_operator: bool
     serial: int  # 0 if there is no command
     words: str
 
 
-OPERATIONS: Commands = {**HOLDABLE, Operation.TABLE: ()}
+OPERATIONS: Commands = {**HOLD_COMMANDS, Operation.TABLE: ()}
 """Operator commands that every level of this kind obeys."""
 
 
@@ -155,49 +155,52 @@ class StateTableExecutor(Executor):
         super().__init__(context)
         params = read_params(StateTableParams, context.params)
         self.tables = {name: self.read(path, context.scene) for name, path in params.tables.items()}
-        if flaws := [f"{name}: {flaw}" for name, flaw in self._unlike(self.tables, context.scene)]:
+        if flaws := [
+            f"{name}: {flaw}"
+            for name, flaw in self._find_unequal_commands(self.tables, context.scene)
+        ]:
             raise TableError(flaws)
         self.state = ""  # of the table
         # Tick at which the state began. None if it begins in this cycle.
-        self._since: int | None = None
-        self.use(next(iter(self.tables)))
+        self._state_since_tick: int | None = None
+        self.use_table(next(iter(self.tables)))
         self.orders = Orders(self.commands)
         self.detail = ""  # reason given by the level below, appended to a row's reason
         self.resting = True  # no motion commanded by this level is under way
         self._newest = WordCommand(False, 0, "")
         self._taken = self._newest  # command in force
-        self._done = 0  # newest completed command of the level above
-        self._kept = ""  # why this level, or the one above, is held; empty if it is not
+        self._done_serial = 0  # newest completed command of the level above
+        self._hold_reason = ""  # why this level, or the one above, is held; empty if it is not
         # Newest operator command that was answered before the board was restarted.
-        self._recalled = 0
+        self._answered_before_restart = 0
         self._started = False
 
     @classmethod
     def read(cls, path: Path, scene: SceneConfig) -> StateTable:
         """Read and check the table in a file. Raises `TableError` with every mistake in it."""
         table = read_table(path, cls.vocabulary)
-        lexicon = None if table.plan is None else cls.lexicon(scene, table.plan)
-        lines = flaws(table, cls.vocabulary, lexicon)
+        lexicon = None if table.plan is None else cls.build_lexicon(scene, table.plan)
+        lines = find_flaws(table, cls.vocabulary, lexicon)
         if table.plan is not None:
-            lines += cls.plan_flaws(scene, table.plan)
+            lines += cls.find_plan_flaws(scene, table.plan)
         if lines:
             raise TableError(lines)
         return table
 
     @classmethod
-    def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
+    def build_lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
         """Return the sets of words that depend on the scene and on a table's plan, by name."""
         return {"object": scene.objects}
 
     @classmethod
-    def plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
+    def find_plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
         """Return one line for every entry of a plan that does not suit the scene."""
         return []
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield every mistake in every table, and commands that one of the tables does not know.
 
         Args:
@@ -213,18 +216,18 @@ class StateTableExecutor(Executor):
             except TableError as error:
                 for flaw in error.flaws:
                     yield f"params.tables.{name}", path.name, flaw
-        for name, why in cls._unlike(tables, context.scene):
+        for name, why in cls._find_unequal_commands(tables, context.scene):
             yield f"params.tables.{name}", files[name].name, why
 
     @classmethod
-    def _unlike(
+    def _find_unequal_commands(
         cls, tables: Mapping[str, StateTable], scene: SceneConfig
     ) -> Iterator[tuple[str, str]]:
         """Yield the name of each table that lacks a command of another one, and the reason.
 
         All tables must know the same commands, because the command in force survives a switch.
         """
-        commands = {name: cls._known(scene, table) for name, table in tables.items()}
+        commands = {name: cls._list_commands(scene, table) for name, table in tables.items()}
         for name, own_commands in commands.items():
             missing = {
                 phrase: other
@@ -240,12 +243,12 @@ class StateTableExecutor(Executor):
                 )
 
     @classmethod
-    def _known(cls, scene: SceneConfig, table: StateTable) -> Sequence[str]:
+    def _list_commands(cls, scene: SceneConfig, table: StateTable) -> Sequence[str]:
         """Return every command that a table accepts, with its parameters."""
-        return tuple(phrases(cls.vocabulary.commands, cls.lexicon(scene, table.plan)))
+        return tuple(list_phrases(cls.vocabulary.commands, cls.build_lexicon(scene, table.plan)))
 
     @classmethod
-    def wording(
+    def list_operation_names(
         cls, what: Operation, params: Mapping[str, Any], scene: SceneConfig
     ) -> Sequence[str]:
         """Return the words that an operator may give with an operation.
@@ -262,9 +265,9 @@ class StateTableExecutor(Executor):
         tables = read_params(StateTableParams, params).tables
         if what is Operation.TABLE:
             return tuple(tables)
-        return cls._known(scene, cls.read(next(iter(tables.values())), scene))
+        return cls._list_commands(scene, cls.read(next(iter(tables.values())), scene))
 
-    def use(self, name: str) -> None:
+    def use_table(self, name: str) -> None:
         """Switch to a table.
 
         The level continues in the state of the same name if the table has one, else in the start
@@ -274,17 +277,19 @@ class StateTableExecutor(Executor):
         self.table = self.tables[name]
         if self.state not in self.table.rows:
             self.state = self.table.start
-            self._since = None
+            self._state_since_tick = None
 
     def process(self, tick: int) -> None:
         """Run one cycle: read, let one row fire, write."""
         if not self._started:
             self._started = True
-            self.recall()
-        self._preprocess()
-        values = self.look(tick)
-        self._since = tick if self._since is None else self._since
-        values[LATE] = YES_NO[(tick - self._since) * self.context.tick_s > self.table.patience_s]
+            self.restore_state()
+        self._take_commands()
+        values = self.evaluate_conditions(tick)
+        self._state_since_tick = tick if self._state_since_tick is None else self._state_since_tick
+        values[LATE] = YES_NO[
+            (tick - self._state_since_tick) * self.context.tick_s > self.table.patience_s
+        ]
         if self.vocabulary.commands:
             # Compare without the words. They differ for one command only if an edited table knows
             # other commands.
@@ -292,21 +297,21 @@ class StateTableExecutor(Executor):
             command = self._newest if is_new else self._taken
             values["command"] = command.words.partition(" ")[0] or "none"
             values["new"] = YES_NO[is_new]
-        number, row = self.table.decide(self.state, values)
+        number, row = self.table.choose_row(self.state, values)
         for phrase in row.do:
             verb, *parameters = phrase.split()
             getattr(self, f"do_{verb}")(*parameters)
         if row.next not in (SAME, self.state):
             self.state = row.next
-            self._since = tick
-        self.give(tick)
-        self._report(number, row)
+            self._state_since_tick = tick
+        self.write_outputs(tick)
+        self._write_status(number, row)
 
     @abstractmethod
-    def look(self, tick: int) -> dict[str, str]:
+    def evaluate_conditions(self, tick: int) -> dict[str, str]:
         """Return the value of each of the level's own conditions in this cycle."""
 
-    def give(self, tick: int) -> None:
+    def write_outputs(self, tick: int) -> None:
         """Write the outputs of the level, except the fields of `TableStatus`."""
 
     def do_take(self) -> None:
@@ -319,73 +324,75 @@ class StateTableExecutor(Executor):
         return self._taken.words.split()
 
     @property
-    def holds(self) -> bool:
+    def is_held(self) -> bool:
         """Whether the level is held, by an operator, the level above, or the loss of that board."""
-        return bool(self._kept)
+        return bool(self._hold_reason)
 
-    def recall(self) -> None:
+    def restore_state(self) -> None:
         """Continue from the level's own last messages after a restart of its board."""
-        if not self.last_status.is_there:
+        if not self.last_status.has_message:
             return
         last = self.last_status.message
         self.status.copy_from(last)
         self.state = last.in_state
-        self.use(last.table if last.table in self.tables else self.table_name)
-        self._recalled = answered(last)
-        self._done = last.done
+        self.use_table(last.table if last.table in self.tables else self.table_name)
+        self._answered_before_restart = find_answered_serial(last)
+        self._done_serial = last.done
         self._taken = WordCommand(last.ordered > 0, last.ordered or last.echo, last.words)
 
-    def _preprocess(self) -> None:
+    def _take_commands(self) -> None:
         """Take the commands of the operator and of the level above."""
         orders = self.orders
-        orders.take(self.operator, self._judge)
-        self._kept = ""
-        self._rests_on = orders.rests_on(0)
+        orders.take_commands(self.operator, self._accept_operator_command)
+        self._hold_reason = ""
+        self._rests_on = orders.find_basis(0)
         above: Reading[TableCommand] | None = None
         if "above" in self.inputs:
             above = next(iter(self.above.values()), None)
         if above is not None:
-            self._hear(above)
+            self._take_command_from_above(above)
         elif orders.standing is not Operation.DO:
             self._newest = self._taken
-        if orders.holds:
-            self._kept = orders.keeps(self.context.board)
+        if orders.is_holding:
+            self._hold_reason = orders.format_reason(self.context.board)
 
-    def _hear(self, above: Reading[TableCommand]) -> None:
+    def _take_command_from_above(self, above: Reading[TableCommand]) -> None:
         """Take the command of the level above, unless an operator commands the level."""
         command = above.message
-        self._rests_on = self.orders.rests_on(command.operator)
+        self._rests_on = self.orders.find_basis(command.operator)
         if self.orders.standing is Operation.DO:
             return
-        if command.id == self._done:
+        if command.id == self._done_serial:
             self._newest = self._taken
         elif self._newest[:2] != (False, command.id):
-            words = UNKNOWN if self._objection(command.words) else command.words
+            words = UNKNOWN if self._find_objection(command.words) else command.words
             self._newest = WordCommand(False, command.id, words)
         if above.is_lost:
-            self._kept = ABOVE_LOST
+            self._hold_reason = ABOVE_LOST
         elif command.hold:
-            self._kept = HELD_FROM_ABOVE
+            self._hold_reason = HELD_FROM_ABOVE
 
-    def _objection(self, words: str) -> str:
+    def _find_objection(self, words: str) -> str:
         """Return why the level does not know a command. Empty if it knows it."""
-        lexicon = self.lexicon(self.context.scene, self.table.plan)
-        return objection(words, self.vocabulary.commands, lexicon)
+        lexicon = self.build_lexicon(self.context.scene, self.table.plan)
+        return find_objection(words, self.vocabulary.commands, lexicon)
 
-    def _judge(self, order: OperatorCommand) -> None:
+    def _accept_operator_command(self, order: OperatorCommand) -> None:
         """Carry out or refuse an operator's command that is specific to this kind of level."""
         if order.what == Operation.TABLE:
             if order.name not in self.tables:
-                self.orders.refuse(f"no table '{order.name}'; tables: {', '.join(self.tables)}")
-            elif order.id > self._recalled:
-                self.use(order.name)
+                self.orders.refuse_newest(
+                    f"no table '{order.name}'; tables: {', '.join(self.tables)}"
+                )
+            elif order.id > self._answered_before_restart:
+                self.use_table(order.name)
         elif order.what == Operation.DO:
-            if why := self._objection(order.name):
-                self.orders.refuse(why)
+            if why := self._find_objection(order.name):
+                self.orders.refuse_newest(why)
             else:
                 self._newest = WordCommand(True, order.id, order.name)
 
-    def _report(self, number: int, row: RowConfig) -> None:
+    def _write_status(self, number: int, row: RowConfig) -> None:
         """Fill the fields of `TableStatus` and, in the command below, the operator's serial.
 
         Args:
@@ -396,9 +403,9 @@ class StateTableExecutor(Executor):
         orders = self.orders
         state = STATES[row.status]
         reason = row.reason
-        if self._kept and state is State.EXECUTING:
+        if self._hold_reason and state is State.EXECUTING:
             state = State.HOLDING
-            reason = self._kept
+            reason = self._hold_reason
         elif reason and self.detail:
             reason = f"{reason}: {self.detail}"
         if row.next == SAME and state is State.ERROR and status.state == state:
@@ -408,11 +415,11 @@ class StateTableExecutor(Executor):
         status.ordered = 0
         if is_operators:
             status.ordered = serial
-            status.echo = 0 if orders.standing is Operation.DO else self._done
+            status.echo = 0 if orders.standing is Operation.DO else self._done_serial
         else:
             status.echo = serial
             if state is State.DONE:
-                self._done = serial
+                self._done_serial = serial
         status.state = state
         status.error = Error.TABLE if state is State.ERROR else Error.NONE
         status.reason = reason
@@ -422,18 +429,18 @@ class StateTableExecutor(Executor):
         status.row = number
         status.fired = row.name
         status.words = words
-        status.done = self._done
-        is_done = self.resting if orders.holds else state is State.DONE
+        status.done = self._done_serial
+        is_done = self.resting if orders.is_holding else state is State.DONE
         if is_operators and serial == orders.in_force and state is State.ERROR:
-            orders.fail(reason)
+            orders.abandon_command(reason)
         elif is_done:
-            orders.done()
+            orders.report_done()
         if "command" in self.outputs:
             self.command.operator = self._rests_on
-        orders.report(status, self._rests_on)
+        orders.fill_status(status, self._rests_on)
 
 
-def answer_of(reading: Reading[TableStatus], serial: int) -> str:
+def classify_answer(reading: Reading[TableStatus], serial: int) -> str:
     """Return the value of the condition `below`, one of `BELOW`.
 
     Args:
@@ -442,6 +449,6 @@ def answer_of(reading: Reading[TableStatus], serial: int) -> str:
     """
     if reading.is_lost:
         return "lost"
-    if not reading.is_there or reading.message.echo != serial or not serial:
+    if not reading.has_message or reading.message.echo != serial or not serial:
         return "waiting"
     return {State.DONE: "done", State.ERROR: "error"}.get(reading.message.state, "executing")

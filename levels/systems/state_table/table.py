@@ -44,9 +44,9 @@ from rack.backplane.regular_file import read_regular_file
 from rack.levels.errors import LevelError
 from rack.levels.tables import Positive, Table, Vector
 
-NAME_BYTES = 24
+MAX_NAME_BYTES = 24
 """Maximum length of a word, a state's name or a table's name."""
-PHRASE_BYTES = 64
+MAX_PHRASE_BYTES = 64
 """Maximum length of a command or action with its parameters."""
 TAKE = "take"
 """Action that every level has: the newest command comes into force.
@@ -87,19 +87,19 @@ class Vocabulary:
     plan: type[Table] = Table
 
 
-def phrases(verbs: Phrases, lexicon: Lexicon) -> Iterator[str]:
+def list_phrases(verbs: Phrases, lexicon: Lexicon) -> Iterator[str]:
     """Yield every command or action with its parameters, such as "pick block1"."""
     for word, parameters in verbs.items():
-        for arguments in product(*(_words(parameter, lexicon) for parameter in parameters)):
+        for arguments in product(*(_list_words(parameter, lexicon) for parameter in parameters)):
             yield " ".join((word, *arguments))
 
 
-def _words(parameter: str | Values, lexicon: Lexicon) -> Sequence[str]:
+def _list_words(parameter: str | Values, lexicon: Lexicon) -> Sequence[str]:
     """Return the permitted words of a parameter, which may be the name of a set."""
     return lexicon[parameter] if isinstance(parameter, str) else parameter
 
 
-def objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
+def find_objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
     """Return why a phrase is not a valid command or action. Empty if it is valid.
 
     Args:
@@ -107,8 +107,8 @@ def objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
         verbs: Commands or actions of the level, by first word.
         lexicon: Sets of words that depend on the scene and the plan.
     """
-    if len(phrase) > PHRASE_BYTES:
-        return f"'{phrase}' has {len(phrase)} characters; permitted: {PHRASE_BYTES}"
+    if len(phrase) > MAX_PHRASE_BYTES:
+        return f"'{phrase}' has {len(phrase)} characters; permitted: {MAX_PHRASE_BYTES}"
     word, *arguments = phrase.split() or [""]
     if word not in verbs:
         return f"unknown '{word}'; known: {', '.join(verbs) or 'none'}"
@@ -116,31 +116,31 @@ def objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
     if len(arguments) != len(parameters):
         return f"'{phrase}' has {len(arguments)} parameters; '{word}' takes {len(parameters)}"
     for value, parameter in zip(arguments, parameters, strict=True):
-        permitted = _words(parameter, lexicon)
+        permitted = _list_words(parameter, lexicon)
         if value not in permitted:
             return f"'{value}' of '{phrase}' is unknown; known: {', '.join(permitted) or 'none'}"
     return ""
 
 
 MAX_FILE_BYTES = 200_000
-ROW_NAME_BYTES = 48
+MAX_ROW_NAME_BYTES = 48
 STATES = {state.name.lower(): state for state in State}
 """States of a level, by the words of a row's `status`."""
-Name = Annotated[str, StringConstraints(pattern=rf"^[a-z][a-z0-9_-]{{0,{NAME_BYTES - 1}}}$")]
-RowName = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{ROW_NAME_BYTES}}}$")]
+Name = Annotated[str, StringConstraints(pattern=rf"^[a-z][a-z0-9_-]{{0,{MAX_NAME_BYTES - 1}}}$")]
+RowName = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{MAX_ROW_NAME_BYTES}}}$")]
 Reason = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{REASON_BYTES}}}$")]
 
 
-def _listed(value: Any) -> Any:
+def _to_tuple(value: Any) -> Any:
     """Convert a single word to a tuple of one word, and a list to an immutable tuple."""
     if isinstance(value, str):
         return (value,)
     return tuple(value) if isinstance(value, list) else value
 
 
-Words = Annotated[tuple[str, ...], BeforeValidator(_listed)]
-States = Annotated[tuple[Name, ...], BeforeValidator(_listed)]
-Place = Annotated[Vector, BeforeValidator(_listed)]
+Words = Annotated[tuple[str, ...], BeforeValidator(_to_tuple)]
+States = Annotated[tuple[Name, ...], BeforeValidator(_to_tuple)]
+Place = Annotated[Vector, BeforeValidator(_to_tuple)]
 
 
 SAME = "same"
@@ -170,7 +170,7 @@ class RowConfig(Table):
     reason: Reason = ""
     """shown with status error or holding"""
 
-    def matches(self, values: Mapping[str, str]) -> bool:
+    def matches_case(self, values: Mapping[str, str]) -> bool:
         """Return True if the row fires for these values of the conditions."""
         return all(values[condition] in permitted for condition, permitted in self.when.items())
 
@@ -229,14 +229,14 @@ class StateTable:
                 rows.setdefault(state, {})[number] = row
         return rows
 
-    def decide(self, state: str, values: Mapping[str, str]) -> tuple[int, RowConfig]:
+    def choose_row(self, state: str, values: Mapping[str, str]) -> tuple[int, RowConfig]:
         """Return the number of the row that fires, and the row.
 
         Number 0 with an error row means that no row takes the case, which cannot happen in a table
         that passed the check.
         """
         for number, row in self.rows.get(state, {}).items():
-            if row.matches(values):
+            if row.matches_case(values):
                 return number, row
         case = ", ".join(f"{name} = {value}" for name, value in values.items())
         reason = f"no row of '{state}' takes {case}"
@@ -255,7 +255,7 @@ def read_table(path: Path, vocabulary: Vocabulary) -> StateTable:
     except OSError as error:
         raise TableError([f"cannot be read: {error.strerror}"]) from error
     except ValidationError as error:
-        raise TableError(_flaws(error, "", TableConfig)) from error
+        raise TableError(_format_validation_errors(error, "", TableConfig)) from error
     except ValueError as error:  # TOML, UTF-8
         raise TableError([f"not TOML: {error}"]) from error
     configs = {}
@@ -265,15 +265,15 @@ def read_table(path: Path, vocabulary: Vocabulary) -> StateTable:
         try:
             configs[number] = RowConfig.model_validate(row)
         except ValidationError as error:
-            flaws += _flaws(error, f"row {number}: ", RowConfig)
+            flaws += _format_validation_errors(error, f"row {number}: ", RowConfig)
     try:
         plan = vocabulary.plan.model_validate(config.plan)
     except ValidationError as error:
-        flaws += _flaws(error, "plan: ", vocabulary.plan)
+        flaws += _format_validation_errors(error, "plan: ", vocabulary.plan)
     return StateTable(config.start, config.patience, configs, plan, zlib.crc32(data), tuple(flaws))
 
 
-def _flaws(error: ValidationError, place: str, kind: type[Table]) -> list[str]:
+def _format_validation_errors(error: ValidationError, place: str, kind: type[Table]) -> list[str]:
     """Format the mistakes in one table of a file.
 
     Args:

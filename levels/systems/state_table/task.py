@@ -10,8 +10,8 @@ from typing import Any
 
 from pydantic import Field as Key
 
-from rack.backplane.message import integer
-from rack.levels.level import Input, LevelContext, Misfits, Output
+from rack.backplane.message import integer_field
+from rack.levels.level import Input, LevelContext, Mismatches, Output
 from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.systems.state_table.elemental_move import MoveTable, MoveTableStatus
 from rack.levels.systems.state_table.level import (
@@ -21,24 +21,24 @@ from rack.levels.systems.state_table.level import (
     StateTableParams,
     TableCommand,
     TableStatus,
-    answer_of,
-    vocabulary,
+    build_vocabulary,
+    classify_answer,
 )
 from rack.levels.systems.state_table.table import Name
 from rack.levels.tables import SceneConfig, Table, read_params
 
-COMMANDS_A_STEP = 2
+COMMANDS_PER_STEP = 2
 """Commands to the level below in one step: one to pick, one to place."""
 
 
 class TaskTableStatus(TableStatus, version=1):
     """Status of the task level of state tables."""
 
-    action: int = integer("steps done", "u2")
-    actions: int = integer("steps of the plan", "u2")
-    moves_done: int = integer("commands done by the level below", "u2")
-    moves: int = integer("commands of the plan", "u2")
-    sent: int = integer("serial of the newest command sent down (0: none)")
+    action: int = integer_field("steps done", "u2")
+    actions: int = integer_field("steps of the plan", "u2")
+    moves_done: int = integer_field("commands done by the level below", "u2")
+    moves: int = integer_field("commands of the plan", "u2")
+    sent: int = integer_field("serial of the newest command sent down (0: none)")
 
 
 class StepConfig(Table):
@@ -68,7 +68,7 @@ class TaskTable(StateTableExecutor):
     command = Output(TableCommand)
     status = Output(TaskTableStatus, rests_on=below)
     commands = OPERATIONS
-    vocabulary = vocabulary(
+    vocabulary = build_vocabulary(
         conditions={
             "below": BELOW,
             # Whether a step of the plan is left.
@@ -84,11 +84,11 @@ class TaskTable(StateTableExecutor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._step = 0  # steps done
-        self._command = TableCommand.zeros({})  # the newest command sent down
+        self._steps_done = 0  # steps done
+        self._newest_command = TableCommand.zeros({})  # the newest command sent down
 
     @classmethod
-    def plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
+    def find_plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
         """Return a line for each step whose object is unknown."""
         known = ", ".join(scene.objects) or "none"
         return [
@@ -98,9 +98,9 @@ class TaskTable(StateTableExecutor):
         ]
 
     @classmethod
-    def misfits(
+    def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Misfits:
+    ) -> Mismatches:
         """Yield every mistake in every table, and steps that the level below does not know.
 
         Args:
@@ -108,13 +108,13 @@ class TaskTable(StateTableExecutor):
             above: Contexts of the levels above.
             below: Contexts of the levels below, whose tables name the places.
         """
-        own_misfits = [*super().misfits(context, above, below)]
+        own_misfits = [*super().find_mismatches(context, above, below)]
         yield from own_misfits
         tables = read_params(StateTableParams, context.params).tables
         for other in below:
-            if own_misfits or [*MoveTable.misfits(other, (), ())]:
+            if own_misfits or [*MoveTable.find_mismatches(other, (), ())]:
                 continue
-            commands = MoveTable.wording(Operation.DO, other.params, context.scene)
+            commands = MoveTable.list_operation_names(Operation.DO, other.params, context.scene)
             for name, path in tables.items():
                 for index, step in enumerate(cls.read(path, context.scene).plan.step):
                     if f"place {step.place}" not in commands:
@@ -124,44 +124,44 @@ class TaskTable(StateTableExecutor):
                         )
                         yield f"params.tables.{name}", path.name, why
 
-    def recall(self) -> None:
+    def restore_state(self) -> None:
         """Continue with the step under way."""
-        super().recall()
-        if self.last_status.is_there and self.last_command.is_there:
-            self._step = self.last_status.message.action
-            self._command.copy_from(self.last_command.message)
-            self._command.id = self.last_status.message.sent
+        super().restore_state()
+        if self.last_status.has_message and self.last_command.has_message:
+            self._steps_done = self.last_status.message.action
+            self._newest_command.copy_from(self.last_command.message)
+            self._newest_command.id = self.last_status.message.sent
 
-    def look(self, tick: int) -> dict[str, str]:
+    def evaluate_conditions(self, tick: int) -> dict[str, str]:
         """Return the answer of the level below, and whether a step is left."""
         self.detail = self.below.message.reason
         self.resting = self.below.message.resting
-        is_left = self._step < len(self.table.plan.step)
+        is_left = self._steps_done < len(self.table.plan.step)
         return {
-            "below": answer_of(self.below, self._command.id),
+            "below": classify_answer(self.below, self._newest_command.id),
             "step": ("none", "more")[is_left],
         }
 
     def do_send(self, verb: str) -> None:
         """Command the level below to pick, place or go home."""
         steps = self.table.plan.step
-        step = steps[min(self._step, len(steps) - 1)]
+        step = steps[min(self._steps_done, len(steps) - 1)]
         words = {"pick": f"pick {step.object}", "place": f"place {step.place}", "home": "home"}
-        self._command.id += 1
-        self._command.words = words[verb]
+        self._newest_command.id += 1
+        self._newest_command.words = words[verb]
 
     def do_next(self) -> None:
         """Advance to the next step."""
-        self._step += 1
+        self._steps_done += 1
 
-    def give(self, tick: int) -> None:
+    def write_outputs(self, tick: int) -> None:
         """Write the command and the progress."""
-        self._command.hold = self.holds
-        self.command.copy_from(self._command)
+        self._newest_command.hold = self.is_held
+        self.command.copy_from(self._newest_command)
         status = self.status
         steps = len(self.table.plan.step)
-        status.action = min(self._step, steps)
+        status.action = min(self._steps_done, steps)
         status.actions = steps
-        status.sent = self._command.id
-        status.moves = steps * COMMANDS_A_STEP
-        status.moves_done = status.action * COMMANDS_A_STEP
+        status.sent = self._newest_command.id
+        status.moves = steps * COMMANDS_PER_STEP
+        status.moves_done = status.action * COMMANDS_PER_STEP

@@ -46,47 +46,49 @@ class JointBoards:
         self._handover = handover
         self.in_step = False
         self.position = np.zeros(len(joints))  # (joints,), rad
-        self._cycles = 0  # since the boards came into step
-        self._silent: dict[str, int] = {}  # consecutive cycles without a new status, by board
-        self.awaited = "no board servoes a joint"
+        self._cycles_in_step = 0  # since the boards came into step
+        self._silent_cycles: dict[
+            str, int
+        ] = {}  # consecutive cycles without a new status, by board
+        self.wait_reason = "no board servoes a joint"
 
     def update(self, statuses: Mapping[str, Reading[JointStatus]]) -> bool:
         """Read all statuses. Returns True in the cycle in which the boards come into step."""
-        self._cycles += 1
+        self._cycles_in_step += 1
         for board, reading in statuses.items():
             has_status = reading.is_new and not reading.is_lost
-            self._silent[board] = 0 if has_status else self._silent.get(board, 0) + 1
-        if reason := self._kept(statuses):
-            self.leave(f"waiting for {reason}")
+            self._silent_cycles[board] = 0 if has_status else self._silent_cycles.get(board, 0) + 1
+        if reason := self._find_board_not_following(statuses):
+            self.leave_step(f"waiting for {reason}")
             return False
-        if self.in_step or not self._hold(statuses):
+        if self.in_step or not self._take_over_hold_positions(statuses):
             return False
         self.in_step = True
-        self._cycles = 0
+        self._cycles_in_step = 0
         return True
 
-    def leave(self, reason: str) -> None:
+    def leave_step(self, reason: str) -> None:
         """Fall out of step. The boards bring the joints to rest, where motion restarts later."""
         self.in_step = False
-        self.awaited = reason
+        self.wait_reason = reason
 
-    def _kept(self, statuses: Mapping[str, Reading[JointStatus]]) -> str:
+    def _find_board_not_following(self, statuses: Mapping[str, Reading[JointStatus]]) -> str:
         """Return the board that does not follow, with the reason.
 
         Empty if no board prevents motion.
         """
         for board, reading in statuses.items():
             status = reading.message
-            silent_cycles = self._silent[board]
-            if silent_cycles > MAX_SILENT_CYCLES or not reading.is_there:
+            silent_cycles = self._silent_cycles[board]
+            if silent_cycles > MAX_SILENT_CYCLES or not reading.has_message:
                 return f"{board}: no status for {silent_cycles} cycles"
             if status.stopped:
                 return f"{board}: {status.reason or 'it does not follow set points'}"
-            if self.in_step and status.holding and self._cycles > self._handover:
+            if self.in_step and status.holding and self._cycles_in_step > self._handover:
                 return f"{board}: it holds"
         return ""
 
-    def _hold(self, statuses: Mapping[str, Reading[JointStatus]]) -> bool:
+    def _take_over_hold_positions(self, statuses: Mapping[str, Reading[JointStatus]]) -> bool:
         """Return True if all boards hold all joints at rest. Takes over the positions they hold."""
         is_driven = np.zeros(len(self._joints), dtype=bool)
         for board, reading in statuses.items():
@@ -94,17 +96,17 @@ class JointBoards:
             own_joints = status.driven.astype(bool)
             # Both comparisons are written such that NaN is neither at rest nor in range.
             are_resting = (np.abs(status.target_velocity[own_joints]) <= MAX_REST_RAD_S).all()
-            if self._silent[board] or not (status.holding and are_resting):
-                self.awaited = f"waiting for {board}: it does not hold its joints at rest"
+            if self._silent_cycles[board] or not (status.holding and are_resting):
+                self.wait_reason = f"waiting for {board}: it does not hold its joints at rest"
                 return False
             is_in_range = (self._low <= status.target) & (status.target <= self._high)
             if (is_outside := own_joints & ~is_in_range).any():
                 joint = int(is_outside.argmax())
                 place = f"'{self._joints[joint]}' at {status.target[joint]:.3g} rad"
-                self.awaited = f"waiting for {board}: it holds {place}, out of its range"
+                self.wait_reason = f"waiting for {board}: it holds {place}, out of its range"
                 return False
             self.position[own_joints] = status.target[own_joints]
             is_driven |= own_joints
         if not is_driven.all():
-            self.awaited = f"no board servoes joint '{self._joints[int(is_driven.argmin())]}'"
+            self.wait_reason = f"no board servoes joint '{self._joints[int(is_driven.argmin())]}'"
         return bool(is_driven.all())

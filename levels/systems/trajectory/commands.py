@@ -39,11 +39,11 @@ from rack.levels.tables import GripperConfig, Table, read_params
 
 DOWN = (0.0, 1.0, 0.0, 0.0)
 """Orientation of a tool that points straight down, as quaternion w, x, y, z."""
-LOOK_S = 0.25
+POLL_S = 0.25
 """Longest wait before the status is read again, s."""
-PATIENCE_S = 2.0
+RESEND_DELAY_S = 2.0
 """Time after which open requests are sent again if none of them is under way, s."""
-WORLD = -1
+WORLD_BODY = -1
 """Body number of a goal in the frame of the world."""
 
 
@@ -68,7 +68,9 @@ class Motions:
         self._bodies = context.scene.bodies
         # Every request of an earlier process has a number up to the count of messages sent.
         self._newest = requests.sent
-        self._open: dict[int, dict[str, Any]] = {}  # requests that have not ended, by number
+        self._open_requests: dict[
+            int, dict[str, Any]
+        ] = {}  # requests that have not ended, by number
         # Time at which requests were first seen open with none under way, s.
         self._idle_since: float | None = None
         if self._newest:
@@ -82,7 +84,7 @@ class Motions:
             **times: Fields `segment` and `acceleration` of the request, s.
         """
         goal = self._robot.home if joints is None else joints
-        return self._request(kind=MotionKind.JOINTS, joints=goal, **times)
+        return self._queue_request(kind=MotionKind.JOINTS, joints=goal, **times)
 
     def line(
         self,
@@ -115,8 +117,8 @@ class Motions:
             raise LevelError(
                 f"line: body = {body}: not in the scene; its bodies are {', '.join(self._bodies)}"
             )
-        frame = self._bodies.index(body) if body else WORLD
-        return self._request(
+        frame = self._bodies.index(body) if body else WORLD_BODY
+        return self._queue_request(
             kind=MotionKind.POSE,
             position=position,
             quaternion=quaternion,
@@ -128,7 +130,7 @@ class Motions:
 
     def stay(self, seconds: float) -> int:
         """Stay at the previous goal for some seconds, following it if it is live."""
-        return self._request(kind=MotionKind.STAY, segment=seconds)
+        return self._queue_request(kind=MotionKind.STAY, segment=seconds)
 
     def grip(self, opening: float | None = None, force: float | None = None) -> int:
         """Move the gripper to an opening, m, with at most `force`, N. The default closes it."""
@@ -136,7 +138,7 @@ class Motions:
             opening = self._gripper.closed
         if force is None:
             force = self._gripper.force
-        return self._request(kind=MotionKind.GRIP, opening=opening, force=force)
+        return self._queue_request(kind=MotionKind.GRIP, opening=opening, force=force)
 
     def release(self) -> int:
         """Open the gripper."""
@@ -150,7 +152,7 @@ class Motions:
 
     def cancel(self) -> int:
         """End the motion under way and drop all others. The arm ramps to rest."""
-        return self._request(kind=MotionKind.CANCEL)
+        return self._queue_request(kind=MotionKind.CANCEL)
 
     def end_of(self, request: int) -> RequestEnd:
         """Return how a request ended. NONE if it is still open or ended too long ago."""
@@ -171,7 +173,7 @@ class Motions:
         while not self.done(request):
             if until() or self._bus.is_over:
                 return False
-            self._look()
+            self._wait_and_resend()
         return True
 
     def where(self) -> list[float]:
@@ -183,18 +185,18 @@ class Motions:
         """Newest status of the level that moves the arm."""
         return self._motion.read().message
 
-    def _request(self, **fields: Any) -> int:
+    def _queue_request(self, **fields: Any) -> int:
         """Queue a request, waiting while the queue is full, and return its number."""
-        request = {"body": WORLD, **fields, "id": self._newest + 1}
-        while not self._send(request):
+        request = {"body": WORLD_BODY, **fields, "id": self._newest + 1}
+        while not self._send_request(request):
             if self._bus.is_over:
                 raise LevelError("the run is over")
-            self._look()
+            self._wait_and_resend()
         self._newest += 1
-        self._open[self._newest] = request
+        self._open_requests[self._newest] = request
         return self._newest
 
-    def _send(self, fields: Mapping[str, Any]) -> bool:
+    def _send_request(self, fields: Mapping[str, Any]) -> bool:
         """Send a request with these fields, all others being zero.
 
         Returns False if the queue is full. Raises `AttributeError` for an unknown field.
@@ -206,23 +208,25 @@ class Motions:
             setattr(request, name, value)
         return self._requests.send()
 
-    def _look(self) -> None:
+    def _wait_and_resend(self) -> None:
         """Wait for a new status. Send open requests again if none is under way for too long."""
-        self._bus.wait(LOOK_S)
+        self._bus.wait(POLL_S)
         status = self._status
         now = self._bus.time_s
-        self._open = {
-            number: request for number, request in self._open.items() if number > status.done
+        self._open_requests = {
+            number: request
+            for number, request in self._open_requests.items()
+            if number > status.done
         }
-        if status.current or not self._open:
+        if status.current or not self._open_requests:
             self._idle_since = None
         elif self._idle_since is None:
             self._idle_since = now
-        elif now - self._idle_since > PATIENCE_S:
+        elif now - self._idle_since > RESEND_DELAY_S:
             self._idle_since = None
             # A request that was only waiting is now queued twice, but carried out once.
-            for request in self._open.values():
-                self._send(request)
+            for request in self._open_requests.values():
+                self._send_request(request)
 
 
 class ScriptParams(Table):
@@ -249,9 +253,11 @@ class CommandEnvironment(HostProgram):
         script = next(filter(Path.is_file, paths), None)
         if script is None:
             raise LevelError(f"params.script = {self._script}: not in a folder of python_path")
-        runpy.run_path(str(script), {"bus": bus, "program": self, **self.names(bus)}, "__main__")
+        runpy.run_path(
+            str(script), {"bus": bus, "program": self, **self.list_prompt_names(bus)}, "__main__"
+        )
 
-    def names(self, bus: Bus) -> Mapping[str, Any]:
+    def list_prompt_names(self, bus: Bus) -> Mapping[str, Any]:
         """Return the calls that a script may use, by name."""
         motions = self.motions(bus)
         calls = {name: getattr(motions, name) for name in dir(motions) if name[0] != "_"}

@@ -15,14 +15,14 @@ from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.level import Executor, Input, Inputs, LevelContext, Output, Reading
 from rack.levels.messages import WorldState
-from rack.levels.operator import HOLDABLE, OperatorCommand, Orders
+from rack.levels.operator import HOLD_COMMANDS, OperatorCommand, Orders
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot import dynamics
-from rack.levels.robot.cell import cell_of
+from rack.levels.robot.cell import build_level_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES, JointBoards
-from rack.levels.systems.trajectory.legs import WorldSight
+from rack.levels.systems.trajectory.legs import WorldView
 from rack.levels.systems.trajectory.messages import (
     MotionKind,
     MotionRequest,
@@ -63,92 +63,94 @@ class TrajectoryExecutor(Executor):
     command = Output(JointReference)
     status = Output(MotionStatus, rests_on=boards)
     state = Output(MotionState)
-    commands = HOLDABLE
+    commands = HOLD_COMMANDS
     params: ClassVar[type[TrajectoryParams]] = TrajectoryParams
     preloads = (dynamics,)
-    work: ClassVar[type[RequestWork]] = RequestWork
+    work_class: ClassVar[type[RequestWork]] = RequestWork
     """Class that begins, blends and ends the requests."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         params = read_params(self.params, context.params)
         robot = context.robot
-        cell = cell_of(context)
+        cell = build_level_cell(context)
         self._ik = InverseKinematics(cell, context.seed)
-        self._sight = WorldSight(context.scene.bodies, params.blind, context.tick_s)
+        self._sight = WorldView(context.scene.bodies, params.blind, context.tick_s)
         tools = MotionTools(self._ik, cell.limits, self._sight, params, context.period_s)
         self._agenda = Agenda()
         self._motion = SampledMotion(cell.limits, robot.joints, context.period_s, cell.home)
-        self._work = self.work(self._agenda, self._motion, tools)
+        self._work = self.work_class(self._agenda, self._motion, tools)
         self._boards = JointBoards(robot.joints, cell.bounds.position, params.handover)
         self._guard = TouchGuard(context.period_s)
         self._orders = Orders(self.commands)
         self._dynamics = Dynamics(cell)
         if robot.gripper is not None:
             self._work.grip = robot.gripper.open, robot.gripper.force
-        self._tick: int | None = None  # of the last cycle; None before the first one
+        self._last_tick: int | None = None  # of the last cycle; None before the first one
         # Numbers of requests on which the last saved state depends.
-        self._saved: tuple[int, ...] = ()
+        self._saved_ids: tuple[int, ...] = ()
 
-    def room(self, port: str) -> int:
+    def max_messages(self, port: str) -> int:
         """Return how many requests to take now. The others stay in the queue."""
         # Take none before the requests of an earlier process are restored.
-        return 0 if self._tick is None else self._agenda.room
+        return 0 if self._last_tick is None else self._agenda.free_places
 
     def process(self, tick: int) -> None:
         """Take requests, advance the motion, and write the set point that is due in two cycles."""
-        if self._tick is None:
-            self._recall()
-            self._tick = tick - self.context.every
-        cycles = (tick - self._tick) // self.context.every
-        self._tick = tick
-        self._orders.take(self.operator)
-        self._sight.look(self.world)
-        cancelled = self._agenda.take(self.requests)
+        if self._last_tick is None:
+            self._restore_state()
+            self._last_tick = tick - self.context.every
+        cycles = (tick - self._last_tick) // self.context.every
+        self._last_tick = tick
+        self._orders.take_commands(self.operator)
+        self._sight.update_model(self.world)
+        cancelled = self._agenda.take_new_requests(self.requests)
         if cycles > HANDOVER_CYCLES and self._boards.in_step:
             # The boards hold by now. Over a network their statuses would show it too late.
-            self._boards.leave(f"{cycles} cycles missed: the boards hold")
-            self._work.interrupt()
+            self._boards.leave_step(f"{cycles} cycles missed: the boards hold")
+            self._work.interrupt_motion()
         self._follow_boards()
         if cancelled:
-            self._work.cancel()
-        self._watch(cycles)
-        hold = self._orders.holds
+            self._work.cancel_motion()
+        self._check_guard(cycles)
+        hold = self._orders.is_holding
         # Catch up on the samples of missed cycles, to lose no time. After more than a few missed
         # cycles the boards hold.
         for late_cycles in reversed(range(min(cycles, HANDOVER_CYCLES))):
             if self._boards.in_step:
-                due_tick = self._due(tick) - late_cycles * self.context.every
+                due_tick = self._compute_due_tick(tick) - late_cycles * self.context.every
                 self._work.step(due_tick * self.context.tick_s, hold)
         self._write_reference(self.command, tick)
         self._write_status(self.status)
         agenda = self._agenda
         self.state.passed = self._work.passed_s
         goal_id = 0 if agenda.goal is None else agenda.goal.id
-        newest_ids = (agenda.taken, agenda.done, agenda.begun, goal_id)
-        if newest_ids != self._saved:
-            self._saved = newest_ids
-            agenda.save(self.state)
+        newest_ids = (agenda.taken, agenda.done, agenda.has_begun, goal_id)
+        if newest_ids != self._saved_ids:
+            self._saved_ids = newest_ids
+            agenda.fill_state(self.state)
 
-    def _recall(self) -> None:
+    def _restore_state(self) -> None:
         """Continue from the level's own last messages after a restart."""
-        if self.last_state.is_there and self.last_status.is_there:
-            self._agenda.recall(self.last_state.message, self.last_status.message)
-            self._work.recall(self.last_state.message.passed, self.last_status.message.progress)
+        if self.last_state.has_message and self.last_status.has_message:
+            self._agenda.restore_requests(self.last_state.message, self.last_status.message)
+            self._work.restore_progress(
+                self.last_state.message.passed, self.last_status.message.progress
+            )
         command = self.last_command.message
-        if self.last_command.is_there and command.id:
+        if self.last_command.has_message and command.id:
             self._work.grip = command.opening, command.force
 
     def _follow_boards(self) -> None:
         """Fall out of step with the boards below, or restart from where they hold the arm."""
         was_in_step = self._boards.in_step
         if self._boards.update(self.boards):
-            self._work.interrupt()
+            self._work.interrupt_motion()
             self._motion.rest_at(self._boards.position)
         elif was_in_step and not self._boards.in_step:
-            self._work.interrupt()
+            self._work.interrupt_motion()
 
-    def _watch(self, cycles: int) -> None:
+    def _check_guard(self, cycles: int) -> None:
         """End the request under way if its guard is struck.
 
         Args:
@@ -160,32 +162,32 @@ class TrajectoryExecutor(Executor):
         # is long past.
         is_steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
         if current is None or current.kind != MotionKind.POSE or not current.touch or not is_steady:
-            self._guard.begin_anew()
+            self._guard.clear_window()
         elif self._guard.is_struck(self.boards, current.touch):
-            self._work.end_guarded()
+            self._work.end_at_guard()
 
-    def _due(self, tick: int) -> int:
+    def _compute_due_tick(self, tick: int) -> int:
         return tick + LEAD_CYCLES * self.context.every
 
     def _write_reference(self, command: JointReference, tick: int) -> None:
         state = self._motion.state
         command.id = tick // self.context.every + 1
         # Out of step the arm's position is uncertain, and no set point is better than a wrong one.
-        command.due = self._due(tick) if self._boards.in_step else 0
+        command.due = self._compute_due_tick(tick) if self._boards.in_step else 0
         command.position, command.velocity, command.acceleration = state
         terms = self._dynamics.terms(state.position, state.velocity)
         command.inertia = terms.inertia.diagonal()
         command.load = terms.bias
         command.opening, command.force = self._work.grip
-        command.operator = self._orders.rests_on(self._agenda.rests_on)
+        command.operator = self._orders.find_basis(self._agenda.rests_on)
 
     def _write_status(self, status: MotionStatus) -> None:
         agenda = self._agenda
         motion = self._motion
         goal = self._work.goal
-        agenda.report(status)
+        agenda.fill_status(status)
         status.echo = agenda.taken
-        reason = self._reason_to_wait() if agenda.held or agenda.missing else ""
+        reason = self._find_wait_reason() if agenda.held or agenda.is_request_missing else ""
         if agenda.error:
             status.state = State.ERROR
         elif agenda.held or reason:
@@ -195,36 +197,36 @@ class TrajectoryExecutor(Executor):
         status.error = agenda.error
         status.reason = agenda.reason or reason
         status.progress = self._work.progress
-        status.resting = motion.resting
+        status.resting = motion.is_resting
         state = motion.state
         status.position = state.position
         status.velocity = state.velocity
-        tool = self._ik.tool_at(state.position).position
+        tool = self._ik.compute_tool_pose(state.position).position
         status.tool = tool
         status.astray = 0.0
-        if goal is not None and goal.live and motion.leg is not None and motion.settled:
-            status.astray = goal.astray(tool, motion.time_s)
-        if motion.resting:
-            self._orders.done()
-        self._orders.report(status, agenda.rests_on)
+        if goal is not None and goal.live and motion.leg is not None and motion.is_settled:
+            status.astray = goal.compute_deviation(tool, motion.time_s)
+        if motion.is_resting:
+            self._orders.report_done()
+        self._orders.fill_status(status, agenda.rests_on)
 
-    def _reason_to_wait(self) -> str:
+    def _find_wait_reason(self) -> str:
         """Return why motion does not continue. Empty if it does."""
         if not self._boards.in_step:
-            return self._boards.awaited
-        if self._orders.stands:
-            return self._orders.keeps(self.context.board)
-        if self._agenda.missing:
+            return self._boards.wait_reason
+        if self._orders.is_in_force:
+            return self._orders.format_reason(self.context.board)
+        if self._agenda.is_request_missing:
             return (
                 f"request {self._agenda.taken + 1} is missing: send all again from there, or a"
                 " cancel"
             )
-        if not self._sight.knows and self._agenda.current is None:
+        if not self._sight.has_model and self._agenda.current is None:
             return "waiting for the world model"
         return ""
 
 
-LASTS_S = 0.04
+MEDIAN_WINDOW_S = 0.04
 """Length of the two medians that are compared, at the start and end of the window, s.
 
 Effects of a late cycle or a short braking decay within half of it. The window is five times as
@@ -241,12 +243,12 @@ class TouchGuard:
     """
 
     def __init__(self, period_s: float) -> None:
-        self._lasting = max(round(LASTS_S / period_s), 3)
-        self._past: deque[Array] = deque(maxlen=5 * self._lasting)
+        self._median_samples = max(round(MEDIAN_WINDOW_S / period_s), 3)
+        self._torques: deque[Array] = deque(maxlen=5 * self._median_samples)
 
-    def begin_anew(self) -> None:
+    def clear_window(self) -> None:
         """Forget all torques so far."""
-        self._past.clear()
+        self._torques.clear()
 
     def is_struck(self, boards: Mapping[str, Reading[JointStatus]], max_change: float) -> bool:
         """Add the torques of this cycle, and check whether they have changed.
@@ -259,11 +261,13 @@ class TouchGuard:
             True if the torque of a joint has changed by more than `max_change`.
         """
         if all(board.is_new and not board.message.holding for board in boards.values()):
-            self._past.append(np.sum([board.message.torque for board in boards.values()], axis=0))
+            self._torques.append(
+                np.sum([board.message.torque for board in boards.values()], axis=0)
+            )
         else:
-            self.begin_anew()
-        past = np.array(self._past)
-        count = self._lasting
+            self.clear_window()
+        past = np.array(self._torques)
+        count = self._median_samples
         if len(past) < 2 * count:
             return False
         change = np.median(past[-count:], axis=0) - np.median(past[:count], axis=0)

@@ -25,32 +25,32 @@ from rack.levels.algebra import Array, norm
 from rack.levels.level import Reading
 from rack.levels.messages import WorldState
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.planning.pose import Pose, pose
+from rack.levels.planning.pose import Pose, make_pose
 from rack.levels.robot.limits import Limits
 from rack.levels.systems.trajectory.messages import MotionRequest
 
-BLEND_PART = 0.5
+LEG_ACCELERATION_FRACTION = 0.5
 """Fraction of the acceleration limits that one leg uses. Two blended legs use all of them."""
-PEAK = 0.75
+PEAK_ACCELERATION_FACTOR = 0.75
 """Peak acceleration of a change of speed by 1 during 2a, times a."""
 STEP_M = 0.04
 """Largest distance between poses of a tool path that are tested before it begins, m."""
 STEP_RAD = 0.1
 """Largest turn between such poses, rad."""
-MAX_STEPS = 40
+MAX_PATH_STEPS = 40
 """Largest number of poses of a tool path that are tested."""
-SAMPLED = 1.15
+SAMPLING_MARGIN = 1.15
 """Safety factor on the derivatives found at the tested poses of a tool path.
 
 Between these poses they may be greater.
 """
 
 
-class Unfit(Exception):
+class InfeasibleMotion(Exception):
     """Raised for a motion that the arm cannot make. The text gives the reason."""
 
 
-class WorldSight:
+class WorldView:
     """The world model as known in this cycle, with extrapolated bodies."""
 
     def __init__(self, bodies: tuple[str, ...], blind_s: float, tick_s: float) -> None:
@@ -66,17 +66,17 @@ class WorldSight:
         self._tick_s = tick_s
         self._model: WorldState | None = None
 
-    def look(self, world: Reading[WorldState]) -> None:
+    def update_model(self, world: Reading[WorldState]) -> None:
         """Take over the newest world model, if it has been sensed."""
-        if world.is_there and world.message.revision:
+        if world.has_message and world.message.revision:
             self._model = world.message
 
     @property
-    def knows(self) -> bool:
+    def has_model(self) -> bool:
         """Whether a world model has been received."""
         return self._model is not None
 
-    def misfit(self, row: int) -> str:
+    def find_body_error(self, row: int) -> str:
         """Return why the world model has no body with this row. Empty if it has one."""
         if -1 <= row < len(self._bodies):
             return ""
@@ -85,7 +85,7 @@ class WorldSight:
             f" {len(self._bodies) - 1}"
         )
 
-    def frame(self, row: int, time_s: float) -> tuple[Pose, Array]:
+    def predict_frame(self, row: int, time_s: float) -> tuple[Pose, Array]:
         """Predict the frame and the velocity of a body.
 
         Args:
@@ -101,11 +101,11 @@ class WorldSight:
         """
         model = self._model
         if model is None:
-            raise Unfit("nothing is known of the world")
+            raise InfeasibleMotion("nothing is known of the world")
         ahead_s = time_s - model.sensed * self._tick_s
         velocity = np.array(model.velocity[row]) if ahead_s <= self._blind_s else np.zeros(3)
         position = model.position[row] + model.velocity[row] * min(ahead_s, self._blind_s)
-        return pose(position, model.quaternion[row]), velocity
+        return make_pose(position, model.quaternion[row]), velocity
 
 
 class ToolGoal:
@@ -116,7 +116,7 @@ class ToolGoal:
         live: Whether the goal follows a body.
     """
 
-    def __init__(self, request: MotionRequest, sight: WorldSight, follow_s: float) -> None:
+    def __init__(self, request: MotionRequest, sight: WorldView, follow_s: float) -> None:
         """Start at the pose of the request.
 
         Args:
@@ -124,7 +124,7 @@ class ToolGoal:
             sight: Gives the frame of the body.
             follow_s: Time constant with which a live goal follows its body, s.
         """
-        self._goal = pose(request.position, request.quaternion)  # in the frame of the body
+        self._goal = make_pose(request.position, request.quaternion)  # in the frame of the body
         self._body = request.body  # row in the world model, -1 for the world
         self.live = request.live and request.body >= 0
         self._sight = sight
@@ -135,7 +135,7 @@ class ToolGoal:
         self._turning = np.zeros(3)
         self.pose = self._goal
 
-    def update(self, time_s: float) -> None:
+    def update_pose(self, time_s: float) -> None:
         """Evaluate the goal for the sample at `time_s`. A second call for a sample has no effect.
 
         Raises:
@@ -143,20 +143,24 @@ class ToolGoal:
         """
         if self._body < 0 or time_s == self._stamp_s or (self._frame is not None and not self.live):
             return
-        body_frame, velocity = self._sight.frame(self._body, time_s)
+        body_frame, velocity = self._sight.predict_frame(self._body, time_s)
         if self._frame is None:
             self._frame = body_frame
             self._velocity = velocity
         else:
-            self._frame = self._followed(self._frame, body_frame, velocity, time_s - self._stamp_s)
+            self._frame = self._smooth_frame(
+                self._frame, body_frame, velocity, time_s - self._stamp_s
+            )
         self._stamp_s = time_s
         self.pose = self._frame @ self._goal
 
-    def astray(self, position: Array, time_s: float) -> float:
+    def compute_deviation(self, position: Array, time_s: float) -> float:
         """Return the distance of a tool position from the unsmoothed goal at `time_s`, m."""
-        return norm((self._sight.frame(self._body, time_s)[0] @ self._goal).position - position)
+        return norm(
+            (self._sight.predict_frame(self._body, time_s)[0] @ self._goal).position - position
+        )
 
-    def _followed(self, frame: Pose, body_frame: Pose, velocity: Array, step_s: float) -> Pose:
+    def _smooth_frame(self, frame: Pose, body_frame: Pose, velocity: Array, step_s: float) -> Pose:
         """Return the frame after one step of following the body.
 
         The position is critically damped and follows a constant velocity without lag. The
@@ -181,10 +185,10 @@ class ToolGoal:
             rate * rotation_error - 2.0 * self._turning
         )
         mujoco.mju_quatIntegrate(quaternion, self._turning, step_s)
-        return pose(frame.position + step_s * self._velocity, quaternion)
+        return make_pose(frame.position + step_s * self._velocity, quaternion)
 
 
-class Times(NamedTuple):
+class LegTimes(NamedTuple):
     """Times that a request asks for, s."""
 
     segment: float  # 0 to choose it from the limits
@@ -207,8 +211,8 @@ class TimeLaw:
     ) -> None:
         self.segment_s = segment_s
         self.half_blend_s = half_blend_s
-        self.least_s = min_end_blend_half_s
-        self.leaving_s = half_blend_s
+        self.min_end_blend_half_s = min_end_blend_half_s
+        self.end_blend_half_s = half_blend_s
 
     @property
     def nominal_s(self) -> float:
@@ -221,23 +225,25 @@ class TimeLaw:
     @property
     def ends_s(self) -> float:
         """Time at which the leg comes to rest at its goal, s."""
-        return self.nominal_s + self.leaving_s
+        return self.nominal_s + self.end_blend_half_s
 
-    def part(self, time_s: float) -> float:
+    def compute_progress(self, time_s: float) -> float:
         """Return the progress after `time_s`, 0 to 1."""
         if time_s <= 0.0:
             return 0.0
         remaining_s = self.ends_s - time_s
         if remaining_s <= 0.0:
             return 1.0
-        if remaining_s < 2.0 * self.leaving_s:
-            return 1.0 - _ramp(remaining_s, self.leaving_s) / self.segment_s
+        if remaining_s < 2.0 * self.end_blend_half_s:
+            return 1.0 - _compute_ramp_distance(remaining_s, self.end_blend_half_s) / self.segment_s
         half_s = self.half_blend_s
-        distance = _ramp(time_s, half_s) if time_s < 2.0 * half_s else time_s - half_s
+        distance = (
+            _compute_ramp_distance(time_s, half_s) if time_s < 2.0 * half_s else time_s - half_s
+        )
         return distance / self.segment_s
 
 
-def _ramp(time_s: float, half_s: float) -> float:
+def _compute_ramp_distance(time_s: float, half_s: float) -> float:
     """Return the distance covered `time_s` after the start of a smooth rise of speed.
 
     The speed rises from 0 to 1 during twice `half_s`.
@@ -251,14 +257,14 @@ class JointLeg:
 
     live = False  # the goal does not move
 
-    def __init__(self, start: Array, goal: Array, times: Times, limits: Limits) -> None:
+    def __init__(self, start: Array, goal: Array, times: LegTimes, limits: Limits) -> None:
         self._start = start.copy()
         self._way = goal - start
-        self.law = timed(times, np.abs(self._way), np.zeros(len(goal)), limits)
+        self.law = build_time_law(times, np.abs(self._way), np.zeros(len(goal)), limits)
 
-    def at(self, time_s: float) -> Array:
+    def compute_position(self, time_s: float) -> Array:
         """Return the joint positions `time_s` after the start, (joints,), rad."""
-        return np.asarray(self._start + self.law.part(time_s) * self._way)
+        return np.asarray(self._start + self.law.compute_progress(time_s) * self._way)
 
 
 class ToolLeg:
@@ -271,7 +277,7 @@ class ToolLeg:
         self,
         start: Array,
         goal: ToolGoal,
-        times: Times,
+        times: LegTimes,
         ik: InverseKinematics,
         limits: Limits,
     ) -> None:
@@ -288,61 +294,67 @@ class ToolLeg:
             InfeasibleMotion: If a pose of the path has no joint positions.
         """
         self._ik = ik
-        self._from = ik.tool_at(start)
+        self._from = ik.compute_tool_pose(start)
         self._goal = goal
         self.live = goal.live
         self._last = start.copy()
-        speed, bend = self._try_out(start, goal.pose)
-        self.law = timed(times, speed, bend, limits)
+        speed, bend = self._sample_derivatives(start, goal.pose)
+        self.law = build_time_law(times, speed, bend, limits)
 
-    def at(self, time_s: float) -> Array:
+    def compute_position(self, time_s: float) -> Array:
         """Return the joint positions `time_s` after the start, (joints,), rad.
 
         Raises:
             InfeasibleMotion: If the pose has no joint positions.
         """
-        progress = self.law.part(time_s)
-        self._last = self._solve(
-            self._from.towards(self._goal.pose, progress), self._last, progress
+        progress = self.law.compute_progress(time_s)
+        self._last = self._solve_joints(
+            self._from.interpolate_to(self._goal.pose, progress), self._last, progress
         )
         return self._last
 
-    def _solve(self, pose: Pose, start: Array, share: float) -> Array:
+    def _solve_joints(self, pose: Pose, start: Array, share: float) -> Array:
         """Return joint positions for a pose of the tool on the branch of `start`.
 
         Raises `InfeasibleMotion` if there are none. Its text contains `share`, the completed
         fraction of the path.
         """
-        joints = self._ik.nearby(pose, start)
+        joints = self._ik.find_nearby(pose, start)
         if joints is None:
             x, y, z = pose.position
-            raise Unfit(
+            raise InfeasibleMotion(
                 f"no joint positions for the tool at {x:.3f} {y:.3f} {z:.3f},"
                 f" {share:.0%} of the way"
             )
         return joints
 
-    def _try_out(self, start: Array, goal: Pose) -> tuple[Array, Array]:
+    def _sample_derivatives(self, start: Array, goal: Pose) -> tuple[Array, Array]:
         """Return the largest first and second derivatives of the joints by the progress.
 
         Both have shape (joints,) and are taken from a number of poses of the path.
         """
         distance = norm(goal.position - self._from.position)
-        turn = self._from.angle_to(goal)
-        steps = min(max(ceil(distance / STEP_M), ceil(turn / STEP_RAD), 4), MAX_STEPS)
+        turn = self._from.compute_angle(goal)
+        steps = min(max(ceil(distance / STEP_M), ceil(turn / STEP_RAD), 4), MAX_PATH_STEPS)
         points = [start]
         for k in range(1, steps + 1):
-            points.append(self._solve(self._from.towards(goal, k / steps), points[-1], k / steps))
+            points.append(
+                self._solve_joints(
+                    self._from.interpolate_to(goal, k / steps), points[-1], k / steps
+                )
+            )
         first = np.diff(points, axis=0) * steps
         second = np.diff(first, axis=0) * steps
-        return SAMPLED * np.abs(first).max(axis=0), SAMPLED * np.abs(second).max(axis=0)
+        return SAMPLING_MARGIN * np.abs(first).max(axis=0), SAMPLING_MARGIN * np.abs(second).max(
+            axis=0
+        )
 
 
 Leg = JointLeg | ToolLeg
 """A single motion."""
 
 
-def timed(times: Times, speed: Array, curvature: Array, limits: Limits) -> TimeLaw:
+def build_time_law(times: LegTimes, speed: Array, curvature: Array, limits: Limits) -> TimeLaw:
     """Build the time law of a leg.
 
     A segment time that is too short for a limit, or for two blends, is stretched.
@@ -354,8 +366,8 @@ def timed(times: Times, speed: Array, curvature: Array, limits: Limits) -> TimeL
         limits: Velocity and acceleration limits of the joints.
     """
     half_blend_s = times.half_blend
-    max_acceleration = BLEND_PART * limits.acceleration
-    slope = PEAK * speed / half_blend_s
+    max_acceleration = LEG_ACCELERATION_FRACTION * limits.acceleration
+    slope = PEAK_ACCELERATION_FACTOR * speed / half_blend_s
     needed_s = np.maximum(
         speed / limits.velocity,
         (slope + np.sqrt(slope * slope + 4.0 * max_acceleration * curvature))
@@ -363,11 +375,11 @@ def timed(times: Times, speed: Array, curvature: Array, limits: Limits) -> TimeL
     )
     segment_s = max(float(needed_s.max()), times.segment, 2.0 * half_blend_s)
     spare_acceleration = max_acceleration - curvature / (segment_s * segment_s)
-    end_half_s = float((PEAK * speed / segment_s / spare_acceleration).max())
+    end_half_s = float((PEAK_ACCELERATION_FACTOR * speed / segment_s / spare_acceleration).max())
     return TimeLaw(segment_s, half_blend_s, min(half_blend_s, end_half_s))
 
 
-class Settling:
+class RampToRest:
     """Independent ramp of every joint to rest.
 
     It starts with the given position, velocity and acceleration.
@@ -393,9 +405,9 @@ class Settling:
         spare_acceleration = max_acceleration - np.abs(self._acceleration) / 3.0
         self._time_s = np.maximum(1.5 * np.abs(self._velocity) / spare_acceleration, min_duration_s)
         self.ends_s = float(self._time_s.max())
-        self.end = self.at(self.ends_s)
+        self.end = self.compute_position(self.ends_s)
 
-    def at(self, time_s: float) -> Array:
+    def compute_position(self, time_s: float) -> Array:
         """Return the joint positions `time_s` after the start, (joints,), rad."""
         t = self._time_s
         h = np.minimum(time_s / t, 1.0)

@@ -9,16 +9,16 @@ from enum import IntEnum
 
 from numpy import ndarray
 
-from rack.backplane.message import Message, field, integer
-from rack.levels.messages import per_joint
+from rack.backplane.message import Message, field, integer_field
+from rack.levels.messages import joint_field
 from rack.levels.operator import AnsweringStatus, RelayedCommand
 
-HELD = 16
+MAX_HELD_REQUESTS = 16
 """Number of motion requests that a trajectory level takes from the queue in advance.
 
 A CANCEL is seen at once while no more requests than this are open.
 """
-ENDED = 8
+LISTED_ENDED_REQUESTS = 8
 """Number of ended requests that a status lists."""
 
 
@@ -57,14 +57,16 @@ class MotionRequest(RelayedCommand, version=1):
     """
 
     kind: MotionKind = field(doc="what to do")
-    joints: ndarray = per_joint("rad", "goal of JOINTS")
+    joints: ndarray = joint_field("rad", "goal of JOINTS")
     position: ndarray = field(
         unit="m", doc="goal of POSE: tool position, in the frame of `body`", shape=3
     )
     quaternion: ndarray = field(
         unit="1", doc="goal of POSE: tool orientation, in the frame of `body`", shape=4
     )
-    body: int = integer("row of the body whose frame the goal refers to (-1: the world)", "i2")
+    body: int = integer_field(
+        "row of the body whose frame the goal refers to (-1: the world)", "i2"
+    )
     live: bool = field(
         doc="1 if the goal follows the body, 0 if the frame is fixed at the start of the request"
     )
@@ -94,26 +96,31 @@ class MotionState(Message, version=1):
         MotionRequest,
         doc="the request at whose goal the arm is, or to which it goes; id 0: none",
     )
-    count: int = integer("requests that follow", "u2")
-    requests: ndarray = field(MotionRequest, doc="taken and not ended, oldest first", shape=HELD)
+    count: int = integer_field("requests that follow", "u2")
+    requests: ndarray = field(
+        MotionRequest, doc="taken and not ended, oldest first", shape=MAX_HELD_REQUESTS
+    )
 
 
 class MotionStatus(AnsweringStatus, version=1):
     """Status of a trajectory level."""
 
-    taken: int = integer("newest request taken from the queue (0: none yet)")
-    current: int = integer("request being carried out (0: none)")
-    done: int = integer("newest request that ended in any way (0: none yet)")
+    taken: int = integer_field("newest request taken from the queue (0: none yet)")
+    current: int = integer_field("request being carried out (0: none)")
+    done: int = integer_field("newest request that ended in any way (0: none yet)")
     ended: ndarray = field(
-        "u4", unit="1", doc="ids of the last requests to end, newest first (0: none)", shape=ENDED
+        "u4",
+        unit="1",
+        doc="ids of the last requests to end, newest first (0: none)",
+        shape=LISTED_ENDED_REQUESTS,
     )
-    ends: ndarray = field("u1", unit=RequestEnd, doc="how they ended", shape=ENDED)
+    ends: ndarray = field("u1", unit=RequestEnd, doc="how they ended", shape=LISTED_ENDED_REQUESTS)
     progress: float = field(
         unit="1", doc="part of the current request's time that has passed, 0 to 1"
     )
     resting: bool = field(doc="1: commanded velocity is zero")
-    position: ndarray = per_joint("rad", "joint positions commanded last")
-    velocity: ndarray = per_joint("rad/s", "joint velocities commanded last")
+    position: ndarray = joint_field("rad", "joint positions commanded last")
+    velocity: ndarray = joint_field("rad/s", "joint velocities commanded last")
     tool: ndarray = field(unit="m", doc="tool position commanded last", shape=3)
     astray: float = field(
         unit="m", doc="its distance from a live goal that was reached (0: no live goal)"

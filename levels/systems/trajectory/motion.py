@@ -14,16 +14,21 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.primitive.path_motion import JointSetPoint
 from rack.levels.robot.limits import Limits
-from rack.levels.systems.trajectory.legs import BLEND_PART, Leg, Settling, Unfit
+from rack.levels.systems.trajectory.legs import (
+    LEG_ACCELERATION_FRACTION,
+    InfeasibleMotion,
+    Leg,
+    RampToRest,
+)
 
-STOP_PART = 0.85
+STOP_ACCELERATION_FRACTION = 0.85
 """Fraction of the acceleration limits that a stop uses.
 
 The margin is needed because states are known only as differences of samples.
 """
-LEAST_STOP_CYCLES = 5
+MIN_STOP_CYCLES = 5
 """Shortest stop, which lets the acceleration of a slow joint end smoothly."""
-EXCESS = 1.04
+LIMIT_TOLERANCE_FACTOR = 1.04
 """Multiple of a limit that a sample may reach, for example by rounding of inverse kinematics.
 
 The planned velocity limits are 5 % lower than the limits of the arm.
@@ -57,21 +62,21 @@ class SampledMotion:
         self._joints = joints
         self._period_s = period_s
         self.leg: Leg | None = None
-        self._begun_s = 0.0
-        self._settling: Settling | None = None
-        self._settles_s = 0.0  # time at which the ramp began
+        self._leg_start_s = 0.0
+        self._ramp: RampToRest | None = None
+        self._ramp_start_s = 0.0  # time at which the ramp began
         self.rest_at(rest)
 
     def rest_at(self, position: Array) -> None:
         """Rest at joint positions, (joints,), rad, and drop the leg."""
         self.leg = None
-        self._settling = None
+        self._ramp = None
         self._rest = np.array(position)
         self.time_s = 0.0
         # The samples before, at and after `time_s`.
         self._samples = self._rest, self._rest, self._rest
 
-    def advance(self, time_s: float) -> None:
+    def advance_to(self, time_s: float) -> None:
         """Advance to the next sample, at `time_s`.
 
         Raises:
@@ -82,13 +87,13 @@ class SampledMotion:
         before, present = self._samples[1:]
         self._samples = before, present, present
         try:
-            self._look_ahead()
+            self._evaluate_next_sample()
             if self.leg is not None:
-                self._check()
-        except Unfit:
+                self._check_limits()
+        except InfeasibleMotion:
             # The next sample cannot be computed: ramp to rest from the previous state.
             velocity = velocity + self._period_s * acceleration
-            self._stop_from(JointSetPoint(present, velocity, acceleration))
+            self._ramp_to_rest_from(JointSetPoint(present, velocity, acceleration))
             raise
 
     @property
@@ -103,17 +108,17 @@ class SampledMotion:
     @property
     def leg_s(self) -> float:
         """Time since the leg began, s."""
-        return self.time_s - self._begun_s
+        return self.time_s - self._leg_start_s
 
     @property
-    def settled(self) -> bool:
+    def is_settled(self) -> bool:
         """Whether the leg has reached its goal and the previous motion has decayed completely."""
         if self.leg is not None and self.leg_s < self.leg.law.ends_s:
             return False
-        return self._settling is None or self.time_s - self._settles_s >= self._settling.ends_s
+        return self._ramp is None or self.time_s - self._ramp_start_s >= self._ramp.ends_s
 
     @property
-    def resting(self) -> bool:
+    def is_resting(self) -> bool:
         """Whether the present sample is at rest."""
         before, present, after = self._samples
         return bool(
@@ -121,16 +126,16 @@ class SampledMotion:
             and (np.abs(after - present) < MAX_REST_RAD).all()
         )
 
-    def stop(self) -> None:
+    def ramp_to_rest(self) -> None:
         """Ramp to rest from the present sample."""
-        self._stop_from(self.state)
+        self._ramp_to_rest_from(self.state)
 
-    def _stop_from(self, state: JointSetPoint) -> None:
-        self._settle(state, STOP_PART)
+    def _ramp_to_rest_from(self, state: JointSetPoint) -> None:
+        self._start_ramp_to_rest(state, STOP_ACCELERATION_FRACTION)
         self.leg = None
-        self._look_ahead()
+        self._evaluate_next_sample()
 
-    def begin(self, make: Callable[[Array], Leg], half_blend_s: float) -> None:
+    def begin_leg(self, make: Callable[[Array], Leg], half_blend_s: float) -> None:
         """Begin a leg while the motion so far slows down.
 
         Args:
@@ -140,19 +145,21 @@ class SampledMotion:
         Raises:
             InfeasibleMotion: If `make` raises it. The arm is then ramping to rest.
         """
-        if self.settled and self.leg is not None and not self.leg.live:
+        if self.is_settled and self.leg is not None and not self.leg.live:
             self._rest = self._samples[1]
-            self._settling = None
-        elif not self.settled or self.leg is not None:
-            self._settle(self.state, BLEND_PART, 2.0 * half_blend_s)
+            self._ramp = None
+        elif not self.is_settled or self.leg is not None:
+            self._start_ramp_to_rest(self.state, LEG_ACCELERATION_FRACTION, 2.0 * half_blend_s)
         self.leg = None
         try:
             self.leg = make(self._rest)
-            self._begun_s = self.time_s
+            self._leg_start_s = self.time_s
         finally:
-            self._look_ahead()
+            self._evaluate_next_sample()
 
-    def _settle(self, state: JointSetPoint, fraction: float, least_s: float = 0.0) -> None:
+    def _start_ramp_to_rest(
+        self, state: JointSetPoint, fraction: float, least_s: float = 0.0
+    ) -> None:
         """Let the present motion decay to rest.
 
         Args:
@@ -160,25 +167,31 @@ class SampledMotion:
             fraction: Fraction of the acceleration limits to use.
             least_s: Shortest time of the ramp, s.
         """
-        least_s = max(least_s, LEAST_STOP_CYCLES * self._period_s)
-        self._settling = Settling(state, fraction * self._limits.acceleration, least_s)
-        self._settles_s = self.time_s
-        self._rest = self._settling.end
+        least_s = max(least_s, MIN_STOP_CYCLES * self._period_s)
+        self._ramp = RampToRest(state, fraction * self._limits.acceleration, least_s)
+        self._ramp_start_s = self.time_s
+        self._rest = self._ramp.end
 
-    def _look_ahead(self) -> None:
+    def _evaluate_next_sample(self) -> None:
         """Evaluate the next sample, again if the motion has changed."""
         before, present, _ = self._samples
-        self._samples = before, present, self._evaluate(self.time_s + self._period_s)
+        self._samples = before, present, self._compute_position(self.time_s + self._period_s)
 
-    def _evaluate(self, time_s: float) -> Array:
+    def _compute_position(self, time_s: float) -> Array:
         """Return the joint positions at `time_s`. Raises `InfeasibleMotion`."""
-        position = self._rest if self.leg is None else self.leg.at(time_s - self._begun_s)
-        settling = self._settling
-        if settling is None or time_s - self._settles_s >= settling.ends_s:
+        position = (
+            self._rest
+            if self.leg is None
+            else self.leg.compute_position(time_s - self._leg_start_s)
+        )
+        settling = self._ramp
+        if settling is None or time_s - self._ramp_start_s >= settling.ends_s:
             return position
-        return np.asarray(position + (settling.at(time_s - self._settles_s) - settling.end))
+        return np.asarray(
+            position + (settling.compute_position(time_s - self._ramp_start_s) - settling.end)
+        )
 
-    def _check(self) -> None:
+    def _check_limits(self) -> None:
         """Raise `InfeasibleMotion` if the present sample exceeds a limit.
 
         This happens, for example, when a live goal is too fast for the arm.
@@ -189,11 +202,11 @@ class SampledMotion:
             (acceleration, self._limits.acceleration, "rad/s2"),
         ):
             # The comparison is written such that NaN exceeds the limit.
-            if not (np.abs(values) <= EXCESS * limits).all():
+            if not (np.abs(values) <= LIMIT_TOLERANCE_FACTOR * limits).all():
                 joint = int((np.abs(values) / limits).argmax())
                 name = self._joints[joint]
                 limit = limits[joint]
-                raise Unfit(
+                raise InfeasibleMotion(
                     f"joint '{name}' would need {abs(values[joint]):.2f} {unit}; permitted:"
                     f" {limit:.2f}"
                 )

@@ -19,7 +19,7 @@ from rack.levels.level import (
     Executor,
     Input,
     LevelContext,
-    Misfits,
+    Mismatches,
     Output,
     Planner,
     Program,
@@ -27,9 +27,14 @@ from rack.levels.level import (
 )
 from rack.levels.messages import TaskStatus, WorldState
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.planning.pose import Pose, pose
-from rack.levels.robot.cell import cell_of
-from rack.levels.systems.trajectory.messages import HELD, MotionKind, MotionRequest, MotionStatus
+from rack.levels.planning.pose import Pose, make_pose
+from rack.levels.robot.cell import build_level_cell
+from rack.levels.systems.trajectory.messages import (
+    MAX_HELD_REQUESTS,
+    MotionKind,
+    MotionRequest,
+    MotionStatus,
+)
 from rack.levels.tables import (
     Finite,
     NotNegative,
@@ -75,7 +80,7 @@ class MoveStep(MotionStep):
     """orientation of the tool, as w, x, y, z; by default as at home"""
 
     @model_validator(mode="after")
-    def _one_goal(self) -> MoveStep:
+    def _check_one_goal(self) -> MoveStep:
         if (self.position is None) == (self.joints is None):
             raise ValueError("a move has either position or joints")
         if self.quaternion is not None and (self.position is None or not any(self.quaternion)):
@@ -101,7 +106,7 @@ class LineStep(MotionStep):
     """whether the goal follows the body; otherwise its frame is copied when the motion begins"""
 
     @model_validator(mode="after")
-    def _follows_a_body(self) -> LineStep:
+    def _check_live_goal(self) -> LineStep:
         if self.live and self.body is None:
             raise ValueError("a live goal needs a body that it follows")
         if self.quaternion is not None and not any(self.quaternion):
@@ -151,7 +156,7 @@ class MotionProgram(Program):
     )
     """steps, in the order of execution"""
 
-    def misfits(self, robot: RobotConfig | None, scene: SceneConfig) -> Misfits:
+    def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
         """Yield key, value and reason of every entry that does not suit the arm or the scene."""
         if robot is None:
             return
@@ -170,9 +175,9 @@ class MotionProgram(Program):
                 yield f"step[{k}].do", step.do, "the robot has no gripper"
 
 
-BATCH = 2
+MAX_REQUESTS_PER_PLAN = 2
 """Largest number of requests made by one plan."""
-PATIENCE_S = 0.5
+RESEND_DELAY_S = 0.5
 """Time after which a request that the level below has not taken is sent again, s.
 
 It may have been lost.
@@ -182,7 +187,7 @@ It may have been lost.
 class PlanningParams(Table):
     """`[board.<name>.params]`: how far the planner works ahead."""
 
-    ahead: int = Field(4, ge=1, le=HELD)
+    ahead: int = Field(4, ge=1, le=MAX_HELD_REQUESTS)
     """largest number of requests queued or under way at the same time"""
 
 
@@ -239,19 +244,19 @@ class RequestPlanner(Planner):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._steps = self.program.read(context.task, context.robot, context.scene).step
-        self._ahead = read_params(PlanningParams, context.params).ahead
-        cell = cell_of(context)
+        self._max_open_requests = read_params(PlanningParams, context.params).ahead
+        cell = build_level_cell(context)
         self._ik = InverseKinematics(cell, context.seed)
         self._home = cell.home
-        self._upright = self._ik.tool_at(cell.home).quaternion
+        self._home_quaternion = self._ik.compute_tool_pose(cell.home).quaternion
         self._bodies = context.scene.bodies
         # Joint positions at the end of each planned step, (joints,), rad.
         self._goals: dict[int, Array] = {}
         self._sent = 0  # newest request queued, or taken below
         self._taken = 0  # newest request taken below
-        self._taken_at = 0  # tick at which `_taken` or `_sent` changed
+        self._taken_tick = 0  # tick at which `_taken` or `_sent` changed
         self._begun = 0  # newest request begun below
-        self._begun_at = 0  # tick at which `_begun` changed
+        self._begun_tick = 0  # tick at which `_begun` changed
 
     def wanted(self, tick: int) -> bool:
         """Return True if a step may be planned now.
@@ -259,34 +264,34 @@ class RequestPlanner(Planner):
         Notes what the level below has taken and begun.
         """
         below = self.below.message
-        if not self.below.is_there or below.error:
+        if not self.below.has_message or below.error:
             return False
         begun = max(below.current, below.done)
         if begun != self._begun:
             self._begun = begun
-            self._begun_at = tick
+            self._begun_tick = tick
         self._sent = max(self._sent, below.taken)
         if below.taken != self._taken:
             self._taken = below.taken
-            self._taken_at = tick
-        waited_s = (tick - self._taken_at) * self.context.tick_s
-        if below.taken < self._sent and waited_s > PATIENCE_S and not self.below.is_lost:
+            self._taken_tick = tick
+        waited_s = (tick - self._taken_tick) * self.context.tick_s
+        if below.taken < self._sent and waited_s > RESEND_DELAY_S and not self.below.is_lost:
             self._sent = below.taken
-            self._taken_at = tick
-        return self._may_send(below.done, tick)
+            self._taken_tick = tick
+        return self._can_send(below.done, tick)
 
     def plan(self, tick: int) -> None:
         """Plan the next steps and queue their requests."""
-        for _ in range(BATCH):
-            if not self._may_send(self.below.message.done, tick):
+        for _ in range(MAX_REQUESTS_PER_PLAN):
+            if not self._can_send(self.below.message.done, tick):
                 return
-            self._fill(self.output.message, self._sent, self.world.message)
+            self._fill_request(self.output.message, self._sent, self.world.message)
             if not self.output.send():
                 return
             self._sent += 1
-            self._taken_at = tick
+            self._taken_tick = tick
 
-    def _may_send(self, done: int, tick: int) -> bool:
+    def _can_send(self, done: int, tick: int) -> bool:
         """Return True if the next step may be queued now.
 
         Args:
@@ -294,18 +299,18 @@ class RequestPlanner(Planner):
             tick: Present tick; a cancel step has a delay.
         """
         sent = self._sent
-        if sent >= len(self._steps) or sent - done >= self._ahead:
+        if sent >= len(self._steps) or sent - done >= self._max_open_requests:
             return False
         step = self._steps[sent]
         if not isinstance(step, CancelStep):
             return True
-        begun_s = (tick - self._begun_at) * self.context.tick_s
+        begun_s = (tick - self._begun_tick) * self.context.tick_s
         return self._begun >= sent and begun_s >= step.after
 
-    def _fill(self, request: MotionRequest, k: int, world: WorldState) -> None:
+    def _fill_request(self, request: MotionRequest, k: int, world: WorldState) -> None:
         """Fill in the request of step k."""
         step = self._steps[k]
-        self._goals[k] = self._goal(k, world)
+        self._goals[k] = self._compute_goal(k, world)
         request.clear()
         request.id = k + 1
         request.body = -1
@@ -313,8 +318,8 @@ class RequestPlanner(Planner):
             request.segment = step.segment
             request.acceleration = step.acceleration
             joints = self._goals[k]
-            tool = self._tool(step)
-            is_solved = joints is not self._goal_before(k, world)
+            tool = self._find_tool_pose(step)
+            is_solved = joints is not self._find_goal_before(k, world)
             if tool is None or (isinstance(step, MoveStep) and is_solved):
                 request.kind = MotionKind.JOINTS
                 request.joints = joints
@@ -337,7 +342,7 @@ class RequestPlanner(Planner):
         else:
             request.kind = MotionKind.CANCEL
 
-    def _goal_before(self, k: int, world: WorldState) -> Array:
+    def _find_goal_before(self, k: int, world: WorldState) -> Array:
         """Return the joint positions at the end of the step before step k.
 
         The step is planned if necessary, for example after a restart.
@@ -345,41 +350,41 @@ class RequestPlanner(Planner):
         if k == 0:
             return self._home
         if k - 1 not in self._goals:
-            self._goals[k - 1] = self._goal(k - 1, world)
+            self._goals[k - 1] = self._compute_goal(k - 1, world)
         return self._goals[k - 1]
 
-    def _goal(self, k: int, world: WorldState) -> Array:
+    def _compute_goal(self, k: int, world: WorldState) -> Array:
         """Return the joint positions at the end of step k.
 
         If the step does not move the arm, or no positions are found, the previous ones are
         returned.
         """
         step = self._steps[k]
-        previous = self._goal_before(k, world)
+        previous = self._find_goal_before(k, world)
         if isinstance(step, HomeStep):
             return self._home
         if isinstance(step, MoveStep) and step.joints is not None:
             return np.array(step.joints)
-        target = self._tool(step)
+        target = self._find_tool_pose(step)
         if target is None:
             return previous
         if isinstance(step, LineStep) and step.body is not None:
             if not world.revision:
                 return previous
             row = self._bodies.index(step.body)
-            target = pose(world.position[row], world.quaternion[row]) @ target
-        joints = self._ik.reach(target, previous)
+            target = make_pose(world.position[row], world.quaternion[row]) @ target
+        joints = self._ik.find_configuration(target, previous)
         if joints is not None:
             return joints
-        solutions = self._ik.reachable(target, previous)
+        solutions = self._ik.find_solutions(target, previous)
         return solutions[0] if solutions else previous
 
-    def _tool(self, step: Step) -> Pose | None:
+    def _find_tool_pose(self, step: Step) -> Pose | None:
         """Return the pose of the tool at the goal of a step, in the step's frame.
 
         None if the step gives no pose.
         """
         if not isinstance(step, MoveStep | LineStep) or step.position is None:
             return None
-        quaternion = self._upright if step.quaternion is None else step.quaternion
-        return pose(step.position, quaternion)
+        quaternion = self._home_quaternion if step.quaternion is None else step.quaternion
+        return make_pose(step.position, quaternion)

@@ -12,17 +12,17 @@ from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.limits import Limits
 from rack.levels.systems.trajectory.boards import HANDOVER_CYCLES
 from rack.levels.systems.trajectory.legs import (
+    InfeasibleMotion,
     JointLeg,
     Leg,
-    Times,
+    LegTimes,
     ToolGoal,
     ToolLeg,
-    Unfit,
-    WorldSight,
+    WorldView,
 )
 from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest, RequestEnd
 from rack.levels.systems.trajectory.motion import SampledMotion
-from rack.levels.systems.trajectory.requests import MOTIONS, Agenda, misfit_of
+from rack.levels.systems.trajectory.requests import MOVING_KINDS, Agenda, find_request_error
 from rack.levels.tables import Positive, Table
 
 
@@ -46,7 +46,7 @@ class MotionTools(NamedTuple):
 
     ik: InverseKinematics
     limits: Limits
-    sight: WorldSight
+    sight: WorldView
     params: TrajectoryParams
     period_s: float
 
@@ -69,10 +69,10 @@ class RequestWork:
         self.goal: ToolGoal | None = None
         self.passed_s = 0.0
         self.grip = 0.0, 0.0
-        self._interrupted = True  # motion must start again from rest
-        self._left = 1.0  # fraction of an interrupted leg's time that remains
+        self._is_interrupted = True  # motion must start again from rest
+        self._remaining_fraction = 1.0  # fraction of an interrupted leg's time that remains
 
-    def recall(self, passed_s: float, progress: float) -> None:
+    def restore_progress(self, passed_s: float, progress: float) -> None:
         """Continue a request after a restart of the level.
 
         Args:
@@ -80,30 +80,30 @@ class RequestWork:
             progress: Fraction of its time that had passed.
         """
         self.passed_s = passed_s
-        self._left = 1.0 - progress
+        self._remaining_fraction = 1.0 - progress
 
-    def interrupt(self) -> None:
+    def interrupt_motion(self) -> None:
         """Note that the arm has been brought to rest away from the goal."""
-        if not self._interrupted:
-            self._left = 1.0 - self.progress
-        self._interrupted = True
+        if not self._is_interrupted:
+            self._remaining_fraction = 1.0 - self.progress
+        self._is_interrupted = True
         self.goal = None
 
-    def cancel(self) -> None:
+    def cancel_motion(self) -> None:
         """Ramp to rest. The CANCEL is then the only request under way."""
-        self._left = 1.0
-        self._interrupted = False
+        self._remaining_fraction = 1.0
+        self._is_interrupted = False
         self.goal = None
-        self.motion.stop()
+        self.motion.ramp_to_rest()
 
-    def end_guarded(self) -> None:
+    def end_at_guard(self) -> None:
         """End the request under way as GUARDED.
 
         The arm ramps to rest, from where the next request continues.
         """
-        self.agenda.end(RequestEnd.GUARDED)
+        self.agenda.end_first(RequestEnd.GUARDED)
         self.agenda.goal = None  # the arm has not reached it
-        self.cancel()
+        self.cancel_motion()
 
     def step(self, time_s: float, hold: bool) -> None:
         """Advance to the sample at `time_s`. With `hold`, ramp to rest and begin nothing."""
@@ -111,21 +111,21 @@ class RequestWork:
         agenda = self.agenda
         try:
             if self.goal is not None:
-                self.goal.update(time_s + self._tools.period_s)
-            motion.advance(time_s)
-        except Unfit as error:
-            self._fail(RequestEnd.FAILED, str(error), Error.LIMIT)
+                self.goal.update_pose(time_s + self._tools.period_s)
+            motion.advance_to(time_s)
+        except InfeasibleMotion as error:
+            self._fail_request(RequestEnd.FAILED, str(error), Error.LIMIT)
         if hold:
             if motion.leg is not None:
-                self.interrupt()
-                motion.stop()
+                self.interrupt_motion()
+                motion.ramp_to_rest()
             return
-        if self._interrupted:
-            self._go_on()
+        if self._is_interrupted:
+            self._resume_motion()
         elif agenda.current is not None and self._is_done(agenda.current):
-            agenda.end(RequestEnd.DONE)
-        if not self._interrupted and agenda.next is not None:
-            self._consider(agenda.next)
+            agenda.end_first(RequestEnd.DONE)
+        if not self._is_interrupted and agenda.next is not None:
+            self._begin_when_due(agenda.next)
 
     @property
     def progress(self) -> float:
@@ -134,14 +134,14 @@ class RequestWork:
         leg = self.motion.leg
         if current is None:
             return 0.0
-        if current.kind not in MOTIONS:
-            duration_s = self._lasts_s(current)
+        if current.kind not in MOVING_KINDS:
+            duration_s = self._compute_duration_s(current)
             return min(self.passed_s / duration_s, 1.0) if duration_s > 0.0 else 1.0
         if leg is None:
-            return 1.0 - self._left
-        return 1.0 - self._left * (1.0 - min(self.motion.leg_s / leg.law.ends_s, 1.0))
+            return 1.0 - self._remaining_fraction
+        return 1.0 - self._remaining_fraction * (1.0 - min(self.motion.leg_s / leg.law.ends_s, 1.0))
 
-    def _fail(self, outcome: RequestEnd, reason: str, code: Error) -> None:
+    def _fail_request(self, outcome: RequestEnd, reason: str, code: Error) -> None:
         """End the request under way with an error and cancel the others.
 
         Args:
@@ -149,42 +149,42 @@ class RequestWork:
             reason: Reason for the user.
             code: Error code for the status.
         """
-        self.agenda.fail(outcome, code, reason)
+        self.agenda.fail_first(outcome, code, reason)
         self.goal = None
-        self._left = 1.0
-        self._interrupted = False
+        self._remaining_fraction = 1.0
+        self._is_interrupted = False
 
-    def _go_on(self) -> None:
+    def _resume_motion(self) -> None:
         """Resume an interrupted motion once the arm rests."""
         goal = self.agenda.goal
         current = self.agenda.current
-        if not self.motion.settled:
+        if not self.motion.is_settled:
             return
         if goal is None or (current is None and not goal.live):
-            self._interrupted = False
-            self._left = 1.0
+            self._is_interrupted = False
+            self._remaining_fraction = 1.0
         elif self._can_begin(goal):
-            self._interrupted = False
+            self._is_interrupted = False
             is_under_way = current is not None and current.id == goal.id
-            segment_s = goal.segment * self._left if is_under_way else 0.0
-            self._move(goal, 0.0, segment_s)
+            segment_s = goal.segment * self._remaining_fraction if is_under_way else 0.0
+            self._begin_leg(goal, 0.0, segment_s)
 
     def _is_done(self, current: MotionRequest) -> bool:
         """Return True if a request has ended. Counts the time that it stays or grips."""
-        if not self.motion.settled:
+        if not self.motion.is_settled:
             return False
-        if current.kind in MOTIONS or current.kind == MotionKind.CANCEL:
+        if current.kind in MOVING_KINDS or current.kind == MotionKind.CANCEL:
             return True
         self.passed_s += self._tools.period_s
-        return self.passed_s >= self._lasts_s(current)
+        return self.passed_s >= self._compute_duration_s(current)
 
-    def _lasts_s(self, request: MotionRequest) -> float:
+    def _compute_duration_s(self, request: MotionRequest) -> float:
         """Return the time that a request without motion lasts, s."""
         if request.kind == MotionKind.GRIP and not request.segment:
             return self._tools.params.gripping
         return request.segment
 
-    def _consider(self, request: MotionRequest) -> None:
+    def _begin_when_due(self, request: MotionRequest) -> None:
         """Begin a request if it is due.
 
         It is due when no other is under way, or when the leg under way must be blended into it.
@@ -194,14 +194,14 @@ class RequestWork:
         if not self._can_begin(request):
             return
         if current is None:
-            if self.motion.settled:
-                self._begin(0.0)
-        elif current.kind in MOTIONS and request.kind in MOTIONS and leg is not None:
-            half_s = self._blend_s(leg, request)
+            if self.motion.is_settled:
+                self._begin_next_request(0.0)
+        elif current.kind in MOVING_KINDS and request.kind in MOVING_KINDS and leg is not None:
+            half_s = self._compute_half_blend_s(leg, request)
             if half_s is not None:
-                self._begin(half_s)
+                self._begin_next_request(half_s)
 
-    def _blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
+    def _compute_half_blend_s(self, leg: Leg, request: MotionRequest) -> float | None:
         """Return half the time in which a leg slows down, if the blend into `request` is due now.
 
         Returns:
@@ -209,43 +209,47 @@ class RequestWork:
         """
         law = leg.law
         passed_s = self.motion.leg_s
-        if passed_s > law.ends_s - 2.0 * law.leaving_s:
+        if passed_s > law.ends_s - 2.0 * law.end_blend_half_s:
             # The leg is slowing down already.
             return max(0.5 * (law.ends_s - passed_s), 0.0)
-        wanted_s = max(request.acceleration or self._tools.params.acceleration, law.least_s)
+        wanted_s = max(
+            request.acceleration or self._tools.params.acceleration, law.min_end_blend_half_s
+        )
         half_s = min(wanted_s, law.segment_s - law.half_blend_s)
-        law.leaving_s = min(half_s, law.half_blend_s)
+        law.end_blend_half_s = min(half_s, law.half_blend_s)
         remaining_s = law.nominal_s - passed_s
         return remaining_s if remaining_s < half_s + self._tools.period_s else None
 
     def _can_begin(self, request: MotionRequest) -> bool:
         """Return False while a goal in the frame of a body awaits the world model."""
-        return request.kind not in MOTIONS or request.body < 0 or self._tools.sight.knows
+        return request.kind not in MOVING_KINDS or request.body < 0 or self._tools.sight.has_model
 
-    def _begin(self, half_s: float) -> None:
+    def _begin_next_request(self, half_s: float) -> None:
         """Begin the next request, blended over twice `half_s`, s. An impossible one is refused."""
-        request = self.agenda.begin()
+        request = self.agenda.begin_next()
         self.passed_s = 0.0
-        self._left = 1.0
-        if reason := self._misfit(request):
-            self._fail(RequestEnd.REFUSED, reason, Error.UNREACHABLE)
-            self.motion.stop()
-        elif request.kind in MOTIONS:
-            self._move(request, half_s, request.segment)
+        self._remaining_fraction = 1.0
+        if reason := self._find_request_error(request):
+            self._fail_request(RequestEnd.REFUSED, reason, Error.UNREACHABLE)
+            self.motion.ramp_to_rest()
+        elif request.kind in MOVING_KINDS:
+            self._begin_leg(request, half_s, request.segment)
         else:
-            self._start(request)
+            self._start_at_rest(request)
 
-    def _misfit(self, request: MotionRequest) -> str:
+    def _find_request_error(self, request: MotionRequest) -> str:
         """Return why a request cannot be carried out. Empty if it may be possible."""
         tools = self._tools
-        return misfit_of(request, tools.limits.position) or tools.sight.misfit(request.body)
+        return find_request_error(request, tools.limits.position) or tools.sight.find_body_error(
+            request.body
+        )
 
-    def _start(self, request: MotionRequest) -> None:
+    def _start_at_rest(self, request: MotionRequest) -> None:
         """Begin a request that does not move the arm."""
         if request.kind == MotionKind.GRIP:
             self.grip = request.opening, request.force
 
-    def _move(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
+    def _begin_leg(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
         """Begin the leg to the goal of a request. If none can be made, the request is refused.
 
         Args:
@@ -255,7 +259,7 @@ class RequestWork:
         """
         tools = self._tools
         half_blend_s = max(request.acceleration or tools.params.acceleration, half_s)
-        times = Times(segment_s, half_blend_s)
+        times = LegTimes(segment_s, half_blend_s)
         goal = None
         if request.kind == MotionKind.POSE:
             goal = ToolGoal(request, tools.sight, tools.params.follow)
@@ -263,11 +267,11 @@ class RequestWork:
         def build_leg(start: Array) -> Leg:
             if goal is None:
                 return JointLeg(start, request.joints, times, tools.limits)
-            goal.update(self.motion.time_s + tools.period_s)
+            goal.update_pose(self.motion.time_s + tools.period_s)
             return ToolLeg(start, goal, times, tools.ik, tools.limits)
 
         try:
-            self.motion.begin(build_leg, half_s)
+            self.motion.begin_leg(build_leg, half_s)
             self.goal = goal
-        except Unfit as error:
-            self._fail(RequestEnd.REFUSED, str(error), Error.UNREACHABLE)
+        except InfeasibleMotion as error:
+            self._fail_request(RequestEnd.REFUSED, str(error), Error.UNREACHABLE)

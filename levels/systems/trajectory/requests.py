@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from rack.backplane.message import copied
+from rack.backplane.message import copy_message
 from rack.levels.algebra import Array
 from rack.levels.level import Reading
 from rack.levels.messages import Error
 from rack.levels.systems.trajectory.messages import (
-    ENDED,
-    HELD,
+    LISTED_ENDED_REQUESTS,
+    MAX_HELD_REQUESTS,
     MotionKind,
     MotionRequest,
     MotionState,
@@ -21,9 +21,9 @@ from rack.levels.systems.trajectory.messages import (
     RequestEnd,
 )
 
-MOTIONS = (MotionKind.JOINTS, MotionKind.POSE)
+MOVING_KINDS = (MotionKind.JOINTS, MotionKind.POSE)
 """Kinds that move the arm, and can be blended into each other."""
-KINDS = range(MotionKind.JOINTS, MotionKind.GRIP + 1)
+VALID_KINDS = range(MotionKind.JOINTS, MotionKind.GRIP + 1)
 """Kinds that every trajectory level can carry out."""
 
 
@@ -34,7 +34,7 @@ def copy_request(record: Any) -> MotionRequest:
     return request
 
 
-def misfit_of(request: MotionRequest, ranges: Array) -> str:
+def find_request_error(request: MotionRequest, ranges: Array) -> str:
     """Return why no arm with these joint ranges can carry out a request.
 
     Args:
@@ -44,8 +44,8 @@ def misfit_of(request: MotionRequest, ranges: Array) -> str:
     Returns:
         The reason. Empty if the request may be possible.
     """
-    if request.kind not in KINDS:
-        return f"kind {request.kind}; permitted: {KINDS[0]} to {KINDS[-1]}"
+    if request.kind not in VALID_KINDS:
+        return f"kind {request.kind}; permitted: {VALID_KINDS[0]} to {VALID_KINDS[-1]}"
     times = request.acceleration, request.segment
     if not np.isfinite((*times, request.opening, request.force)).all() or min(times) < 0.0:
         return f"times {times[0]:g} and {times[1]:g} s; permitted: finite, 0 or more"
@@ -87,25 +87,25 @@ class Agenda:
 
     def __init__(self) -> None:
         self.held: list[MotionRequest] = []
-        self.begun = False  # whether the first of them is under way
+        self.has_begun = False  # whether the first of them is under way
         self.goal: MotionRequest | None = None
         self.taken = 0
         self.rests_on = 0
         self.error = Error.NONE
         self.reason = ""
         # Whether the request after `taken` was lost with a board that died while taking it.
-        self.missing = False
-        self._ended: deque[tuple[int, RequestEnd]] = deque(maxlen=ENDED)
+        self.is_request_missing = False
+        self._ended: deque[tuple[int, RequestEnd]] = deque(maxlen=LISTED_ENDED_REQUESTS)
 
     @property
     def current(self) -> MotionRequest | None:
         """Request under way. None if there is none."""
-        return self.held[0] if self.begun else None
+        return self.held[0] if self.has_begun else None
 
     @property
     def next(self) -> MotionRequest | None:
         """Request to begin next. None if there is none."""
-        index = int(self.begun)
+        index = int(self.has_begun)
         return self.held[index] if len(self.held) > index else None
 
     @property
@@ -114,60 +114,60 @@ class Agenda:
         return self._ended[0][0] if self._ended else 0
 
     @property
-    def room(self) -> int:
+    def free_places(self) -> int:
         """Number of requests that may be taken now."""
-        return HELD - len(self.held)
+        return MAX_HELD_REQUESTS - len(self.held)
 
-    def take(self, requests: Reading[MotionRequest]) -> bool:
+    def take_new_requests(self, requests: Reading[MotionRequest]) -> bool:
         """Take new requests. Returns True if a CANCEL was among them, and the arm must stop."""
         is_cancelled = False
         if requests.is_new:
             for message in (*requests.earlier, requests.message):
-                is_cancelled |= self._take(copied(message))
+                is_cancelled |= self._take_request(copy_message(message))
         return is_cancelled
 
-    def _take(self, request: MotionRequest) -> bool:
+    def _take_request(self, request: MotionRequest) -> bool:
         """Take or ignore a request. Returns True for a CANCEL."""
         # A planning level sends a request again after its own restart, or if the status does not
         # show the request. Such a repetition is ignored.
         if request.id <= self.taken:
             return False
         if request.kind != MotionKind.CANCEL and self.taken and request.id != self.taken + 1:
-            self.missing = True
+            self.is_request_missing = True
             return False
-        self.missing = False
+        self.is_request_missing = False
         self.taken = request.id
         self.rests_on = max(self.rests_on, request.operator)
         if request.kind == MotionKind.CANCEL:
-            self._drop_all()
+            self._cancel_all()
             self.error = Error.NONE
             self.reason = ""
             self.held = [request]
-            self.begun = True
+            self.has_begun = True
             self.goal = None
             return True
         if self.error:
-            self._end(request, RequestEnd.REFUSED)
+            self._record_end(request, RequestEnd.REFUSED)
         else:
             self.held.append(request)
         return False
 
-    def begin(self) -> MotionRequest:
+    def begin_next(self) -> MotionRequest:
         """Begin the next request. The one under way ends DONE."""
-        if self.begun:
-            self.end(RequestEnd.DONE)
-        self.begun = True
+        if self.has_begun:
+            self.end_first(RequestEnd.DONE)
+        self.has_begun = True
         request = self.held[0]
-        if request.kind in MOTIONS:
+        if request.kind in MOVING_KINDS:
             self.goal = request
         return request
 
-    def end(self, outcome: RequestEnd) -> None:
+    def end_first(self, outcome: RequestEnd) -> None:
         """End the first request with the given outcome."""
-        self._end(self.held.pop(0), outcome)
-        self.begun = False
+        self._record_end(self.held.pop(0), outcome)
+        self.has_begun = False
 
-    def fail(self, outcome: RequestEnd, code: Error, reason: str) -> None:
+    def fail_first(self, outcome: RequestEnd, code: Error, reason: str) -> None:
         """Fail the first request, cancel the others, and refuse new ones from now on.
 
         Args:
@@ -180,21 +180,21 @@ class Agenda:
         self.goal = None
         if self.held:
             self.reason = f"request {self.held[0].id}: {reason}"
-            self.end(outcome)
-        self._drop_all()
+            self.end_first(outcome)
+        self._cancel_all()
 
-    def _drop_all(self) -> None:
+    def _cancel_all(self) -> None:
         """End all requests as CANCELLED."""
         for request in self.held:
-            self._end(request, RequestEnd.CANCELLED)
+            self._record_end(request, RequestEnd.CANCELLED)
         self.held = []
-        self.begun = False
+        self.has_begun = False
 
-    def _end(self, request: MotionRequest, outcome: RequestEnd) -> None:
+    def _record_end(self, request: MotionRequest, outcome: RequestEnd) -> None:
         """Remember how a request ended."""
         self._ended.appendleft((request.id, outcome))
 
-    def report(self, status: MotionStatus) -> None:
+    def fill_status(self, status: MotionStatus) -> None:
         """Fill the ids, outcomes and error of a `MotionStatus`."""
         current = self.current
         status.taken = self.taken
@@ -203,9 +203,9 @@ class Agenda:
         for k, ended in enumerate(self._ended):
             status.ended[k], status.ends[k] = ended
 
-    def save(self, state: MotionState) -> None:
+    def fill_state(self, state: MotionState) -> None:
         """Fill the open requests and the goal of a `MotionState`."""
-        state.begun = self.begun
+        state.begun = self.has_begun
         state.count = len(self.held)
         for k, request in enumerate(self.held):
             state.requests[k] = request.record
@@ -214,10 +214,10 @@ class Agenda:
         else:
             state.goal["id"] = 0
 
-    def recall(self, state: MotionState, status: MotionStatus) -> None:
+    def restore_requests(self, state: MotionState, status: MotionStatus) -> None:
         """Continue from the last messages of a level that was restarted."""
         self.held = [copy_request(record) for record in state.requests[: state.count]]
-        self.begun = state.begun
+        self.has_begun = state.begun
         self.goal = copy_request(state.goal) if state.goal["id"] else None
         self.taken = status.taken
         self.rests_on = status.operator

@@ -10,11 +10,11 @@ from itertools import pairwise
 import pytest
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.clock.driver import ClockDriver, Ended, RealtimeDriver
+from rack.backplane.clock.driver import ClockDriver, FindEndTick, RealtimeDriver
 from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import wake_semaphore
-from rack.backplane.watch.alarms import Alarm, alarm_ring
+from rack.backplane.semaphores import get_wake_semaphore
+from rack.backplane.watch.alarms import Alarm, open_alarm_ring
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
@@ -50,7 +50,7 @@ def given_out(
 def test_a_run_stops_at_its_tick_and_wakes_all_tasks(make_bus: MakeBus) -> None:
     segment = make_bus()
     start(segment)
-    posts = [wake_semaphore(segment, name) for name in ("writer", "reader")]
+    posts = [get_wake_semaphore(segment, name) for name in ("writer", "reader")]
     ticks = given_out(segment, STOP)
     epoch = segment.words[System.EPOCH_NS]
     assert all(at >= epoch + tick * PERIOD_NS for tick, at in ticks)
@@ -66,10 +66,10 @@ def test_the_clock_works_ahead_for_tasks_that_sleep(make_bus: MakeBus) -> None:
     segment = make_bus(task("sleeper", wake="timer"), task("waiter", slot=3))
     start(segment, 20 * PERIOD_NS)
     epoch, made = segment.words[System.EPOCH_NS], []
-    sleeper, waiter = segment.block("sleeper"), segment.block("waiter")
+    sleeper, waiter = segment.get_block("sleeper"), segment.get_block("waiter")
 
     def take() -> None:
-        post = wake_semaphore(segment, "waiter")
+        post = get_wake_semaphore(segment, "waiter")
         while segment.words[System.STATE] != Run.STOPPED:
             if post.acquire(BOUND_S):
                 made.append((sleeper[Block.RELEASED], waiter[Block.RELEASED], time.monotonic_ns()))
@@ -82,7 +82,7 @@ def test_the_clock_works_ahead_for_tasks_that_sleep(make_bus: MakeBus) -> None:
     assert all(at >= epoch + second * PERIOD_NS and first >= second for first, second, at in made)
     # One post as the grid begins, one at the end; one more only for a tick of which the clock was
     # late.
-    assert wake_semaphore(segment, "sleeper").value < 2 + len(ticks)
+    assert get_wake_semaphore(segment, "sleeper").value < 2 + len(ticks)
 
 
 def test_a_clock_that_is_late_posts_the_tasks_that_sleep(make_bus: MakeBus) -> None:
@@ -92,7 +92,7 @@ def test_a_clock_that_is_late_posts_the_tasks_that_sleep(make_bus: MakeBus) -> N
     numbers = [
         tick for tick, _ in given_out(segment, 30, lambda tick: time.sleep(2 * PERIOD_NS * 1e-9))
     ]
-    assert wake_semaphore(segment, "sleeper").value == 2 + len(numbers) - 1
+    assert get_wake_semaphore(segment, "sleeper").value == 2 + len(numbers) - 1
 
 
 def test_the_controller_works_before_and_after_the_releases_of_each_tick(
@@ -105,7 +105,7 @@ def test_the_controller_works_before_and_after_the_releases_of_each_tick(
 
     class Noting:
         def note(self, step: str, tick: int) -> None:
-            is_released = segment.block("poller")[Block.RELEASED] == tick
+            is_released = segment.get_block("poller")[Block.RELEASED] == tick
             work.append((step, tick, is_released))
 
         def begin(self, tick: int) -> None:
@@ -121,7 +121,7 @@ def test_the_controller_works_before_and_after_the_releases_of_each_tick(
     assert len(ticks) > 1
     assert work == [step for steps in both for step in steps]
     # A task that polls is released without a post: the one is the end's.
-    assert wake_semaphore(segment, "poller").value == 1
+    assert get_wake_semaphore(segment, "poller").value == 1
 
 
 def test_a_late_clock_skips_ticks_and_counts_them(make_bus: MakeBus) -> None:
@@ -139,7 +139,7 @@ def test_a_late_clock_skips_ticks_and_counts_them(make_bus: MakeBus) -> None:
     left_out = sum(second - first - 1 for first, second in pairwise([-1, *numbers]))
     assert segment.words[System.CLOCK_SKIPPED] == left_out
     # Its own gap is on record: since which tick it was due, and how much later it woke.
-    rows, _ = alarm_ring(segment, CLOCK).drain()
+    rows, _ = open_alarm_ring(segment, CLOCK).read_new_rows()
     (late,) = [row for row in rows if row["since"] == held_up[0] + 1]
     assert (late["code"], late["tick"]) == (Alarm.CLOCK_LATE, following)
     assert (
@@ -182,7 +182,7 @@ def test_a_clock_that_starts_late_does_not_shift_its_grid(make_bus: MakeBus) -> 
     assert first >= 10
     assert segment.words[System.CLOCK_SKIPPED] >= first
     # Before its first tick nothing took its core.
-    assert not any(row["since"] == 0 for row in alarm_ring(segment, CLOCK).drain()[0])
+    assert not any(row["since"] == 0 for row in open_alarm_ring(segment, CLOCK).read_new_rows()[0])
 
 
 @pytest.mark.parametrize("skipped", [(), (5,), (4, 5, 6, 7, 8, 9, 10)])
@@ -196,7 +196,7 @@ def test_tasks_with_phases_have_their_own_releases_even_across_skipped_ticks(
     driver = RealtimeDriver(segment, lambda _: None)
     last, found = -1, dict[str, list[int]]()
     for tick in (tick for tick in range(24) if tick not in skipped):
-        for due in driver.due(tick, last):
+        for due in driver.list_due_tasks(tick, last):
             due.release(tick)
             found.setdefault(due.spec.name, []).append(due.block[Block.RELEASED])
         last = tick
@@ -217,8 +217,8 @@ def test_tasks_with_phases_have_their_own_releases_even_across_skipped_ticks(
 def test_a_clock_without_a_launcher_ends(make_bus: MakeBus, driver: str) -> None:
     segment = make_bus()
     start(segment)
-    segment.release()
-    never: Ended = lambda tick: None  # noqa: E731
+    segment.release_launcher_lock()
+    never: FindEndTick = lambda tick: None  # noqa: E731
     clock: ClockDriver = RealtimeDriver(segment, never)
     if driver == "lockstep":
         clock = LockstepDriver(segment, never, False, HISTORY)

@@ -13,11 +13,11 @@ from typing import get_args
 import pytest
 
 from rack.backplane import process
-from rack.backplane.clock.lockstep import BATCH, LockstepDriver
+from rack.backplane.clock.lockstep import MAX_BATCH_TICKS, LockstepDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.layout import Wake
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import done_semaphore
+from rack.backplane.semaphores import get_done_semaphore
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
@@ -31,13 +31,13 @@ def serve(
     segment: Segment, name: str, cycle: NextCycle, log: list[tuple[str, str, int]], work_s: float
 ) -> None:
     """Run a task's cycles slowly, and report each to the clock."""
-    block = segment.block(name)
+    block = segment.get_block(name)
     while (tick := cycle.wait()) is not None:
         log.append(("begin", name, tick))
         time.sleep(work_s)
         log.append(("end", name, tick))
         block[Block.DONE] = tick
-        done_semaphore(segment, name).release()
+        get_done_semaphore(segment, name).release()
 
 
 def lockstep(
@@ -138,7 +138,7 @@ def test_lockstep_waits_without_a_bound_for_a_recorder_that_lives(
         looks += 1
         if looks == 100:
             segment.words[System.FOLLOWER_TICK] = 3 * HISTORY
-        return process.state_of(pid)
+        return process.read_state(pid)
 
     monkeypatch.setattr("rack.backplane.clock.lockstep.state_of", state_of)
     with forked(signal.pause) as follower:
@@ -188,7 +188,7 @@ def test_the_lead_of_the_clock_over_its_recorder_is_bounded(
     segment.words[System.FOLLOWER_TICK] = 0
     segment.words[System.FOLLOWER_DRAINED] = drained
     driver.is_flooded = flooded
-    assert driver._is_ahead(ticks) is is_ahead
+    assert driver._is_recorder_behind(ticks) is is_ahead
 
 
 class Idle:
@@ -198,14 +198,14 @@ class Idle:
         self.begun: list[int] = []
         self._until = until
 
-    def begin(self, tick: int) -> None:
+    def begin_tick(self, tick: int) -> None:
         """Note that the clock works at a tick."""
         self.begun.append(tick)
 
-    def released(self, tick: int) -> None:
+    def finish_release(self, tick: int) -> None:
         """Do nothing."""
 
-    def rests_until(self, tick: int) -> int:
+    def find_next_work_tick(self, tick: int) -> int:
         """Return the tick with work."""
         return self._until
 
@@ -236,7 +236,7 @@ def test_an_executor_that_alone_is_due_gets_its_ticks_at_once(make_bus: MakeBus)
 @pytest.mark.parametrize(
     ("word", "value", "end"),
     [
-        (System.STOP_TICK, 0, 1 + BATCH),
+        (System.STOP_TICK, 0, 1 + MAX_BATCH_TICKS),
         (System.STOP_TICK, 4, 4),
         # It holds before tick 5.
         (System.HOLD_AT, 6, 5),
@@ -249,24 +249,24 @@ def test_a_batch_ends_at_the_end_of_the_run_or_at_a_hold(
     segment = make_bus(task("fast", slot=2), task("slow", every=40, slot=3))
     driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
     driver.controller = Idle()
-    driver._begins(0)
+    driver._wait_for_tick(0)
     segment.words[word] = value
-    assert driver._batch_end(driver.due(1, 0), 1) == end
+    assert driver._find_batch_end(driver.list_due_tasks(1, 0), 1) == end
 
 
 def test_a_batch_ends_before_the_next_work_of_the_clock(make_bus: MakeBus) -> None:
     segment = make_bus(task("fast", slot=2), task("slow", every=40, slot=3))
     driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
     driver.controller = Idle(until=7)
-    driver._begins(1)
-    due = driver.due(1, 0)
-    assert driver._batch_end(due, 1) == 7
+    driver._wait_for_tick(1)
+    due = driver.list_due_tasks(1, 0)
+    assert driver._find_batch_end(due, 1) == 7
     driver.snapshot = lambda tick: 4
-    driver._begins(1)
-    assert driver._batch_end(due, 1) == 4
+    driver._wait_for_tick(1)
+    assert driver._find_batch_end(due, 1) == 4
     driver.snapshot = lambda tick: tick
-    driver._begins(1)
-    assert driver._batch_end(due, 1) == 2
+    driver._wait_for_tick(1)
+    assert driver._find_batch_end(due, 1) == 2
 
 
 def test_a_planner_several_tasks_and_one_that_is_stopped_get_one_tick_each(
@@ -276,22 +276,22 @@ def test_a_planner_several_tasks_and_one_that_is_stopped_get_one_tick_each(
     segment = make_bus(task("fast", slot=2), task("also", every=2, slot=3), planner)
     driver = LockstepDriver(segment, lambda tick: None, False, HISTORY)
     driver.controller = Idle()
-    driver._begins(0)
-    assert driver._batch_end(driver.due(2, 1), 2) == 3
-    assert driver._batch_end([], 1) == 2
+    driver._wait_for_tick(0)
+    assert driver._find_batch_end(driver.list_due_tasks(2, 1), 2) == 3
+    assert driver._find_batch_end([], 1) == 2
     fast, also, thinking = driver.tasks
-    assert [driver._batch_end([one], 2) for one in (fast, also, thinking)] == [3, 3, 3]
+    assert [driver._find_batch_end([one], 2) for one in (fast, also, thinking)] == [3, 3, 3]
     also.deadline = thinking.deadline = 20
-    assert driver._batch_end([fast], 1) == 1 + BATCH
+    assert driver._find_batch_end([fast], 1) == 1 + MAX_BATCH_TICKS
     fast.deadline = 20
-    assert [driver._batch_end([one], 1) for one in (also, thinking)] == [2, 2]
+    assert [driver._find_batch_end([one], 1) for one in (also, thinking)] == [2, 2]
     fast.is_stopped = True
-    assert driver._batch_end([fast], 1) == 2
+    assert driver._find_batch_end([fast], 1) == 2
 
 
 def test_a_restarted_clock_waits_for_the_batch_of_its_predecessor(make_bus: MakeBus) -> None:
     segment = make_bus(task("fast"))
-    words, block = segment.words, segment.block("fast")
+    words, block = segment.words, segment.get_block("fast")
     words[System.LOCKSTEP] = 1
     words[System.STATE] = Run.RUNNING
     words[System.TICK] = 3
@@ -307,6 +307,6 @@ def test_a_restarted_clock_waits_for_the_batch_of_its_predecessor(make_bus: Make
     driver = LockstepDriver(segment, ended, False, HISTORY)
     with in_thread(driver.run):
         block[Block.DONE] = 6
-        done_semaphore(segment, "fast").release()
+        get_done_semaphore(segment, "fast").release()
     assert asked
     assert set(asked) == {6}

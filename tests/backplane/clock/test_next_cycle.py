@@ -15,8 +15,8 @@ from rack.backplane.clock.driver import RealtimeDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.layout import Wake
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import wake_semaphore
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.semaphores import get_wake_semaphore
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.backplane.words import Block, Run, System
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
@@ -46,8 +46,8 @@ def start_grid(segment: Segment, passed_ns: int = 0, period_ns: int = PERIOD_NS)
 
 
 def release(segment: Segment, tick: int) -> None:
-    segment.block("level")[Block.RELEASED] = tick
-    wake_semaphore(segment, "level").release()
+    segment.get_block("level")[Block.RELEASED] = tick
+    get_wake_semaphore(segment, "level").release()
 
 
 def test_a_task_with_a_phase_waits_for_its_own_ticks(make_bus: MakeBus) -> None:
@@ -58,11 +58,11 @@ def test_a_task_with_a_phase_waits_for_its_own_ticks(make_bus: MakeBus) -> None:
         seen.append((cycle.wait(), cycle.skipped))
     assert seen == [(3, 0), (7, 0), (19, 2)]
     # A new process takes the next release on the same grid, and a plan ends on it.
-    bus.block("level")[Block.DONE] = 19
+    bus.get_block("level")[Block.DONE] = 19
     cycle = NextCycle(bus, "level")
     release(bus, 23)
     assert (cycle.wait(), cycle.skipped) == (23, 0)
-    cycle.hold_until(32)
+    cycle.skip_until(32)
     release(bus, 35)
     assert (cycle.wait(), cycle.skipped) == (35, 0)
 
@@ -92,7 +92,7 @@ def test_a_busy_planner_takes_no_release_and_skips_none(
     cycle = NextCycle(bus, "level")
     release(bus, 0)
     cycle.wait()
-    cycle.hold_until(12)
+    cycle.skip_until(12)
     for tick in releases:
         release(bus, tick)
     assert (cycle.wait(), cycle.skipped) == (releases[-1], skipped)
@@ -121,7 +121,7 @@ def test_a_restarted_task_waits_for_the_next_release_and_has_skipped_those_witho
     bus: Segment, done: int, skipped: int
 ) -> None:
     release(bus, 8)
-    bus.block("level")[Block.DONE] = done
+    bus.get_block("level")[Block.DONE] = done
     cycle = NextCycle(bus, "level")
     release(bus, 12)
     assert (cycle.wait(), cycle.skipped) == (12, skipped)
@@ -135,7 +135,7 @@ def test_the_end_of_the_run_ends_a_wait(bus: Segment) -> None:
     )
     thread.start()
     bus.words[System.STATE] = Run.STOPPED
-    wake_semaphore(bus, "level").release()
+    get_wake_semaphore(bus, "level").release()
     thread.join(BOUND_S)
     assert found == [-1, None]
 
@@ -143,7 +143,7 @@ def test_the_end_of_the_run_ends_a_wait(bus: Segment) -> None:
 @pytest.mark.slow
 @WAKES
 def test_the_launchers_end_ends_a_wait(bus: Segment) -> None:
-    bus.release()
+    bus.release_launcher_lock()
     assert NextCycle(bus, "level").wait() is None
 
 
@@ -154,7 +154,7 @@ def busy() -> None:
 
 def publish(segment: Segment, tick: int) -> None:
     """Release the task as a clock does that is in time: without a post."""
-    segment.block("level")[Block.RELEASED] = tick
+    segment.get_block("level")[Block.RELEASED] = tick
 
 
 TIMER = pytest.mark.parametrize("wake", ["timer"], indirect=True)
@@ -236,7 +236,7 @@ def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: S
     bus.words[System.LOCKSTEP] = 1
     # A grid in the far future: it does not count, for a task that sleeps neither.
     start_grid(bus, -1_000 * EVERY * PERIOD_NS)
-    block = bus.block("level")
+    block = bus.get_block("level")
     cycle = NextCycle(bus, "level")
     release(bus, 0)
     seen = [(cycle.wait(), cycle.skipped)]
@@ -248,7 +248,7 @@ def test_releases_given_at_once_in_lockstep_are_taken_one_after_the_other(bus: S
     block[Block.FIRST] = 24
     release(bus, 28)
     assert [(cycle.wait(), cycle.skipped) for _ in range(2)] == [(24, 2), (28, 0)]
-    assert wake_semaphore(bus, "level").value == 0
+    assert get_wake_semaphore(bus, "level").value == 0
 
 
 @pytest.mark.filterwarnings(FORKS)
@@ -257,7 +257,7 @@ def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
     start_grid(bus)
     cycle, ring = (
         NextCycle(bus, "level", clock_alarms=AlarmWriter(bus, "level")),
-        alarm_ring(bus, "level"),
+        open_alarm_ring(bus, "level"),
     )
     release(bus, 0)
     cycle.wait()
@@ -266,6 +266,6 @@ def test_a_clock_that_stops_again_is_reported_again(bus: Segment) -> None:
         bus.words[System.CLOCK_PID] = pid
         for tick in (4, 8):
             with in_thread(cycle.wait):
-                wait_until(lambda: ring.waiting > 0)
-                assert Alarm(ring.drain().rows["code"][0]) is Alarm.CLOCK_STOPPED
+                wait_until(lambda: ring.waiting_count > 0)
+                assert Alarm(ring.read_new_rows().rows["code"][0]) is Alarm.CLOCK_STOPPED
                 release(bus, tick)

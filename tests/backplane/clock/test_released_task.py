@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from rack.backplane.clock.released_task import ReleasedTask, by_priority
+from rack.backplane.clock.released_task import ReleasedTask, sort_by_priority
 from rack.backplane.layout import TaskSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, TaskState
@@ -82,19 +82,19 @@ def test_a_tick_waits_for_a_task_with_this_deadline(released: ReleasedTask) -> N
 def test_a_lost_task_stays_lost_until_it_has_rejoined(released: ReleasedTask) -> None:
     released.release(5)
     assert released.lost_tick == -1
-    released.lose(7)
+    released.mark_lost(7)
     block = released.block
     assert (released.lost_tick, block[Block.STATE]) == (7, TaskState.ABSENT)
-    assert not released.is_free(9)
+    assert not released.can_take_release(9)
     assert released.is_settled()
     released.missed = 3
     released.is_stopped = True
-    released.rejoin()
+    released.admit_new_process()
     assert (released.lost_tick, released.missed, released.is_stopped) == (-1, 0, False)
     assert (block[Block.DONE], block[Block.DEADLINE]) == (5, 0)
     # It is free from its deadline on.
     block[Block.DEADLINE] = 9
-    assert [released.is_free(tick) for tick in (8, 9)] == [False, True]
+    assert [released.can_take_release(tick) for tick in (8, 9)] == [False, True]
 
 
 @pytest.mark.parametrize("state", TaskState)
@@ -111,7 +111,7 @@ def test_executors_come_first_then_the_faster_then_the_earlier() -> None:
     late = replace(task("late", every=2), phase=1)
     slow = task("slow", every=8)
     fast = task("fast", every=2)
-    found = by_priority(layout("r", (), [planner, slow, late, fast]))
+    found = sort_by_priority(layout("r", (), [planner, slow, late, fast]))
     assert [spec.name for spec in found] == ["fast", "late", "slow", "plan"]
 
 
@@ -125,9 +125,9 @@ def test_several_releases_at_once_have_the_deadline_of_the_last(released: Releas
 
 def test_the_next_event_of_a_task_is_its_deadline_or_its_release(released: ReleasedTask) -> None:
     released.release(5)
-    assert released.next_event(6) == 9
+    assert released.find_next_event(6) == 9
     # Its plan is due later, or it is not released any more.
     released.deadline = 21
-    assert released.next_event(6) == 21
+    assert released.find_next_event(6) == 21
     released.deadline = 0
-    assert [released.next_event(tick) for tick in (4, 5, 8)] == [5, 9, 9]
+    assert [released.find_next_event(tick) for tick in (4, 5, 8)] == [5, 9, 9]

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import pytest
 
 from rack.backplane.clock import wake
-from rack.backplane.clock.wake import CLOCK_TICKS, SilentClock
+from rack.backplane.clock.wake import CLOCK_PATIENCE_TICKS, SilentClock
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.backplane.words import Run, System
 from tests.backplane.conftest import MakeBus
 
@@ -35,9 +35,9 @@ class Silence:
         """What happens while the state of the clock's process is looked up."""
         for module in ("wake", "system_clock"):
             monkeypatch.setattr(f"rack.backplane.clock.{module}.monotonic_ns", lambda: self.now_ns)
-        monkeypatch.setattr(wake, "state_of", self._state_of)
+        monkeypatch.setattr(wake, "read_state", self._state_of)
         self.clock = SilentClock(segment, AlarmWriter(segment, "reader"))
-        self._ring = alarm_ring(segment, "reader")
+        self._ring = open_alarm_ring(segment, "reader")
 
     def _state_of(self, pid: int) -> str:
         assert pid == CLOCK_PID
@@ -53,7 +53,7 @@ class Silence:
         self.now_ns = EPOCH_NS + now * PERIOD_NS
         self.clock.check()
         names = ["tick", "code", "subject", "value", "since"]
-        return [row.tolist() for row in self._ring.drain().rows[names]]
+        return [row.tolist() for row in self._ring.read_new_rows().rows[names]]
 
 
 @pytest.fixture
@@ -62,11 +62,11 @@ def watched(make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch) -> Silence:
 
 
 def test_a_task_waits_until_the_clock_is_checked_then_two_ticks_each_time(watched: Silence) -> None:
-    due = EPOCH_NS + (10 + CLOCK_TICKS) * PERIOD_NS
+    due = EPOCH_NS + (10 + CLOCK_PATIENCE_TICKS) * PERIOD_NS
     patience = []
     for early in (PERIOD_NS, 1, 0, -1):
         watched.now_ns = due - early
-        patience.append(watched.clock.patience_ns(10))
+        patience.append(watched.clock.compute_patience_ns(10))
     assert patience == [PERIOD_NS, 1, 2 * PERIOD_NS, 2 * PERIOD_NS]
 
 
@@ -83,7 +83,7 @@ def test_a_silence_is_reported_once_and_the_next_one_again(watched: Silence) -> 
     watched.tick(7)
     assert [len(watched.check(now)) for now in (9, 10, 40)] == [1, 0, 0]
     watched.tick(40)
-    watched.clock.has_ticked()
+    watched.clock.end_silence()
     assert [len(watched.check(now)) for now in (42, 43)] == [1, 0]
     # The clock has caught up, as a check sees it.
     watched.tick(43)

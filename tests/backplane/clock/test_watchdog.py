@@ -8,10 +8,10 @@ import time
 
 import pytest
 
-from rack.backplane.clock.released_task import LEAST_NS, RELEASES_MISSED, ReleasedTask, Watchdog
-from rack.backplane.process import state_of
+from rack.backplane.clock.released_task import MIN_HANG_NS, RELEASES_MISSED, ReleasedTask, Watchdog
+from rack.backplane.process import read_state
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.backplane.words import Block, TaskState
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, forked, wait_until
@@ -19,15 +19,15 @@ from tests.processes import FORKS, forked, wait_until
 PERIOD_NS = 2_500_000
 
 
-class Watched:
+class MailboxWatcher:
     """A task played by the test, and the watchdog's alarms."""
 
     def __init__(self, segment: Segment, pid: int) -> None:
-        self.task = ReleasedTask(segment, segment.layout.task("writer"))
+        self.task = ReleasedTask(segment, segment.layout.find_task("writer"))
         self.task.block[Block.PID] = pid
         self.task.block[Block.STATE] = TaskState.RUNNING
         self._watchdog = Watchdog(AlarmWriter(segment, "clock"), PERIOD_NS)
-        self._ring = alarm_ring(segment, "clock")
+        self._ring = open_alarm_ring(segment, "clock")
         self.tick = -1
 
     def release(self, answered: bool) -> list[Alarm]:
@@ -38,7 +38,7 @@ class Watched:
         self.task.release(self.tick)
         if self.task.missed:
             self._watchdog.check(self.task, self.tick)
-        return [Alarm(code) for code in self._ring.drain().rows["code"]]
+        return [Alarm(code) for code in self._ring.read_new_rows().rows["code"]]
 
     @property
     def losses(self) -> int:
@@ -47,7 +47,7 @@ class Watched:
 
 
 def test_a_late_cycle_counts_as_one_miss(make_bus: MakeBus) -> None:
-    watched = Watched(make_bus(), os.getpid())
+    watched = MailboxWatcher(make_bus(), os.getpid())
     watched.release(True)
     assert [watched.release(True) for _ in range(5)] == [[]] * 5
     rung = [watched.release(answered) for answered in (False, False, True, True, False)]
@@ -55,7 +55,7 @@ def test_a_late_cycle_counts_as_one_miss(make_bus: MakeBus) -> None:
 
 
 def test_a_process_that_could_run_is_starved_and_not_lost(make_bus: MakeBus) -> None:
-    watched = Watched(make_bus(), os.getpid())
+    watched = MailboxWatcher(make_bus(), os.getpid())
     watched.release(True)
     rung = [watched.release(False) for _ in range(3 * RELEASES_MISSED)]
     assert [alarms for alarms in rung if alarms] == [[Alarm.LATE], [Alarm.STARVED]]
@@ -63,10 +63,10 @@ def test_a_process_that_could_run_is_starved_and_not_lost(make_bus: MakeBus) -> 
     assert (watched.losses, watched.task.lost_tick) == (0, -1)
 
 
-def silent(watched: Watched) -> list[Alarm]:
+def silent(watched: MailboxWatcher) -> list[Alarm]:
     """Release a task for longer than any may be silent; return the alarms of the next release."""
     watched.release(True)
-    assert not any(Alarm.HANG in watched.release(False) for _ in range(LEAST_NS // PERIOD_NS))
+    assert not any(Alarm.HANG in watched.release(False) for _ in range(MIN_HANG_NS // PERIOD_NS))
     return watched.release(False)
 
 
@@ -80,15 +80,15 @@ def burn(seconds: float) -> None:
 def test_a_process_that_waits_for_something_else_is_lost_in_the_end(make_bus: MakeBus) -> None:
     segment = make_bus()
     with forked(lambda: time.sleep(60)) as pid:
-        wait_until(lambda: state_of(pid) == "S")
-        watched = Watched(segment, pid)
+        wait_until(lambda: read_state(pid) == "S")
+        watched = MailboxWatcher(segment, pid)
         assert silent(watched) == [Alarm.HANG]
     assert watched.task.lost_tick == watched.tick
 
 
 def test_a_process_that_gets_no_processor_time_is_never_lost(make_bus: MakeBus) -> None:
     # This process runs, and its releases go by faster than it could use the time.
-    assert silent(Watched(make_bus(), os.getpid())) == []
+    assert silent(MailboxWatcher(make_bus(), os.getpid())) == []
 
 
 def test_a_process_that_computes_and_never_ends_its_cycle_is_lost_in_the_end(
@@ -97,7 +97,7 @@ def test_a_process_that_computes_and_never_ends_its_cycle_is_lost_in_the_end(
     monkeypatch.setattr(
         "rack.backplane.clock.released_task.LEAST_NS", 4 * RELEASES_MISSED * PERIOD_NS
     )
-    watched = Watched(make_bus(), os.getpid())
+    watched = MailboxWatcher(make_bus(), os.getpid())
     watched.release(True)
     rung = [watched.release(False) for _ in range(5 * RELEASES_MISSED)]
     assert not any(Alarm.HANG in alarms for alarms in rung)
@@ -109,21 +109,21 @@ def test_a_process_that_computes_and_never_ends_its_cycle_is_lost_in_the_end(
 def test_a_stopped_process_is_lost_after_four_releases(make_bus: MakeBus) -> None:
     segment = make_bus()
     with forked(lambda: time.sleep(60)) as pid:
-        watched = Watched(segment, pid)
+        watched = MailboxWatcher(segment, pid)
         watched.release(True)
         os.kill(pid, signal.SIGSTOP)
-        wait_until(lambda: state_of(pid) == "T")
+        wait_until(lambda: read_state(pid) == "T")
         rung = [watched.release(False) for _ in range(RELEASES_MISSED)]
     assert rung == [[Alarm.LATE], [], [], [Alarm.HANG]]
     assert watched.losses == 1
-    assert not watched.task.is_free(watched.tick + 1)
+    assert not watched.task.can_take_release(watched.tick + 1)
 
 
 def test_a_task_that_finishes_every_cycle_too_late_is_late_and_not_lost(make_bus: MakeBus) -> None:
-    watched = Watched(make_bus(), os.getpid())
+    watched = MailboxWatcher(make_bus(), os.getpid())
     watched.release(True)
     rung = []
-    for tick in range(1, 20 * LEAST_NS // PERIOD_NS):
+    for tick in range(1, 20 * MIN_HANG_NS // PERIOD_NS):
         rung += watched.release(False)
         # It finishes the release before this one meanwhile.
         watched.task.block[Block.DONE] = tick - 1

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from rack.backplane.mailbox.history import chains, digest
+from rack.backplane.mailbox.history import compute_digest, find_chains
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.faults.message_steps import forge
+from rack.boards.faults.message_steps import forge_message
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
 from tests.processes import FORKS, exit_status, fork
@@ -35,7 +35,7 @@ def write(segment: Segment, name: str, values: list[int]) -> None:
 def test_equal_messages_have_equal_chains_whenever_they_were_written(bus: Segment) -> None:
     write(bus, NAME, [1, 2, 3])
     write(bus, OTHER, [1, 2, 3])
-    found = chains(bus, 100)
+    found = find_chains(bus, 100)
     assert found[NAME] == found[OTHER]
     assert found[NAME][0] == 3
 
@@ -44,42 +44,42 @@ def test_equal_messages_have_equal_chains_whenever_they_were_written(bus: Segmen
 def test_any_difference_changes_the_digest(bus: Segment, values: list[int]) -> None:
     write(bus, NAME, [1, 2, 3])
     write(bus, OTHER, values)
-    found = chains(bus, 100)
+    found = find_chains(bus, 100)
     assert found[NAME][1] != found[OTHER][1]
 
 
 def test_messages_visible_after_the_last_tick_do_not_count(bus: Segment) -> None:
     write(bus, NAME, [1, 2, 3])
-    assert [chains(bus, until)[NAME][0] for until in (2, 3, 4, 5, 6, 7)] == [0, 1, 1, 2, 2, 3]
-    before = digest(bus, 7), digest(bus, 9)
+    assert [find_chains(bus, until)[NAME][0] for until in (2, 3, 4, 5, 6, 7)] == [0, 1, 1, 2, 2, 3]
+    before = compute_digest(bus, 7), compute_digest(bus, 9)
     open_writer(bus, NAME).write(6)
-    assert digest(bus, 7) == before[0]
-    assert digest(bus, 9) != before[1]
+    assert compute_digest(bus, 7) == before[0]
+    assert compute_digest(bus, 9) != before[1]
     # It goes as far as the run.
     bus.words[System.STOP_TICK] = 4
-    assert digest(bus) == digest(bus, 4) != digest(bus, 7)
+    assert compute_digest(bus) == compute_digest(bus, 4) != compute_digest(bus, 7)
 
 
 def test_the_chain_covers_overwritten_messages(bus: Segment) -> None:
     write(bus, NAME, list(range(500)))
     write(bus, OTHER, [-1, *range(1, 500)])
-    found = chains(bus, 5000)
+    found = find_chains(bus, 5000)
     assert found[NAME][0] == found[OTHER][0] == 500
     assert found[NAME][1] != found[OTHER][1]
     # Where no message is left there is no chain.
-    assert chains(bus, 3)[NAME][1] == 0
+    assert find_chains(bus, 3)[NAME][1] == 0
 
 
 def test_the_chain_of_a_damaged_message_is_replaced_by_the_one_before_it(bus: Segment) -> None:
     write(bus, NAME, list(range(500)))
-    before = chains(bus, 999)[NAME]
+    before = find_chains(bus, 999)[NAME]
     bus.bytes[message_address(bus, 500)] ^= 1
-    assert chains(bus, 5000)[NAME] == before == (499, before[1])
+    assert find_chains(bus, 5000)[NAME] == before == (499, before[1])
     assert before[1] != bytes(8)
 
 
 def test_a_forged_message_is_no_part_of_the_run(bus: Segment) -> None:
     write(bus, NAME, [1, 2, 3])
-    before = chains(bus, 100)[NAME]
-    assert exit_status(fork(lambda: forge(bus, NAME, 6))) == 0
-    assert chains(bus, 100)[NAME] == before
+    before = find_chains(bus, 100)[NAME]
+    assert exit_status(fork(lambda: forge_message(bus, NAME, 6))) == 0
+    assert find_chains(bus, 100)[NAME] == before

@@ -9,7 +9,7 @@ from rack.backplane.mailbox.host_ring import HostReader, HostWriter, is_proper
 from rack.backplane.message import AnyMessage
 from rack.backplane.message_type import Field, MessageType
 from rack.backplane.segment import Segment
-from rack.boards.config.layout import field_specs
+from rack.boards.config.layout import build_field_specs
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
 from tests.boards.host_programs import Number
@@ -25,14 +25,14 @@ def segment(make_bus: MakeBus) -> Segment:
 
 def send(writer: HostWriter, number: int) -> bool:
     writer.message.id = number
-    return writer.send(tick=number)
+    return writer.send_message(tick=number)
 
 
 def taken(reader: HostReader) -> list[int | None]:
     """Take all that waits; None stands for a message refused."""
     found = []
-    while reader.waiting:
-        message = reader.take()
+    while reader.waiting_count:
+        message = reader.take_oldest()
         found.append(None if message is None else int(message.id))
     return found
 
@@ -40,10 +40,15 @@ def taken(reader: HostReader) -> list[int | None]:
 def test_messages_come_once_and_in_order(segment: Segment) -> None:
     writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
     assert [send(writer, number) for number in (1, 2, 3)] == [True] * 3
-    assert (reader.waiting, taken(reader), reader.waiting, reader.written) == (3, [1, 2, 3], 0, 3)
+    assert (reader.waiting_count, taken(reader), reader.waiting_count, reader.written_tick) == (
+        3,
+        [1, 2, 3],
+        0,
+        3,
+    )
     for number in (4, 5, 6):
         send(writer, number)
-    reader.take()
+    reader.take_oldest()
     # A restarted reader goes on where the first one was.
     assert taken(HostReader(segment, NAME)) == [5, 6]
 
@@ -52,8 +57,8 @@ def test_a_full_ring_refuses_messages_and_keeps_the_waiting_ones(segment: Segmen
     writer, reader = HostWriter(segment, NAME), HostReader(segment, NAME)
     sent = [send(writer, number) for number in range(1, 9)]
     assert sent == [True] * CAPACITY + [False] * 3
-    assert (reader.full, reader.waiting) == (3, CAPACITY)
-    reader.take()
+    assert (reader.full_count, reader.waiting_count) == (3, CAPACITY)
+    reader.take_oldest()
     assert send(writer, 9)
     assert taken(reader) == [2, 3, 4, 5, 9]
 
@@ -64,7 +69,7 @@ def test_the_newest_message_supersedes_the_others(segment: Segment) -> None:
         send(writer, number)
     message = reader.take_newest(most=8)
     assert message is not None
-    assert (message.id, reader.superseded, reader.waiting) == (3, 2, 0)
+    assert (message.id, reader.superseded, reader.waiting_count) == (3, 2, 0)
     assert reader.take_newest(most=8) is None
 
 
@@ -89,7 +94,7 @@ def test_messages_overwritten_by_an_unbounded_writer_are_counted(
 
 
 def test_undeclared_lengths_and_non_ascii_texts_are_improper_but_empty_groups_are_not() -> None:
-    fields, message = field_specs(Number.message_type, {}), Number.zeros({})
+    fields, message = build_field_specs(Number.message_type, {}), Number.zeros({})
     for value, colour, permitted in ((0.0, 0, True), (0.0, 2, False), (np.nan, 1, False)):
         message.value, message.colour = value, colour
         assert is_proper(message.record, fields) is permitted
@@ -100,7 +105,7 @@ def test_undeclared_lengths_and_non_ascii_texts_are_improper_but_empty_groups_ar
         1,
         (Field("ones", one, "1", "them", (3,)), Field("far", "f4", "m", "", (), (0.0, 5.0))),
     )
-    fields, message = field_specs(kind, {}), AnyMessage(kind.dtype({}))
+    fields, message = build_field_specs(kind, {}), AnyMessage(kind.build_dtype({}))
     assert is_proper(message.record, fields)
     for far, permitted in ((5.0, True), (-5.0, True), (5.1, False), (-5.1, False), (0.0, True)):
         message.far = far

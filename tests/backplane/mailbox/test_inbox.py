@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rack.backplane.mailbox.inbox import Inbox, InterruptSource, burst_of
+from rack.backplane.mailbox.inbox import Inbox, InterruptSource, compute_burst
 
 ARRIVALS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 30)), max_size=60)
 """Pauses before messages, and their services."""
@@ -16,9 +16,9 @@ ARRIVALS = st.lists(st.tuples(st.integers(0, 40), st.integers(0, 30)), max_size=
 
 def test_a_message_for_a_full_inbox_is_lost_and_takes_no_service_time() -> None:
     inbox = Inbox(2)
-    assert [inbox.arrive(0, 60) for _ in range(4)] == [60, 120, 180, None]
+    assert [inbox.add_message(0, 60) for _ in range(4)] == [60, 120, 180, None]
     # At 60 the first is done: a place to wait is free again.
-    assert [inbox.arrive(59, 60), inbox.arrive(60, 60)] == [None, 240]
+    assert [inbox.add_message(59, 60), inbox.add_message(60, 60)] == [None, 240]
     assert (inbox.lost, inbox.most_waiting) == (2, 2)
 
 
@@ -30,7 +30,7 @@ def test_no_two_services_overlap_and_no_more_wait_than_permitted(
     for pause, service in pauses:
         at += pause
         waiting = sum(end - took > at for _, end, took in served)
-        end = inbox.arrive(at, service)
+        end = inbox.add_message(at, service)
         assert (end is None) == (waiting >= depth)
         if end is not None:
             served.append((at, end, service))
@@ -41,22 +41,22 @@ def test_no_two_services_overlap_and_no_more_wait_than_permitted(
 
 
 def test_a_burst_of_all_senders_waits_for_each_other() -> None:
-    burst = burst_of([InterruptSource(2_500, 60)] * 5)
+    burst = compute_burst([InterruptSource(2_500, 60)] * 5)
     assert (burst.waiting, burst.longest_ns) == (4, 300)
     assert burst.load == pytest.approx(0.12)
-    assert burst.fits(4)
-    assert not burst.fits(3)
+    assert burst.fits_depth(4)
+    assert not burst.fits_depth(3)
 
 
 def test_a_burst_includes_messages_that_arrive_during_its_service() -> None:
     # From 0: 300 of service, during which the fast source comes twice more.
-    burst = burst_of([InterruptSource(100, 10), InterruptSource(1_000, 250)])
+    burst = compute_burst([InterruptSource(100, 10), InterruptSource(1_000, 250)])
     assert burst.longest_ns == 260
     assert burst.waiting == 2
 
 
 @pytest.mark.parametrize("service", [500, 600])
 def test_a_handler_that_is_never_idle_fills_every_inbox(service: int) -> None:
-    burst = burst_of([InterruptSource(2_500, service)] * 5)
+    burst = compute_burst([InterruptSource(2_500, service)] * 5)
     assert burst.waiting is burst.longest_ns is None
-    assert not burst.fits(1_000_000)
+    assert not burst.fits_depth(1_000_000)

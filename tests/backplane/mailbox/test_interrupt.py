@@ -108,7 +108,13 @@ def test_a_message_written_in_the_tick_in_which_it_is_due_is_late(make_bus: Make
         False,
         False,
     ]
-    assert [writer.visible_at(8, now) for now in (None, 8, 10, 11, 12)] == [11, 11, 11, 12, 13]
+    assert [writer.compute_visible_tick(8, now) for now in (None, 8, 10, 11, 12)] == [
+        11,
+        11,
+        11,
+        12,
+        13,
+    ]
 
 
 def test_a_message_served_across_a_release_is_visible_at_the_next(make_bus: MakeBus) -> None:
@@ -166,10 +172,10 @@ def test_a_lost_message_raises_no_interrupt_and_a_damaged_one_does(make_bus: Mak
     board = Board(make_bus(*boxes(), *tasks()))
     board.send(0, "first")
     writer = board.writers["first"]
-    writer.lose()
+    writer.lose_message()
     assert board.read(1) == {"first": 0}
     assert (board.readers["first"].found, board.inbox.count) == (2, 1)
-    writer.publish(2, 3, 2, damage=(5,))
+    writer.publish_message(2, 3, 2, damage=(5,))
     assert board.read(3) == {}
     assert board.inbox.count == 2
     assert board.readers["first"].statistics.corrupt == 1

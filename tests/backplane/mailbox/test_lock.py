@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.mailbox.mailbox import Verdict
 from rack.backplane.mailbox.protocols import MailboxLock, open_reader, open_writer
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import lock_semaphore
+from rack.backplane.semaphores import get_lock_semaphore
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, fork, forked, kill, wait_until
@@ -154,12 +154,12 @@ def test_a_holder_killed_anywhere_does_not_keep_the_lock(bus: Segment, bystander
 def test_a_holder_overtaken_between_its_two_steps_is_not_the_owner(bus: Segment) -> None:
     slow, quick = MailboxLock(bus, NAME), MailboxLock(bus, NAME)
     # The slow one has passed the semaphore, and is preempted before it owns the lock.
-    lock_semaphore(bus, NAME).acquire(0)
+    get_lock_semaphore(bus, NAME).acquire(0)
     assert quick.acquire()
     assert not slow._owner.take()
     # Nor does a semaphore posted once too often let a second one in.
-    lock_semaphore(bus, NAME).release()
+    get_lock_semaphore(bus, NAME).release()
     assert not slow.acquire()
     quick.release()
-    assert lock_semaphore(bus, NAME).value == 1
+    assert get_lock_semaphore(bus, NAME).value == 1
     assert slow.acquire()

@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.mailbox import Reader, Verdict, Writer
 from rack.backplane.mailbox.protocols import open_reader, open_writer
-from rack.backplane.mailbox.slots import Slots, claim, epoch_of
+from rack.backplane.mailbox.slots import Slots, build_signature, get_epoch
 from rack.backplane.segment import Segment
 from tests.backplane.bus import NAME, mailbox, message_address
 from tests.backplane.conftest import MakeBus
@@ -39,7 +39,7 @@ def seen(reader: Reader, tick: int) -> tuple[int, Verdict]:
 def test_a_message_becomes_visible_at_the_end_of_its_slice(make_bus: MakeBus) -> None:
     writer, reader = ends(make_bus(mailbox(every=4, delay=8)))
     assert seen(reader, 100) == (0, NONE)
-    assert not reader.read(100).is_there
+    assert not reader.read(100).has_message
     assert write(writer, 4, now=6)
     assert [seen(reader, tick) for tick in (6, 11)] == [(0, NONE), (0, NONE)]
     assert [seen(reader, tick) for tick in (12, 13)] == [(1, NEW), (1, OLD)]
@@ -135,7 +135,7 @@ def test_earlier_messages_are_returned_while_they_are_in_their_slots(
         write(writer, tick)
     oldest = 100 - depth + 1
     assert seen(reader, oldest - 1) == (0, NONE)
-    assert not reader.read(oldest - 1).is_there
+    assert not reader.read(oldest - 1).has_message
     assert reader.statistics.bus_errors == 2
     assert seen(reader, oldest) == (oldest, NEW)
 
@@ -166,8 +166,8 @@ def test_a_forged_message_is_counted_with_the_process_that_it_names(make_bus: Ma
     write(writer, 0)
     assert seen(reader, 1) == (1, NEW)
     forger = Slots(segment, writer.spec)
-    forger.resume(claim(epoch_of(writer.slots.signature), 4321))
-    forger.publish(1, 2, 1)
+    forger.resume_writing(build_signature(get_epoch(writer.slots.signature), 4321))
+    forger.publish_message(1, 2, 1)
     assert seen(reader, 2) == (1, OLD)
     statistics = reader.statistics
     assert (statistics.forged, statistics.forger) == (1, 4321)

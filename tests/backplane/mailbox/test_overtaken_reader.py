@@ -83,7 +83,7 @@ class Overtaken:
 
     def __init__(self, rack: Link) -> None:
         self.rack, self.tick = rack, 0
-        self._slots = Slots(rack.segment, rack.segment.layout.mailbox(NAME))
+        self._slots = Slots(rack.segment, rack.segment.layout.find_mailbox(NAME))
 
     def write(self, cycles: int) -> None:
         for _ in range(cycles):
@@ -110,7 +110,7 @@ class Overtaken:
     def _write_half(self) -> None:
         """Leave the writer in the middle of the copy of one more message into its slot."""
         serial = self._slots.box[0] + 1
-        self._slots.fetch(serial - 1)
+        self._slots.fetch_message(serial - 1)
         half = len(self._slots.record) // 2
         self._slots.places[serial % DEPTH][:half] = self._slots.record[:half]
 

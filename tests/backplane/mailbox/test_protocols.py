@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from xxhash import xxh3_64_intdigest
 
-from rack.backplane.layout import BY_TICKS, PROTOCOLS, Protocol
+from rack.backplane.layout import PROTOCOLS, TICK_PROTOCOLS, Protocol
 from rack.backplane.mailbox.mailbox import Reader, Verdict
 from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
-from rack.backplane.mailbox.slots import CHECKED_FROM, Slots, epoch_of
+from rack.backplane.mailbox.slots import CHECKED_FROM, Slots, get_epoch
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import lock_semaphore
+from rack.backplane.semaphores import get_lock_semaphore
 from tests.backplane.bus import NAME, mailbox
 from tests.backplane.conftest import MakeBus
 from tests.processes import BOUND_S, FORKS, fork, forked, kill, wait_until
@@ -61,10 +61,10 @@ def test_an_observer_reads_by_its_protocol_and_never_waits(
     writer, observer = open_writer(segment, NAME), open_observer(segment, NAME)
     writer.write(0)
     if protocol == "lock":
-        lock_semaphore(segment, NAME).acquire(0)
-    expected = Verdict.NONE if protocol in BY_TICKS else Verdict.NEW
+        get_lock_semaphore(segment, NAME).acquire(0)
+    expected = Verdict.NONE if protocol in TICK_PROTOCOLS else Verdict.NEW
     assert observer.read(0).verdict is expected
-    assert observer.read(4).is_there
+    assert observer.read(4).has_message
     assert observer.statistics.bus_errors == 0
 
 
@@ -84,9 +84,9 @@ def test_a_reader_never_gets_half_a_message(make_bus: MakeBus, protocol: Protoco
 
 def follows(slots: Slots, serial: int) -> bool:
     """Check whether a message's checksum is seeded with that of the message before it."""
-    assert slots.fetch(serial - 1)
+    assert slots.fetch_message(serial - 1)
     before = slots.chain
-    assert slots.fetch(serial)
+    assert slots.fetch_message(serial)
     return xxh3_64_intdigest(slots.record[CHECKED_FROM:], before) == slots.chain
 
 
@@ -96,14 +96,14 @@ def test_a_writer_killed_anywhere_leaves_its_last_whole_message(
     make_bus: MakeBus, protocol: Protocol
 ) -> None:
     segment = make_bus(mailbox(protocol, depth=4))
-    reader, slots = open_reader(segment, NAME), Slots(segment, segment.layout.mailbox(NAME))
+    reader, slots = open_reader(segment, NAME), Slots(segment, segment.layout.find_mailbox(NAME))
     rng, latest = random.Random(7), np.iinfo(np.int64).max
     for _ in range(KILLS):
         writer, known = fork(lambda: hammer(segment)), reader.serial
-        wait_until(lambda: reader.peek().is_there and reader.serial > known)  # noqa: B023  called before the next turn
+        wait_until(lambda: reader.peek().has_message and reader.serial > known)  # noqa: B023  called before the next turn
         time.sleep(rng.uniform(0.0, 0.002))
         kill(writer)
-        assert reader.read(latest).is_there
+        assert reader.read(latest).has_message
         assert reader.serial == slots.box[0]
         assert is_whole(reader)
         successor = open_writer(segment, NAME)
@@ -116,5 +116,5 @@ def test_a_writer_killed_anywhere_leaves_its_last_whole_message(
         assert reader.read(latest).is_new
     # A fast writer may overtake a reader: a bus error. It never shows a damaged message.
     assert reader.statistics.corrupt == 0
-    assert slots.fetch(reader.serial)
-    assert epoch_of(slots.signature) == 2 * KILLS
+    assert slots.fetch_message(reader.serial)
+    assert get_epoch(slots.signature) == 2 * KILLS

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, slot_stride
+from rack.backplane.address_map import MAILBOX_HEAD_SIZE, SLOT_HEAD_SIZE, compute_slot_stride
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.protocols import open_observer, open_reader, open_writer
-from rack.backplane.mailbox.queue import QueueReader, QueueWriter, taken_name
+from rack.backplane.mailbox.queue import QueueReader, QueueWriter, get_position_mailbox
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot
 from tests.backplane.bus import NAME, message_address, queue
@@ -62,7 +62,8 @@ def test_reader_takes_no_more_than_it_has_room_for(make_bus: MakeBus) -> None:
     writer, reader = ends(make_bus(*queue(8)))
     send(writer, 0, 1, 2, 3, 4)
     assert [
-        ids(reader.take(tick, most)) for tick, most in ((1, 0), (2, 1), (3, 2), (4, -1), (5, 9))
+        ids(reader.take_messages(tick, most))
+        for tick, most in ((1, 0), (2, 1), (3, 2), (4, -1), (5, 9))
     ] == [
         [],
         [1],
@@ -75,10 +76,10 @@ def test_reader_takes_no_more_than_it_has_room_for(make_bus: MakeBus) -> None:
 def test_a_full_queue_refuses_messages_and_keeps_the_unread_ones(make_bus: MakeBus) -> None:
     segment = make_bus(*queue(3))
     writer, reader = ends(segment)
-    assert writer.room() == 3
+    assert writer.count_free_places() == 3
     assert send(writer, 0, 1, 2) == [True, True]
     assert send(writer, 1, 3, 4) == [True, False]
-    assert (writer.room(), writer.refused) == (0, 1)
+    assert (writer.count_free_places(), writer.refused) == (0, 1)
     assert open_observer(segment, NAME).slots.box[Box.REFUSED] == 1
     assert ids(reader.read(2)) == [1, 2, 3]
     assert send(writer, 2, 5) == [False]
@@ -97,9 +98,9 @@ def test_messages_of_a_cycle_are_published_together_or_not_at_all(make_bus: Make
         for serial in (3, 4):
             writer.message.id, writer.message.row = serial, serial
             writer.send()
-        for _ in writer.outgoing():
+        for _ in writer.iterate_outgoing():
             # Killed before they are shown.
-            writer.publish(1, 2, 1)
+            writer.publish_message(1, 2, 1)
 
     assert exit_status(fork(die)) == 0
     writer, reader = ends(segment)
@@ -129,24 +130,24 @@ def test_an_observer_takes_no_message_from_a_queue(make_bus: MakeBus) -> None:
     assert ids(reader.read(1)) == [1, 2]
     send(writer, 1, 3, 4, 5)
     send(writer, 2, 6)
-    reader.take(2, 1)
+    reader.take_messages(2, 1)
     reader.close()
     # A restarted reader still has the last message taken as an old one.
     _, reader = writer.close(), open_reader(segment, NAME)
     assert isinstance(reader, QueueReader)
-    again = reader.take(3, 0)
+    again = reader.take_messages(3, 0)
     assert (again.verdict, again.message.id) == (Verdict.OLD, 3)
     # Its position counts the messages left.
-    position = open_observer(segment, taken_name(NAME)).peek().message
+    position = open_observer(segment, get_position_mailbox(NAME)).peek().message
     assert (position.taken, position.unread) == (3, 3)
 
 
 def test_a_lost_message_is_found_at_its_tick_even_without_a_later_one(make_bus: MakeBus) -> None:
     writer, reader = ends(make_bus(*queue(1, rates=(4, 1))))
-    writer.visible_at(0, None)
-    writer.lose()
-    writer.show()
-    assert writer.room() == 0
+    writer.compute_visible_tick(0, None)
+    writer.lose_message()
+    writer.show_published()
+    assert writer.count_free_places() == 0
     assert [reader.read(tick).is_new or reader.statistics.lost for tick in (0, 3, 4)] == [0, 0, 1]
     assert reader.taken == 1
     writer.taken = reader.taken
@@ -176,20 +177,24 @@ def take_three(segment: Segment) -> None:
     """Take messages 1 and 2 in one cycle and 3 in the next, as a reader that is then killed."""
     reader = open_reader(segment, NAME)
     assert isinstance(reader, QueueReader)
-    assert [ids(reader.take(1, 2)), ids(reader.take(2, 1))] == [[1, 2], [3]]
+    assert [ids(reader.take_messages(1, 2)), ids(reader.take_messages(2, 1))] == [[1, 2], [3]]
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 def bookkeeping(segment: Segment) -> Iterator[int]:
     """Yield the addresses of the heads of a queue, of its position, and of the slots in use of
     both."""
-    for name, serials in ((NAME, range(1, 6)), (taken_name(NAME), range(1, 3))):
+    for name, serials in ((NAME, range(1, 6)), (get_position_mailbox(NAME), range(1, 3))):
         start = segment.map.mailboxes[name]
         yield from range(start, start + MAILBOX_HEAD_SIZE)
         for serial in serials:
             message = message_address(segment, serial, name)
             # The position is part of its message.
-            size = SLOT_HEAD_SIZE if name == NAME else slot_stride(segment.layout.mailbox(name))
+            size = (
+                SLOT_HEAD_SIZE
+                if name == NAME
+                else compute_slot_stride(segment.layout.find_mailbox(name))
+            )
             yield from range(message - SLOT_HEAD_SIZE, message - SLOT_HEAD_SIZE + size)
 
 
@@ -210,7 +215,7 @@ def test_no_flipped_bit_lets_a_restarted_reader_take_a_message_twice(
         segment.bytes[address] ^= 1 << bit
         reader = open_reader(segment, NAME)
         assert isinstance(reader, QueueReader)
-        found = [*ids(reader.take(3, 1)), *ids(reader.read(4))]
+        found = [*ids(reader.take_messages(3, 1)), *ids(reader.read(4))]
         damaged, counted = f"bit {bit} at {address}", reader.statistics.bad_reads
         reader.close()
         assert found == [serial for serial in (4, 5) if serial in found], damaged

@@ -26,11 +26,11 @@ def bus(make_bus: MakeBus) -> Segment:
 
 
 def between(slots: Slots, before: int, newest: int) -> list[int]:
-    return [int(message.id) for message in slots.between(before, newest)]
+    return [int(message.id) for message in slots.iterate_between(before, newest)]
 
 
 def test_between_two_serials_each_good_message_is_copied(bus: Segment) -> None:
-    slots = Slots(bus, bus.layout.mailbox(NAME))
+    slots = Slots(bus, bus.layout.find_mailbox(NAME))
     assert between(slots, 1, 5) == [2, 3, 4]
     assert between(slots, 4, 5) == []
     bus.bytes[message_address(bus, 3)] ^= 1
@@ -44,9 +44,9 @@ def test_between_two_serials_each_good_message_is_copied(bus: Segment) -> None:
 
 
 def test_a_slot_that_is_used_again_is_not_kept(bus: Segment) -> None:
-    slots = Slots(bus, bus.layout.mailbox(NAME))
-    assert [slots.copy(serial) for serial in (1, 5)] == [True, True]
+    slots = Slots(bus, bus.layout.find_mailbox(NAME))
+    assert [slots.copy_slot(serial) for serial in (1, 5)] == [True, True]
     writer = open_writer(bus, NAME)
     for serial in range(6, 2 + DEPTH):
         writer.write(serial)
-    assert [slots.copy(serial) for serial in (1, 5)] == [False, True]
+    assert [slots.copy_slot(serial) for serial in (1, 5)] == [False, True]

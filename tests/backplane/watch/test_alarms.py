@@ -13,7 +13,7 @@ from rack.backplane.watch.alarms import (
     Alarm,
     AlarmWriter,
     Episodes,
-    alarm_ring,
+    open_alarm_ring,
 )
 from tests.backplane.bus import mailbox
 from tests.backplane.conftest import MakeBus
@@ -24,13 +24,13 @@ EVERY = 4
 
 def test_alarms_are_read_as_they_were_rung(make_bus: MakeBus) -> None:
     segment = make_bus()
-    writer, ring = AlarmWriter(segment, "writer"), alarm_ring(segment, "writer")
-    writer.ring(7, Alarm.GAP, 3, 2.0, since=5)
+    writer, ring = AlarmWriter(segment, "writer"), open_alarm_ring(segment, "writer")
+    writer.raise_alarm(7, Alarm.GAP, 3, 2.0, since=5)
     for other in ("clock", "reader"):
-        AlarmWriter(segment, other).ring(9, Alarm.LATE)
+        AlarmWriter(segment, other).raise_alarm(9, Alarm.LATE)
     # A restarted task continues its ring.
-    AlarmWriter(segment, "writer").ring(8, Alarm.STALE)
-    rows, lost = ring.drain()
+    AlarmWriter(segment, "writer").raise_alarm(8, Alarm.STALE)
+    rows, lost = ring.read_new_rows()
     assert not lost
     found = [tuple(rows[name].tolist()) for name in ("tick", "code", "subject", "value", "since")]
     assert found == [(7, 8), (Alarm.GAP, Alarm.STALE), (3, -1), (2.0, 0.0), (5, 8)]
@@ -42,7 +42,7 @@ def test_an_alarm_wakes_the_rack_and_a_miss_does_not(make_bus: MakeBus) -> None:
     try:
         writer = AlarmWriter(segment, "writer", attention)
         for code in Alarm:
-            writer.ring(0, code)
+            writer.raise_alarm(0, code)
         assert os.eventfd_read(attention) == len(Alarm) - len(MISSES)
     finally:
         os.close(attention)
@@ -53,14 +53,14 @@ def episodes(make_bus: MakeBus) -> tuple[Episodes, Ring]:
     """Episodes about the second of two mailboxes, and the ring of the task that finds them."""
     other, box = mailbox(name="writer.other"), mailbox(every=EVERY, delay=EVERY)
     segment = make_bus(other, box)
-    return Episodes(segment, box.name, AlarmWriter(segment, "reader")), alarm_ring(
+    return Episodes(segment, box.name, AlarmWriter(segment, "reader")), open_alarm_ring(
         segment, "reader"
     )
 
 
 def rung(ring: Ring) -> list[tuple[int, int, float, int]]:
     """Return code, tick, value and since of the alarms since the last call, all about mailbox 1."""
-    rows = ring.drain().rows
+    rows = ring.read_new_rows().rows
     assert set(rows["subject"].tolist()) <= {1}
     return [
         (row["code"], row["tick"], row["value"], row["since"])
@@ -72,9 +72,9 @@ def test_a_finding_that_lasts_raises_one_alarm_with_what_was_found(
     episodes: tuple[Episodes, Ring],
 ) -> None:
     found, ring = episodes
-    found.find(Alarm.STALE, 1, 10)
-    found.find(Alarm.STALE, 2, 11, 5.0, since=3)
-    found.find(Alarm.GAP, 2, 11, 5.0, since=3)
+    found.record_finding(Alarm.STALE, 1, 10)
+    found.record_finding(Alarm.STALE, 2, 11, 5.0, since=3)
+    found.record_finding(Alarm.GAP, 2, 11, 5.0, since=3)
     assert rung(ring) == [(Alarm.STALE, 10, 0.0, 10), (Alarm.GAP, 11, 5.0, 3)]
 
 
@@ -90,11 +90,11 @@ def test_an_episode_ends_after_both_enough_clean_accesses_and_cycles_of_the_writ
     episodes: tuple[Episodes, Ring], accesses: int, ticks: int, is_open: bool
 ) -> None:
     found, ring = episodes
-    found.find(Alarm.STALE, 1, 10)
+    found.record_finding(Alarm.STALE, 1, 10)
     # The later finding counts from now on.
-    found.find(Alarm.STALE, 7, 30)
+    found.record_finding(Alarm.STALE, 7, 30)
     assert found.is_open(Alarm.STALE, 7 + accesses, 30 + ticks) is is_open
     assert not found.is_open(Alarm.GAP, 7, 30)
     rung(ring)
-    found.find(Alarm.STALE, 7 + accesses, 30 + ticks)
+    found.record_finding(Alarm.STALE, 7 + accesses, 30 + ticks)
     assert len(rung(ring)) == (0 if is_open else 1)

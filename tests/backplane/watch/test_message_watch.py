@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.backplane.layout import BY_TICKS, PROTOCOLS, Protocol
+from rack.backplane.layout import PROTOCOLS, TICK_PROTOCOLS, Protocol
 from rack.backplane.watch.alarms import Alarm
 from tests.backplane.bus import NAME, message_address
 from tests.link import Link, MakeLink, ReadingTask, WritingTask, links
@@ -23,7 +23,7 @@ def publish(rack: Link, tick: int, visible_at: int) -> None:
     writer = rack.writer.ports.writers["point"]
     writer.message.id = tick
     writer.message.row = tick
-    writer.publish(tick, visible_at, tick)
+    writer.publish_message(tick, visible_at, tick)
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
@@ -87,7 +87,7 @@ def test_a_restarted_writer_is_not_taken_for_a_fault(
     rack.run(250, 300)
     assert rack.alarms() == []
     assert rack.alarms("writer") == []
-    assert rack.reader.seen[-1].released == 299 - (protocol in BY_TICKS)
+    assert rack.reader.seen[-1].released == 299 - (protocol in TICK_PROTOCOLS)
 
 
 @pytest.mark.parametrize("rates", [(1, 8), (1, 24)])
@@ -138,7 +138,7 @@ def test_a_lost_message_is_missing_from_the_tick_at_which_it_would_be_visible(
     rack = link(rates=(every, 1))
     rack.run(0, 8 * every)
     writer = rack.writer.ports.writers["point"]
-    writer.lose()
+    writer.lose_message()
     found = {}
     for tick in range(8 * every, 12 * every):
         rack.reader.cycle(tick)

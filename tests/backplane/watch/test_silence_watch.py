@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from rack.backplane.layout import PROTOCOLS, Protocol
-from rack.backplane.process import state_of
+from rack.backplane.process import read_state
 from rack.backplane.trace import Flag
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block
@@ -33,12 +33,12 @@ def test_a_writer_that_is_only_late_is_neither_mute_nor_stale(
     rack = link(protocol)
     rack.run(0, 20)
     # The clock may say for a lost task that it has finished.
-    rack.segment.block("writer")[Block.DONE] = 25
+    rack.segment.get_block("writer")[Block.DONE] = 25
     for tick in range(20, 60):
         rack.reader.cycle(tick)
     assert rack.alarms() == []
     # But its reader holds: a cycle and the slice are permitted, three more are not.
-    age = 3 + rack.segment.layout.mailbox(NAME).delay
+    age = 3 + rack.segment.layout.find_mailbox(NAME).delay
     assert [seen.tick for seen in rack.reader.seen if seen.is_lost] == [*range(19 + age, 60)]
 
 
@@ -80,13 +80,13 @@ def test_a_message_whose_writer_is_dead_or_stopped_is_stale(
         signal.pause()
 
     with forked(write) as pid:
-        wait_until(lambda: rack.segment.block("writer")[Block.DONE] == 19)
+        wait_until(lambda: rack.segment.get_block("writer")[Block.DONE] == 19)
         rack.reader.cycle(19)
         for tick in range(20, 30):
             rack.reader.cycle(tick)
         assert rack.alarms() == []
         os.kill(pid, number)
-        wait_until(lambda: state_of(pid) == state)
+        wait_until(lambda: read_state(pid) == state)
         for tick in range(30, 40):
             rack.reader.cycle(tick)
         assert rack.alarms() == [(30, Alarm.STALE)]
@@ -99,15 +99,15 @@ def test_a_message_whose_writer_is_dead_or_stopped_is_stale(
 def test_a_marked_loss_shows_from_the_next_tick(link: MakeLink) -> None:
     rack = link()
     rack.run(0, 20)
-    rack.segment.block("writer")[Block.LOST] = 1 + 20
+    rack.segment.get_block("writer")[Block.LOST] = 1 + 20
     assert [rack.reader.cycle(tick).is_lost for tick in (20, 21, 22)] == [False, True, True]
-    rack.segment.block("writer")[Block.LOST] = 0
+    rack.segment.get_block("writer")[Block.LOST] = 0
     assert not rack.reader.cycle(22).is_lost
 
 
 def test_a_lost_writer_that_never_wrote_does_not_count_as_lost(link: MakeLink) -> None:
     rack = link()
-    rack.segment.block("writer")[Block.LOST] = 1
+    rack.segment.get_block("writer")[Block.LOST] = 1
     assert not rack.reader.cycle(5).is_lost
     assert not rack.reader.cycle(500).is_lost
 

@@ -7,9 +7,9 @@ import pytest
 from rack.backplane.mailbox.queue import QueueWriter
 from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.backplane.watch.silence_watch import ReadingTask
-from rack.backplane.watch.watched_reader import WatchedQueue, watched
+from rack.backplane.watch.watched_reader import WatchedQueue, open_watched
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME, message_address, queue
 from tests.backplane.conftest import MakeBus
@@ -25,16 +25,16 @@ class Site:
         self.writer = QueueWriter(segment, NAME)
         self.task = ReadingTask()
         self.room = CAPACITY
-        found = watched(
+        found = open_watched(
             segment,
             NAME,
             AlarmWriter(segment, "reader"),
             self.task,
-            room=lambda: self.room,
+            count_room=lambda: self.room,
         )
         assert isinstance(found, WatchedQueue)
         self.reader = found
-        self._ring: Ring = alarm_ring(segment, "reader")
+        self._ring: Ring = open_alarm_ring(segment, "reader")
 
     def send(self, tick: int, *numbers: int) -> None:
         """Send messages in a cycle of the writer, which knows what has been taken."""
@@ -52,7 +52,7 @@ class Site:
 
     def alarms(self) -> list[tuple[int, int, float]]:
         """Return code, tick and value of the alarms since the last call."""
-        rows = self._ring.drain().rows
+        rows = self._ring.read_new_rows().rows
         return [(int(row["code"]), int(row["tick"]), float(row["value"])) for row in rows]
 
 
@@ -76,10 +76,10 @@ def test_messages_in_order_raise_no_alarm(site: Site) -> None:
 def test_a_lost_message_is_reported_as_a_gap_and_counted_as_trouble(site: Site) -> None:
     site.send(0, 1)
     assert site.read(1) == [1]
-    site.writer.visible_at(2, None)
-    site.writer.lose()
-    site.writer.lose()
-    site.writer.show()
+    site.writer.compute_visible_tick(2, None)
+    site.writer.lose_message()
+    site.writer.lose_message()
+    site.writer.show_published()
     assert site.read(3) == []
     assert (site.alarms(), site.task.troubles) == ([(Alarm.GAP, 3, 2.0)], 1)
     site.send(4, 7)
@@ -90,7 +90,7 @@ def test_a_lost_message_is_reported_as_a_gap_and_counted_as_trouble(site: Site) 
 def test_a_damaged_message_is_reported_and_later_messages_are_read(site: Site) -> None:
     site.send(0, 1, 2, 3)
     address = message_address(site.segment, 2)
-    site.segment.view(address, 1)[0] ^= 1
+    site.segment.get_bytes(address, 1)[0] ^= 1
     assert site.read(1) == [1, 3]
     (alarm,) = site.alarms()
     assert alarm[:2] == (Alarm.DAMAGED, 1)
@@ -102,6 +102,6 @@ def test_a_writer_is_lost_from_the_tick_after_its_loss(
     site: Site, lost: int, at: int, is_lost: bool
 ) -> None:
     assert not site.reader.read(at).is_lost
-    site.segment.block("writer")[Block.LOST] = lost
+    site.segment.get_block("writer")[Block.LOST] = lost
     assert site.reader.read(at).is_lost is is_lost
     assert site.reader.is_writer_lost(at) is is_lost

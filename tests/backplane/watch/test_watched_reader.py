@@ -11,7 +11,7 @@ from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.watched_reader import (
     GridReader,
     WatchedReader,
-    watched,
+    open_watched,
 )
 from rack.backplane.words import Block
 from tests.backplane.bus import NAME
@@ -30,7 +30,7 @@ class Grid:
     def __init__(self, rack: Link, every: int, phase: int) -> None:
         self._rack = rack
         ports = rack.reader.ports
-        found = watched(rack.segment, NAME, AlarmWriter(rack.segment, "reader"), ports.task)
+        found = open_watched(rack.segment, NAME, AlarmWriter(rack.segment, "reader"), ports.task)
         assert isinstance(found, WatchedReader)
         self.watched = found
         self.reader = GridReader(found, TickGrid(every, phase))
@@ -69,7 +69,7 @@ def test_a_lost_writer_is_reported_between_grid_ticks(link: MakeLink) -> None:
     for tick in range(9):
         rack.writer.cycle(tick)
         grid.read(tick)
-    block = rack.segment.block("writer")
+    block = rack.segment.get_block("writer")
     block[Block.LOST] = 10
     assert [grid.read(tick)[1] for tick in (9, 10, 11, 12)] == [False, True, True, True]
     block[Block.LOST] = 0

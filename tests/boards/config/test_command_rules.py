@@ -8,9 +8,9 @@ import pytest
 
 from rack.backplane.address_map import OPERATOR_ENTRIES
 from rack.boards.config import RackConfig, load
-from rack.boards.config.cell import built_cell
-from rack.boards.config.commands import asked, command_mistakes
-from rack.boards.config.published import publish
+from rack.boards.config.cell import build_rack_cell
+from rack.boards.config.commands import find_command_mistakes, parse_command
+from rack.boards.config.published import gather_facts
 
 HOME = [0.0, 0.7, -2.4, 0.0, -1.4, 0.0]
 PLACE = {"position": [0.4, 0.1, 0.3]}
@@ -28,8 +28,11 @@ def gentle() -> RackConfig:
 
 
 def mistakes(config: RackConfig, broken: frozenset[str] = frozenset(), **given: Any) -> list[str]:
-    levels = publish(config).levels
-    return [str(found) for found in command_mistakes([("", asked(given))], config, levels, broken)]
+    levels = gather_facts(config).levels
+    return [
+        str(found)
+        for found in find_command_mistakes([("", parse_command(given))], config, levels, broken)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -120,16 +123,16 @@ def test_a_mistake_is_one_line(nasrem: RackConfig, given: dict[str, Any], line: 
 def test_the_limits_of_a_joints_range_are_valid(nasrem: RackConfig) -> None:
     robot = nasrem.robot
     assert robot is not None
-    ends = built_cell(nasrem).limits.position.T.tolist()
+    ends = build_rack_cell(nasrem).limits.position.T.tolist()
     for joints in ends:
         assert mistakes(nasrem, level="servo", what="setpoint", joints=joints) == []
 
 
 def test_more_commands_than_the_table_has_entries_are_refused(nasrem: RackConfig) -> None:
-    hold = ("", asked({"level": "task", "what": "hold"}))
-    levels = publish(nasrem).levels
-    assert command_mistakes([hold] * OPERATOR_ENTRIES, nasrem, levels) == []
-    (found,) = command_mistakes([hold] * (OPERATOR_ENTRIES + 1), nasrem, levels)
+    hold = ("", parse_command({"level": "task", "what": "hold"}))
+    levels = gather_facts(nasrem).levels
+    assert find_command_mistakes([hold] * OPERATOR_ENTRIES, nasrem, levels) == []
+    (found,) = find_command_mistakes([hold] * (OPERATOR_ENTRIES + 1), nasrem, levels)
     many = OPERATOR_ENTRIES + 1
     assert str(found) == (
         f"command = {many}: too many commands; at most {OPERATOR_ENTRIES} may be pending"

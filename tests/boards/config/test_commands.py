@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.message import Message
-from rack.boards.config import RackConfig, load, wire
-from rack.boards.config.commands import DOWN, asked, request, takes
-from rack.boards.config.published import publish
+from rack.boards.config import RackConfig, load, resolve_layout
+from rack.boards.config.commands import DOWN, build_request, describe_commands, parse_command
+from rack.boards.config.published import gather_facts
 from rack.levels.operator import Goal, Operation
 
 HOME = [0.1 * k for k in range(6)]
@@ -22,11 +22,11 @@ def nasrem() -> RackConfig:
 
 def message_of(config: RackConfig, **given: object) -> tuple[Message, int]:
     """Return the message of a command, and the tick at which it is given."""
-    layout = wire(config)
-    made = request(asked(given), config, publish(config).levels, layout)
+    layout = resolve_layout(config)
+    made = build_request(parse_command(given), config, gather_facts(config).levels, layout)
     box = layout.mailboxes[made.mailbox]
     assert box.name == f"{given['level']}.operator"
-    message = Message(message_dtype(box.fields, box.size))
+    message = Message(build_message_dtype(box.fields, box.size))
     message.raw[:] = np.frombuffer(made.message, np.uint8)
     return message, made.tick
 
@@ -67,9 +67,9 @@ def test_a_quaternion_is_normalised(nasrem: RackConfig) -> None:
 
 
 def test_the_commands_of_a_level_are_listed_with_their_valid_names(nasrem: RackConfig) -> None:
-    assert takes(publish(nasrem).levels["primitive"]) == "hold, resume"
+    assert describe_commands(gather_facts(nasrem).levels["primitive"]) == "hold, resume"
     config = load("configs/examples/own-modification/gentle.toml")
-    servo = publish(config).levels["servo"]
-    assert "modify gentle on|off" in takes(servo)
-    assert "set bandwidth|damping" in takes(servo)
+    servo = gather_facts(config).levels["servo"]
+    assert "modify gentle on|off" in describe_commands(servo)
+    assert "set bandwidth|damping" in describe_commands(servo)
     assert servo.names == ("gentle",)

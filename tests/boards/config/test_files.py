@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import CONFIGS, load, loads, names
-from rack.boards.config.files import assembled, named_classes
-from rack.boards.config.resolved import classes
+from rack.boards.config import CONFIGS, list_names, load, load_text
+from rack.boards.config.files import assemble, list_level_classes
+from rack.boards.config.resolved import list_class_names
 from rack.boards.errors import ConfigError
 
 Write = Callable[[str, str], Path]
@@ -21,18 +21,18 @@ def lines(error: pytest.ExceptionInfo[ConfigError]) -> list[str]:
     return str(error.value).splitlines()
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", list_names())
 def test_every_bundled_config_survives_as_text_and_is_of_the_newest_format(name: str) -> None:
     config = load(name)
-    assert loads(config.text()) == config
-    assert config.changed == []
-    assert named_classes(assembled(name, (), None).tables) == classes(config)
+    assert load_text(config.to_toml_text()) == config
+    assert config.format_notes == []
+    assert list_level_classes(assemble(name, (), None).tables) == list_class_names(config)
 
 
 def test_text_names_a_bundled_model_without_its_folder() -> None:
     config = load("nasrem")
-    assert str(CONFIGS) not in config.text()
-    assert loads(config.text()).robot.model.is_file()
+    assert str(CONFIGS) not in config.to_toml_text()
+    assert load_text(config.to_toml_text()).robot.model.is_file()
 
 
 def test_text_of_a_config_with_strings_and_nested_values_loads_again(small: Path) -> None:
@@ -45,16 +45,16 @@ def test_text_of_a_config_with_strings_and_nested_values_loads_again(small: Path
     ]
     config = load(small, overrides)
     assert config.board["lower"].params["deep"] == {"on": True}
-    assert loads(config.text()) == config
+    assert load_text(config.to_toml_text()) == config
     config = load(small, [*overrides, "board.lower.params.gain = nan"])
-    assert math.isnan(loads(config.text()).board["lower"].params["gain"])
+    assert math.isnan(load_text(config.to_toml_text()).board["lower"].params["gain"])
 
 
 def test_other_racks_in_the_folder_of_a_bundled_one_have_names_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert {"cell", "cell/puma", "cell/k1607"} <= set(names())
-    assert not {"cell/arm", "brown/kill-each-board", "robots/puma560"} & set(names()), (
+    assert {"cell", "cell/puma", "cell/k1607"} <= set(list_names())
+    assert not {"cell/arm", "brown/kill-each-board", "robots/puma560"} & set(list_names()), (
         "these are no racks"
     )
     assert load("cell/puma").name == "cell-puma"
@@ -76,9 +76,9 @@ def test_the_format_of_a_file_does_not_depend_on_the_files_it_extends(
     older = load(write("older.toml", 'name = "mine"\nextends = ["small.toml"]\n'))
     newer = load(write("newer.toml", 'format = 2\nname = "mine"\nextends = ["older.toml"]\n'))
     assert (load(small).format, older.format, newer.format) == (2, 1, 2)
-    assert loads(older.text()).format == 1
-    assert newer.changed == []
-    (line,) = older.changed
+    assert load_text(older.to_toml_text()).format == 1
+    assert newer.format_notes == []
+    (line,) = older.format_notes
     assert line.startswith("config format 1, from before rack 0.2: since then ")
     assert line.endswith("write format = 2 when that suits you")
     assert "\n" not in line
@@ -209,7 +209,7 @@ def test_an_impossible_file_name_is_reported_as_missing(
         ConfigError, match=r"^config = .*: no such file; valid are a path or one of the names "
     ) as error:
         load(name)
-    assert len(lines(error)[0]) - len(", ".join(names())) < 160, (
+    assert len(lines(error)[0]) - len(", ".join(list_names())) < 160, (
         "it is cut, apart from the names of racks"
     )
     with pytest.raises(ConfigError, match=r"^--faults = .*: no such file"):
@@ -258,9 +258,9 @@ def test_every_impossible_override_is_reported(small: Path) -> None:
 
 def test_a_fault_script_of_the_rack_precedes_a_bundled_one_of_the_same_name(write: Write) -> None:
     rack = write("mine.toml", 'name = "mine"')
-    bundled = assembled(rack, (), "overload").tables["fault"]
+    bundled = assemble(rack, (), "overload").tables["fault"]
     write("overload.toml", "[[fault]]\nkind = 'kill'\nboard = 'lower'\ntick = 5")
-    own = assembled(rack, (), "overload").tables["fault"]
+    own = assemble(rack, (), "overload").tables["fault"]
     assert (len(own), own[0]["board"]) == (1, "lower")
     assert bundled != own
 
@@ -268,8 +268,8 @@ def test_a_fault_script_of_the_rack_precedes_a_bundled_one_of_the_same_name(writ
 def test_classes_are_found_in_tables_that_have_not_been_checked() -> None:
     named = {"executor": "mine:Arm", "planner": "mine:Planner"}
     boards = {"one": named, "two": {"executor": "mine:Arm"}, "odd": 3, "wrong": {"executor": 7}}
-    assert named_classes({"board": boards}) == ("mine:Arm", "mine:Planner")
-    assert named_classes({"board": [1]}) == named_classes({}) == ()
+    assert list_level_classes({"board": boards}) == ("mine:Arm", "mine:Planner")
+    assert list_level_classes({"board": [1]}) == list_level_classes({}) == ()
 
 
 def test_a_config_in_the_current_folder_is_found_by_name(
@@ -279,5 +279,5 @@ def test_a_config_in_the_current_folder_is_found_by_name(
     (tmp_path / "mine" / "mine.toml").write_text('format = 2\nname = "mine"\nextends = ["fig2"]\n')
     (tmp_path / "fig2.toml").write_text('format = 2\nname = "other"\n')
     monkeypatch.chdir(tmp_path)
-    assert assembled("mine", (), None).tables["name"] == "mine"
-    assert assembled("fig2", (), None).tables["name"] == "fig2"
+    assert assemble("mine", (), None).tables["name"] == "mine"
+    assert assemble("fig2", (), None).tables["name"] == "fig2"

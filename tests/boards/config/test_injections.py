@@ -10,9 +10,9 @@ import pytest
 
 from rack.backplane.address_map import FAULT_ENTRIES
 from rack.backplane.layout import Layout
-from rack.boards.config import load, loads, wire
-from rack.boards.config.injections import fault_mistakes
-from rack.boards.config.published import Levels, publish
+from rack.boards.config import load, load_text, resolve_layout
+from rack.boards.config.injections import find_fault_mistakes
+from rack.boards.config.published import Levels, gather_facts
 from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig
@@ -106,20 +106,22 @@ def rack_for(locked: bool, lockstep: bool) -> tuple[RackConfig, Levels, Layout]:
     """Return the rack that can have every kind, but for those that need locks, or real time."""
     mode = "lockstep" if lockstep else "realtime"
     text = DRIVEN.replace('mode = "lockstep"', f'mode = "{mode}"')
-    found = loads(text + ('[protocol]\ndefault = "lock"\n' if locked else ""))
-    return found, publish(found).levels, wire(found)
+    found = load_text(text + ('[protocol]\ndefault = "lock"\n' if locked else ""))
+    return found, gather_facts(found).levels, resolve_layout(found)
 
 
 def mistake_of(kind: Kind, lockstep: bool = False, **keys: Any) -> str:
     """Return the one mistake that a fault of that kind has, as its line."""
     fault = FaultConfig.model_validate(fault_of(kind, **keys))
-    (mistake,) = fault_mistakes([("fault[0]", fault)], *rack_for(kind.where == "lock", lockstep))
+    (mistake,) = find_fault_mistakes(
+        [("fault[0]", fault)], *rack_for(kind.where == "lock", lockstep)
+    )
     return str(mistake)
 
 
 def mistakes(config: MakeConfig, *faults: Fault, settings: tuple[str, ...] = ()) -> list[Mistake]:
     with pytest.raises(ConfigError) as error:
-        wire(rack(config, *faults, settings=settings))
+        resolve_layout(rack(config, *faults, settings=settings))
     return error.value.mistakes
 
 
@@ -207,7 +209,7 @@ def test_a_lock_is_held_only_where_the_mailbox_has_one(config: MakeConfig) -> No
     assert "mailboxes of 'wave' that use it: none" in only_mistake(
         config, fault, settings=(setting,)
     )
-    wire(rack(config, fault, settings=(LOCKED,)))
+    resolve_layout(rack(config, fault, settings=(LOCKED,)))
 
 
 def test_a_joint_that_the_arm_does_not_have_is_refused() -> None:
@@ -216,7 +218,7 @@ def test_a_joint_that_the_arm_does_not_have_is_refused() -> None:
         ConfigError,
         match="joint = 6: out of range; valid: whole numbers -1 to 5; joint, counted from 0",
     ):
-        wire(load("nasrem", settings))
+        resolve_layout(load("nasrem", settings))
 
 
 def test_more_faults_than_a_run_can_have_are_refused(config: MakeConfig) -> None:

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.boards.config import load, loads, rack_timing, resolve, wire
+from rack.boards.config import build_rack_timing, load, load_text, resolve, resolve_layout
 from rack.boards.config.files import Assembled
-from rack.boards.config.loader import validated
-from rack.boards.config.timing import without_interrupts
-from rack.boards.config.toml import override, parse
+from rack.boards.config.loader import validate
+from rack.boards.config.timing import subtract_interrupts
+from rack.boards.config.toml import apply_settings, parse_tables
 from rack.boards.errors import ConfigError
-from rack.boards.timing.verdicts import INBOX, verdicts
+from rack.boards.timing.verdicts import INBOX, judge_rack
 from tests.boards.run.test_interrupts import BOARDS, RACK
 
 INTERRUPT = "protocol.default=interrupt"
@@ -23,7 +23,7 @@ LOOSE = ("board.lower.coupling=loose", "board.lower.planner_slot=9")
 
 def layout_of(small: Path, *settings: str) -> Layout:
     """Return the layout of the small rack under this protocol."""
-    return wire(load(small, [INTERRUPT, *settings]))
+    return resolve_layout(load(small, [INTERRUPT, *settings]))
 
 
 def sent(box: MailboxSpec) -> tuple[int, int, int]:
@@ -35,24 +35,24 @@ def sent(box: MailboxSpec) -> tuple[int, int, int]:
 
 def test_a_message_is_sent_after_the_budget_of_its_cycle(small: Path) -> None:
     budget = "board.upper.budget={ read_ms = 0.5, process_ms = 2.0, write_ms = 0.6 }"
-    assert sent(layout_of(small, budget).mailbox("upper.command")) == (3_100_000, 2, 2)
+    assert sent(layout_of(small, budget).find_mailbox("upper.command")) == (3_100_000, 2, 2)
     # Without a budget after a tick, so it is served in the next one.
-    assert sent(layout_of(small).mailbox("upper.command")) == (2_500_000, 1, 2)
+    assert sent(layout_of(small).find_mailbox("upper.command")) == (2_500_000, 1, 2)
     over = "board.upper.budget.process_ms=1000"
     layout = layout_of(small, over)
-    assert sent(layout.mailbox("upper.command"))[1] == layout.task("upper").every
+    assert sent(layout.find_mailbox("upper.command"))[1] == layout.find_task("upper").every
 
 
 def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path) -> None:
     layout = layout_of(small, "protocol.interrupt={ fixed_us = 10, word_us = 2.5, depth = 3 }")
     command, plan = (
-        layout.mailbox("upper.command").interrupt,
-        layout.mailbox("lower.plan").interrupt,
+        layout.find_mailbox("upper.command").interrupt,
+        layout.find_mailbox("lower.plan").interrupt,
     )
     assert command is not None
     assert plan is not None
-    assert command.service_ns == 10_000 + 2_500 * (layout.mailbox("upper.command").size // 4)
-    assert (command.depth, command.slots) == (3, (layout.task("lower").slot,))
+    assert command.service_ns == 10_000 + 2_500 * (layout.find_mailbox("upper.command").size // 4)
+    assert (command.depth, command.slots) == (3, (layout.find_task("lower").slot,))
     # Planner and executor share a board.
     assert plan.slots == ()
 
@@ -68,33 +68,39 @@ def test_a_message_costs_its_words_and_interrupts_other_boards_only(small: Path)
 )
 def test_an_asynchronous_port_with_interrupts_is_refused(setting: str, why: str) -> None:
     with pytest.raises(ConfigError) as error:
-        resolve(validated(Assembled(override(parse(RACK), [setting], []))))
+        resolve(validate(Assembled(apply_settings(parse_tables(RACK), [setting], []))))
     assert why in str(error.value)
 
 
 def test_interrupts_are_part_of_reading_and_of_a_plan(small: Path) -> None:
     budget = "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0 }"
     config = load(small, [INTERRUPT, budget, *LOOSE])
-    layout = wire(config)
-    timing = rack_timing(config, layout)
+    layout = resolve_layout(config)
+    timing = build_rack_timing(config, layout)
     inbox = timing.inboxes["lower"]
     assert set(inbox.mailboxes) == {"upper.command", "lower.plan"}
-    cost = inbox.cost_ns(layout.task("lower").every * layout.clock_ns)
+    cost = inbox.cost_ns(layout.find_task("lower").every * layout.clock_ns)
     assert cost == sum(source.service_ns for source in inbox.sources)
-    level = timing.level("lower")
+    level = timing.build_level("lower")
     assert level.read_ns == 100_000 + cost
     assert {task.name: task.cost_ns for task in timing.tasks}["lower"] == 600_000 + cost
-    assert level.plan_ns == 2_000_000 + timing.interrupted_ns("lower.planner")
+    assert level.plan_ns == 2_000_000 + timing.compute_interrupted_ns("lower.planner")
     measured = {"lower": timing.boards["lower"].budget}
     assert measured["lower"] is not None
     # In lockstep they take no time, so nothing was measured of them.
-    assert without_interrupts(timing, {"lower": measured["lower"]}) == measured
+    assert subtract_interrupts(timing, {"lower": measured["lower"]}) == measured
 
 
 @pytest.mark.parametrize(("depth", "holds"), [(BOARDS - 1, True), (BOARDS - 2, False)])
 def test_an_inbox_that_a_burst_overflows_fails(depth: int, holds: bool) -> None:
-    config = loads(RACK.replace('"interrupt"', f'"interrupt"\nprotocol.interrupt.depth = {depth}'))
-    found = [v for v in verdicts(rack_timing(config, wire(config))) if v.equation == INBOX]
+    config = load_text(
+        RACK.replace('"interrupt"', f'"interrupt"\nprotocol.interrupt.depth = {depth}')
+    )
+    found = [
+        v
+        for v in judge_rack(build_rack_timing(config, resolve_layout(config)))
+        if v.equation == INBOX
+    ]
     assert [(v.subject, v.left, v.right, v.holds) for v in found] == [
         ("hub", BOARDS - 1, depth, holds)
     ]

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.layout import depth_for
-from rack.boards.config import load, resolve, shared_out, wire
+from rack.backplane.layout import compute_depth
+from rack.boards.config import list_replaced_cores, load, resolve, resolve_layout
 from rack.boards.config import resolved as resolved
-from rack.boards.config.layout import obtained_core
-from rack.boards.config.rules import broken_rules
+from rack.boards.config.layout import find_core
+from rack.boards.config.rules import apply_rules
 
 SIZES = {"joints": 6, "bodies": 3, "state": 120}
 
 
 def test_mailboxes_have_one_writer_and_the_readers_that_the_levels_name(small: Path) -> None:
-    layout = wire(load(small))
+    layout = resolve_layout(load(small))
     assert {m.name: (m.writer, m.readers) for m in layout.mailboxes} == {
         "upper.command": ("upper", ("lower", "lower.planner")),
         "upper.status": ("upper", ()),
@@ -27,7 +27,7 @@ def test_mailboxes_have_one_writer_and_the_readers_that_the_levels_name(small: P
 
 
 def test_a_message_is_delayed_by_its_writers_slice(small: Path) -> None:
-    layout = wire(load(small))
+    layout = resolve_layout(load(small))
     assert {m.name: (m.every, m.delay) for m in layout.mailboxes} == {
         "upper.command": (8, 8),
         "upper.status": (8, 8),
@@ -37,17 +37,17 @@ def test_a_message_is_delayed_by_its_writers_slice(small: Path) -> None:
 
 
 def test_mailboxes_retain_two_seconds_and_at_least_their_readers_slice(small: Path) -> None:
-    layout = wire(load(small, ["board.lower.within_cycles=9000"]))
-    assert layout.mailbox("lower.status").depth == depth_for(800, 1)
-    assert layout.mailbox("upper.command").depth == depth_for(9008, 8)
+    layout = resolve_layout(load(small, ["board.lower.within_cycles=9000"]))
+    assert layout.find_mailbox("lower.status").depth == compute_depth(800, 1)
+    assert layout.find_mailbox("upper.command").depth == compute_depth(9008, 8)
 
 
 def test_missing_cores_are_replaced_and_reported(
     small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3})
-    assert [obtained_core(core) for core in range(6)] == [2, 3, 2, 3, 2, 3]
-    assert shared_out(
+    assert [find_core(core) for core in range(6)] == [2, 3, 2, 3, 2, 3]
+    assert list_replaced_cores(
         load(small, ["board.upper.core=5", "clock.core=3", "board.lower.core=2"])
     ) == ["core 5 is not available (available: 2, 3): core 3 runs upper"]
 
@@ -56,9 +56,7 @@ def test_a_launch_resolves_and_checks_everything_once(
     small: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     checked = []
-    monkeypatch.setattr(
-        resolved, "broken_rules", lambda *of: checked.append(of) or broken_rules(*of)
-    )
+    monkeypatch.setattr(resolved, "apply_rules", lambda *of: checked.append(of) or apply_rules(*of))
     settings = [
         "fault=[{ kind = 'self-test', board = 'upper' }]",
         "board.lower.transfer.read_ms=0.5",
@@ -73,7 +71,7 @@ def test_a_launch_resolves_and_checks_everything_once(
     assert (len(found.faults), found.commands, found.ends_run) == (1, (), "upper.status")
     assert found.tasks[1].transfer.read_ns == 500_000
     assert [task.wake for task in found.layout.tasks] == ["timer"] * 3
-    clock = found.clock(10.0)
+    clock = found.build_clock_wiring(10.0)
     assert (clock.stop_tick, clock.linger, clock.silent, clock.history) == (4000, 200, 12_000, 400)
 
 
@@ -96,7 +94,7 @@ def test_a_board_may_override_the_racks_wake_and_a_planner_never_polls(small: Pa
 
 
 def test_a_queue_has_room_for_unread_messages_and_a_late_recorder() -> None:
-    layout = wire(load("penn"))
+    layout = resolve_layout(load("penn"))
     sizes = {box.name: (box.capacity, box.depth) for box in layout.mailboxes}
     # Of a host board: its capacity, what may be under way, and what a writer needs; a power of two.
     assert sizes["coordinator.requests"] == (32, 64)
@@ -104,8 +102,11 @@ def test_a_queue_has_room_for_unread_messages_and_a_late_recorder() -> None:
     assert sizes["bridge.requests"] == (32, 512)
     # Two seconds of the reader's cycles.
     assert sizes["bridge.requests_taken"] == (0, 128)
-    slow = wire(load("penn", ["protocol.depth={ 'bridge.requests' = 4 }"]))
-    assert (slow.mailbox("bridge.requests").capacity, slow.mailbox("bridge.requests").depth) == (
+    slow = resolve_layout(load("penn", ["protocol.depth={ 'bridge.requests' = 4 }"]))
+    assert (
+        slow.find_mailbox("bridge.requests").capacity,
+        slow.find_mailbox("bridge.requests").depth,
+    ) == (
         4,
         256,
     )

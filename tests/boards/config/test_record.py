@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, loads, resolve
+from rack.boards.config import load, load_text, resolve
 from rack.boards.errors import ConfigError
 
 
 def test_durations_are_text_or_seconds_and_survive_the_config_of_a_run(small: Path) -> None:
     config = load(small, ["record={ keep = '10 min', before = '500 ms', after = 2 }"])
     assert (config.record.keep, config.record.before, config.record.after) == (600.0, 0.5, 2.0)
-    assert loads(config.text()).record == config.record
+    assert load_text(config.to_toml_text()).record == config.record
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from rack.boards.config import CONFIGS, FAULTS, load, names
-from rack.boards.config.files import assembled, with_faults
-from rack.boards.config.reference import Key, find_tables, key_tables
+from rack.boards.config import CONFIGS, FAULTS, list_names, load
+from rack.boards.config.files import append_faults, assemble
+from rack.boards.config.reference import Key, find_tables, list_key_tables
 from rack.boards.errors import ConfigError
 from tests.boards.conftest import MakeConfig
 
@@ -59,7 +59,7 @@ WHOLE = (
 def reference(config: str | Path) -> dict[str, dict[str, Key]]:
     """Return the keys by table of a config; tables that differ in their kind are put together."""
     found: dict[str, dict[str, Key]] = {}
-    for table in key_tables(load(config)):
+    for table in list_key_tables(load(config)):
         place = table.heading.partition(" with ")[0].strip("[]").replace("(top of the file)", "")
         found.setdefault(place, {}).update({key.name: key for key in table.keys})
     return found
@@ -94,7 +94,7 @@ ALIKE = re.compile(r".*three-poses|nasrem-1khz|fig[34].*|crossing|k1607|nist-sta
 """Racks whose boards other racks have as well."""
 EACH_RACK = [
     pytest.param(name, marks=pytest.mark.thorough if ALIKE.fullmatch(name) else ())
-    for name in names()
+    for name in list_names()
 ]
 
 
@@ -104,7 +104,7 @@ def test_the_reference_has_every_key_of_every_shipped_config_with_meaning_and_un
     name: str,
 ) -> None:
     known = reference(name)
-    tables = assembled(name, (), None).tables
+    tables = assemble(name, (), None).tables
     assert {
         (at, key) for at, key in used(tables) if key not in known.get(general(at, known), {})
     } == set()
@@ -120,7 +120,7 @@ def test_the_reference_has_every_key_of_every_shipped_config_with_meaning_and_un
 
 def test_the_reference_has_every_key_of_every_shipped_fault_script() -> None:
     known = reference("nasrem")["fault"]
-    scripts = [with_faults({}, name, CONFIGS)["fault"] for name in names(FAULTS)]
+    scripts = [append_faults({}, name, CONFIGS)["fault"] for name in list_names(FAULTS)]
     assert {key for script in scripts for fault in script for key in fault} <= set(known)
 
 
@@ -134,7 +134,7 @@ def test_a_users_own_level_is_in_the_reference(small: Path) -> None:
 
 
 def test_the_events_of_a_users_own_level_are_in_the_reference(config: MakeConfig) -> None:
-    assert not [table for table in key_tables(config()) if table.name.endswith(".findings")]
+    assert not [table for table in list_key_tables(config()) if table.name.endswith(".findings")]
     surf = config("board.wave.executor=wave_levels:Surf")
     (table,) = find_tables("board.wave.findings", surf)
     assert table.heading == "(events of board.wave)"

@@ -14,10 +14,11 @@ from tests.boards.conftest import MakeConfig
 
 def test_the_clock_is_wired_in_ticks(config: MakeConfig) -> None:
     plan = resolve(config("supervision.lockstep_restart_s=0.25"))
-    clock = plan.clock(0.5)
+    clock = plan.build_clock_wiring(0.5)
     # A tick of 2.5 ms.
     assert (
-        resolve(config("clock.mode=realtime", "clock.speed=2")).clock(None).period_ns == 1_250_000
+        resolve(config("clock.mode=realtime", "clock.speed=2")).build_clock_wiring(None).period_ns
+        == 1_250_000
     )
     assert (clock.period_ns, clock.stop_tick, clock.restart_ticks, clock.linger) == (
         2_500_000,
@@ -28,8 +29,8 @@ def test_the_clock_is_wired_in_ticks(config: MakeConfig) -> None:
     assert (clock.lockstep, clock.keeps_awake, clock.ends_run) == (True, False, "watch.status")
     assert set(clock.on_loss) == {"wave", "watch"}
     assert all(isinstance(demand, Demand) for demand in clock.on_loss.values())
-    assert plan.clock(None).stop_tick == 0
-    assert plan.clock(1e-9).stop_tick == 1
+    assert plan.build_clock_wiring(None).stop_tick == 0
+    assert plan.build_clock_wiring(1e-9).stop_tick == 1
 
 
 @pytest.mark.parametrize(
@@ -78,7 +79,7 @@ def test_in_lockstep_the_clock_shares_the_core_of_the_fastest_board_that_yields(
     cores = ["clock.core=0", "board.upper.core=0", "board.lower.core=1"]
 
     def core(*settings: str) -> int:
-        return resolve(load(small, [*cores, *settings])).clock(None).core
+        return resolve(load(small, [*cores, *settings])).build_clock_wiring(None).core
 
     assert core() == 1
     assert core("clock.mode=realtime") == 0

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rack.boards.config import load
-from rack.boards.config.files import CONFIGS, assembled
+from rack.boards.config.files import CONFIGS, assemble
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import build_cell
 
@@ -18,7 +18,7 @@ LIMITS = ("home", "velocity", "acceleration", "jerk")
 
 
 def tables_of(path: Path) -> dict[str, Any]:
-    return assembled(path, (), None).tables
+    return assemble(path, (), None).tables
 
 
 POSES = [action["joints"] for action in tables_of(TASKS / "three-poses.toml")["task"]["action"]]
@@ -40,4 +40,4 @@ def test_every_form_of_the_motion_has_the_same_poses() -> None:
     assert config.robot is not None
     ik = InverseKinematics(build_cell(config.robot, config.scene, config.clock_ns), 0)
     for name, pose in zip(order, np.array(POSES), strict=True):
-        assert np.abs(ik.tool_at(pose).position - places[name]).max() < 1e-4
+        assert np.abs(ik.compute_tool_pose(pose).position - places[name]).max() < 1e-4

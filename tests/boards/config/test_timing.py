@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import budgets, load, loads, rack_timing, wire
-from rack.boards.config.timing import with_budgets
+from rack.boards.config import build_rack_timing, load, load_text, read_budgets, resolve_layout
+from rack.boards.config.timing import replace_budgets
 from rack.boards.errors import ConfigError
 from rack.boards.timing.tasks import Budget, Part, Unit
 
@@ -21,23 +21,27 @@ def test_budgets_are_whole_nanoseconds_by_board(small: Path) -> None:
     config = load(
         small, ["board.lower.budget={ read_ms = 0.1, process_ms = 1.25, update_ms = 0.000001 }"]
     )
-    assert budgets(config) == {"lower": Budget(read_ns=100_000, process_ns=1_250_000, update_ns=1)}
+    assert read_budgets(config) == {
+        "lower": Budget(read_ns=100_000, process_ns=1_250_000, update_ns=1)
+    }
 
 
 def test_plan_within_ms_is_not_part_of_the_budget(small: Path) -> None:
-    assert budgets(load(small, [WITHIN])) == {
+    assert read_budgets(load(small, [WITHIN])) == {
         "lower": Budget(process_ns=1_500_000, plan_ns=3_000_000)
     }
 
 
 def test_budgets_written_to_a_config_are_read_back_unchanged(small: Path) -> None:
     upper = Budget(process_ns=3, exchange_ns=5)
-    changed = loads(with_budgets(load(small, [WITHIN]), {"lower": MEASURED, "upper": upper}).text())
+    changed = load_text(
+        replace_budgets(load(small, [WITHIN]), {"lower": MEASURED, "upper": upper}).to_toml_text()
+    )
     # The upper level has no planner, and so no plan to read.
-    assert budgets(changed) == {"lower": MEASURED, "upper": Budget(process_ns=3)}
+    assert read_budgets(changed) == {"lower": MEASURED, "upper": Budget(process_ns=3)}
     assert changed.board["lower"].budget is not None
     assert changed.board["lower"].budget.plan_within_ms == 20
-    assert budgets(loads(with_budgets(changed, {}).text())) == {}
+    assert read_budgets(load_text(replace_budgets(changed, {}).to_toml_text())) == {}
 
 
 @pytest.mark.slow
@@ -47,8 +51,10 @@ def test_planner_times_without_a_planner_are_a_mistake(small: Path, table: str, 
     with pytest.raises(
         ConfigError, match=rf"board\.upper\.{table}\.{key} = 1\.5: the board has no planner"
     ):
-        wire(load(small, [f"board.upper.{table}.{key}=1.5"]))
-    assert wire(load(small, [f"board.upper.{table}.{key}=0", f"board.lower.{table}.{key}=1.5"]))
+        resolve_layout(load(small, [f"board.upper.{table}.{key}=1.5"]))
+    assert resolve_layout(
+        load(small, [f"board.upper.{table}.{key}=0", f"board.lower.{table}.{key}=1.5"])
+    )
 
 
 def test_tasks_are_on_the_cores_that_the_config_requests(small: Path) -> None:
@@ -62,7 +68,7 @@ def test_tasks_are_on_the_cores_that_the_config_requests(small: Path) -> None:
     config = load(
         small, [*(f"board.lower.{setting}" for setting in settings), "board.lower.budget.plan_ms=2"]
     )
-    tasks = {task.name: task for task in rack_timing(config, wire(config)).tasks}
+    tasks = {task.name: task for task in build_rack_timing(config, resolve_layout(config)).tasks}
     assert {name: task.core for name, task in tasks.items()} == {"lower": 7, "lower.planner": 11}
     assert tasks["lower.planner"].parts == (Part(Unit.PLAN, 2_000_000),)
     assert (tasks["lower"].period_ns, tasks["lower.planner"].period_ns) == (2_500_000, 10_000_000)

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from rack.boards.config import load, resolve
-from rack.boards.config.timing import rack_timing
+from rack.boards.config.timing import build_rack_timing
 from tests.snapshots import ROOT, SHIPPED, Snapshots, each_shipped_rack
 
 SNAPSHOTS = Snapshots(__file__)
@@ -29,9 +29,13 @@ def test_a_shipped_rack_is_wired_as_before(name: str) -> None:
         "faults": rack.faults,
         "commands": rack.commands,
         "goals": rack.goals,
-        "clock": (rack.clock(None), rack.clock(3.0), lockstep.clock(None)),
+        "clock": (
+            rack.build_clock_wiring(None),
+            rack.build_clock_wiring(3.0),
+            lockstep.build_clock_wiring(None),
+        ),
         "crate": (rack.crate_priority, rack.ends_run),
-        "timing": rack_timing(rack.config, rack.layout),
+        "timing": build_rack_timing(rack.config, rack.layout),
     }
     SNAPSHOTS.check(name, parts)
 

@@ -10,14 +10,21 @@ import pytest
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import DamageError
 from rack.backplane.fault_table import FaultTable
-from rack.backplane.segment import Segment, unlink
-from rack.backplane.watch.alarms import BY_DEMAND, MISSES, NO_TORQUE, Alarm, AlarmWriter, alarm_ring
+from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.watch.alarms import (
+    BRAKED_BY_DEMAND,
+    BRAKED_WITHOUT_TORQUE,
+    MISSES,
+    Alarm,
+    AlarmWriter,
+    open_alarm_ring,
+)
 from rack.backplane.words import Demand
-from rack.boards.config import load, wire
-from rack.boards.config.cell import geom_name
-from rack.boards.config.injections import injections
+from rack.boards.config import load, resolve_layout
+from rack.boards.config.cell import find_geom_name
+from rack.boards.config.injections import build_injections
 from rack.boards.config.published import PublishedFinding, PublishedLevel
-from rack.boards.crate.alarm_events import AlarmEvents
+from rack.boards.crate.alarm_events import AlarmConverter
 from rack.boards.events import Event
 from rack.levels.messages import Error
 from rack.levels.robot.cell import build_cell
@@ -57,22 +64,22 @@ KINDS = {
 @pytest.fixture
 def segment(config: MakeConfig, rack_name: str) -> Iterator[Segment]:
     found = rack(config, *FAULTS)
-    layout = wire(found)
-    made = Segment.create(layout, found.text())
-    for fault in injections(found, layout):
-        FaultTable(made).add(fault)
+    layout = resolve_layout(found)
+    made = Segment.create(layout, found.to_toml_text())
+    for fault in build_injections(found, layout):
+        FaultTable(made).add_fault(fault)
     yield made
     made.close()
-    unlink(rack_name)
+    unlink_segment(rack_name)
 
 
 def alarm_events(
     segment: Segment,
     geom: Callable[[int], str] = str,
     names: tuple[str, ...] = ("first", "second"),
-) -> AlarmEvents:
+) -> AlarmConverter:
     wave = PublishedLevel(names=names, findings=FINDINGS)
-    return AlarmEvents(segment, JOINTS, geom, {"wave": wave})
+    return AlarmConverter(segment, JOINTS, geom, {"wave": wave})
 
 
 def heard(
@@ -85,9 +92,9 @@ def heard(
     text: str = "",
 ) -> Event:
     """Ring an alarm at tick 400 and return the event that it makes."""
-    AlarmWriter(segment, owner).ring(400, alarm, subject, value, since, text)
-    row = alarm_ring(segment, owner).drain().rows[-1]
-    return alarm_events(segment).of(row, owner)
+    AlarmWriter(segment, owner).raise_alarm(400, alarm, subject, value, since, text)
+    row = open_alarm_ring(segment, owner).read_new_rows().rows[-1]
+    return alarm_events(segment).build_event(row, owner)
 
 
 @pytest.mark.parametrize(
@@ -163,12 +170,12 @@ def test_every_alarm_makes_an_event_of_its_kind(segment: Segment, alarm: Alarm) 
             0.5,
             "joint 7 does not move as its torque commands: off by 0.5",
         ),
-        ("driven", Alarm.BRAKES_CLOSED, BY_DEMAND, 0, "brakes engaged: a stop is demanded"),
+        ("driven", Alarm.BRAKES_CLOSED, BRAKED_BY_DEMAND, 0, "brakes engaged: a stop is demanded"),
         ("driven", Alarm.BRAKES_CLOSED, Error.SENSORS, 0, "brakes engaged: sensors"),
         (
             "driven",
             Alarm.BRAKES_CLOSED,
-            NO_TORQUE,
+            BRAKED_WITHOUT_TORQUE,
             4,
             "brakes engaged: no torque for 4 ticks (10 ms)",
         ),
@@ -231,7 +238,7 @@ def test_a_fault_names_its_target(
 
 
 def test_the_end_of_a_fault_reports_how_often_it_acted(segment: Segment) -> None:
-    FaultTable(segment).entries[2].acted(400)
+    FaultTable(segment).entries[2].record_action(400)
     event = heard(segment, CLOCK, Alarm.FAULT_ENDS, 2, 1.0)
     assert (event.code, event.value, event.text) == ("ends", 1.0, "kill ends; acted 1 time")
 
@@ -241,8 +248,8 @@ def test_a_collision_names_both_geoms(segment: Segment) -> None:
     assert config.robot is not None
     cell = build_cell(config.robot, config.scene, config.clock_ns)
     post, palm = (cell.model.geom(name).id for name in ("post", "palm"))
-    AlarmWriter(segment, "wave").ring(400, Alarm.COLLISION, post, palm)
-    row = alarm_ring(segment, "wave").drain().rows[-1]
-    event = alarm_events(segment, partial(geom_name, config)).of(row, "wave")
+    AlarmWriter(segment, "wave").raise_alarm(400, Alarm.COLLISION, post, palm)
+    row = open_alarm_ring(segment, "wave").read_new_rows().rows[-1]
+    event = alarm_events(segment, partial(find_geom_name, config)).build_event(row, "wave")
     assert (event.code, event.subject) == ("collision", "post")
     assert event.text == "unintended contact: 'post' touches 'palm'"

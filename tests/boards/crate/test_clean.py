@@ -16,12 +16,12 @@ from rack.backplane.layout import Layout
 from rack.backplane.segment import (
     SHM_FOLDER,
     Segment,
-    racks,
-    shm_path,
-    unlink,
+    get_shm_path,
+    list_racks,
+    unlink_segment,
 )
 from rack.backplane.words import Head, System
-from rack.boards.crate.clean import clean, remove_dead, remove_own
+from rack.boards.crate.clean import remove_dead_rack, remove_dead_racks, remove_own_racks
 from tests.backplane.bus import layout, mailbox
 from tests.processes import FORKS, exit_status, fork, kill, wait_until
 
@@ -34,7 +34,7 @@ as_root = pytest.mark.skipif(os.getuid() != 0, reason="only root can become anot
 def spec(rack_name: str) -> Iterator[Layout]:
     """A layout; whatever is made of it is removed."""
     yield layout(rack_name, [mailbox("lock")])
-    unlink(rack_name)
+    unlink_segment(rack_name)
 
 
 def leave_dead(spec: Layout) -> None:
@@ -53,7 +53,7 @@ def left(rack: str) -> list[str]:
 def test_a_dead_racks_segment_is_removed(spec: Layout) -> None:
     leave_dead(spec)
     assert len(left(spec.rack)) == 1
-    assert remove_dead(spec.rack)
+    assert remove_dead_rack(spec.rack)
     assert left(spec.rack) == []
 
 
@@ -63,16 +63,16 @@ def test_a_live_rack_is_refused_with_its_launcher(spec: Layout) -> None:
         SegmentError,
         match=f"rack '{spec.rack}' is already running, launched by process {os.getpid()}",
     ):
-        remove_dead(spec.rack)
-    assert segment.has_its_name
+        remove_dead_rack(spec.rack)
+    assert segment.is_named
     segment.close()
 
 
 @pytest.mark.parametrize("size", [0, 100, 8192])
 def test_a_file_too_small_for_a_segment_is_removed(rack_name: str, size: int) -> None:
-    shm_path(rack_name).write_bytes(bytes(size))
-    assert remove_dead(rack_name)
-    assert rack_name not in racks()
+    get_shm_path(rack_name).write_bytes(bytes(size))
+    assert remove_dead_rack(rack_name)
+    assert rack_name not in list_racks()
 
 
 @as_root
@@ -82,13 +82,13 @@ def test_another_users_rack_is_left_alone(spec: Layout) -> None:
     def remove() -> None:
         os.setuid(STRANGER)
         with pytest.raises(SegmentError, match="belongs to another user"):
-            remove_dead(spec.rack)
-        removed, in_use, strange = clean()
+            remove_dead_rack(spec.rack)
+        removed, in_use, strange = remove_dead_racks()
         assert spec.rack not in removed + in_use
         assert any(line.startswith(f"rack '{spec.rack}' belongs to another") for line in strange)
 
     assert exit_status(fork(remove)) == 0
-    assert spec.rack in racks()
+    assert spec.rack in list_racks()
 
 
 def test_a_rack_removed_and_launched_meanwhile_is_not_removed(
@@ -96,12 +96,12 @@ def test_a_rack_removed_and_launched_meanwhile_is_not_removed(
 ) -> None:
     leave_dead(spec)
     found = Segment.open(spec.rack)
-    assert remove_dead(spec.rack)
+    assert remove_dead_rack(spec.rack)
     again = Segment.create(spec, "")
     # Who has looked before all that finds a dead rack still.
     monkeypatch.setattr(Segment, "open", lambda rack: found)
-    assert not remove_dead(spec.rack)
-    assert again.has_its_name
+    assert not remove_dead_rack(spec.rack)
+    assert again.is_named
     again.close()
 
 
@@ -113,7 +113,7 @@ def test_a_rack_relaunched_during_the_check_is_not_removed(
     look = Segment.open
 
     def overtaken(rack: str) -> Segment:
-        unlink(rack)
+        unlink_segment(rack)
         try:
             return look(rack)
         finally:
@@ -121,8 +121,8 @@ def test_a_rack_relaunched_during_the_check_is_not_removed(
 
     monkeypatch.setattr(Segment, "open", overtaken)
     with pytest.raises(SegmentError):
-        remove_dead(spec.rack)
-    assert anew[0].has_its_name
+        remove_dead_rack(spec.rack)
+    assert anew[0].is_named
     anew[0].close()
 
 
@@ -131,10 +131,10 @@ def test_a_removal_under_way_is_left_alone(spec: Layout) -> None:
     found = Segment.open(spec.rack)
     other = ByteLock(found.fd, 8 * Head.MAGIC)
     assert other.take()
-    assert not remove_dead(spec.rack)
-    assert found.has_its_name
+    assert not remove_dead_rack(spec.rack)
+    assert found.is_named
     other.close()
-    assert remove_dead(spec.rack)
+    assert remove_dead_rack(spec.rack)
     found.close()
 
 
@@ -144,12 +144,12 @@ def contend(spec: Layout, start: Segment, word: int) -> bool:
     while not start.words[System.TICK]:
         pass
     try:
-        remove_dead(spec.rack)
+        remove_dead_rack(spec.rack)
         segment = Segment.create(spec, "")
     except SegmentError:
         start.words[word] = 2
         return False
-    start.words[word] = 3 if segment.has_its_name else 4
+    start.words[word] = 3 if segment.is_named else 4
     time.sleep(60)
     return True
 
@@ -175,20 +175,20 @@ def test_one_of_several_launches_takes_and_keeps_a_dead_racks_name(
     finally:
         for pid in launchers:
             kill(pid)
-        unlink(start.rack)
+        unlink_segment(start.rack)
         start.close()
 
 
 @pytest.mark.parametrize("kind", ["directory", "symbolic link"])
 def test_a_foreign_entry_is_named_and_left_alone(rack_name: str, tmp_path: Path, kind: str) -> None:
-    place, target = shm_path(rack_name), tmp_path / "target"
+    place, target = get_shm_path(rack_name), tmp_path / "target"
     target.write_bytes(bytes(8192))
     place.mkdir() if kind == "directory" else place.symlink_to(target)
     why = f"rack '{rack_name}': {place} is a {kind}, not a segment"
     try:
-        assert why in clean()[2]
+        assert why in remove_dead_racks()[2]
         with pytest.raises(SegmentError, match=re.escape(why)):
-            remove_dead(rack_name)
+            remove_dead_rack(rack_name)
         with pytest.raises(SegmentError, match=re.escape(why)):
             Segment.attach(rack_name)
         assert place.is_dir() if kind == "directory" else place.is_symlink()
@@ -201,10 +201,10 @@ def test_a_rack_of_another_pid_namespace_is_not_mistaken_for_ones_own(spec: Layo
     # Every container has a process 1.
     segment = Segment.create(spec, "")
     segment.words[Head.LAUNCHER_NAMESPACE] += 1
-    remove_own(spec.rack, killed=[os.getpid()])
-    assert segment.has_its_name
+    remove_own_racks(spec.rack, killed=[os.getpid()])
+    assert segment.is_named
     with pytest.raises(RackInUseError, match="launched by a process of another PID namespace"):
-        remove_dead(spec.rack)
+        remove_dead_rack(spec.rack)
     segment.close()
 
 
@@ -213,10 +213,10 @@ def test_a_process_removes_only_the_racks_that_it_launched(spec: Layout, rack_na
     other = layout(f"{rack_name}-other")
     assert exit_status(fork(lambda: Segment.create(other, "").close())) == 0
     try:
-        remove_own()
-        assert left(spec.rack) == [shm_path(other.rack).name]
-        remove_own(killed=[Segment.open(other.rack).launcher])
+        remove_own_racks()
+        assert left(spec.rack) == [get_shm_path(other.rack).name]
+        remove_own_racks(killed=[Segment.open(other.rack).launcher])
         assert left(spec.rack) == []
     finally:
-        unlink(other.rack)
+        unlink_segment(other.rack)
         own.close()

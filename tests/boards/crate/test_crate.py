@@ -15,7 +15,7 @@ import pytest
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.crate.line import CrateLine, WarmCrate, received
+from rack.boards.crate.line import CrateLine, WarmCrate, receive_or_none
 from rack.boards.crate.requests import Preload, Preloading
 from rack.boards.errors import LaunchError
 from tests.processes import children_of, runs, wait_until
@@ -36,9 +36,9 @@ def test_a_line_reports_a_lost_other_end_even_within_a_message() -> None:
     # The length of a message that never comes whole.
     os.write(theirs.fileno(), struct.pack("!i", 100) + b"half")
     theirs.close()
-    assert received(ours) == "whole"
-    assert received(ours) is None
-    assert received(ours) is None
+    assert receive_or_none(ours) == "whole"
+    assert receive_or_none(ours) is None
+    assert receive_or_none(ours) is None
 
 
 def test_a_crate_that_does_not_end_is_killed() -> None:
@@ -50,12 +50,12 @@ def test_a_crate_that_does_not_end_is_killed() -> None:
 
 def test_a_crate_preloads_each_class_once(line: CrateLine) -> None:
     wanted = Preload(("wave_levels:Preloaded",), PATH)
-    line.send(wanted)
-    line.send(wanted)
-    line.send(Preload(("wave_levels:Wave",), PATH))
+    line.send_request(wanted)
+    line.send_request(wanted)
+    line.send_request(Preload(("wave_levels:Wave",), PATH))
     # Where the numba cache is empty, the crate also reports each function that it compiles.
     preloadings = []
-    for answer in iter(line.receive, None):
+    for answer in iter(line.receive_message, None):
         if isinstance(answer, Preloading):
             preloadings.append(answer)
         if answer == Preloading("wave_levels:Wave"):
@@ -70,14 +70,14 @@ def test_a_request_to_a_crate_that_is_gone_is_a_launch_error(line: CrateLine) ->
     os.kill(line.pid, signal.SIGKILL)
     wait_until(lambda: not runs(line.pid))
     with pytest.raises(LaunchError, match="the crate has ended"):
-        line.send(Preload((), ()))
-    line.ask(Preload((), ()))
+        line.send_request(Preload((), ()))
+    line.try_request(Preload((), ()))
 
 
 def test_the_crate_ignores_an_interrupt_from_the_terminal() -> None:
     line = CrateLine()
-    line.send(Preload(("wave_printer:Printer",), PATH))
-    wait_until(line.printed)
+    line.send_request(Preload(("wave_printer:Printer",), PATH))
+    wait_until(line.read_output)
     os.kill(line.pid, signal.SIGINT)
     line.close(20.0)
     # Killed by the interrupt, it would have another status.
@@ -108,7 +108,7 @@ def test_a_warm_crate_serves_racks_one_after_the_other_and_keeps_nothing_of_them
         held.append(len(list(Path(f"/proc/{warm.pid}/fd").iterdir())))
     assert len(set(held)) == 1
     assert not warm.is_over
-    warm.end()
+    warm.end_crate()
     assert warm.is_over
     assert not runs(warm.pid)
 

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 import pytest
 
 from rack.backplane.address_map import CLOCK
-from rack.backplane.process import WAITING, state_of
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.process import WAITING_STATES, read_state
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import Block, Run, System
 from rack.boards.crate import heartbeat
 from rack.boards.crate.heartbeat import LOCKSTEP_S, Heartbeat
@@ -41,7 +41,7 @@ def bus(rack_name: str) -> Iterator[Segment]:
     segment.words[System.STATE] = Run.RUNNING
     segment.words[System.LOCKSTEP] = 1
     yield segment
-    unlink(rack_name)
+    unlink_segment(rack_name)
     segment.close()
 
 
@@ -65,7 +65,7 @@ def run_on(segment: Segment, clock: Clock, seconds: float, *hanging: str) -> Non
         seconds * 1e9 / PERIOD_NS
     )
     for name in (FAST, SLOW):
-        block = segment.block(name)
+        block = segment.get_block(name)
         block[Block.RELEASED] = tick
         if name not in hanging:
             block[Block.DONE] = tick
@@ -77,7 +77,7 @@ def test_a_task_that_recovered_and_hangs_again_is_reported_again(
     beat, found = Heartbeat(bus), []
     for hanging in ((FAST,), (), (FAST,)):
         run_on(bus, clock, 2 * LOCKSTEP_S, *hanging)
-        found += beat.hanging()
+        found += beat.find_hanging()
     assert found == [FAST, FAST]
 
 
@@ -85,44 +85,44 @@ def test_a_task_that_recovered_and_hangs_again_is_reported_again(
 def test_a_lost_task_does_not_hang_and_in_real_time_the_clock_checks_tasks(
     bus: Segment, clock: Clock, is_lost: bool
 ) -> None:
-    bus.words[System.LOCKSTEP], bus.block(FAST)[Block.LOST] = is_lost, is_lost
+    bus.words[System.LOCKSTEP], bus.get_block(FAST)[Block.LOST] = is_lost, is_lost
     beat = Heartbeat(bus)
     run_on(bus, clock, 2 * LOCKSTEP_S, FAST)
-    assert beat.hanging() == []
+    assert beat.find_hanging() == []
 
 
 def test_an_idle_task_does_not_hang(bus: Segment, clock: Clock) -> None:
     beat = Heartbeat(bus)
     for name in (FAST, SLOW):
-        bus.block(name)[Block.RELEASED] = bus.block(name)[Block.DONE] = 8
+        bus.get_block(name)[Block.RELEASED] = bus.get_block(name)[Block.DONE] = 8
     for _ in range(20):
         clock.now_s += 1.0
         bus.words[System.TICK] += 1
-        assert beat.hanging() == []
+        assert beat.find_hanging() == []
 
 
 def test_a_clock_that_waits_for_several_cycles_at_once_does_not_hang(
     bus: Segment, clock: Clock
 ) -> None:
     beat = Heartbeat(bus)
-    bus.block(FAST)[Block.RELEASED] = 8
+    bus.get_block(FAST)[Block.RELEASED] = 8
     with forked(signal.pause) as pid:
-        wait_until(lambda: state_of(pid) in WAITING)
+        wait_until(lambda: read_state(pid) in WAITING_STATES)
         bus.words[System.CLOCK_PID] = pid
         for tick in range(8):
-            bus.block(FAST)[Block.DONE] = tick
+            bus.get_block(FAST)[Block.DONE] = tick
             clock.now_s += LOCKSTEP_S / 2
-            assert beat.hanging() == []
+            assert beat.find_hanging() == []
 
 
 def test_a_clock_without_ticks_hangs(bus: Segment, clock: Clock) -> None:
     bus.words[System.LOCKSTEP] = 0
     beat = Heartbeat(bus)
     run_on(bus, clock, 0.5)
-    assert beat.hanging() == []
+    assert beat.find_hanging() == []
     clock.now_s += 2.5
-    assert beat.hanging() == [CLOCK]
-    assert beat.hanging() == []
+    assert beat.find_hanging() == [CLOCK]
+    assert beat.find_hanging() == []
 
 
 @pytest.mark.parametrize(
@@ -142,12 +142,12 @@ def test_a_silent_clock_hangs_only_where_it_waits_or_was_stopped(
         if number:
             os.kill(pid, number)
         state = "T" if number else "S" if doing == "waits" else "R"
-        wait_until(lambda: state_of(pid) == state)
+        wait_until(lambda: read_state(pid) == state)
         beat = Heartbeat(bus)
         run_on(bus, clock, 0.5)
-        assert beat.hanging() == []
+        assert beat.find_hanging() == []
         clock.now_s += 2.5
-        assert [beat.hanging() for _ in range(3)] == looks
+        assert [beat.find_hanging() for _ in range(3)] == looks
 
 
 @pytest.mark.parametrize("state", [Run.STARTING, Run.STOPPED])
@@ -155,20 +155,20 @@ def test_no_task_hangs_before_or_after_the_run(bus: Segment, clock: Clock, state
     beat = Heartbeat(bus)
     bus.words[System.STATE] = state
     clock.now_s += 1000.0
-    assert beat.hanging() == []
+    assert beat.find_hanging() == []
 
 
 def test_time_limits_are_longer_at_lower_speed(bus: Segment, clock: Clock) -> None:
     bus.words[System.PERIOD_NS], bus.words[System.LOCKSTEP] = 1000 * PERIOD_NS, 0
     beat = Heartbeat(bus)
-    assert beat.hanging() == []
+    assert beat.find_hanging() == []
     clock.now_s += 9.0
-    assert beat.hanging() == []
+    assert beat.find_hanging() == []
     clock.now_s += 2.0
-    assert CLOCK in beat.hanging()
+    assert CLOCK in beat.find_hanging()
 
 
 def test_in_lockstep_a_long_plan_does_not_hang(bus: Segment, clock: Clock) -> None:
     beat = Heartbeat(bus)
     clock.now_s += 30.0
-    assert beat.hanging() == []
+    assert beat.find_hanging() == []

@@ -9,12 +9,12 @@ from typing import cast
 
 import pytest
 
-from rack.backplane.process import STOPPED, state_of
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.process import STOPPED_STATES, read_state
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import Block, TaskState
 from rack.boards.config import resolve
 from rack.boards.crate.line import CrateLine
-from rack.boards.crate.recovery import Recovery, Supervision
+from rack.boards.crate.recovery import Recovery, RestartPolicy
 from rack.boards.crate.requests import Ended, PowerOff, PowerOn
 from rack.boards.events import Event, Journal
 from tests.boards.conftest import MakeConfig
@@ -29,13 +29,13 @@ class Site:
 
     def __init__(self, segment: Segment, recovery: Recovery, asked: list[object]) -> None:
         self.recovery, self.asked = recovery, asked
-        self.block = segment.block("program")
+        self.block = segment.get_block("program")
 
     def lose(self, status: int, tick: int) -> None:
         """Lose the program's process, and do what is due then."""
         end = Ended("program", 1, status, 0, tick)
-        self.recovery.lose(end, is_over=False, record_printed=lambda: None)
-        self.recovery.advance()
+        self.recovery.record_loss(end, is_over=False, record_printed=lambda: None)
+        self.recovery.restart_due_boards()
 
 
 @pytest.fixture
@@ -59,13 +59,13 @@ def site(config: MakeConfig, journal: Journal) -> Iterator[Site]:
             """Note it."""
             asked.append(request)
 
-    supervision = Supervision(made, plan.layout)
+    supervision = RestartPolicy(made, plan.layout)
     crate = cast(CrateLine, Crate())
     recovery = Recovery(segment, supervision, crate, journal)
-    recovery.start(plan.clock(None), plan)
+    recovery.start(plan.build_clock_wiring(None), plan)
     yield Site(segment, recovery, asked)
     segment.close()
-    unlink(plan.layout.rack)
+    unlink_segment(plan.layout.rack)
 
 
 def told(journal: Journal) -> list[tuple[str, str]]:
@@ -111,17 +111,17 @@ def test_a_host_board_stopped_by_a_signal_is_killed_once(site: Site, journal: Jo
     with forked(signal.pause) as pid:
         site.block[Block.PID] = pid
         site.asked.clear()
-        site.recovery.advance()
+        site.recovery.restart_due_boards()
         assert (site.asked, told(journal)) == ([], [])
         os.kill(pid, signal.SIGSTOP)
-        wait_until(lambda: state_of(pid) in STOPPED)
-        site.recovery.advance()
-        site.recovery.advance()
+        wait_until(lambda: read_state(pid) in STOPPED_STATES)
+        site.recovery.restart_due_boards()
+        site.recovery.restart_due_boards()
         assert site.asked == [PowerOff("program")]
         (event,) = cast("list[Event]", journal.events)
         assert (event.kind, event.code, event.subject) == ("detection", "hang", "program")
         assert event.text == "'program' is not responding: stopped by a signal"
         # Its successor may be stopped, too.
         site.lose(-signal.SIGKILL, 10)
-        site.recovery.advance()
+        site.recovery.restart_due_boards()
         assert site.asked.count(PowerOff("program")) == 2

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.segment import Segment, racks
+from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import Block, System
 from rack.boards import Rack
-from rack.boards.crate.clean import remove_dead
+from rack.boards.crate.clean import remove_dead_rack
 from tests.boards.conftest import LOOSE, NEVER, MakeConfig
 from tests.boards.programs import launcher
 from tests.boards.runs import end_of
@@ -34,9 +34,9 @@ def process_of(rack: Rack, name: str) -> int:
     """Return the process of a task, of the clock, or of the crate, which is the parent of them
     all."""
     if name in TASKS:
-        return rack.segment.block(name)[Block.PID]
-    crate = parent_of(rack.segment.block(TASKS[0])[Block.PID])
-    boards = {rack.segment.block(task)[Block.PID] for task in TASKS}
+        return rack.segment.get_block(name)[Block.PID]
+    crate = parent_of(rack.segment.get_block(TASKS[0])[Block.PID])
+    boards = {rack.segment.get_block(task)[Block.PID] for task in TASKS}
     return (
         crate if name == "crate" else next(pid for pid in children_of(crate) if pid not in boards)
     )
@@ -56,7 +56,7 @@ def test_a_killed_process_ends_the_run_with_its_name(
         family = [process_of(rack, name) for name in (*TASKS, "clock", "crate")]
         os.kill(process_of(rack, victim), signal.SIGKILL)
         outcome = end_of(rack)
-    assert (outcome.cause, outcome.worked) == ("board lost", False)
+    assert (outcome.cause, outcome.is_success) == ("board lost", False)
     text = "the crate ended" if victim == "crate" else f"board '{victim}' ended: signal SIGKILL"
     assert any(text in fault for fault in outcome.faults)
     assert next(event.board for event in rack.events if event.kind == "died") == victim
@@ -158,7 +158,7 @@ def waves(config: MakeConfig, rack_name: str, tmp_path: Path) -> Iterator[tuple[
     the end."""
     config()
     yield tmp_path / "waves.toml", f"name={rack_name}"
-    remove_dead(rack_name)
+    remove_dead_rack(rack_name)
 
 
 @pytest.mark.slow
@@ -185,7 +185,7 @@ def test_the_next_launch_takes_a_killed_racks_name(
         with Rack(config()) as rack:
             assert rack.run(0.1).cause == "time over"
         program.wait_for_descendants()
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
 
 
 @pytest.mark.slow
@@ -197,7 +197,7 @@ def test_an_interrupted_launcher_leaves_no_process_and_removes_its_segment_if_it
         program.wait_for_launch()
         program.send(number)
         assert program.ended() != 0
-        assert not is_gone or (rack_name not in racks() and not program.descendants)
+        assert not is_gone or (rack_name not in list_racks() and not program.descendants)
         program.wait_for_descendants()
 
 
@@ -210,13 +210,13 @@ def test_a_launcher_killed_at_any_moment_leaves_nothing_behind_the_next_clean(
         with launcher(*waves, REALTIME) as program:
             # From the first import to the first cycles; half of the times a segment exists.
             if round_ % 2:
-                wait_until(lambda: rack_name in racks())
+                wait_until(lambda: rack_name in list_racks())
             time.sleep(rng.uniform(0.0, 0.5))
             program.send(signal.SIGKILL)
             program.ended()
             program.wait_for_descendants()
-        remove_dead(rack_name)
-        assert rack_name not in racks()
+        remove_dead_rack(rack_name)
+        assert rack_name not in list_racks()
         assert not named(f"{rack_name}:")
 
 

@@ -8,7 +8,7 @@ import pytest
 from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
-from rack.boards.crate.lateness import _permit
+from rack.boards.crate.lateness import _count_permitted
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
 from tests.boards.runs import faulty, kill
@@ -26,7 +26,7 @@ def run(config: RackConfig, seconds: float) -> tuple[Outcome, list[Event], dict[
         outcome = rack.run(seconds)
         counted = {
             task.name: (
-                rack.segment.block(task.name)[Block.CYCLES],
+                rack.segment.get_block(task.name)[Block.CYCLES],
                 *rack.segment.count_cycles(task, outcome.ticks)[:3],
             )
             for task in rack.segment.layout.tasks
@@ -49,7 +49,7 @@ def run(config: RackConfig, seconds: float) -> tuple[Outcome, list[Event], dict[
 def test_the_permitted_fraction_is_rounded_up_but_never_permits_losing_every_cycle(
     due: int, fraction: float, plan: int, permitted: int
 ) -> None:
-    assert _permit(due, fraction, plan) == permitted
+    assert _count_permitted(due, fraction, plan) == permitted
 
 
 @pytest.mark.slow
@@ -58,7 +58,7 @@ def test_a_level_that_crashes_in_every_first_cycle_has_skipped_all_and_fails_the
 ) -> None:
     outcome, events, counted = run(config(JUDGED, SOON, *CRASHES, text=PLAIN), 0.2)
     assert counted == {"wave": (0, 0, 80, 80), "watch": (10, 0, 0, 10)}
-    assert (outcome.cause, outcome.worked) == ("time over", False)
+    assert (outcome.cause, outcome.is_success) == ("time over", False)
     assert outcome.faults == (
         "level 'wave' missed 0 and skipped 80 of its 80 cycles (100 %; at most 5 % permitted)",
     )
@@ -98,7 +98,7 @@ def test_lost_cycles_are_excused_by_an_injected_fault_as_far_as_it_can_have_cost
 ) -> None:
     struck = kill("wave", 80)
     outcome, _, counted = run(faulty(config(JUDGED, SOON, text=PLAIN), struck), 0.8)
-    assert (outcome.worked, counted["wave"]) == (True, (300, 0, 20, 320))
+    assert (outcome.is_success, counted["wave"]) == (True, (300, 0, 20, 320))
     # Its tick, one cycle, 20 ticks for the restart, and 100 for the recovery.
     named = "122 of which were due during faults and recoveries: kill of wave"
     assert outcome.excused == (f"level 'wave' missed 0 and skipped 20 of its 320 cycles, {named}",)
@@ -121,7 +121,7 @@ def test_a_board_that_dies_by_itself_is_not_excused(
     dies = ('board.wave.params.trouble="die"', "board.wave.params.at=100")
     outcome, _, counted = run(config(*settings, *dies, text=PLAIN), 0.4)
     assert counted["wave"] == (140, 0, 20, 160)
-    assert outcome.worked is worked
+    assert outcome.is_success is worked
     assert outcome.excused == ()
 
 
@@ -130,5 +130,5 @@ def test_a_planner_is_judged_by_its_releases_of_which_a_plan_takes_several(
     config: MakeConfig,
 ) -> None:
     outcome, _, counted = run(config(JUDGED), 0.5)
-    assert outcome.worked
+    assert outcome.is_success
     assert counted["wave.planner"][1:] == (0, 0, 197)

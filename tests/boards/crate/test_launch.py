@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.lines import UtilityLines
-from rack.backplane.segment import racks
+from rack.backplane.segment import list_racks
 from rack.backplane.words import Block, TaskState
 from rack.boards import Rack
 from rack.boards.errors import ConfigError, LaunchError
@@ -56,7 +56,7 @@ def test_the_reason_of_a_board_is_the_launch_error_and_holds_its_sysfail(
     if case not in ("not preloaded", "left"):
         assert 2 in UtilityLines(rack.segment).sysfail
     if case in ("self-test", "not made"):
-        assert rack.segment.block("wave")[Block.STATE] == TaskState.FAILED
+        assert rack.segment.get_block("wave")[Block.STATE] == TaskState.FAILED
 
 
 @pytest.mark.slow
@@ -76,7 +76,7 @@ def test_a_crate_killed_during_the_launch_is_reported(config: MakeConfig) -> Non
 
     rack = Rack(config(), kill_crate)
     assert "crate" in refusal(rack)
-    assert rack.config.name not in racks()
+    assert rack.config.name not in list_racks()
 
 
 @pytest.mark.slow
@@ -144,7 +144,7 @@ def test_a_config_that_cannot_be_wired_starts_no_process(
     with pytest.raises(ConfigError, match="Nobody"):
         Rack(bad).launch()
     assert children_of(os.getpid()) == children
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
 
 
 @pytest.mark.slow
@@ -154,4 +154,4 @@ def test_a_rack_may_be_closed_before_its_launch_and_twice_after(config: MakeConf
     rack.launch()
     rack.close()
     rack.close()
-    assert rack.config.name not in racks()
+    assert rack.config.name not in list_racks()

@@ -8,7 +8,7 @@ from resource import RLIMIT_MEMLOCK, getrlimit
 
 import pytest
 
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import Block
 from rack.boards.config.resolved import Resolved, resolve
 from rack.boards.crate.launch_checks import check_realtime, list_launch_notes
@@ -26,7 +26,7 @@ def memory(config: MakeConfig) -> Iterator[tuple[Resolved, Segment]]:
     )
     segment = Segment.create(plan.layout, "")
     yield plan, segment
-    unlink(segment.rack)
+    unlink_segment(segment.rack)
     segment.close()
 
 
@@ -35,10 +35,10 @@ def test_a_refused_priority_is_noted_and_ends_the_launch_if_configured(
 ) -> None:
     plan, segment = memory
     for task in plan.layout.tasks:
-        segment.block(task.name)[Block.PRIORITY] = task.priority
+        segment.get_block(task.name)[Block.PRIORITY] = task.priority
     check_realtime(plan, segment)
     assert not [note for note in list_launch_notes(plan, segment) if "SCHED_FIFO" in note]
-    segment.block("wave")[Block.PRIORITY] = 0
+    segment.get_block("wave")[Block.PRIORITY] = 0
     (note,) = [note for note in list_launch_notes(plan, segment) if "SCHED_FIFO" in note]
     assert note.startswith(f"{REFUSED}; missed deadlines are likely")
     with pytest.raises(LaunchError, match=REFUSED):
@@ -55,7 +55,7 @@ def test_memory_that_is_not_locked_is_noted_with_its_limit(
     plan, segment = memory
     for task in plan.layout.tasks:
         # The test's own process, which locks none.
-        segment.block(task.name)[Block.PID] = os.getpid()
+        segment.get_block(task.name)[Block.PID] = os.getpid()
     limit = getrlimit(RLIMIT_MEMLOCK)[0]
     said = f"memory not locked for wave, wave.planner, watch: the limit is {limit} bytes, a board "
     (note,) = [note for note in list_launch_notes(plan, segment) if "not locked" in note]

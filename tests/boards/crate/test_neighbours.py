@@ -14,7 +14,7 @@ import pytest
 from rack.backplane.process import Reservation, name_process, take_core
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
-from rack.boards.crate.neighbours import holders
+from rack.boards.crate.neighbours import find_holders
 from rack.boards.errors import ConfigError
 from tests.boards.conftest import CLOCK, PLAIN, MakeConfig
 from tests.machine import needs_deadlines, needs_fifo, needs_two_cores
@@ -74,7 +74,9 @@ def test_a_rack_that_shares_a_core_reports_it(config: MakeConfig, first: Rack) -
 def test_a_core_held_by_another_users_rack_is_seen(first: Rack) -> None:
     def look() -> bool:
         os.setuid(65_533)
-        return str(holders("another").get(0)).startswith(f"rack '{first.config.name}' (process ")
+        return str(find_holders("another").get(0)).startswith(
+            f"rack '{first.config.name}' (process "
+        )
 
     assert exit_status(fork(look)) == 0
 
@@ -92,8 +94,8 @@ def test_a_task_that_has_reserved_time_is_seen_without_its_segment(
         signal.pause()
 
     with forked(reserve) as pid:
-        wait_until(lambda: holders("another"))
-        assert holders("another")[0].process == f"process {pid}"
+        wait_until(lambda: find_holders("another"))
+        assert find_holders("another")[0].process == f"process {pid}"
 
 
 @pytest.mark.slow
@@ -112,7 +114,7 @@ def test_a_board_without_a_core_setting_moves_to_a_free_core(
 ) -> None:
     with Rack(second(config, first, text=ELSEWHERE), share=False) as rack:
         ready = [event.text for event in rack.events if event.kind == "ready"]
-        core = rack.segment.layout.task("wave").core
+        core = rack.segment.layout.find_task("wave").core
     assert core == min(os.sched_getaffinity(0) - {0})
     assert ready[0].startswith(f"wave on core {core}: rack '{first.config.name}'")
 
@@ -125,7 +127,7 @@ def test_without_real_time_priority_every_view_of_a_rack_says_so(
     config: MakeConfig, tmp_path: Path
 ) -> None:
     path = tmp_path / "config.toml"
-    path.write_text(config(*FIFO, "clock.on_no_realtime=warn", text=PLAIN).text())
+    path.write_text(config(*FIFO, "clock.on_no_realtime=warn", text=PLAIN).to_toml_text())
     command = ["setpriv", "--bounding-set", "-sys_nice", "--inh-caps", "-sys_nice", *RACK]
     words = ["run", str(path), "--seconds", "0.5", "--no-record", "--share"]
     done = subprocess.run(

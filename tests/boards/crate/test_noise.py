@@ -17,27 +17,27 @@ from rack.backplane.address_map import (
     ALARM_RECORD_SIZE,
     ALARM_SIZE,
     BLOCK_SIZE,
+    CACHE_LINE,
     FAULT_ENTRY_SIZE,
-    LINE,
     MAILBOX_HEAD_SIZE,
-    operator_entry_size,
+    compute_operator_entry_size,
 )
 from rack.backplane.errors import BackplaneError
-from rack.backplane.mailbox.history import digest
-from rack.backplane.segment import Segment, racks, unlink
-from rack.backplane.trace import trace_ring
+from rack.backplane.mailbox.history import compute_digest
+from rack.backplane.segment import Segment, list_racks, unlink_segment
+from rack.backplane.trace import open_trace_ring
 from rack.boards import Rack
 from rack.boards.config import load, read_stored
-from rack.boards.crate.alarm_events import AlarmWatch
+from rack.boards.crate.alarm_events import AlarmReader
 from rack.boards.crate.heartbeat import Heartbeat
-from rack.boards.crate.patience import RackAwaited
+from rack.boards.crate.patience import PeerWaitReporter
 from rack.boards.events import Ending, Journal
-from rack.tools.faults.campaigns.trial import levels_of
-from rack.tools.faults.ending import arm_of, strikes
+from rack.tools.faults.campaigns.trial import format_levels
+from rack.tools.faults.ending import list_strikes, read_arm
 from rack.tools.faults.live import LiveRack
-from rack.tools.monitor.desk import LiveDesk
+from rack.tools.monitor.desk import LevelCommander
 from rack.tools.monitor.snapshot import RackMonitor
-from rack.tools.recording.spool import rings
+from rack.tools.recording.spool import open_rings
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, named, wait_until
 from tests.tools.command_line import BOUND_S
@@ -49,7 +49,7 @@ NOISE = 8 * 32
 """Address behind the head, whose words are checked when a program attaches."""
 
 
-class Ran(NamedTuple):
+class RunContext(NamedTuple):
     """A rack at the end of a run: its segment's memory, and what stands in the head's texts."""
 
     memory: bytes
@@ -77,7 +77,7 @@ message counts as lost. Noise in all alarms, or anywhere, hits mostly unused mem
 
 def first_of(alarms: int) -> int:
     """Return the address of the first record that a ring of alarms gets."""
-    return alarms + LINE + ALARM_RECORD_SIZE
+    return alarms + CACHE_LINE + ALARM_RECORD_SIZE
 
 
 def regions(segment: Segment) -> dict[str, tuple[int, int]]:
@@ -89,11 +89,11 @@ def regions(segment: Segment) -> dict[str, tuple[int, int]]:
     found = (
         (NOISE, 8 * 96),
         (places.faults, places.faults + 2 * FAULT_ENTRY_SIZE),
-        (places.operator, places.operator + 2 * operator_entry_size(segment.layout)),
+        (places.operator, places.operator + 2 * compute_operator_entry_size(segment.layout)),
         (alarms, alarms + ALARM_SIZE),
         (first_of(alarms), first_of(alarms) + ALARM_NUMBERS),
         (first_of(clock_alarms), first_of(clock_alarms) + ALARM_NUMBERS),
-        (alarms, alarms + LINE),
+        (alarms, alarms + CACHE_LINE),
         (places.blocks[task], places.blocks[task] + BLOCK_SIZE),
         (places.traces[task], alarms),
         (places.mailboxes[box], places.mailboxes[box] + MAILBOX_HEAD_SIZE),
@@ -121,24 +121,24 @@ def looks(segment: Segment) -> dict[str, Callable[[], object]]:
     one = Segment.attach(segment.rack)
     heartbeat = Heartbeat(segment)
     return {
-        "monitor": lambda: RackMonitor(segment).look(),
-        "alarms": lambda: AlarmWatch(segment).drain(),
-        "heartbeat": heartbeat.hanging,
-        "awaited": lambda: RackAwaited(segment, Journal(None)).look(),
-        "digest": lambda: digest(segment, 100),
-        "latched": ending.latched,
-        "levels": lambda: levels_of(segment),
-        "arm": lambda: arm_of(segment),
-        "strikes": lambda: strikes(segment, joints),
-        "faults": lambda: LiveRack(segment).faults(),
-        "desk": lambda: list(LiveDesk(one).text()),
-        "rings": lambda: [ring.drain() for ring in rings(segment).values()],
-        "trace": lambda: trace_ring(segment, segment.layout.tasks[0].name).drain(),
+        "monitor": lambda: RackMonitor(segment).take_snapshot(),
+        "alarms": lambda: AlarmReader(segment).read_alarms(),
+        "heartbeat": heartbeat.find_hanging,
+        "awaited": lambda: PeerWaitReporter(segment, Journal(None)).report_if_due(),
+        "digest": lambda: compute_digest(segment, 100),
+        "latched": ending.list_latched_faults,
+        "levels": lambda: format_levels(segment),
+        "arm": lambda: read_arm(segment),
+        "strikes": lambda: list_strikes(segment, joints),
+        "faults": lambda: LiveRack(segment).list_faults(),
+        "desk": lambda: list(LevelCommander(one).format_levels()),
+        "rings": lambda: [ring.read_new_rows() for ring in open_rings(segment).values()],
+        "trace": lambda: open_trace_ring(segment, segment.layout.tasks[0].name).read_new_rows(),
     }
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
+def ran(tmp_path_factory: pytest.TempPathFactory) -> RunContext:
     """A rack after a run with commands, faults and alarms."""
     path = tmp_path_factory.mktemp("noise") / "rack.toml"
     path.write_text(COMMANDED)
@@ -149,22 +149,24 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
         memory = bytes(one.segment.bytes)
         segment = one.segment
     assert {event.kind for event in one.events} >= {"fault", "detection", "command"}
-    return Ran(memory, segment)
+    return RunContext(memory, segment)
 
 
 @pytest.fixture
-def copy(ran: Ran, rack_name: str) -> Iterator[Segment]:
+def copy(ran: RunContext, rack_name: str) -> Iterator[Segment]:
     """A segment like that of the rack."""
     found = ran.segment
     made = Segment.create(replace(found.layout, rack=rack_name), found.config, found.published)
     yield made
     made.close()
-    unlink(rack_name)
+    unlink_segment(rack_name)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("region", REGIONS)
-def test_every_tool_refuses_or_reads_a_damaged_rack(region: str, ran: Ran, copy: Segment) -> None:
+def test_every_tool_refuses_or_reads_a_damaged_rack(
+    region: str, ran: RunContext, copy: Segment
+) -> None:
     refused = 0
     end = copy.map.size
     for seed in range(SEEDS):
@@ -210,12 +212,12 @@ def test_a_launcher_that_reads_no_valid_alarm_ends_in_one_line_and_leaves_nothin
         segment = Segment.attach(rack_name)
         address = segment.map.alarms["lower"]
         count = segment.words[address // 8] + 1
-        record = address + LINE + count % ALARM_DEPTH * ALARM_RECORD_SIZE
+        record = address + CACHE_LINE + count % ALARM_DEPTH * ALARM_RECORD_SIZE
         segment.words[record // 8 + 2] = 4711
         segment.words[address // 8] = count
         segment.close()
         _, err = process.communicate(timeout=BOUND_S)
     said = "the rack's shared memory is damaged: 4711 is not a value of Alarm"
     assert (process.returncode, err) == (1, f"{said}\n")
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
     wait_until(lambda: not named(f"{rack_name}:"))

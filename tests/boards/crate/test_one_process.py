@@ -25,8 +25,8 @@ def test_levels_behave_as_in_a_rack_in_lockstep(
         assert rack.tick == 201
         assert rack.serials
         for name, serial in rack.serials.items():
-            (row,) = np.flatnonzero(recording.signal(name, "serial") == serial)
-            assert rack.newest(name).record[()] == recording.rows(name)["message"][row], name
+            (row,) = np.flatnonzero(recording.read_signal(name, "serial") == serial)
+            assert rack.newest(name).record[()] == recording.read_rows(name)["message"][row], name
 
 
 def test_missing_mailboxes_and_messages_are_reported(small: Path) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from rack.boards.crate import output
-from rack.boards.crate.output import LONGEST_LINE, HostOutput, lines_of
+from rack.boards.crate.output import LONGEST_LINE, HostOutput, split_lines
 
 MOST = 4
 
@@ -30,11 +30,11 @@ def dropped(lines: int) -> str:
 
 def test_complete_lines_are_split_and_an_incomplete_line_waits() -> None:
     long = b"x" * LONGEST_LINE
-    assert lines_of(b"one\n\ntwo\nthr") == [b"one\n", b"\n", b"two\n"]
-    assert lines_of(long[:-1]) == []
-    assert lines_of(long) == [long]
-    assert lines_of(long + b"\nrest\n") == [long + b"\n", b"rest\n"]
-    assert lines_of(long + b"rest\n") == [long, b"rest\n"]
+    assert split_lines(b"one\n\ntwo\nthr") == [b"one\n", b"\n", b"two\n"]
+    assert split_lines(long[:-1]) == []
+    assert split_lines(long) == [long]
+    assert split_lines(long + b"\nrest\n") == [long + b"\n", b"rest\n"]
+    assert split_lines(long + b"rest\n") == [long, b"rest\n"]
 
 
 def test_a_line_in_pieces_is_copied_once_it_is_complete(
@@ -42,10 +42,10 @@ def test_a_line_in_pieces_is_copied_once_it_is_complete(
 ) -> None:
     for piece, whole in ((b"on", ""), (b"e\ntw", "one\n"), (b"o\n", "two\n")):
         os.write(printed.writer, piece)
-        printed.pass_on()
+        printed.copy_output()
         assert capfd.readouterr().out == whole
     # Nothing has come since.
-    printed.pass_on()
+    printed.copy_output()
     assert capfd.readouterr().out == ""
 
 
@@ -53,9 +53,9 @@ def test_the_last_line_of_an_ended_board_needs_no_line_end(
     printed: HostOutput, capfd: pytest.CaptureFixture[str]
 ) -> None:
     os.write(printed.writer, b"one\ntwo")
-    printed.pass_on(is_over=True)
+    printed.copy_output(is_over=True)
     assert capfd.readouterr().out == "one\ntwo\n"
-    printed.pass_on(is_over=True)
+    printed.copy_output(is_over=True)
     assert capfd.readouterr().out == ""
 
 
@@ -65,9 +65,9 @@ def test_a_run_keeps_the_first_lines_and_reports_each_doubling_of_dropped_lines(
     said = []
     for _ in range(12):
         os.write(printed.writer, b"line\n")
-        printed.pass_on()
+        printed.copy_output()
         said.append(capfd.readouterr().out)
     kept = ["line\n"] * MOST
     assert said == [*kept, dropped(1), "", "", "", "", dropped(6), "", ""]
-    printed.pass_on(is_over=True)
+    printed.copy_output(is_over=True)
     assert capfd.readouterr().out == dropped(8)

@@ -13,9 +13,9 @@ from rack.boards.crate.line import CrateLine
 from rack.boards.crate.patience import (
     COMPILE_S,
     PATIENCE_S,
-    Patience,
-    RackAwaited,
-    await_opened,
+    PeerWaitReporter,
+    ReportedWait,
+    await_open_segment,
 )
 from rack.boards.crate.requests import Compiling, Opened, PreloadFailed, Preloading
 from rack.boards.errors import LaunchError
@@ -48,16 +48,16 @@ def said(journal: Journal) -> list[str]:
 
 def test_a_wait_is_reported_each_time_it_has_doubled(clock: Clock) -> None:
     journal = Journal(None)
-    wait = Patience(journal, LIMIT_S)
+    wait = ReportedWait(journal, LIMIT_S)
     assert wait.left_s == PATIENCE_S
     for passed in (1.9, 2.0, 2.1, 3.9, 4.0, 7.9, 8.1):
         clock.now = 1000.0 + passed
-        wait.report("loading")
+        wait.report_if_due("loading")
     assert said(journal) == [f"loading, {seconds} s so far" for seconds in (2, 4, 8)]
     assert wait.left_s == pytest.approx(16.0 - 8.1)
 
 
-class Line:
+class InputMailbox:
     """A crate that answers at its times; each wait for it moves the clock on."""
 
     def __init__(self, clock: Clock, *answers: tuple[float, object]) -> None:
@@ -83,11 +83,11 @@ class Line:
 def opened(clock: Clock, *answers: tuple[float, object], output: str = "") -> tuple[list[str], str]:
     """Wait for a crate with these answers; return what was said, and why it failed."""
     journal = Journal(None)
-    line = Line(clock, *answers)
+    line = InputMailbox(clock, *answers)
     line.output = output.split("\n") if output else []
     why = ""
     try:
-        await_opened(cast(CrateLine, line), journal, LIMIT_S)
+        await_open_segment(cast(CrateLine, line), journal, LIMIT_S)
     except LaunchError as error:
         why = str(error)
     return said(journal), why
@@ -122,17 +122,17 @@ def test_a_wait_for_another_rack_is_reported_each_time_it_has_doubled(
     clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits = [("lan", "waits for rack 'b'")]
-    monkeypatch.setattr(patience, "awaited", lambda segment: iter(waits))
+    monkeypatch.setattr(patience, "find_waits", lambda segment: iter(waits))
     journal = Journal(None)
-    rack = RackAwaited(cast("Segment", None), journal)
+    rack = PeerWaitReporter(cast("Segment", None), journal)
     for passed in (0.0, 1.9, 2.1, 4.1):
         clock.now = 1000.0 + passed
-        rack.look()
+        rack.report_if_due()
     assert said(journal) == [f"'lan' waits for rack 'b', {s} s so far" for s in (2, 4)]
     waits.clear()
-    rack.look()
+    rack.report_if_due()
     waits.append(("lan", "waits for rack 'c'"))
-    rack.look()
+    rack.report_if_due()
     clock.now += 2.1
-    rack.look()
+    rack.report_if_due()
     assert said(journal)[2:] == ["'lan' waits for rack 'c', 2 s so far"]

@@ -17,7 +17,7 @@ import pytest
 from rack.backplane.errors import SegmentError
 from rack.backplane.lines import UtilityLines
 from rack.backplane.process import LATENCY_REQUEST
-from rack.backplane.segment import Segment, racks, shm_path, unlink
+from rack.backplane.segment import Segment, get_shm_path, list_racks, unlink_segment
 from rack.backplane.words import Block, Run, System, TaskState
 from rack.boards import Rack
 from rack.boards.config.resolved import resolve
@@ -58,7 +58,7 @@ def test_a_run_ends_when_its_task_is_done(config: MakeConfig) -> None:
     outcome = run(Rack(config("board.wave.params.done_at=40")))
     # Written at 40, read by the level that ends the run at 48, visible at 56; then half a second to
     # see it at rest.
-    assert (outcome.cause, outcome.state, outcome.ticks, outcome.worked) == (
+    assert (outcome.cause, outcome.state, outcome.ticks, outcome.is_success) == (
         "task done",
         "done",
         56 + 200,
@@ -69,7 +69,7 @@ def test_a_run_ends_when_its_task_is_done(config: MakeConfig) -> None:
 def test_a_task_that_ends_in_error_has_failed_with_its_reason(config: MakeConfig) -> None:
     outcome = run(Rack(config("board.wave.params.done_at=8", "board.wave.params.final=ERROR")))
     assert (outcome.cause, outcome.state, outcome.reason) == ("task failed", "error", "the tide")
-    assert not outcome.worked
+    assert not outcome.is_success
 
 
 @pytest.mark.slow
@@ -86,7 +86,7 @@ def test_a_run_of_given_length_ends_at_its_exact_tick(
     assert told == ["launch", "start", "end"]
     assert (received[0].tick, received[-1].tick) == (-1, ticks - 1)
     assert rack.segment.words[System.TICK] == ticks - 1
-    assert rack.segment.block("wave")[Block.CYCLES] == ticks
+    assert rack.segment.get_block("wave")[Block.CYCLES] == ticks
 
 
 def holders(rack: Rack) -> list[int]:
@@ -106,12 +106,12 @@ def test_boards_are_ready_before_the_clock_runs_and_a_stop_from_outside_ends_the
     settings = (f"clock.mode={mode}", "protocol.default=lock", "clock.idle_cores=awake")
     with Rack(config(*settings), share=True) as rack:
         # Ready before the clock runs, and only the segment has a name.
-        tasks = [rack.segment.block(task.name) for task in rack.segment.layout.tasks]
+        tasks = [rack.segment.get_block(task.name) for task in rack.segment.layout.tasks]
         words = rack.segment.words
         assert (words[System.STATE], words[System.TICK]) == (Run.STARTING, 0)
         assert UtilityLines(rack.segment).sysfail == []
         assert all(TaskState.READY <= task[Block.STATE] <= TaskState.RUNNING for task in tasks)
-        own = shm_path(rack.config.name)
+        own = get_shm_path(rack.config.name)
         assert [p for p in own.parent.iterdir() if rack.config.name in p.name] == [own]
         rack.start()
         wait_until(lambda: rack.watch(0.01) and words[System.TICK] > 2)
@@ -120,9 +120,9 @@ def test_boards_are_ready_before_the_clock_runs_and_a_stop_from_outside_ends_the
         assert holders(rack) == [words[System.CLOCK_PID]] * holding
         Segment.attach(rack.config.name).words[System.STOP_REQUEST] = 1
         outcome = end_of(rack)
-    assert (outcome.cause, outcome.worked) == ("stopped", False)
+    assert (outcome.cause, outcome.is_success) == ("stopped", False)
     assert {task[Block.STATE] for task in tasks} == {TaskState.ENDED}
-    assert rack.config.name not in racks()
+    assert rack.config.name not in list_racks()
 
 
 def test_a_run_ended_by_the_loss_of_its_crate_ends_in_the_tick_that_had_begun(
@@ -130,7 +130,7 @@ def test_a_run_ended_by_the_loss_of_its_crate_ends_in_the_tick_that_had_begun(
 ) -> None:
     with Rack(config("clock.mode=realtime")) as rack:
         rack.start()
-        words, block = rack.segment.words, rack.segment.block("wave")
+        words, block = rack.segment.words, rack.segment.get_block("wave")
         wait_until(lambda: words[System.TICK] > 20)
         before = words[System.TICK]
         os.kill(parent_of(block[Block.PID]), signal.SIGKILL)
@@ -156,10 +156,10 @@ def test_a_running_racks_name_is_refused_and_the_rack_continues(config: MakeConf
 def test_a_removed_rack_frees_its_memory(config: MakeConfig) -> None:
     rack = Rack(config())
     run(rack, 0.0025)
-    name = shm_path(rack.config.name).name
+    name = get_shm_path(rack.config.name).name
     maps = Path("/proc/self/maps")
     # Unlinked but still mapped, so the counters of an ended run remain readable.
-    assert rack.segment.block("wave")[Block.CYCLES] == 1
+    assert rack.segment.get_block("wave")[Block.CYCLES] == 1
     before = maps.read_text().count("(deleted)")
     del rack
     gc.collect()
@@ -203,13 +203,13 @@ def test_a_limit_of_the_system_is_one_line_with_its_value(
     config: MakeConfig, tmp_path: Path, limits: tuple[str, ...], why: str
 ) -> None:
     plain = config(text=PLAIN)
-    segment = Segment.create(resolve(plain).layout, plain.text())
+    segment = Segment.create(resolve(plain).layout, plain.to_toml_text())
     size = len(segment.bytes)
-    unlink(segment.rack)
+    unlink_segment(segment.rack)
     segment.close()
     sizes = {"half": str(size // mmap.PAGESIZE // 2 * mmap.PAGESIZE), "all": str(size)}
     path = tmp_path / "limited.toml"
-    path.write_text(plain.text())
+    path.write_text(plain.to_toml_text())
     command = [*(sizes.get(word, word) for word in limits), *RACK, "run", str(path)]
     done = subprocess.run(
         [*command, "--seconds", "0.1", "--no-record", "--share"],

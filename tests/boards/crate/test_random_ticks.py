@@ -16,8 +16,8 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.events import Event
 from rack.boards.wiring import Continuation, SnapshotPolicy
-from rack.tools.lab.benches.observed import record
-from rack.tools.launch.continued import RunAgain
+from rack.tools.lab.benches.observed import record_rack
+from rack.tools.launch.continued import RepeatedRun
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
@@ -113,10 +113,12 @@ def test_a_shipped_rack_with_host_programs_continues_with_their_recorded_message
     system: str, rack_name: str, tmp_path: Path
 ) -> None:
     config, _ = rack_of(system, rack_name)
-    one = record(config, HOSTED_S, tmp_path / "one")
+    one = record_rack(config, HOSTED_S, tmp_path / "one")
     ends = one.result.outcome
-    with RunAgain(Recording(tmp_path / "one")) as again:
+    with RepeatedRun(Recording(tmp_path / "one")) as again:
         for tick in random.Random(SEED).sample(range(ends.ticks), OF_SHIPPED):
             folder = tmp_path / str(tick)
-            result = run_rack(config, HOSTED_S, folder, Display(), begins=again.beginning(tick))
+            result = run_rack(
+                config, HOSTED_S, folder, Display(), beginning=again.continue_at(tick)
+            )
             assert result.outcome.digest == ends.digest, tick

@@ -15,7 +15,7 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
-from tests.boards.messages import Written
+from tests.boards.messages import WrittenMessages
 from tests.boards.runs import end_of, faulty, kill
 
 TASKS = ("wave", "wave.planner", "watch")
@@ -43,7 +43,7 @@ def test_a_lost_board_is_back_on_the_grid_at_its_tick(
 ) -> None:
     outcome, events = run(faulty(config(), {"kind": kind, "board": victim, "tick": 100}))
     assert outcome.cause == "time over"
-    assert outcome.worked
+    assert outcome.is_success
     every = 8 if victim == "watch" else 1
     lost = 100 if kind == "kill" else of(events, "detection", "hang")[0].tick
     (back,) = of(events, "recovery", "rejoined")
@@ -68,7 +68,7 @@ def test_a_run_with_its_faults_repeats(config: MakeConfig) -> None:
 def test_a_restarted_writer_continues_its_serials_in_a_new_epoch(config: MakeConfig) -> None:
     with Rack(faulty(config(), kill("wave", 100))) as rack:
         rack.run(1.0)
-        rows = Written.on(rack.segment).messages["wave.status"]
+        rows = WrittenMessages.on(rack.segment).messages["wave.status"]
     assert rows["serial"].tolist() == list(range(1, len(rows) + 1))
     assert rows["tick"].tolist() == [*range(100), *range(300, 400)]
     assert sorted(set((rows["epoch"] & 0xFFFFFFFF).tolist())) == [1, 2]
@@ -130,11 +130,13 @@ def test_a_kill_from_outside_in_real_time_is_survived(config: MakeConfig, victim
         while words[System.TICK] < 40:
             assert rack.watch(0.05)
         pid = (
-            words[System.CLOCK_PID] if victim == "clock" else rack.segment.block(victim)[Block.PID]
+            words[System.CLOCK_PID]
+            if victim == "clock"
+            else rack.segment.get_block(victim)[Block.PID]
         )
         os.kill(pid, signal.SIGKILL)
         outcome = end_of(rack)
-    assert (outcome.cause, outcome.worked) == ("time over", True)
+    assert (outcome.cause, outcome.is_success) == ("time over", True)
     assert [event.board for event in of(rack.events, "died")] == [victim]
     assert [event.board for event in of(rack.events, "recovery", "rejoined")] == [victim]
 
@@ -149,7 +151,7 @@ def test_a_stopped_clock_is_detected_by_the_fastest_board(config: MakeConfig) ->
     # The clock itself may have been late and skipped the fault's tick.
     assert stopped.since == of(events, "fault", "begins")[0].tick
     assert of(events, "recovery", "rejoined")[0].board == "clock"
-    assert outcome.worked
+    assert outcome.is_success
 
 
 @pytest.mark.slow
@@ -163,7 +165,7 @@ def test_a_late_alarm_about_a_dead_clock_does_not_end_its_successor(config: Make
         os.kill(dead, signal.SIGKILL)
         while not of(rack.events, "recovery", "rejoined"):
             assert rack.watch(0.05)
-        AlarmWriter(rack.segment, "watch").ring(
+        AlarmWriter(rack.segment, "watch").raise_alarm(
             words[System.TICK], Alarm.CLOCK_STOPPED, dead, 3, 40
         )
         end_of(rack)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.segment import Segment, racks
+from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import System
 from tests.boards.conftest import PLAIN, MakeConfig
 from tests.boards.crate.test_rack import as_root, as_user
@@ -31,7 +31,7 @@ def test_a_restart_that_the_system_refuses_is_reported_and_ends_the_run_properly
     config: MakeConfig, tmp_path: Path, rack_name: str
 ) -> None:
     path, out = tmp_path / "limited.toml", tmp_path / "out"
-    path.write_text(config("clock.mode=realtime", text=PLAIN).text())
+    path.write_text(config("clock.mode=realtime", text=PLAIN).to_toml_text())
     limits = ("prlimit", "--nproc=5", *as_user(FIVE_MAY))
 
     def run_long() -> None:
@@ -52,7 +52,7 @@ def test_a_restart_that_the_system_refuses_is_reported_and_ends_the_run_properly
     with ExitStack() as stack:
         runner = stack.enter_context(forked(run_long))
         # A whole command: on a loaded machine its imports alone may take half a minute.
-        wait_until(lambda: rack_name in racks(), BOUND_S)
+        wait_until(lambda: rack_name in list_racks(), BOUND_S)
         segment = Segment.attach(rack_name)
         stack.callback(segment.close)
         # Before the clock runs, a board that cannot be forked is a launch that fails.

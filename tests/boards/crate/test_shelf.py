@@ -21,7 +21,7 @@ def shelf() -> Iterator[SnapshotShelf]:
     before = descriptors()
     shelf = SnapshotShelf()
     yield shelf
-    shelf.clear()
+    shelf.drop_all()
     with closing(shelf.line), closing(shelf.boards_line):
         pass
     assert descriptors() == before
@@ -31,19 +31,19 @@ def hold(shelf: SnapshotShelf, tick: int) -> None:
     """Hold a snapshot of a rack without processes."""
     memory = os.memfd_create("test")
     os.ftruncate(memory, SIZE)
-    shelf._hold(HeldSnapshot(tick, memory=memory))
+    shelf._add_whole_snapshot(HeldSnapshot(tick, memory=memory))
 
 
 def ticks(shelf: SnapshotShelf) -> list[int]:
-    return sorted(snapshot.tick for snapshot in shelf._held)
+    return sorted(snapshot.tick for snapshot in shelf._whole_snapshots)
 
 
 def test_the_nearest_snapshot_before_a_tick_is_found(shelf: SnapshotShelf) -> None:
     for tick in (0, 100, 50):
         hold(shelf, tick)
-    found = [shelf.nearest(tick) for tick in (0, 49, 50, 99, 1000)]
+    found = [shelf.find_nearest(tick) for tick in (0, 49, 50, 99, 1000)]
     assert [one and one.tick for one in found] == [0, 0, 50, 50, 100]
-    assert shelf.nearest(-1) is None
+    assert shelf.find_nearest(-1) is None
 
 
 def test_the_first_and_newest_snapshots_stay_and_older_ones_are_thinned_out(

@@ -13,13 +13,13 @@ from typing import Any
 
 import pytest
 
-from rack.backplane.process import children_of, is_alive, readable
+from rack.backplane.process import is_alive, list_children, wait_readable
 from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
-from rack.boards.crate.clean import remove_dead
+from rack.boards.crate.clean import remove_dead_rack
 from rack.boards.crate.line import WarmCrate
-from rack.boards.errors import UNKEPT, SnapshotError
+from rack.boards.errors import NO_SNAPSHOTS_PREFIX, SnapshotError
 from rack.boards.events import Event, Outcome
 from rack.boards.faults.config import FaultConfig
 from rack.boards.wiring import Continuation, SnapshotPolicy
@@ -73,9 +73,9 @@ def continued(
 
 def ticks_on(crate: WarmCrate) -> list[int]:
     """Return the ticks of all snapshots."""
-    found = [crate.show(1 << 40, "").tick]
+    found = [crate.read_attributes(1 << 40, "").tick]
     while found[-1] > 0:
-        found.append(crate.show(found[-1] - 1, "").tick)
+        found.append(crate.read_attributes(found[-1] - 1, "").tick)
     return [tick for tick in found[::-1] if tick >= 0]
 
 
@@ -128,7 +128,7 @@ def test_a_snapshot_shows_the_attributes_of_its_levels(
     config: MakeConfig, crate: WarmCrate
 ) -> None:
     taken(config(text=REMEMBERING), crate, SnapshotPolicy(part=0, at=210))
-    found = crate.show(399, "wave")
+    found = crate.read_attributes(399, "wave")
     assert found.tick == 210
     shown = json.loads(found.attributes)
     assert (shown["_factor"], shown["_half"], shown["_list"]) == (1.0, 0.5, "210 items")
@@ -216,7 +216,7 @@ def test_a_level_that_cannot_be_copied_is_named_and_runs_as_before(
     outcome, events = taken(rack, crate)
     assert (outcome.cause, outcome.digest) == ("time over", expected.digest)
     (note,) = [event.text for event in events if event.kind == "ready"]
-    assert note.startswith(f"{UNKEPT}wave: {named}")
+    assert note.startswith(f"{NO_SNAPSHOTS_PREFIX}wave: {named}")
     assert ticks_on(crate) == []
 
 
@@ -231,7 +231,7 @@ def test_without_a_snapshot_and_in_real_time_a_rack_is_refused(
 
 def copies_of(crate: WarmCrate) -> set[int]:
     """Return the processes of a crate between two racks: copies that wait."""
-    return {pid for pid in children_of(crate.pid) if is_alive(pid)}
+    return {pid for pid in list_children(crate.pid) if is_alive(pid)}
 
 
 def test_snapshots_end_with_their_crate_however_that_ends(config: MakeConfig) -> None:
@@ -301,12 +301,12 @@ def test_nothing_is_left_of_snapshots_whose_launcher_is_killed(config: MakeConfi
                     continue
 
     with forked(launch) as launcher:
-        assert readable(begun, BOUND_S)
+        assert wait_readable(begun, BOUND_S)
         crate = int.from_bytes(os.read(begun, 4), "little")
-        family = {crate, *children_of(crate)}
+        family = {crate, *list_children(crate)}
         for child in [*family]:
-            family |= children_of(child)
+            family |= list_children(child)
         os.kill(launcher, signal.SIGKILL)
         wait_until(lambda: not any(map(is_alive, family)))
     assert len(family) > 2 * (len(rack.board) + 2)
-    remove_dead(rack.name)
+    remove_dead_rack(rack.name)

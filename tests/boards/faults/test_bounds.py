@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from rack.backplane.layout import Layout
-from rack.boards.config import wire
-from rack.boards.config.injections import injections
+from rack.boards.config import resolve_layout
+from rack.boards.config.injections import build_injections
 from rack.boards.faults.kind import KINDS
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
@@ -46,8 +46,10 @@ def bound(
     config: MakeConfig, fault: dict[str, Any], reader: str | None, *settings: str
 ) -> int | None:
     found = rack(config, fault, settings=settings)
-    layout: Layout = wire(found)
-    return KINDS[fault["kind"]].bound_ticks(injections(found, layout)[0], layout, reader)
+    layout: Layout = resolve_layout(found)
+    return KINDS[fault["kind"]].compute_bound_ticks(
+        build_injections(found, layout)[0], layout, reader
+    )
 
 
 @pytest.mark.parametrize(("fault", "reader", "ticks"), CASES.values(), ids=CASES)

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
-from rack.boards.config import load, wire
-from rack.boards.faults.bounds import last_read, struck_mailboxes
+from rack.boards.config import load, resolve_layout
+from rack.boards.faults.bounds import compute_last_read_ticks, list_struck_mailboxes
 from rack.boards.faults.kind import KINDS, Kind
 from tests.snapshots import ROOT, Snapshots, each_shipped_rack
 
@@ -26,26 +26,28 @@ def injections(kind: Kind, layout: Layout) -> Iterator[Injection]:
 
 @each_shipped_rack
 def test_the_bounds_of_a_shipped_rack_are_as_before(name: str) -> None:
-    layout = wire(load(ROOT / "configs" / name))
+    layout = resolve_layout(load(ROOT / "configs" / name))
     parts: dict[str, object] = {}
     for kind in KINDS:
         if kind.where == "clock":
             clock = Injection(
                 kind.number, -1, -1, 0, 0, 0, 0, None, tuple(3.0 for _ in kind.parameters)
             )
-            parts[kind.name] = kind.bound_ticks(clock, layout)
+            parts[kind.name] = kind.compute_bound_ticks(clock, layout)
             continue
         found: list[object] = []
         for injection in injections(kind, layout):
             board = layout.processes[injection.task].name
-            struck = struck_mailboxes(layout, injection.mailbox, board)
+            struck = list_struck_mailboxes(layout, injection.mailbox, board)
             readers = sorted({reader for box in struck for reader in box.readers})
-            if kind.tasks and layout.task(board).role not in kind.tasks:
+            if kind.tasks and layout.find_task(board).role not in kind.tasks:
                 continue
             if kind.takes_mailbox and not readers:
                 continue
-            found += [kind.bound_ticks(injection, layout, reader) for reader in (None, *readers)]
-            found += [kind.recovery_ticks(board, layout, restart) for restart in RESTARTS_S]
+            found += [
+                kind.compute_bound_ticks(injection, layout, reader) for reader in (None, *readers)
+            ]
+            found += [kind.compute_recovery_ticks(board, layout, restart) for restart in RESTARTS_S]
         parts[kind.name] = found
-    parts["last reads"] = [last_read((box.name,), layout) for box in layout.mailboxes]
+    parts["last reads"] = [compute_last_read_ticks((box.name,), layout) for box in layout.mailboxes]
     SNAPSHOTS.check(name, {"bounds": parts})

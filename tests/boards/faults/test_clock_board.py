@@ -14,10 +14,10 @@ from rack.backplane.clock.lockstep import LockstepDriver
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.fault_table import NEVER, FaultEntry, FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.process import STOPPED, WAITING, is_alive, state_of
+from rack.backplane.process import STOPPED_STATES, WAITING_STATES, is_alive, read_state
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import done_semaphore
-from rack.backplane.watch.alarms import Alarm, alarm_ring
+from rack.backplane.semaphores import get_done_semaphore
+from rack.backplane.watch.alarms import Alarm, open_alarm_ring
 from rack.backplane.words import Block, Run, System
 from rack.boards.faults.clock_board import FaultStage
 from rack.boards.faults.kind import KINDS
@@ -35,7 +35,7 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:
     segment = make_bus(task("writer", every=8), mailbox(every=8, delay=8))
     segment.words[System.LOCKSTEP] = 1
     table = FaultTable(segment)
-    entry = table.add(Injection(KINDS["mute"].number, 0, mailbox=0, tick=3, ticks=6))
+    entry = table.add_fault(Injection(KINDS["mute"].number, 0, mailbox=0, tick=3, ticks=6))
     cycle, seen = NextCycle(segment, "writer"), []
 
     def serve() -> None:
@@ -43,8 +43,8 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:
             seen.append((tick, entry.stage))
             time.sleep(CYCLE_S)
             seen.append((tick, entry.stage))
-            segment.block("writer")[Block.DONE] = tick
-            done_semaphore(segment, "writer").release()
+            segment.get_block("writer")[Block.DONE] = tick
+            get_done_semaphore(segment, "writer").release()
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
@@ -54,10 +54,10 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:
     class Controller:
         def begin(self, tick: int) -> None:
             if tick >= stage.next_tick or segment.words[System.INJECTED] != stage.injected:
-                stage.advance(tick)
+                stage.advance_faults(tick)
 
         def released(self, tick: int) -> None:
-            stage.within(tick)
+            stage.act_within_tick(tick)
 
     driver.controller = Controller()
     driver.run()
@@ -80,17 +80,19 @@ class Site:
         self.table = FaultTable(segment)
         self.driver = LockstepDriver(segment, lambda _: None, False, 8)
         self.stage = FaultStage(segment, self.driver)
-        self._ring = alarm_ring(segment, "clock")
+        self._ring = open_alarm_ring(segment, "clock")
         self.write_other = open_writer(segment, "other.point")
 
     def add(self, kind: str, task: int = 0, **more: Any) -> FaultEntry:
         """Add a fault, of the writer if nothing else is said."""
         defaults = tuple(p.default or 1.0 for p in KINDS[kind].parameters)
-        return self.table.add(Injection(KINDS[kind].number, task, parameters=defaults, **more))
+        return self.table.add_fault(
+            Injection(KINDS[kind].number, task, parameters=defaults, **more)
+        )
 
     def alarms(self) -> list[tuple[Alarm, int, int, float]]:
         """Return code, tick, subject and value of the alarms since the last call."""
-        rows = self._ring.drain().rows
+        rows = self._ring.read_new_rows().rows
         return [
             (Alarm(row["code"]), int(row["tick"]), int(row["subject"]), float(row["value"]))
             for row in rows
@@ -98,7 +100,7 @@ class Site:
 
     def advance(self, *ticks: int) -> list[tuple[Alarm, int, int, float]]:
         for tick in ticks:
-            self.stage.advance(tick)
+            self.stage.advance_faults(tick)
         return self.alarms()
 
 
@@ -148,7 +150,7 @@ def test_messages_that_flow_again_after_a_message_fault_are_reported(site: Site)
     site.advance(2)
     writer.write(3)
     site.advance(5)
-    box = site.segment.layout.mailboxes.index(site.segment.layout.mailbox(NAME))
+    box = site.segment.layout.mailboxes.index(site.segment.layout.find_mailbox(NAME))
     # A message made while it was active is none of those after it.
     assert (site.stage.next_tick, site.advance(6)) == (6, [])
     site.write_other.write(6)
@@ -186,7 +188,7 @@ def test_a_kill_needs_a_process_and_waits_until_its_loss_is_known(site: Site) ->
     absent = site.add("kill", tick=1)
     site.advance(1)
     assert (absent.count, absent.stage) == (0, Stage.ACTIVE)
-    block = site.segment.block("writer")
+    block = site.segment.get_block("writer")
     with forked(signal.pause) as pid:
         block[Block.PID] = pid
 
@@ -194,7 +196,7 @@ def test_a_kill_needs_a_process_and_waits_until_its_loss_is_known(site: Site) ->
             wait_until(lambda: not is_alive(pid))
             block[Block.LOST] = 3
             site.segment.words[System.LOSSES] += 2
-            done_semaphore(site.segment, "writer").release()
+            get_done_semaphore(site.segment, "writer").release()
 
         entry = site.add("kill", tick=2)
         with in_thread(crate):
@@ -210,24 +212,24 @@ def test_a_kill_needs_a_process_and_waits_until_its_loss_is_known(site: Site) ->
 def test_a_hanging_task_continues_at_the_end_of_its_fault_unless_it_is_lost(
     site: Site,
 ) -> None:
-    block = site.segment.block("writer")
+    block = site.segment.get_block("writer")
     with forked(signal.pause) as pid:
         block[Block.PID] = pid
         site.add("hang", tick=1, ticks=3)
         site.advance(1)
-        wait_until(lambda: state_of(pid) in STOPPED)
+        wait_until(lambda: read_state(pid) in STOPPED_STATES)
         target = next(one for one in site.driver.tasks if one.spec.name == "writer")
         assert target.is_stopped
         site.advance(4)
-        wait_until(lambda: state_of(pid) in WAITING)
+        wait_until(lambda: read_state(pid) in WAITING_STATES)
         assert not target.is_stopped
         lasting = site.add("hang", tick=5)
         site.advance(5)
-        wait_until(lambda: state_of(pid) in STOPPED)
+        wait_until(lambda: read_state(pid) in STOPPED_STATES)
         block[Block.LOST] = 7
         site.advance(6)
         assert (lasting.stage, lasting.until) == (Stage.OVER, 6)
-        assert state_of(pid) in STOPPED
+        assert read_state(pid) in STOPPED_STATES
 
 
 def test_in_real_time_a_fault_with_a_phase_strikes_within_its_tick(site: Site) -> None:
@@ -237,10 +239,10 @@ def test_in_real_time_a_fault_with_a_phase_strikes_within_its_tick(site: Site) -
     entry = site.add("clock-skip", task=-1, tick=5, phase=900)
     site.advance(5)
     assert (entry.count, entry.stage) == (0, Stage.ACTIVE)
-    site.stage.within(5)
+    site.stage.act_within_tick(5)
     assert entry.count == 1
     assert entry.struck_ns >= site.segment.words[System.EPOCH_NS] + 5.9 * 2_500_000
-    site.stage.within(6)
+    site.stage.act_within_tick(6)
     assert entry.count == 1
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import FAULTS, load, loads, names, wire
+from rack.boards.config import FAULTS, list_names, load, load_text, resolve_layout
 from rack.boards.errors import ConfigError
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS
@@ -42,12 +42,12 @@ def test_the_faults_of_a_script_come_after_those_of_the_config(small: Path, writ
     assert load(small, faults=str(script)).fault == load(small, faults=script).fault
 
 
-@pytest.mark.parametrize("name", names(FAULTS))
+@pytest.mark.parametrize("name", list_names(FAULTS))
 def test_every_bundled_script_fits_the_nasrem_rack(name: str) -> None:
     config = load("nasrem", ["clock.mode=realtime"], name)
-    wire(config)
+    resolve_layout(config)
     assert config.fault
-    assert loads(config.text()) == config
+    assert load_text(config.to_toml_text()) == config
 
 
 @pytest.mark.parametrize("text", ["[clock]\nspeed = 2\n", "fault = 3\n", 'name = "x"\n'])

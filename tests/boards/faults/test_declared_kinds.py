@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rack.boards.faults.drawing import BEYOND, Drawing, swept
+from rack.boards.faults.drawing import MAX_SIZE_RATIO, Drawing, list_sweep_sizes
 from rack.boards.faults.kind import KINDS, Kind, Parameter
 from rack.boards.faults.kinds import BUILT_IN
 from tests.snapshots import Snapshots
@@ -60,8 +60,8 @@ def test_drawn_values_are_permitted_ones(kind: Kind) -> None:
 
 
 def test_a_sweep_extends_from_the_least_size_beyond_the_visible_size() -> None:
-    sizes = swept(0.001, 0.02, 5)
-    assert (sizes[0], sizes[-1]) == (0.001, pytest.approx(BEYOND * 0.02))
+    sizes = list_sweep_sizes(0.001, 0.02, 5)
+    assert (sizes[0], sizes[-1]) == (0.001, pytest.approx(MAX_SIZE_RATIO * 0.02))
     ratios = [after / before for before, after in pairwise(sizes)]
     assert ratios == pytest.approx([ratios[0]] * 4, rel=1e-2)
-    assert swept(0.001, 0.02, 1) == [0.001]
+    assert list_sweep_sizes(0.001, 0.02, 1) == [0.001]

@@ -5,7 +5,13 @@ from __future__ import annotations
 import pytest
 
 from rack.backplane.fault_table import NEVER, FaultTable, Injection, Stage
-from rack.boards.faults.describe import ALL_JOINTS, board_of, describe, document, subject_of
+from rack.boards.faults.describe import (
+    ALL_JOINTS,
+    describe_fault,
+    find_board,
+    find_subject,
+    to_document,
+)
 from rack.boards.faults.kind import KINDS
 from tests.backplane.bus import NAME, mailbox, task
 from tests.backplane.conftest import MakeBus
@@ -41,35 +47,37 @@ def injection(
 def test_a_fault_is_a_line_with_its_target(
     table: FaultTable, fault: Injection, board: str, subject: str, text: str | None
 ) -> None:
-    entry = table.add(fault)
+    entry = table.add_fault(fault)
     layout = table._segment.layout
-    assert board_of(entry, layout) == board
-    assert subject_of(entry, layout, JOINTS) == subject
-    line = describe(entry, layout, JOINTS)
+    assert find_board(entry, layout) == board
+    assert find_subject(entry, layout, JOINTS) == subject
+    line = describe_fault(entry, layout, JOINTS)
     assert line.startswith(f"{KINDS[fault.kind].name} of {board}")
     assert subject in line
     assert text in (None, line)
-    assert describe(entry, layout, JOINTS, with_board=False) == line.replace(f" of {board}", "")
+    assert describe_fault(entry, layout, JOINTS, with_board=False) == line.replace(
+        f" of {board}", ""
+    )
 
 
 def test_parameters_have_their_units_and_ratios_none(table: FaultTable) -> None:
     layout = table._segment.layout
-    drop = table.add(injection("drop", mailbox=0, parameters=(0.25,)))
-    assert describe(drop, layout, JOINTS) == f"drop of writer ({NAME}, probability 0.25)"
-    overrun = table.add(injection("overrun", parameters=(1.5, 0.0)))
-    assert describe(overrun, layout, JOINTS) == "overrun of writer (by 1.5 cycles, random 0)"
+    drop = table.add_fault(injection("drop", mailbox=0, parameters=(0.25,)))
+    assert describe_fault(drop, layout, JOINTS) == f"drop of writer ({NAME}, probability 0.25)"
+    overrun = table.add_fault(injection("overrun", parameters=(1.5, 0.0)))
+    assert describe_fault(overrun, layout, JOINTS) == "overrun of writer (by 1.5 cycles, random 0)"
 
 
 def test_a_document_contains_the_ticks_known_at_its_stage(table: FaultTable) -> None:
-    entry = table.add(Injection(KINDS["mute"].number, 0, 0, tick=40, ticks=8))
+    entry = table.add_fault(Injection(KINDS["mute"].number, 0, 0, tick=40, ticks=8))
     layout = table._segment.layout
     entry.until = 48
-    waiting = document(entry, layout, JOINTS)
+    waiting = to_document(entry, layout, JOINTS)
     assert (waiting["stage"], waiting["begins"], waiting["until"]) == ("waiting", 40, None)
     assert (waiting["struck_tick"], waiting["acted"], waiting["ticks"]) == (-1, 0, 8)
     assert (waiting["kind"], waiting["board"], waiting["mailbox"]) == ("mute", "writer", NAME)
     for stage in (Stage.ACTIVE, Stage.OVER):
         entry.stage = stage
-        assert document(entry, layout, JOINTS)["until"] == 48
+        assert to_document(entry, layout, JOINTS)["until"] == 48
     entry.until = NEVER
-    assert document(entry, layout, JOINTS)["until"] is None
+    assert to_document(entry, layout, JOINTS)["until"] is None

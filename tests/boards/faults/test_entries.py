@@ -8,15 +8,15 @@ import pytest
 
 from rack.backplane.fault_table import Injection
 from rack.backplane.message import State
-from rack.boards.config import wire
-from rack.boards.config.injections import injections
+from rack.boards.config import resolve_layout
+from rack.boards.config.injections import build_injections
 from tests.boards.conftest import MakeConfig
 from tests.boards.fault_racks import rack
 
 
 def injected(config: MakeConfig, *faults: dict[str, Any]) -> tuple[Injection, ...]:
     found = rack(config, *faults)
-    return injections(found, wire(found))
+    return build_injections(found, resolve_layout(found))
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_a_condition_compares_with_a_number_or_its_name(config: MakeConfig, valu
     (found,) = injected(
         config, {"kind": "kill", "board": "wave", "when": f"watch.status.state=={value}"}
     )
-    layout = wire(rack(config))
+    layout = resolve_layout(rack(config))
     assert found.when is not None
     box, field, number = found.when
     assert (layout.mailboxes[box].name, layout.mailboxes[box].fields[field].name) == (
@@ -85,4 +85,4 @@ def test_faults_draw_different_random_numbers_that_repeat_with_the_racks_seed(
     assert given.seed == 7
     assert injected(config, drop, drop)[1].seed == second.seed
     other = rack(config, drop, settings=("seed=1",))
-    assert injections(other, wire(other))[0].seed != first.seed
+    assert build_injections(other, resolve_layout(other))[0].seed != first.seed

@@ -11,10 +11,10 @@ import pytest
 from rack.backplane.address_map import CLOCK
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.message import State
-from rack.backplane.trace import trace_ring
+from rack.backplane.trace import open_trace_ring
 from rack.backplane.words import Block
 from rack.boards import Rack
-from rack.boards.config.injections import injections
+from rack.boards.config.injections import build_injections
 from rack.boards.errors import LaunchError
 from rack.boards.faults.bounds import cycle_ticks
 from rack.boards.faults.kind import KINDS, Kind
@@ -61,11 +61,11 @@ def test_a_fault_is_detected_and_ends_or_latches_within_its_bound(
     with rack_with(config, kind, length) as rack:
         layout = rack.segment.layout
         outcome = rack.run(2.0)
-        (entry,) = FaultTable(rack.segment).staged((Stage.ACTIVE, Stage.OVER))
+        (entry,) = FaultTable(rack.segment).list_entries((Stage.ACTIVE, Stage.OVER))
         board = layout.tasks[entry.task].name if entry.task >= 0 else CLOCK
-        rows = trace_ring(rack.segment, "watch").drain().rows
-    bound = kind.bound_ticks(
-        injections(rack.config, layout)[0], layout, "watch" if kind.takes_mailbox else None
+        rows = open_trace_ring(rack.segment, "watch").read_new_rows().rows
+    bound = kind.compute_bound_ticks(
+        build_injections(rack.config, layout)[0], layout, "watch" if kind.takes_mailbox else None
     )
     found = min((event.tick for event in rack.events if event.code in kind.codes), default=None)
     if found is None:
@@ -76,16 +76,16 @@ def test_a_fault_is_detected_and_ends_or_latches_within_its_bound(
     assert found - max(FIRST, entry.struck_tick) <= bound
     if outcome.state == "error":
         latched = int(rows["tick"][rows["state"] == State.ERROR][0])
-        assert not outcome.worked
+        assert not outcome.is_success
         assert outcome.reason.startswith("nothing heard of the wave for")
         assert latched <= found + bound + PATIENCE_TICKS + cycle_ticks(layout, "watch")
         return
-    assert outcome.worked
+    assert outcome.is_success
     restart_s = rack.config.supervision.lockstep_restart_s
     over = max(entry.until if entry.stage == Stage.OVER else 0, found)
     if kind.is_over_when_found:
         over = found
-    after = rows[rows["tick"] >= over + kind.recovery_ticks(board, layout, restart_s)]
+    after = rows[rows["tick"] >= over + kind.compute_recovery_ticks(board, layout, restart_s)]
     assert len(after) > 20
     assert np.all(after["state"] == State.EXECUTING)
 
@@ -96,8 +96,8 @@ def test_a_fault_in_real_time_finally_ends_or_latches(
 ) -> None:
     with rack_with(config, kind, length) as rack:
         rack.start()
-        entry, watch = FaultTable(rack.segment).entries[0], rack.segment.block("watch")
-        tasks = [rack.segment.block(task.name) for task in rack.segment.layout.tasks]
+        entry, watch = FaultTable(rack.segment).entries[0], rack.segment.get_block("watch")
+        tasks = [rack.segment.get_block(task.name) for task in rack.segment.layout.tasks]
 
         def is_over() -> bool:
             return entry.stage == Stage.OVER and not any(task[Block.LOST] for task in tasks)

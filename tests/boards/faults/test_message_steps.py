@@ -12,7 +12,7 @@ import pytest
 from rack.backplane.fault_table import FaultTable, Injection
 from rack.backplane.layout import PROTOCOLS, Protocol
 from rack.backplane.mailbox.mailbox import Verdict
-from rack.backplane.process import state_of
+from rack.backplane.process import read_state
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import message_steps as messages
 from rack.boards.faults.kind import KINDS
@@ -44,7 +44,7 @@ def link(rack_name: str) -> Iterator[MakeLink]:
 
 
 def forge(rack: Link, tick: int) -> None:
-    assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
+    assert exit_status(fork(lambda: messages.forge_message(rack.segment, NAME, tick))) == 0
 
 
 @pytest.mark.slow
@@ -65,7 +65,7 @@ def test_a_fault_is_detected_within_its_bound_and_identified_and_nothing_before_
     rack.run(END, LAST)
     about = KINDS[kind]
     injection = Injection(about.number, 0, 0, parameters=FAULTS[kind])
-    bound = about.bound_ticks(injection, rack.segment.layout, "reader")
+    bound = about.compute_bound_ticks(injection, rack.segment.layout, "reader")
     alarms = rack.alarms()
     found = [tick for tick, code in alarms if code in about.detected_as]
     assert found
@@ -223,17 +223,17 @@ def test_a_process_that_ends_in_the_critical_section_is_detected_by_the_next_wai
     rack = link("lock")
     rack.run(0, 4)
     rack.writer.close()
-    entry = FaultTable(rack.segment).add(
+    entry = FaultTable(rack.segment).add_fault(
         Injection(KINDS["lock-held"].number, 0, parameters=(float(is_killed),))
     )
 
     def write() -> None:
         writer = WritingTask(rack.segment)
-        writer.ports.apply([entry])
+        writer.ports.apply_faults([entry])
         writer.cycle(4)
 
     with forked(write) as pid:
-        wait_until(lambda: state_of(pid) in ("Z" if is_killed else "T"))
+        wait_until(lambda: read_state(pid) in ("Z" if is_killed else "T"))
         assert (struck(entry), entry.count) == (4, 1)
         reading = rack.reader.cycle(5)
         # The lock of a dead process goes to the waiter; a stopped process keeps it.

@@ -9,11 +9,11 @@ from collections.abc import Iterator
 import pytest
 
 from rack.boards import Rack
-from rack.boards.config import wire
-from rack.boards.config.injections import injections
+from rack.boards.config import resolve_layout
+from rack.boards.config.injections import build_injections
 from rack.boards.faults import KINDS, Kind, Parameter
-from rack.boards.faults.bounds import cycles
-from rack.tools.commands.inject import kinds_text
+from rack.boards.faults.bounds import cycle_bound
+from rack.tools.commands.inject import format_kinds
 from tests.boards.conftest import PLAIN, MakeConfig
 
 BOUND_S = 60
@@ -37,8 +37,8 @@ def fault(keys: str) -> str:
 
 
 def test_a_users_kind_is_listed_with_its_bound_and_parameters(config: MakeConfig) -> None:
-    wire(config(text=GAUGED))
-    lines = [line.split("  ") for line in kinds_text() if line.startswith("lose-every ")]
+    resolve_layout(config(text=GAUGED))
+    lines = [line.split("  ") for line in format_kinds() if line.startswith("lose-every ")]
     kind, parameter = ([cell.strip() for cell in line if cell] for line in lines)
     assert kind == ["lose-every", "every n-th message is lost", "1 write + 1 delivery"]
     assert parameter == ["lose-every", "n", "messages", "4", "2 to 8", "the n"]
@@ -49,8 +49,8 @@ def test_a_fault_begins_when_a_field_has_a_value_of_a_users_enum(
     config: MakeConfig, valve: str
 ) -> None:
     found = config(fault(f'cycles = 80, when = "wave.status.valve == {valve}"'), text=GAUGED)
-    layout = wire(found)
-    (injection,) = injections(found, layout)
+    layout = resolve_layout(found)
+    (injection,) = build_injections(found, layout)
     assert injection.when == (
         0,
         [field.name for field in layout.mailboxes[0].fields].index("valve"),
@@ -65,7 +65,7 @@ def test_a_users_kind_acts_and_is_detected(config: MakeConfig) -> None:
     ) as rack:
         outcome = rack.run(1.0)
         events = rack.events
-    assert outcome.worked
+    assert outcome.is_success
     begins = next(event for event in events if event.kind == "fault")
     assert (begins.tick, begins.text.partition(",")[0]) == (42, "lose-every (n 4 messages) begins")
     detected = next(event for event in events if event.kind == "detection")
@@ -75,13 +75,13 @@ def test_a_users_kind_acts_and_is_detected(config: MakeConfig) -> None:
 
 def test_two_kinds_of_one_name_are_refused() -> None:
     with pytest.raises(ValueError, match="kind 'kill' has the number of 'kill'; rename it"):
-        KINDS.add(Kind("kill", "process", "", (), cycles(1)))
+        KINDS.add(Kind("kill", "process", "", (), cycle_bound(1)))
 
 
 def test_a_kind_has_no_more_parameters_than_an_entry_of_the_fault_table_holds() -> None:
     nine = tuple(Parameter(f"p{at}", "1", "a number", 0, 0, 1) for at in range(9))
     with pytest.raises(ValueError, match="kind 'many' has 9 parameters; at most 8 are allowed"):
-        KINDS.add(Kind("many", "process", "", (), cycles(1), parameters=nine))
+        KINDS.add(Kind("many", "process", "", (), cycle_bound(1), parameters=nine))
 
 
 def test_a_kind_that_this_process_has_not_imported_is_an_unknown_fault() -> None:

@@ -12,16 +12,16 @@ import pytest
 
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.fault_table import FaultEntry, FaultTable, Injection, Stage
-from rack.backplane.process import processor_ns
+from rack.backplane.process import read_processor_ns
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
-from rack.boards.faults.kind import KINDS, kind_of
+from rack.boards.faults.kind import KINDS, find_kind
 from rack.boards.faults.tasks import (
     ExtraComputing,
     LoadStep,
     TaskFaults,
-    overrun,
-    slow_plan,
+    extend_cycle,
+    extend_time_slice,
     take_core,
 )
 from rack.levels.fault_steps import Fault
@@ -41,12 +41,12 @@ LEAST_S = 0.5
 def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(make_bus: MakeBus) -> None:
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = 2_500_000
-    segment.block("level")[Block.CORE] = 0
-    entry = FaultTable(segment).add(Injection(KINDS["hog"].number, 0, tick=40, ticks=400))
+    segment.get_block("level")[Block.CORE] = 0
+    entry = FaultTable(segment).add_fault(Injection(KINDS["hog"].number, 0, tick=40, ticks=400))
     with forked(lambda: take_core(segment, entry)) as pid:
         begun = time.monotonic()
         wait_until(lambda: time.monotonic() - begun > LEAST_S, BOUND_S)
-        assert processor_ns(pid) < 0.5 * (time.monotonic() - begun) * 1e9
+        assert read_processor_ns(pid) < 0.5 * (time.monotonic() - begun) * 1e9
         assert os.sched_getaffinity(pid) == {0}
         segment.words[System.STATE] = Run.STOPPED
         assert exit_status(pid) == 0
@@ -54,7 +54,7 @@ def test_a_hog_that_waits_for_the_start_leaves_the_core_to_others(make_bus: Make
 
 def load(segment: Segment, kind: str, until: LoadStep, *parameters: float) -> ExtraComputing:
     """Return extra computing time of a task of three ticks, whose plans have two cycles."""
-    entry = FaultTable(segment).add(
+    entry = FaultTable(segment).add_fault(
         Injection(KINDS[kind].number, 0, tick=0, seed=5, parameters=parameters)
     )
     return ExtraComputing(
@@ -71,7 +71,7 @@ def test_extra_computing_takes_the_time_that_its_step_asks_for(make_bus: MakeBus
 
     extra = load(make_bus(task("level")), "overrun", step, 1.0)
     begun = time.monotonic_ns()
-    extra.burn(20)
+    extra.burn_time(20)
     assert time.monotonic_ns() >= ends[0] >= begun + 20_000_000
     assert (extra.entry.count, extra.entry.struck_tick) == (1, 20)
 
@@ -80,17 +80,19 @@ def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(make_bus:
     segment = make_bus(task("level"))
     segment.words[System.PERIOD_NS] = period = 2_500_000
     segment.words[System.EPOCH_NS] = epoch = 1_000_000_000
-    assert overrun(load(segment, "overrun", overrun, 2.0, 0.0), 4, 77) == 77 + 2 * 3 * period
-    random = load(segment, "overrun", overrun, 2.0, 1.0)
-    drawn = [overrun(random, tick, 0) for tick in range(50)]
-    assert drawn == [overrun(random, tick, 0) for tick in range(50)]
+    assert (
+        extend_cycle(load(segment, "overrun", extend_cycle, 2.0, 0.0), 4, 77) == 77 + 2 * 3 * period
+    )
+    random = load(segment, "overrun", extend_cycle, 2.0, 1.0)
+    drawn = [extend_cycle(random, tick, 0) for tick in range(50)]
+    assert drawn == [extend_cycle(random, tick, 0) for tick in range(50)]
     assert 0 <= min(drawn) < max(drawn) <= 2 * 3 * period
     assert len(set(drawn)) == 50
-    late = load(segment, "planner-slow", slow_plan, 2.0)
+    late = load(segment, "planner-slow", extend_time_slice, 2.0)
     slice_end = epoch + (4 + 3 * 2) * period
-    assert slow_plan(late, 4, 0) == slice_end + 2 * 3 * period
+    assert extend_time_slice(late, 4, 0) == slice_end + 2 * 3 * period
     # One that is beyond its slice already has them added.
-    assert slow_plan(late, 4, slice_end + 5) == slice_end + 5 + 2 * 3 * period
+    assert extend_time_slice(late, 4, slice_end + 5) == slice_end + 5 + 2 * 3 * period
 
 
 class Level:
@@ -110,7 +112,7 @@ class Writes:
         self.applied: list[str] = []
 
     def apply(self, faults: Sequence[FaultEntry]) -> None:
-        self.applied = [kind_of(entry).name for entry in faults]
+        self.applied = [find_kind(entry).name for entry in faults]
 
 
 def test_a_task_has_the_faults_that_are_active_by_its_tick(make_bus: MakeBus) -> None:
@@ -118,25 +120,27 @@ def test_a_task_has_the_faults_that_are_active_by_its_tick(make_bus: MakeBus) ->
     table = FaultTable(segment)
     level = Level()
     outputs = Writes()
-    faults = TaskFaults(segment, segment.layout.task("level"), outputs.apply, cast(Executor, level))
+    faults = TaskFaults(
+        segment, segment.layout.find_task("level"), outputs.apply, cast(Executor, level)
+    )
     kinds = ("overrun", "drop", "sensor-bias", "hog")
     entries = [
-        table.add(Injection(KINDS[kind].number, 0, tick=4, seed=9, parameters=(1.0,)))
+        table.add_fault(Injection(KINDS[kind].number, 0, tick=4, seed=9, parameters=(1.0,)))
         for kind in kinds
     ]
-    table.add(Injection(KINDS["drop"].number, 1, tick=4))
-    assert (faults.refresh(3), faults.loads, outputs.applied) == (table.generation, [], [])
+    table.add_fault(Injection(KINDS["drop"].number, 1, tick=4))
+    assert (faults.refresh_faults(3), faults.loads, outputs.applied) == (table.generation, [], [])
     for entry in entries:
         entry.stage = Stage.ACTIVE
         entry.tick = 4
     # The clock works ahead: for this task they begin a tick later.
-    assert (faults.refresh(3), faults.loads, outputs.applied) == (-1, [], [])
-    assert faults.refresh(4) == table.generation
+    assert (faults.refresh_faults(3), faults.loads, outputs.applied) == (-1, [], [])
+    assert faults.refresh_faults(4) == table.generation
     assert [load.entry.kind for load in faults.loads] == [KINDS["overrun"].number]
     assert outputs.applied == ["drop"]
     (struck,) = level.injected
     assert (struck.kind, struck.seed, struck.since) == ("sensor-bias", 9, 4)
-    faults.count({0: True}, 6)
+    faults.count_actions({0: True}, 6)
     assert (entries[2].count, entries[2].struck_tick) == (1, 6)
-    faults.burn(7)
+    faults.burn_time(7)
     assert (entries[0].count, entries[0].struck_tick) == (1, 7)

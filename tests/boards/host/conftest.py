@@ -9,14 +9,14 @@ from typing import Any
 import pytest
 
 from rack.backplane.mailbox.protocols import open_observer
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.boards.classes import find_class
 from rack.boards.config import resolve
 from rack.boards.config.resolved import Resolved
 from rack.boards.host.bus import HostBus
 from rack.boards.host.bus_adapter import BusAdapter
-from rack.boards.host.entries import Outward
+from rack.boards.host.entries import OutwardEntry
 from rack.boards.run.ports import InputPorts, OutputPorts
 from tests.boards.conftest import MakeConfig
 from tests.boards.host.test_board import HOSTED
@@ -32,7 +32,7 @@ class Site:
     def __init__(self, plan: Resolved, segment: Segment) -> None:
         self.plan = plan
         self.segment = segment
-        self.host = segment.block("program")
+        self.host = segment.get_block("program")
         self.adapter = self.started()
         self.tick = -EVERY
 
@@ -40,7 +40,7 @@ class Site:
         """Return an adapter, as a board that begins has it, with its ports."""
         (wiring,) = (task for task in self.plan.tasks if task.task == "bridge")
         adapter = find_class(wiring.target, BusAdapter)(wiring.context)
-        adapter.attach(self.segment, None)
+        adapter.attach_segment(self.segment, None)
         alarms = AlarmWriter(self.segment, "bridge")
         self.inputs = InputPorts(self.segment, adapter, wiring.inputs, alarms)
         self.outputs = OutputPorts(
@@ -53,7 +53,7 @@ class Site:
         for writer in self.outputs.writers.values():
             writer.close()
         for _, entry in self.adapter._entries:
-            if isinstance(entry, Outward):
+            if isinstance(entry, OutwardEntry):
                 entry._writer.close()
         self.adapter = self.started()
 
@@ -75,7 +75,7 @@ class Site:
     def crossed(self) -> list[float]:
         """Return the numbers that are in the bridge's own mailbox, oldest first."""
         reading = open_observer(self.segment, "bridge.numbers").peek()
-        values = [*reading.earlier, reading.message] if reading.is_there else []
+        values = [*reading.earlier, reading.message] if reading.has_message else []
         return [message.value for message in values]
 
 
@@ -89,7 +89,7 @@ def make_site(config: MakeConfig) -> Iterator[MakeSite]:
         def make(*settings: str) -> Site:
             plan = resolve(config(*settings, text=HOSTED))
             segment = Segment.create(plan.layout, "")
-            stack.callback(unlink, plan.layout.rack)
+            stack.callback(unlink_segment, plan.layout.rack)
             stack.callback(segment.close)
             return Site(plan, segment)
 
@@ -122,7 +122,7 @@ def open_program(open_bus: OpenBus) -> Callable[[Site], Host]:
 def connected(bus: HostBus, site: Site) -> Host:
     """Return the board's program, with its ports."""
     program = Host(site.plan.hosts[0].context)
-    bus.connect(program)
+    bus.connect_ports(program)
     return program
 
 

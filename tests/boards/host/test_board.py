@@ -11,7 +11,7 @@ from collections.abc import Callable
 import pytest
 
 from rack.backplane.errors import MailboxError
-from rack.backplane.mailbox.history import chains
+from rack.backplane.mailbox.history import find_chains
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
@@ -107,19 +107,22 @@ def test_hung_dead_failed_and_finished_programs_do_not_affect_the_real_time_side
     settings += ("host.failed={ restarts = 1, restarts_within_s = 1e6 }",)
     with Rack(config(*settings, text=text)) as rack:
         rack.start()
-        block = rack.segment.block("killed")
+        block = rack.segment.get_block("killed")
         wait_until(lambda: block[Block.PID] > 0 and rack.watch(0.01) is not None)
         os.kill(block[Block.PID], signal.SIGKILL)
         ends = {"killed": "rejoined", "failed": "given_up", "finished": "done"}
         watch(rack, lambda: all(code in codes(rack, board) for board, code in ends.items()))
         assert rack.segment.words[System.EMERGENCY_STOP] == 0
         assert (
-            sum(rack.segment.block(task.name)[Block.MISSED] for task in rack.segment.layout.tasks)
+            sum(
+                rack.segment.get_block(task.name)[Block.MISSED]
+                for task in rack.segment.layout.tasks
+            )
             == 0
         )
         assert rack.outcome is not None
         ticks = rack.outcome.ticks
-        found = chains(rack.segment, ticks)["adder.status"]
+        found = find_chains(rack.segment, ticks)["adder.status"]
     assert codes(rack, "killed") == ["died", "restart", "rejoined"]
     # It may fail again before the Rack has seen its new process.
     failed = [code for code in codes(rack, "failed") if code != "rejoined"]
@@ -135,7 +138,7 @@ def test_hung_dead_failed_and_finished_programs_do_not_affect_the_real_time_side
     ]
     with Rack(config(*settings, *external, text=text)) as alone:
         alone.run(ticks * 0.0025)
-        assert chains(alone.segment, ticks)["adder.status"] == found
+        assert find_chains(alone.segment, ticks)["adder.status"] == found
 
 
 @pytest.mark.slow
@@ -165,7 +168,7 @@ def test_a_daemon_in_another_session_ends_with_its_host_board(
         rack.start()
         wait_until(lambda: rack.watch(0.01) and bool(daemons(rack)))
         first = daemons(rack)[0]
-        os.kill(rack.segment.block("program")[Block.PID], signal.SIGKILL)
+        os.kill(rack.segment.get_block("program")[Block.PID], signal.SIGKILL)
         wait_until(lambda: rack.watch(0.01) and "died" in codes(rack, "program"))
         assert not runs(first)
         # Another one ends with the rack.
@@ -189,17 +192,17 @@ def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConf
             HostBus(rack.segment, wiring)
         with pytest.raises(LevelError, match="port 'numbers': no board has connected it"):
             program.send_number(2.0)
-        first.connect(program)
+        first.connect_ports(program)
         assert program.send_number(2.0)
         first.close()
         second = HostBus(rack.segment, wiring)
-        second.connect(program)
+        second.connect_ports(program)
         assert program.send_number(3.0)
         wait_until(lambda: rack.watch(0.01) and program.sum.read().message.last == 2)
         assert (program.sum.read().message.sum, program.numbers.sent) == (5.0, 2)
         with pytest.raises(AttributeError, match="no field 'valu'; did you mean 'value'"):
             program.numbers.message.valu = 1  # type: ignore[attr-defined]
-        second.finish()
+        second.declare_done()
         assert end_of(rack).cause == "task done"
         assert second.is_over
         assert not second.wait(60.0)

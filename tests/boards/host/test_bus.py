@@ -8,7 +8,7 @@ import pytest
 
 from rack.backplane.errors import MailboxError
 from rack.backplane.message import State
-from rack.backplane.semaphores import done_semaphore, wake_semaphore
+from rack.backplane.semaphores import get_done_semaphore, get_wake_semaphore
 from rack.backplane.words import Block, Head, System, TaskState
 from rack.boards.host.bus import WORD, HostBus
 from rack.levels.errors import LevelError
@@ -55,12 +55,12 @@ def test_a_message_without_an_id_has_its_number(
         message.value = value
         assert program.numbers.send()
     site.cycle()
-    assert not program.sum.read().is_there
+    assert not program.sum.read().has_message
     ids = []
     entry = site.adapter._entries[0][1]
     ring = entry._ring._slots  # type: ignore[attr-defined]
     for serial in (1, 2, 3):
-        assert ring.fetch(serial)
+        assert ring.fetch_message(serial)
         ids.append((ring.message.id, ring.message.value, ring.message.colour))
     # A field that is not filled is zero, whatever the message before it had.
     assert ids == [(1, 1.5, 0), (40, 2.5, 0), (3, 3.5, 0)]
@@ -75,7 +75,7 @@ def test_a_message_that_cannot_be_sent_is_not_cleared(
     while program.send_number(1.0):
         pass
     sent = program.numbers.sent
-    assert sent == site.segment.layout.mailbox("program.numbers").capacity
+    assert sent == site.segment.layout.find_mailbox("program.numbers").capacity
     assert (program.numbers.message.id, program.numbers.message.value) == (sent + 1, 1.0)
     site.cycle()
     assert program.numbers.send()
@@ -99,18 +99,18 @@ def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bu
     site = make_site()
     bus = open_bus(site)
     assert bus.tasks == ["bridge", "adder"]
-    site.segment.block("adder")[Block.CYCLES] = 77
-    address = bus.address("adder")
-    assert bus.words(address + WORD * Block.CYCLES) == [77]
-    assert bus.words(address, 3) == list(site.segment.block("adder")[:3])
-    assert bus.address("adder.status") == site.segment.map.mailboxes["adder.status"]
+    site.segment.get_block("adder")[Block.CYCLES] = 77
+    address = bus.find_address("adder")
+    assert bus.read_words(address + WORD * Block.CYCLES) == [77]
+    assert bus.read_words(address, 3) == list(site.segment.get_block("adder")[:3])
+    assert bus.find_address("adder.status") == site.segment.map.mailboxes["adder.status"]
     size = site.segment.map.size
-    assert len(bus.words(size - WORD)) == 1
+    assert len(bus.read_words(size - WORD)) == 1
     for wrong, count in ((size - WORD, 2), (size, 1), (-WORD, 1), (4, 1), (0, 0)):
         with pytest.raises(ValueError, match="the bus has 0 to"):
-            bus.words(wrong, count)
+            bus.read_words(wrong, count)
     with pytest.raises(LookupError, match="nothing on the bus is called 'x'; known: "):
-        bus.address("x")
+        bus.find_address("x")
 
 
 def test_in_real_time_a_program_waits_for_a_message_or_its_timeout(
@@ -125,13 +125,13 @@ def test_in_real_time_a_program_waits_for_a_message_or_its_timeout(
     assert not bus.wait(0.02)
     assert time.monotonic() - began >= 0.02
     assert not bus.wait(-1.0)
-    semaphore = wake_semaphore(site.segment, "program")
+    semaphore = get_wake_semaphore(site.segment, "program")
     with in_thread(semaphore.release):
         assert bus.wait(BOUND_S)
     bus.await_turn()
-    bus.finish()
+    bus.declare_done()
     assert site.host[Block.STATE] == TaskState.ENDED
-    assert done_semaphore(site.segment, "program").value == 0
+    assert get_done_semaphore(site.segment, "program").value == 0
 
 
 def test_in_lockstep_a_programs_time_is_the_tick_of_its_turn(
@@ -141,8 +141,8 @@ def test_in_lockstep_a_programs_time_is_the_tick_of_its_turn(
     site.segment.words[System.LOCKSTEP] = 1
     site.host[Block.RELEASED] = 8
     bus = open_bus(site)
-    done = done_semaphore(site.segment, "program")
-    wake = wake_semaphore(site.segment, "program")
+    done = get_done_semaphore(site.segment, "program")
+    wake = get_wake_semaphore(site.segment, "program")
     assert (bus.tick, bus.time_s) == (8, pytest.approx(8 * TICK_S))
     seen: list[tuple[bool, int]] = []
 
@@ -156,13 +156,13 @@ def test_in_lockstep_a_programs_time_is_the_tick_of_its_turn(
             wait_until(lambda: done.value)
             assert (site.host[Block.DONE], site.host[Block.DEADLINE]) == (8, 10)
             assert site.host[Block.WAITS_UNTIL] == until
-            assert done.take()
+            assert done.try_acquire()
             # Its next turn, because a message has come.
             site.host[Block.WAITS_UNTIL] = 0
             site.host[Block.RELEASED] = 12
             wake.release()
     assert seen == [(True, 12)] * 3
-    bus.finish()
+    bus.declare_done()
     assert (done.value, site.host[Block.DONE]) == (1, 12)
 
 
@@ -181,5 +181,5 @@ def test_a_program_in_lockstep_runs_only_in_its_turn(
         with in_thread(lambda passed=passed: passed.append(bus.await_turn() is None)):
             assert passed == []
             block[word] = free
-            wake_semaphore(site.segment, "program").release()
+            get_wake_semaphore(site.segment, "program").release()
         assert passed == [True]

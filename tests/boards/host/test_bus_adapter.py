@@ -6,10 +6,10 @@ from __future__ import annotations
 import pytest
 
 from rack.backplane.message import State
-from rack.backplane.semaphores import wake_semaphore
+from rack.backplane.semaphores import get_wake_semaphore
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Block, System, TaskState
-from rack.boards.host.entries import NEVER, EntryConfig, Replayed
+from rack.boards.host.entries import NEVER, EntryConfig, ReplayedEntry
 from rack.boards.run.ports import InputPorts, OutputPorts
 from tests.bare_level import BareLevel
 from tests.boards.host.conftest import EVERY, MakeSite, OpenBus, OpenProgram, connected
@@ -67,7 +67,7 @@ def test_a_full_ring_refuses_messages_and_the_bridge_counts_them(
 ) -> None:
     site = make_site()
     program = open_program(site)
-    capacity = site.segment.layout.mailbox("program.numbers").capacity
+    capacity = site.segment.layout.find_mailbox("program.numbers").capacity
     answers = [program.numbers.send() for _ in range(capacity + 2)]
     assert answers == [True] * capacity + [False] * 2
     site.cycle()
@@ -119,7 +119,7 @@ def test_a_message_for_a_program_wakes_it_once(make_site: MakeSite, open_bus: Op
     site = make_site()
     bus = open_bus(site)
     program = connected(bus, site)
-    semaphore = wake_semaphore(site.segment, "program")
+    semaphore = get_wake_semaphore(site.segment, "program")
     site.cycle()
     assert (semaphore.value, site.count("sum")) == (0, {"arrived": NEVER, "age": NEVER})
     adder, alarms = BareLevel(), AlarmWriter(site.segment, "adder")
@@ -194,10 +194,10 @@ def test_a_replay_writes_the_recorded_messages_at_their_ticks(
     is_sent: bool, since: int, expected: list[object]
 ) -> None:
     rows = [(0, 0, b"\1"), (4, 3, b"\2"), (8, 7, b"\3"), (12, 11, b"\4")]
-    replayed = Replayed(rows, "port", is_sent, since)
+    replayed = ReplayedEntry(rows, "port", is_sent, since)
     out = Out()
     seen: list[object] = []
     for tick in (3, 8, 11):
-        replayed.exchange({}, {"port": out}, tick)
+        replayed.exchange_messages({}, {"port": out}, tick)
         seen.append(list(out.sent) if is_sent else out.raw[0])
     assert seen == expected

@@ -12,7 +12,7 @@ import pytest
 from rack.backplane.words import Block
 from rack.boards import Rack
 from rack.boards.host.bus_adapter import LONGEST_S
-from rack.tools.faults.ending import strikes
+from rack.tools.faults.ending import list_strikes
 from tests.boards.conftest import MakeConfig
 from tests.boards.host.test_board import ENDS, HOSTED, codes, status, watch
 from tests.boards.runs import stop
@@ -83,7 +83,7 @@ def test_a_fault_does_not_strike_a_finished_program_whose_process_still_exists(
     )
     with Rack(config(*settings, "board.bridge.ends_run=false", text=HOSTED)) as rack:
         assert rack.run(0.5).cause == "time over"
-        assert [strike.tick for strike in strikes(rack.segment, ())] == [-1]
+        assert [strike.tick for strike in list_strikes(rack.segment, ())] == [-1]
 
 
 def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: MakeConfig) -> None:
@@ -93,7 +93,7 @@ def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: Make
     )
     with Rack(config(*settings, text=HOSTED)) as rack:
         outcome = rack.run()
-    assert (outcome.cause, outcome.worked) == ("board lost", False)
+    assert (outcome.cause, outcome.is_success) == ("board lost", False)
     (fault,) = outcome.faults
     assert fault.startswith(
         "board 'bridge': the program of host board 'program' has not waited for 1 s of real time,"
@@ -104,7 +104,7 @@ def test_a_program_that_does_not_wait_ends_the_run_with_that_reason(config: Make
 def test_a_stop_ends_the_wait_for_a_program(config: MakeConfig) -> None:
     with Rack(config("host.program.program=host_programs:Silent", text=HOSTED)) as rack:
         rack.start()
-        block = rack.segment.block("program")
+        block = rack.segment.get_block("program")
         wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
         began = time.monotonic()
         assert stop(rack).cause == "stopped"
@@ -116,7 +116,7 @@ def test_a_program_that_stops_while_the_rack_waits_for_it_does_not_hold_the_rack
 ) -> None:
     with Rack(config("host.program.program=host_programs:Silent", text=HOSTED)) as rack:
         rack.start()
-        block = rack.segment.block("program")
+        block = rack.segment.get_block("program")
         wait_until(lambda: rack.watch(0.01) and block[Block.PID] and block[Block.RELEASED] >= 0)
         os.kill(block[Block.PID], signal.SIGSTOP)
         watch(rack, lambda: "rejoined" in codes(rack, "program"))

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import System
-from rack.boards.config.loader import loads
-from rack.boards.config.resolved import wire
-from rack.boards.config.toml import override, parse, to_toml
-from rack.boards.lan.link import Arrived
+from rack.boards.config.loader import load_text
+from rack.boards.config.resolved import resolve_layout
+from rack.boards.config.toml import apply_settings, parse_tables, to_toml
+from rack.boards.lan.link import ReceivedMessage
 from tests.boards.lan.racks import rack_text
 
 EVERY = 8
@@ -25,7 +25,7 @@ class Network:
     """Stands in for the link: what tests put into `come` arrives, what is sent is in `sent`."""
 
     def __init__(self) -> None:
-        self.come: deque[Arrived] = deque()
+        self.come: deque[ReceivedMessage] = deque()
         self.sent: list[tuple[bytes, bytes]] = []
 
     def subscribe(self, key: str) -> Any:
@@ -40,18 +40,20 @@ class Network:
 def segment(rack_name: str, request: pytest.FixtureRequest) -> Iterator[Segment]:
     """The segment of a rack that imports; its epoch is the origin of all clocks, so that stamps are
     simulated times."""
-    config = loads(
+    config = load_text(
         to_toml(
-            override(
-                parse(rack_text(rack_name, "", [], "two")), [f"clock.mode={request.param}"], []
+            apply_settings(
+                parse_tables(rack_text(rack_name, "", [], "two")),
+                [f"clock.mode={request.param}"],
+                [],
             )
         )
     )
-    made = Segment.create(wire(config), config.text())
+    made = Segment.create(resolve_layout(config), config.to_toml_text())
     made.words[System.PERIOD_NS], made.words[System.LOCKSTEP] = (
         2_500_000,
         request.param == "lockstep",
     )
     yield made
     made.close()
-    unlink(rack_name)
+    unlink_segment(rack_name)

@@ -13,7 +13,7 @@ import numpy as np
 from rack.backplane.message import AnyMessage, Message
 from rack.backplane.message_type import Field, MessageType
 from rack.boards.lan.config import ImportConfig
-from rack.levels.level import Executor, LevelContext, MadePorts, Output
+from rack.levels.level import ConfiguredPorts, Executor, LevelContext, Output
 
 Case = tuple[str, bytes, bool]
 """What is extreme, the message, and whether its type permits it."""
@@ -30,9 +30,11 @@ class Extremes(Executor):
         ]
 
     @classmethod
-    def made_ports(cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]) -> MadePorts:
+    def build_ports(
+        cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
+    ) -> ConfiguredPorts:
         """Return the port that sends."""
-        return MadePorts(outputs={params["port"]: Output(message_class(params["type"]))})
+        return ConfiguredPorts(outputs={params["port"]: Output(message_class(params["type"]))})
 
     def process(self, tick: int) -> None:
         """Write the next one."""
@@ -43,7 +45,7 @@ class Extremes(Executor):
 def message_class(name: str) -> type[Message]:
     """Return a message class by its name in a config."""
     table = {"from": "x/x.x", "type": name, "rate_hz": 1, "max_age_ms": 1}
-    return ImportConfig.model_validate(table).message_class()
+    return ImportConfig.model_validate(table).find_message_class()
 
 
 def cases(
@@ -74,7 +76,7 @@ def filled(
     kind: type[Message], base: Mapping[str, Any], sizes: Mapping[str, int] | None = None
 ) -> Message:
     """Return a message with these fields."""
-    message = AnyMessage(kind.message_type.dtype(sizes or {}))
+    message = AnyMessage(kind.message_type.build_dtype(sizes or {}))
     for name, value in base.items():
         if isinstance(value, Mapping):
             for inner, number in value.items():

@@ -11,11 +11,11 @@ import select
 import sys
 import time
 
-from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.message import Message
-from rack.boards.config.layout import field_specs
+from rack.boards.config.layout import build_field_specs
 from rack.boards.lan.config import LanTable
-from rack.boards.lan.envelope import Envelope, kind_of
+from rack.boards.lan.envelope import Envelope, compute_kind
 from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import LanLink
 from tests.boards.lan.lan_levels import PulseStatus
@@ -33,11 +33,12 @@ def main(name: str, endpoint: str, victim: str) -> None:
         LanTable.model_validate({"connect": (endpoint,), "peers": (victim,), "export": exports}),
     )
     flood, calm = (link.publish(out_key(name, f"{port}.status")) for port in ("pulse", "calm"))
-    dtype = message_dtype(
-        field_specs(PulseStatus.message_type, {}), PulseStatus.message_type.dtype({}).itemsize
+    dtype = build_message_dtype(
+        build_field_specs(PulseStatus.message_type, {}),
+        PulseStatus.message_type.build_dtype({}).itemsize,
     )
-    message, kind, number, due = Message(dtype), kind_of("pulse", 1, dtype), 0, 0
-    link.declare_alive(LAUNCH)
+    message, kind, number, due = Message(dtype), compute_kind("pulse", 1, dtype), 0, 0
+    link.declare_token(LAUNCH)
     while not select.select([sys.stdin], [], [], 0)[0]:
         for at in range(BURST):
             flood(bytes(at), b"flood")

@@ -22,7 +22,7 @@ from cryptography.x509 import load_pem_x509_certificate
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Flaw, Sealer
 from rack.boards.lan.keys import out_key
-from rack.boards.lan.link import Arrived
+from rack.boards.lan.link import ReceivedMessage
 from rack.tools.network import certificates
 from tests.boards.lan.home import serve
 
@@ -39,14 +39,14 @@ def below(folder: Path, signer: str, name: str, made: Path) -> Credentials:
     issuer = load_pem_x509_certificate(own.certificate.read_bytes())
     now = datetime.now(UTC)
     key = certificates.ec.generate_private_key(certificates.ec.SECP256R1())
-    authority = certificates.Authority(issuer, own.pair.key)
+    authority = certificates.Authority(issuer, own.key_pair.key)
     found = certificates.sign_certificate(name, key, authority, now + timedelta(days=1))
     of_name = Credentials(made, name)
-    chain = certificates.pem_of(found) + own.pair.chain
+    chain = certificates.to_pem(found) + own.key_pair.chain
     files = {
         "authority.pem": own.authority.read_bytes(),
         of_name.certificate.name: chain,
-        of_name.key.name: certificates.pem_of_key(key),
+        of_name.key.name: certificates.key_to_pem(key),
     }
     certificates.write_credentials(made, files)
     return of_name
@@ -81,8 +81,8 @@ class Forger:
     def cycle(self) -> None:
         """Forge what follows on each message that has come, then send it again."""
         while (sample := self._heard.try_recv()) is not None:
-            key, envelope, payload = Arrived.of(sample)
-            head = self._own.opened(key, envelope, payload)
+            key, envelope, payload = ReceivedMessage.from_sample(sample)
+            head = self._own.open_message(key, envelope, payload)
             self._count["heard"] += 1
             if isinstance(head, Flaw):
                 continue

@@ -36,13 +36,13 @@ class Home:
         self._arrived = [
             link.subscribe(out_key(entry.rack, entry.mailbox)) for entry in table.imports.values()
         ]
-        self._questions = link.answer(estop_key("*", rack))
+        self._questions = link.open_questions(estop_key("*", rack))
         self._exports = [
             (key, link.publish(key))
             for key in (out_key(rack, e.source) for e in table.exports.values())
         ]
-        self._changes = link.watch_alive()
-        link.declare_alive(LAUNCH)
+        self._changes = link.watch_tokens()
+        link.declare_token(LAUNCH)
         self._came, self._good, self._asked = Counter[str](), Counter[str](), Counter[str]()
         self._tokens: list[str] = []
         self._sizes = defaultdict[str, set[int]](set)
@@ -53,7 +53,7 @@ class Home:
             for key, envelope, payload in take():
                 self._came[key] += 1
                 self._sizes[key].add(len(payload))
-                self._good[key] += not isinstance(sealer.opened(key, envelope, payload), Flaw)
+                self._good[key] += not isinstance(sealer.open_message(key, envelope, payload), Flaw)
         for asked, reply in self._questions():
             self._asked[asked.key] += 1
             reply(b"answer", sealer.seal(asked.key, HEAD, b"answer"))

@@ -27,7 +27,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.errors import ConfigError, LaunchError
 from rack.boards.events import Event, Outcome
-from rack.tools.viewer.window import free_port
+from rack.tools.viewer.window import find_free_port
 from tests.processes import BOUND_S
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -97,7 +97,7 @@ peers = {json.dumps(list(peers))}
 
 def endpoints(count: int) -> list[str]:
     """Return endpoints on free ports of this machine's loopback."""
-    return [f"tcp/127.0.0.1:{free_port()}" for _ in range(count)]
+    return [f"tcp/127.0.0.1:{find_free_port()}" for _ in range(count)]
 
 
 def ring_texts(

@@ -7,7 +7,15 @@ from typing import Any
 
 import pytest
 
-from rack.boards.lan.access import IN, OUT, PUT, SUBSCRIBE, TOKEN, WATCH_TOKENS, access_control
+from rack.boards.lan.access import (
+    IN,
+    OUT,
+    PUT,
+    SUBSCRIBE,
+    TOKEN,
+    WATCH_TOKENS,
+    build_access_control,
+)
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.keys import alive_key, launch_and_cycle
 
@@ -20,7 +28,7 @@ def rules(
     endpoint: str, is_operator: bool = False, **table: Any
 ) -> Iterator[tuple[str, str, str, str]]:
     """Yield flow, message, key and common name (* for anyone) of all that is allowed."""
-    found = access_control(
+    found = build_access_control(
         "home", LanTable.model_validate({"listen": (endpoint,), **table}), is_operator
     )
     assert (found["enabled"], found["default_permission"]) == (True, "deny")

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.message import Message, State, field
-from rack.backplane.segment import Segment, unlink
-from rack.backplane.words import System, is_on
+from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.words import System, is_switched_on
 from rack.boards.classes import find_class
 from rack.boards.config import resolve
 from rack.boards.lan.adapter import LanAdapter
-from rack.boards.lan.clocks import UNKNOWN_NS
+from rack.boards.lan.clocks import REPORT_UNKNOWN_NS
 from rack.boards.lan.envelope import Flaw, Sealer
-from rack.boards.lan.status import status_of
+from rack.boards.lan.status import build_status_class
 from rack.levels.peer import PeerPresence
 from tests.boards.lan.racks import configs, rack_text
 
@@ -45,19 +45,19 @@ def make(rack_name: str, tmp_path: Path) -> Iterator[MakeAdapter]:
             (config,) = configs([text], tmp_path, f"clock.mode={mode}")
             plan = resolve(config)
             segment = Segment.create(plan.layout, "")
-            stack.callback(unlink, rack_name)
+            stack.callback(unlink_segment, rack_name)
             stack.callback(segment.close)
             segment.words[System.LOCKSTEP] = lockstep
             segment.words[System.PERIOD_NS] = PERIOD_NS
             (wiring,) = (task for task in plan.tasks if task.task == "lan")
             adapter = find_class(wiring.target, LanAdapter)(wiring.context)
-            adapter.attach(segment, None)
+            adapter.attach_segment(segment, None)
 
             def taken() -> Iterator[Change]:
                 while changes:
                     yield changes.pop(0)
 
-            adapter._peers.watch(taken, lockstep)
+            adapter._peers.set_source(taken, lockstep)
             return adapter, segment
 
         yield make_one
@@ -72,34 +72,34 @@ def test_a_lost_rack_stops_the_arm_until_it_is_back(
 
     def look(tick: int, *seen: Change) -> int:
         changes.extend(seen)
-        adapter._look(tick)
+        adapter._update_presence(tick)
         return segment.words[System.PEER_STOP]
 
     # One that has not come yet is not lost.
     assert look(8) == stop == 0
     assert look(16, ("b", FIRST, True)) == 0
     lost = look(24, ("b", FIRST, False))
-    assert [is_on(lost, tick) for tick in (23, 24)] == [False, True]
+    assert [is_switched_on(lost, tick) for tick in (23, 24)] == [False, True]
     assert look(32) == lost
     back = look(40, ("b", FIRST, True))
-    assert [is_on(back, tick) for tick in (39, 40)] == [True, False]
+    assert [is_switched_on(back, tick) for tick in (39, 40)] == [True, False]
 
 
 def test_in_lockstep_a_demand_counts_from_the_next_cycle(make: MakeAdapter) -> None:
     changes: list[Change] = [("b", FIRST, True)]
     adapter, segment = make(changes, STOP, lockstep=True)
-    adapter._look(8)
+    adapter._update_presence(8)
     changes.append(("b", FIRST, False))
-    adapter._look(16)
+    adapter._update_presence(16)
     word = segment.words[System.PEER_STOP]
-    assert [is_on(word, tick) for tick in (16 + EVERY - 1, 16 + EVERY)] == [False, True]
+    assert [is_switched_on(word, tick) for tick in (16 + EVERY - 1, 16 + EVERY)] == [False, True]
 
 
 def test_a_lost_rack_does_not_stop_the_arm_if_the_config_says_go_on(make: MakeAdapter) -> None:
     changes: list[Change] = [("b", FIRST, True), ("b", FIRST, False)]
     adapter, segment = make(changes, 'on_peer_loss = "go on"')
-    adapter._look(8)
-    assert adapter._peers.lost == ["b"]
+    adapter._update_presence(8)
+    assert adapter._peers.lost_racks == ["b"]
     assert segment.words[System.PEER_STOP] == 0
 
 
@@ -108,10 +108,10 @@ def test_a_rack_that_joins_is_sent_every_newest_message(make: MakeAdapter) -> No
     adapter, _ = make(changes)
     (export,) = adapter._exports.values()
     export.is_asked = False
-    adapter._look(8)
+    adapter._update_presence(8)
     assert not export.is_asked
     changes.append(("stranger", FIRST, True))
-    adapter._look(16)
+    adapter._update_presence(16)
     assert export.is_asked
 
 
@@ -133,12 +133,12 @@ def test_the_status_says_why_the_exchange_is_incomplete(make: MakeAdapter) -> No
 
     def said(tick: int, *seen: Change) -> str:
         changes.extend(seen)
-        adapter._look(tick)
-        return adapter._trouble(tick)
+        adapter._update_presence(tick)
+        return adapter._find_trouble(tick)
 
     assert said(0) == "rack 'b' is not there yet"
     assert said(8, ("b", FIRST, True)) == ""
-    unknown = 8 + UNKNOWN_NS // PERIOD_NS
+    unknown = 8 + REPORT_UNKNOWN_NS // PERIOD_NS
     assert said(unknown) == ""
     assert said(unknown + 1) == "clock of rack 'b' is not known: it does not answer pings"
     adapter._peers["b"].offset_ns = 0
@@ -164,13 +164,13 @@ def test_in_real_time_the_status_counts_messages_with_flaws(make: MakeAdapter) -
 
         sealer = Sealer()
 
-    Link.sealer.resume([3] * len(Flaw))
-    out = status_of(adapter._table.exports, adapter._table.imports).zeros({})
+    Link.sealer.resume_counts([3] * len(Flaw))
+    out = build_status_class(adapter._table.exports, adapter._table.imports).zeros({})
     adapter.place_output("status", out)
     adapter.place_output("peer_b", PeerPresence.zeros({}))
-    adapter._report(8)
+    adapter._write_status(8)
     assert out.flaws.tolist() == (0,) * len(Flaw)
     assert (out.state, out.reason) == (State.HOLDING, "rack 'b' is not there yet")
     adapter._link = Link()  # type: ignore[assignment]
-    adapter._report(8)
+    adapter._write_status(8)
     assert out.flaws.tolist() == (3,) * len(Flaw)

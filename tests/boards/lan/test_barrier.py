@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import Block
-from rack.boards.config.loader import loads
-from rack.boards.config.resolved import wire
-from rack.boards.lan.awaited import Why, word_of
+from rack.boards.config.loader import load_text
+from rack.boards.config.resolved import resolve_layout
+from rack.boards.lan.awaited import WaitReason, encode_wait
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.keys import out_key, step_key
-from rack.boards.lan.link import Arrived
+from rack.boards.lan.link import ReceivedMessage
 from rack.boards.lan.lockstep import (
     NEVER,
     STEP_KIND,
@@ -27,7 +27,7 @@ from rack.boards.lan.lockstep import (
     pack_step,
     unpack_step,
 )
-from rack.boards.lan.peers import NONE
+from rack.boards.lan.peers import NO_LAUNCH
 from tests.boards.lan.conftest import EVERY, LAUNCH
 from tests.boards.lan.racks import rack_text
 
@@ -56,7 +56,7 @@ class Session:
 
     def bring(self, rack: str, cycle: int, *keys: str) -> None:
         """Bring the step of a rack's cycle, with an export under each key."""
-        exports = [Arrived(key, b"", f"{rack} {cycle}".encode()) for key in keys]
+        exports = [ReceivedMessage(key, b"", f"{rack} {cycle}".encode()) for key in keys]
         content = pack_step(CYCLE_NS, [self.rack], exports)
         head = Envelope(STEP_KIND, LAUNCH, cycle + 1, cycle + 1, cycle, cycle * CYCLE_NS, 0)
         envelope = self.sealer.seal(step_key(rack), head, content)
@@ -72,11 +72,11 @@ class Session:
 @pytest.fixture
 def segment(rack_name: str) -> Iterator[Segment]:
     """The segment of a rack that steps with two others."""
-    config = loads(rack_text(rack_name, "", [], "two", peers=OTHERS))
-    made = Segment.create(wire(config), config.text())
+    config = load_text(rack_text(rack_name, "", [], "two", peers=OTHERS))
+    made = Segment.create(resolve_layout(config), config.to_toml_text())
     yield made
     made.close()
-    unlink(rack_name)
+    unlink_segment(rack_name)
 
 
 def opened(segment: Segment) -> tuple[Barrier, Session]:
@@ -90,7 +90,7 @@ def test_a_rack_exports_nothing_for_another(segment: Segment) -> None:
     arrived = {rack: barrier.subscribe(key) for rack, key in KEYS.items()}
     session.bring("two", 0, *KEYS.values())
     session.bring("three", 0, KEYS["three"])
-    assert barrier.meet(0)
+    assert barrier.exchange_steps(0)
     assert {rack: [one.payload for one in take()] for rack, take in arrived.items()} == {
         "two": [b"two 0"],
         "three": [b"three 0"],
@@ -98,13 +98,13 @@ def test_a_rack_exports_nothing_for_another(segment: Segment) -> None:
 
 
 def test_exports_delivered_before_a_restart_are_not_delivered_again(segment: Segment) -> None:
-    segment.block("lan")[Block.DONE] = 2 * EVERY
+    segment.get_block("lan")[Block.DONE] = 2 * EVERY
     barrier, session = opened(segment)
     take = barrier.subscribe(KEYS["two"])
     for cycle in (2, 3):
         for rack in OTHERS:
             session.bring(rack, cycle, KEYS[rack])
-    assert barrier.meet(3 * EVERY)
+    assert barrier.exchange_steps(3 * EVERY)
     assert [one.payload for one in take()] == [b"two 3"]
 
 
@@ -116,29 +116,29 @@ def step(time_ns: int, flags: int = 0) -> Step:
 def test_steps_are_delivered_once_and_up_to_a_time() -> None:
     partner = Partner("b", 3)
     for time_ns in (8, 16, 16, 8, 24):
-        partner.take(step(time_ns))
-    assert [passed.head.time_ns for passed in partner.passed(16)] == [8, 16]
-    assert [passed.head.time_ns for passed in partner.passed(16)] == []
+        partner.add_step(step(time_ns))
+    assert [passed.head.time_ns for passed in partner.take_steps(16)] == [8, 16]
+    assert [passed.head.time_ns for passed in partner.take_steps(16)] == []
     assert [partner.has_reached(time_ns) for time_ns in (24, 25)] == [True, False]
-    assert [passed.head.time_ns for passed in partner.passed(100)] == [24]
+    assert [passed.head.time_ns for passed in partner.take_steps(100)] == [24]
 
 
 def test_a_rack_that_has_ended_is_not_awaited_until_it_sends_again() -> None:
     partner = Partner("b", 3)
     partner.gone_s = 1.0
-    partner.take(step(8, StepFlag.OVER))
+    partner.add_step(step(8, StepFlag.OVER))
     assert (partner.has_reached(1000), partner.gone_s) == (True, None)
-    partner.take(step(16))
+    partner.add_step(step(16))
     assert not partner.has_reached(1000)
 
 
 def test_the_word_says_why_it_is_awaited() -> None:
     partner = Partner("b", 3)
-    assert partner.word == word_of(3, Why.UNSEEN)
+    assert partner.wait_word == encode_wait(3, WaitReason.UNSEEN)
     partner.launch = 7
-    assert partner.word == word_of(3, Why.SLOWER)
+    assert partner.wait_word == encode_wait(3, WaitReason.SLOWER)
     partner.gone_s = 1.0
-    assert partner.word == word_of(3, Why.GONE)
+    assert partner.wait_word == encode_wait(3, WaitReason.GONE)
 
 
 def test_a_partner_that_is_reset_is_awaited_as_at_first() -> None:
@@ -146,18 +146,18 @@ def test_a_partner_that_is_reset_is_awaited_as_at_first() -> None:
     partner.launch = 7
     partner.gone_s = 1.0
     partner.is_there = True
-    partner.take(step(8, StepFlag.OVER))
-    partner.forget()
-    assert (partner.launch, partner.time_ns, partner.gone_s) == (NONE, NEVER, None)
+    partner.add_step(step(8, StepFlag.OVER))
+    partner.reset_state()
+    assert (partner.launch, partner.time_ns, partner.gone_s) == (NO_LAUNCH, NEVER, None)
     assert not partner.steps
     assert [partner.is_out, partner.is_there, partner.has_reached(0)] == [False] * 3
 
 
 HEAD = Envelope(STEP_KIND, 11, 1, 1, 40, 100_000_000, 0, StepFlag.OVER)
 EXPORTS = (
-    Arrived("a/first", b"head of one", b"payload"),
-    Arrived("b", b"", b""),
-    Arrived("c/third", b"h", b"x" * 300),
+    ReceivedMessage("a/first", b"head of one", b"payload"),
+    ReceivedMessage("b", b"", b""),
+    ReceivedMessage("c/third", b"h", b"x" * 300),
 )
 
 
@@ -169,9 +169,9 @@ def test_a_step_arrives_as_it_was_sent(count: int) -> None:
 
 
 def test_an_export_without_an_envelope_arrives_with_an_empty_one() -> None:
-    step = unpack_step(HEAD, pack_step(1, ("puma",), [Arrived("a", None, b"payload")]))
+    step = unpack_step(HEAD, pack_step(1, ("puma",), [ReceivedMessage("a", None, b"payload")]))
     assert step is not None
-    assert step.exports == [Arrived("a", b"", b"payload")]
+    assert step.exports == [ReceivedMessage("a", b"", b"payload")]
 
 
 def test_truncated_extended_or_foreign_content_is_not_a_step() -> None:

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rack.backplane.layout import Layout
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import System
 from rack.boards.lan import clocks
 from rack.boards.lan.clocks import (
@@ -21,12 +21,12 @@ from rack.boards.lan.clocks import (
     _PONG,
     _PONG_KIND,
     ANSWER_NS,
-    EAGER,
     EAGER_NS,
-    MOST_ASKERS,
+    EAGER_ROUND_TRIPS,
+    MAX_ASKERS,
+    MAX_ROUND_TRIPS,
+    MAX_UNANSWERED,
     PING_NS,
-    RECENT,
-    UNANSWERED,
     ClockOffset,
     Clocks,
     PeerClock,
@@ -35,7 +35,7 @@ from rack.boards.lan.clocks import (
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
-from rack.boards.lan.link import Arrived
+from rack.boards.lan.link import ReceivedMessage
 from rack.boards.lan.peers import PeerRack, Peers
 from rack.levels.peer import DRIFT_PPM
 from rack.tools.network.certificates import make_credentials
@@ -66,13 +66,13 @@ def test_the_true_offset_is_always_within_the_uncertainty(
         sent = now + pause
         received, answered = sent + there, sent + there + answering
         now = answered + back
-        assert found.add(RoundTrip(sent, theirs(received), theirs(answered), now))
+        assert found.add_round_trip(RoundTrip(sent, theirs(received), theirs(answered), now))
         assert found.steps == 0
         assert found.best is not None
         for later in (now, now + 7 * S):
-            assert abs(found.best.offset_ns - (theirs(later) - later)) <= found.best.uncertainty_ns(
-                later
-            )
+            assert abs(
+                found.best.offset_ns - (theirs(later) - later)
+            ) <= found.best.compute_uncertainty_ns(later)
 
 
 def trip(at: int, offset: int, there: int = 200 * US, back: int = 200 * US) -> RoundTrip:
@@ -82,11 +82,11 @@ def trip(at: int, offset: int, there: int = 200 * US, back: int = 200 * US) -> R
 def test_the_shortest_recent_round_trip_counts_until_it_is_too_old() -> None:
     found = ClockOffset()
     best = trip(0, 5 * S, 20 * US, 20 * US)
-    found.add(best)
-    found.add(trip(1 * S, 5 * S))
+    found.add_round_trip(best)
+    found.add_round_trip(trip(1 * S, 5 * S))
     assert found.best == best
-    for at in range(2, RECENT + 2):
-        found.add(trip(at * S, 5 * S))
+    for at in range(2, MAX_ROUND_TRIPS + 2):
+        found.add_round_trip(trip(at * S, 5 * S))
     assert found.best is not None
     assert found.best.sent > S
 
@@ -95,8 +95,8 @@ def test_the_shortest_recent_round_trip_counts_until_it_is_too_old() -> None:
 def test_a_clock_that_steps_begins_a_new_estimate(step: int) -> None:
     found = ClockOffset()
     for at in range(5):
-        found.add(trip(at * S, 0))
-    found.add(trip(5 * S, step))
+        found.add_round_trip(trip(at * S, 0))
+    found.add_round_trip(trip(5 * S, step))
     assert found.steps == 1
     assert len(found) == 1
     assert found.best is not None
@@ -108,26 +108,26 @@ def test_a_clock_that_steps_begins_a_new_estimate(step: int) -> None:
 )
 def test_an_impossible_round_trip_is_refused(bad: RoundTrip) -> None:
     found = ClockOffset()
-    assert not found.add(bad)
+    assert not found.add_round_trip(bad)
     assert found.best is None
 
 
 def test_measurements_of_an_earlier_launch_are_discarded() -> None:
     peer = PeerRack("b")
-    peer.comes(7, 0)
+    peer.add_token(7, 0)
     clock = PeerClock(peer)
-    assert clock.time_ns(10 * S) == 0
-    clock.begin()
+    assert clock.to_simulated_ns(10 * S) == 0
+    clock.discard_if_outdated()
     clock.epoch_ns, clock.period_ns, clock.clock_ns, clock.due_ns = 4 * S, 2 * MS, 5 * MS, 9
     clock.sent[1] = 2
-    clock.begin()
+    clock.discard_if_outdated()
     # Two and a half times as fast as time, since 4 s.
-    assert (clock.time_ns(4 * S - 1), clock.time_ns(6 * S)) == (0, 5 * S)
+    assert (clock.to_simulated_ns(4 * S - 1), clock.to_simulated_ns(6 * S)) == (0, 5 * S)
     assert (clock.due_ns, clock.sent) == (9, {1: 2})
-    peer.comes(8, 1)
-    clock.begin()
+    peer.add_token(8, 1)
+    clock.discard_if_outdated()
     assert (clock.epoch_ns, clock.clock_ns, clock.due_ns, clock.sent) == (0, 0, 0, {})
-    assert clock.time_ns(6 * S) == 0
+    assert clock.to_simulated_ns(6 * S) == 0
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ def segment(rack_name: str) -> Iterator[Segment]:
     made = Segment.create(Layout(rack_name, CLOCK_NS, (), ()), "")
     yield made
     made.close()
-    unlink(rack_name)
+    unlink_segment(rack_name)
 
 
 def test_a_message_never_counts_as_younger_than_it_is(segment: Segment) -> None:
@@ -144,9 +144,9 @@ def test_a_message_never_counts_as_younger_than_it_is(segment: Segment) -> None:
     grid, peer = OwnGrid(segment, 1), PeerRack("b")
     head = Envelope(0, 0, 1, 1, 0, 0, stamp_ns=1100 * S + 10 * PERIOD_NS)
     peer.offset_ns, peer.uncertainty_ns = 1000 * S, 0
-    assert grid.tick_of(head, peer, tick=50) == 10
+    assert grid.to_local_tick(head, peer, tick=50) == 10
     peer.uncertainty_ns = 3 * PERIOD_NS
-    assert grid.tick_of(head, peer, tick=50) == 7
+    assert grid.to_local_tick(head, peer, tick=50) == 7
 
 
 def test_the_mailbox_of_a_rack_has_its_clock_in_seconds(segment: Segment) -> None:
@@ -154,7 +154,7 @@ def test_the_mailbox_of_a_rack_has_its_clock_in_seconds(segment: Segment) -> Non
     segment.words[System.EPOCH_NS] = 100 * S
     peers = Peers(["b"])
     found = Clocks(segment, peers, 1, OwnGrid(segment, 1))
-    found.fill(out := SimpleNamespace(), "b", 4)
+    found.write_clock(out := SimpleNamespace(), "b", 4)
     assert vars(out) == {
         "steps": 0,
         "offset": 0.0,
@@ -163,12 +163,12 @@ def test_the_mailbox_of_a_rack_has_its_clock_in_seconds(segment: Segment) -> Non
         "uncertainty": -1.0,
         "round_trip": -1.0,
     }
-    peers["b"].comes(7, 0)
+    peers["b"].add_token(7, 0)
     clock = found._clocks["b"]
     clock.epoch_ns, clock.period_ns, clock.clock_ns = 1100 * S, 2 * MS, 5 * MS
-    clock.offset.add(trip(101 * S, 1000 * S, 300 * US, 100 * US))
+    clock.offset.add_round_trip(trip(101 * S, 1000 * S, 300 * US, 100 * US))
     found._now_ns = 102 * S
-    found.fill(out, "b", tick=800)
+    found.write_clock(out, "b", tick=800)
     # Of both ways' 0.4 ms the half, and what a clock drifts in a second.
     assert out.uncertainty == pytest.approx(200e-6 + DRIFT_PPM * 1e-6, rel=1e-5)
     assert (out.round_trip, out.speed, out.steps) == (400e-6, 2.5, 0)
@@ -181,22 +181,22 @@ class Answers:
     """Takes answers in place of a network."""
 
     def __init__(self) -> None:
-        self.sent: list[Arrived] = []
+        self.sent: list[ReceivedMessage] = []
 
     def on(self, key: str, callback: Any) -> None:
         """Bring nothing: the tests do."""
 
     def publish(self, key: str) -> Any:
-        return lambda payload, envelope: self.sent.append(Arrived(key, envelope, payload))
+        return lambda payload, envelope: self.sent.append(ReceivedMessage(key, envelope, payload))
 
 
 def clocks_of(segment: Segment) -> Clocks:
     return Clocks(segment, Peers([]), 1, OwnGrid(segment, 1))
 
 
-def ping(asker: str, sealer: Sealer, to: str) -> Arrived:
+def ping(asker: str, sealer: Sealer, to: str) -> ReceivedMessage:
     key = f"rack/{asker}/ping/{to}"
-    return Arrived(key, sealer.seal(key, Envelope(_PING_KIND, 1, 1, 1, 0, 0, 0), b""), b"")
+    return ReceivedMessage(key, sealer.seal(key, Envelope(_PING_KIND, 1, 1, 1, 0, 0, 0), b""), b"")
 
 
 def test_a_flood_of_pings_is_bounded_and_counted(segment: Segment) -> None:
@@ -206,22 +206,22 @@ def test_a_flood_of_pings_is_bounded_and_counted(segment: Segment) -> None:
     responder.open(network, sealer)  # type: ignore[arg-type]
     began = time.monotonic_ns()
     for _ in range(1000):
-        responder._on_ping(ping("flood", sealer, segment.rack))
+        responder._answer_ping(ping("flood", sealer, segment.rack))
     most = 1 + (time.monotonic_ns() - began) // ANSWER_NS
     assert 1 <= len(network.sent) == responder.answered <= most
     assert responder.withheld == 1000 - responder.answered
     # An answer says when the ping came, when it went itself, and on which grid this rack is.
     key, envelope, payload = network.sent[0]
     launch, received, *grid = _PONG.unpack(payload)
-    head = sealer.opened(key, envelope, payload)
+    head = sealer.open_message(key, envelope, payload)
     assert isinstance(head, Envelope)
     assert (launch, grid) == (1, [100 * S, PERIOD_NS, CLOCK_NS])
     assert began <= received <= head.stamp_ns
     # One rack's flood takes nothing from another; but of racks, too, there are not endlessly many.
-    for at in range(MOST_ASKERS):
-        responder._on_ping(ping(f"rack-{at}", sealer, segment.rack))
+    for at in range(MAX_ASKERS):
+        responder._answer_ping(ping(f"rack-{at}", sealer, segment.rack))
     keys = {answer.key for answer in network.sent}
-    assert len(keys) == MOST_ASKERS
+    assert len(keys) == MAX_ASKERS
     assert f"rack/{segment.rack}/pong/rack-0" in keys
 
 
@@ -234,10 +234,10 @@ def test_a_ping_with_a_seal_of_another_rack_gets_no_answer(
     )
     responder, network = clocks_of(segment), Answers()
     responder.open(network, own)  # type: ignore[arg-type]
-    responder._on_ping(ping("asker", stranger, segment.rack))
+    responder._answer_ping(ping("asker", stranger, segment.rack))
     assert network.sent == []
     assert (responder.answered, responder.refused) == (0, 1)
-    responder._on_ping(ping("asker", asker, segment.rack))
+    responder._answer_ping(ping("asker", asker, segment.rack))
     assert (responder.answered, responder.refused) == (1, 1)
 
 
@@ -249,22 +249,22 @@ class Wire:
         segment.words[System.PERIOD_NS] = PERIOD_NS
         segment.words[System.EPOCH_NS] = 100 * S
         self._heard: dict[str, Any] = {}
-        self.sent: list[Arrived] = []
+        self.sent: list[ReceivedMessage] = []
         self.peers = Peers(["b"])
         self.clocks = Clocks(segment, self.peers, LAUNCH, OwnGrid(segment, 1))
         self.sealer = Sealer()
         self.clocks.open(self, self.sealer)  # type: ignore[arg-type]
-        self.peers["b"].comes(OTHER, 0)
+        self.peers["b"].add_token(OTHER, 0)
 
     def on(self, key: str, callback: Any) -> None:
         self._heard[key] = callback
 
     def publish(self, key: str) -> Any:
-        return lambda payload, envelope: self.sent.append(Arrived(key, envelope, payload))
+        return lambda payload, envelope: self.sent.append(ReceivedMessage(key, envelope, payload))
 
-    def answer(self, rack: str, ping: Arrived, **more: Any) -> None:
+    def answer(self, rack: str, ping: ReceivedMessage, **more: Any) -> None:
         """Answer a ping, as rack `b` does at once, or otherwise."""
-        head = self.sealer.opened(ping.key, ping.envelope, ping.payload)
+        head = self.sealer.open_message(ping.key, ping.envelope, ping.payload)
         assert isinstance(head, Envelope)
         now = time.monotonic_ns()
         told = {"launch": LAUNCH, "period": 1_000_000, "clock": CLOCK_NS, "kind": _PONG_KIND}
@@ -274,11 +274,13 @@ class Wire:
         key = f"rack/b/pong/{rack}"
         back = Envelope(told["kind"], told["from"], told["serial"], told["serial"], 0, 0, theirs)
         seal = self.sealer.seal(key, back, payload)
-        self._heard[f"rack/*/pong/{rack}"](Arrived(key, seal, payload + more.get("more", b"")))
+        self._heard[f"rack/*/pong/{rack}"](
+            ReceivedMessage(key, seal, payload + more.get("more", b""))
+        )
 
     def take(self) -> tuple[int, int]:
         """Do a cycle; return the answers taken and refused so far."""
-        self.clocks.exchange()
+        self.clocks.exchange_pings()
         return self.clocks.taken, self.clocks.refused
 
 
@@ -296,10 +298,10 @@ def test_a_rack_is_pinged_often_until_its_clock_is_known(
     now = [time.monotonic_ns()]
     monkeypatch.setattr(clocks, "monotonic_ns", lambda: now[0])
     clock = wire.clocks._clocks["b"]
-    for trips in range(EAGER + 2):
+    for trips in range(EAGER_ROUND_TRIPS + 2):
         wire.take()
         assert len(wire.sent) == trips + 1
-        pause = PING_NS if trips >= EAGER else EAGER_NS
+        pause = PING_NS if trips >= EAGER_ROUND_TRIPS else EAGER_NS
         assert clock.due_ns == now[0] + pause
         monkeypatch.setattr(time, "monotonic_ns", lambda: now[0])
         wire.answer(segment.rack, wire.sent[-1])
@@ -345,7 +347,7 @@ def test_an_unexpected_answer_is_refused(
 
 
 def test_an_absent_rack_is_not_pinged(wire: Wire) -> None:
-    wire.peers["b"].goes(OTHER, 1)
+    wire.peers["b"].remove_token(OTHER, 1)
     wire.take()
     assert wire.sent == []
 
@@ -354,8 +356,8 @@ def test_only_the_newest_unanswered_pings_are_remembered(
     wire: Wire, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = wire.clocks._clocks["b"]
-    for _ in range(UNANSWERED + 3):
+    for _ in range(MAX_UNANSWERED + 3):
         clock.due_ns = 0
         wire.take()
-    assert len(clock.sent) == UNANSWERED
-    assert min(clock.sent) == max(clock.sent) - UNANSWERED + 1
+    assert len(clock.sent) == MAX_UNANSWERED
+    assert min(clock.sent) == max(clock.sent) - MAX_UNANSWERED + 1

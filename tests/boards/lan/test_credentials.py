@@ -39,7 +39,8 @@ def folder(made: Path, tmp_path: Path) -> Path:
 def flaws(folder: Path, rack: str = "cell", *addresses: str) -> list[str]:
     """Return what is wrong, without the folder's name."""
     return [
-        str(flaw).removeprefix(f"{folder}/") for flaw in Credentials(folder, rack).flaws(addresses)
+        str(flaw).removeprefix(f"{folder}/")
+        for flaw in Credentials(folder, rack).find_flaws(addresses)
     ]
 
 
@@ -134,10 +135,10 @@ def test_a_certificate_that_is_not_valid_now_is_refused(
     now = datetime.now(UTC)
     signer = serialization.load_pem_private_key((folder / "authority-key.pem").read_bytes(), None)
     assert isinstance(signer, ec.EllipticCurvePrivateKey)
-    key = Credentials(folder, "cell").pair.key
+    key = Credentials(folder, "cell").key_pair.key
     dates = now + begins * DAY, now + ends * DAY
     new = builder("cell", key, certificates.AUTHORITY_NAME, dates).sign(signer, hashes.SHA256())
-    (folder / "cell.pem").write_bytes(certificates.pem_of(new))
+    (folder / "cell.pem").write_bytes(certificates.to_pem(new))
     (flaw,) = flaws(folder)
     assert flaw.startswith(why)
 
@@ -181,12 +182,12 @@ def test_an_authority_may_sign_through_another_but_not_through_a_rack(
     certificates.write_credentials(
         tmp_path,
         {
-            "authority.pem": certificates.pem_of(root),
-            "cell.pem": certificates.pem_of(own) + certificates.pem_of(between),
-            "cell-key.pem": certificates.pem_of_key(own_key),
+            "authority.pem": certificates.to_pem(root),
+            "cell.pem": certificates.to_pem(own) + certificates.to_pem(between),
+            "cell-key.pem": certificates.key_to_pem(own_key),
         },
     )
     assert flaws(tmp_path) == expected
     found = Credentials(tmp_path, "cell")
-    identity = found.identity(found.pair.chain)
+    identity = found.identify_sender(found.key_pair.chain)
     assert (identity is None) == bool(expected)

@@ -20,8 +20,8 @@ from rack.boards.lan.endpoint import Endpoint
 def test_an_endpoint_has_a_protocol_a_host_and_a_port(
     text: str, parts: tuple[str, str, int]
 ) -> None:
-    assert Endpoint.of(text) == parts
-    assert str(Endpoint.of(text)) == text
+    assert Endpoint.from_text(text) == parts
+    assert str(Endpoint.from_text(text)) == text
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ def test_an_endpoint_has_a_protocol_a_host_and_a_port(
 )
 def test_a_malformed_endpoint_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="must be tcp/, tls/ or quic/"):
-        Endpoint.of(text)
+        Endpoint.from_text(text)
 
 
 @pytest.mark.parametrize(
@@ -54,8 +54,8 @@ def test_a_malformed_endpoint_is_refused(text: str) -> None:
 def test_an_endpoint_knows_who_can_reach_it(
     host: str, is_loopback: bool, is_everywhere: bool
 ) -> None:
-    endpoint = Endpoint.of(f"tcp/{host}:7447")
-    assert (endpoint.is_loopback, endpoint.is_everywhere) == (is_loopback, is_everywhere)
+    endpoint = Endpoint.from_text(f"tcp/{host}:7447")
+    assert (endpoint.is_loopback, endpoint.is_wildcard) == (is_loopback, is_everywhere)
 
 
 def test_which_protocols_have_certificates() -> None:

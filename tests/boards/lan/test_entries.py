@@ -7,21 +7,21 @@ import pytest
 
 from rack.backplane.mailbox.mailbox import Verdict
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.mailbox.slots import message_dtype
+from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.message import AnyMessage, State
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.silence_watch import ReadingTask
-from rack.backplane.watch.watched_reader import watched
-from rack.boards.config.loader import loads
+from rack.backplane.watch.watched_reader import open_watched
+from rack.boards.config.loader import load_text
 from rack.boards.lan.adapter import LanAdapter
 from rack.boards.lan.entries import Import
-from rack.boards.lan.envelope import Envelope, Sealer, kind_of
+from rack.boards.lan.envelope import Envelope, Sealer, compute_kind
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
-from rack.boards.lan.link import Arrived
+from rack.boards.lan.link import ReceivedMessage
 from rack.boards.lan.peers import PeerRack
-from rack.boards.lan.status import status_of
+from rack.boards.lan.status import build_status_class
 from rack.boards.run.ports import OutputPort
 from tests.boards.lan.conftest import EVERY, LAUNCH, Network
 
@@ -35,21 +35,23 @@ class Importing:
     def __init__(self, segment: Segment, goes_on: bool = False) -> None:
         self.segment, self.peer, self.network = (
             segment,
-            PeerRack("two", goes_on=goes_on, offset_ns=0),
+            PeerRack("two", keeps_messages=goes_on, offset_ns=0),
             Network(),
         )
         self.grid = OwnGrid(segment, EVERY)
-        config = loads(segment.config)
+        config = load_text(segment.config)
         assert config.adapter.lan is not None
         self.table = config.adapter.lan.imports["other"]
-        self.spec = segment.layout.mailbox("lan.other")
-        self.kind = kind_of(
-            self.spec.message, self.spec.version, message_dtype(self.spec.fields, self.spec.size)
+        self.spec = segment.layout.find_mailbox("lan.other")
+        self.kind = compute_kind(
+            self.spec.message,
+            self.spec.version,
+            build_message_dtype(self.spec.fields, self.spec.size),
         )
         self.key, self.sealer = out_key("two", "pulse.status"), Sealer()
-        self.status = status_of((), ("other",)).zeros({})
+        self.status = build_status_class((), ("other",)).zeros({})
         self.task = ReadingTask()
-        self.reader = watched(segment, "lan.other", AlarmWriter(segment, "echo"), self.task)
+        self.reader = open_watched(segment, "lan.other", AlarmWriter(segment, "echo"), self.task)
         self.open()
 
     def open(self) -> None:
@@ -65,7 +67,7 @@ class Importing:
         self.writer.close()
         self.network.come.clear()
         self.open()
-        self.entry.resume(self.status.import_other, tick)
+        self.entry.restore_counts(self.status.import_other, tick)
 
     def send(
         self,
@@ -77,7 +79,7 @@ class Importing:
         **head: int,
     ) -> None:
         """Let a message arrive, written there at the time of our tick `written`."""
-        message = AnyMessage(message_dtype(self.spec.fields, self.spec.size))
+        message = AnyMessage(build_message_dtype(self.spec.fields, self.spec.size))
         message.count = number if count is None else count
         message.record["state"] = state
         time_ns = self.grid.time_ns(written)
@@ -86,18 +88,18 @@ class Importing:
         )
         payload = bytes(message.raw)
         self.network.come.append(
-            Arrived(self.key, self.sealer.seal(self.key, envelope, payload), payload)
+            ReceivedMessage(self.key, self.sealer.seal(self.key, envelope, payload), payload)
         )
 
     def cycle(self, tick: int) -> None:
-        self.entry.look(tick)
-        self.entry.exchange(self.port.value, tick)
+        self.entry.update_presence(tick)
+        self.entry.deliver_newest(self.port.value, tick)
         self.port.write(tick, None)
-        self.entry.fill(self.status.import_other, tick)
+        self.entry.write_counts(self.status.import_other, tick)
 
     def read(self, tick: int) -> tuple[Verdict, int, bool]:
         """Return verdict, count and loss, as a level reads them at `tick`."""
-        self.task.reads(tick)
+        self.task.record_read(tick)
         reading = self.reader.read(tick)
         return reading.verdict, reading.message.count, reading.is_lost
 
@@ -110,7 +112,7 @@ class Importing:
 @pytest.fixture
 def importing(segment: Segment) -> Importing:
     found = Importing(segment)
-    found.peer.comes(LAUNCH, 0)
+    found.peer.add_token(LAUNCH, 0)
     found.peer.offset_ns = 0
     return found
 
@@ -200,13 +202,13 @@ def test_a_lost_rack_stays_lost_until_its_next_message(
     importing.send(1, written=2)
     importing.cycle(8)
     assert importing.read(16) == (NEW, 1, False)
-    importing.peer.goes(LAUNCH, 16)
-    importing.peer.leaves(16)
+    importing.peer.remove_token(LAUNCH, 16)
+    importing.peer.mark_lost(16)
     importing.cycle(16)
     lost_from = 24 if importing.grid.is_lockstep else 16
     assert importing.read(lost_from - 1)[2] is (lost_from <= 15)
     assert importing.read(lost_from) == (OLD, 1, True)
-    importing.peer.comes(LAUNCH, 24)
+    importing.peer.add_token(LAUNCH, 24)
     importing.peer.offset_ns = 0
     importing.cycle(24)
     assert importing.read(32) == (OLD, 1, True)
@@ -219,15 +221,15 @@ def test_a_lost_rack_stays_lost_until_its_next_message(
 @pytest.mark.parametrize("segment", ["realtime"], indirect=True)
 def test_with_go_on_levels_keep_the_last_message_however_old(segment: Segment) -> None:
     importing = Importing(segment, goes_on=True)
-    importing.peer.comes(LAUNCH, 0)
+    importing.peer.add_token(LAUNCH, 0)
     importing.peer.offset_ns = 0
     importing.send(1, written=2)
     importing.cycle(8)
-    importing.peer.leaves(16)
+    importing.peer.mark_lost(16)
     importing.cycle(16)
     assert importing.read(24) == (NEW, 1, False)
     assert importing.read(10 * MAX_AGE) == (OLD, 1, False)
-    importing.peer.comes(NEXT, 10 * MAX_AGE)
+    importing.peer.add_token(NEXT, 10 * MAX_AGE)
     importing.peer.offset_ns = 0
     importing.send(1, written=10 * MAX_AGE, launch=NEXT, count=5)
     importing.cycle(10 * MAX_AGE + 8)
@@ -256,10 +258,10 @@ def test_a_restarted_adapter_continues_and_takes_nothing_twice(importing: Import
 def test_an_adapter_restarted_while_a_rack_is_lost_knows_that_it_is(importing: Importing) -> None:
     importing.send(1, written=2)
     importing.cycle(8)
-    importing.peer.leaves(16)
+    importing.peer.mark_lost(16)
     importing.cycle(16)
     importing.restart(16)
-    importing.peer.comes(LAUNCH, 24)
+    importing.peer.add_token(LAUNCH, 24)
     importing.peer.offset_ns = 0
     importing.cycle(24)
     assert importing.read(32) == (NEW, 1, True)
@@ -280,14 +282,14 @@ def test_the_first_message_of_a_restarted_rack_is_known_from_an_old_one(
     importing.send(1, written=14, launch=NEXT, count=5)
     importing.cycle(16)
     assert importing.counts() == {"taken": 1}
-    peer.comes(NEXT, 24)
+    peer.add_token(NEXT, 24)
     peer.offset_ns = 0
     importing.cycle(24)
     assert importing.read(32) == (NEW, 5, False)
     # Of the old launch, whose token has not expired yet, and after it has.
     importing.send(901, written=30)
     importing.cycle(32)
-    peer.goes(LAUNCH, 40)
+    peer.remove_token(LAUNCH, 40)
     importing.send(902, written=38)
     importing.cycle(40)
     assert importing.read(48) == (OLD, 5, False)
@@ -350,6 +352,6 @@ def test_a_message_from_before_the_first_tick_keeps_its_age(
 
 
 def test_the_status_is_written_before_what_it_counts(segment: Segment) -> None:
-    ports = LanAdapter.made_ports(loads(segment.config).board["lan"].params, {})
+    ports = LanAdapter.build_ports(load_text(segment.config).board["lan"].params, {})
     assert next(iter(ports.outputs)) == "status"
-    assert segment.layout.mailbox("lan.other").max_age == MAX_AGE
+    assert segment.layout.find_mailbox("lan.other").max_age == MAX_AGE

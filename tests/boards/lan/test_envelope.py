@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import rack.boards.lan
 from rack.boards.lan import credentials as files
 from rack.boards.lan.credentials import Credentials, KeyPair
-from rack.boards.lan.envelope import _HEAD, MOST_ENVELOPE, Envelope, Flaw, Sealer
+from rack.boards.lan.envelope import _HEAD, MAX_ENVELOPE_BYTES, Envelope, Flaw, Sealer
 from rack.boards.lan.keys import (
     estop_answer_key,
     estop_key,
@@ -62,7 +62,7 @@ def test_a_sealed_message_is_opened_unchanged(
     sealer: Sealer, end: str, head: Envelope, payload: bytes
 ) -> None:
     key = KEY + end
-    assert sealer.opened(key, sealer.seal(key, head, payload), payload) == head
+    assert sealer.open_message(key, sealer.seal(key, head, payload), payload) == head
 
 
 @UNTIMED
@@ -76,7 +76,7 @@ def test_arbitrary_input_raises_nothing_and_never_passes(
     sealer: Sealer, key: str, envelope: bytes | None, magic: bytes, payload: bytes
 ) -> None:
     given = None if envelope is None else magic + envelope
-    assert isinstance(sealer.opened(key, given, payload), Flaw)
+    assert isinstance(sealer.open_message(key, given, payload), Flaw)
 
 
 @UNTIMED
@@ -89,7 +89,7 @@ def test_no_bit_of_envelope_or_payload_can_change(
     bit = place % (8 * len(whole))
     whole[bit // 8] ^= 1 << bit % 8
     at = len(envelope)
-    assert isinstance(sealer.opened(KEY, bytes(whole[:at]), bytes(whole[at:])), Flaw)
+    assert isinstance(sealer.open_message(KEY, bytes(whole[:at]), bytes(whole[at:])), Flaw)
 
 
 @UNTIMED
@@ -100,9 +100,9 @@ def test_a_message_with_another_end_is_no_message(sealer: Sealer, place: int, mo
     whole = envelope + payload
     cut = place % len(whole)
     at = len(envelope)
-    assert isinstance(sealer.opened(KEY, whole[:cut][:at], whole[:cut][at:]), Flaw)
-    assert sealer.opened(KEY, envelope, payload + more) is Flaw.UNSIGNED
-    assert isinstance(sealer.opened(KEY, envelope + more, payload), Flaw)
+    assert isinstance(sealer.open_message(KEY, whole[:cut][:at], whole[:cut][at:]), Flaw)
+    assert sealer.open_message(KEY, envelope, payload + more) is Flaw.UNSIGNED
+    assert isinstance(sealer.open_message(KEY, envelope + more, payload), Flaw)
 
 
 @UNTIMED
@@ -112,7 +112,7 @@ def test_a_message_replayed_under_another_key_is_unsigned(
 ) -> None:
     assume(key != other)
     envelope = sealer.seal(KEY + key, HEAD, payload)
-    assert sealer.opened(KEY + other, envelope, payload) is Flaw.UNSIGNED
+    assert sealer.open_message(KEY + other, envelope, payload) is Flaw.UNSIGNED
 
 
 @UNTIMED
@@ -123,22 +123,22 @@ def test_the_end_of_a_key_cannot_pass_for_the_beginning_of_a_payload(
     moved = end[-1].encode() + payload
     assume(len(moved) <= MOST)
     envelope = sealer.seal(KEY + end, HEAD, payload)
-    assert sealer.opened((KEY + end)[:-1], envelope, moved) is Flaw.UNSIGNED
+    assert sealer.open_message((KEY + end)[:-1], envelope, moved) is Flaw.UNSIGNED
 
 
 @pytest.mark.slow
 def test_a_spoilt_certificate_names_nobody_else(folder: Path) -> None:
     own = Credentials(folder, "cell")
-    chain = own.pair.chain
+    chain = own.key_pair.chain
     for at in range(len(chain)):
         for change in (1, 0x80):
             spoilt = bytes([*chain[:at], chain[at] ^ change, *chain[at + 1 :]])
-            identity = own.identity(spoilt)
+            identity = own.identify_sender(spoilt)
             # The authority has not signed how it says that it has signed: that may differ.
-            assert identity is None or identity.key == own.pair.key.public_key()
-    assert own.identity(chain) is not None
-    assert own.identity(b"") is None
-    assert own.identity(chain + chain[:-1]) is None
+            assert identity is None or identity.key == own.key_pair.key.public_key()
+    assert own.identify_sender(chain) is not None
+    assert own.identify_sender(b"") is None
+    assert own.identify_sender(chain + chain[:-1]) is None
 
 
 def test_each_key_is_sealed_by_the_sender_that_it_names() -> None:
@@ -168,10 +168,10 @@ def forged(folder: Path, sealer: Sealer, mixed: KeyPair) -> Iterator[bytes]:
 def test_no_rack_makes_the_seal_of_another(folder: Path) -> None:
     cell = Credentials(folder, "cell")
     sealer = Sealer(cell)
-    mixed = KeyPair(cell.pair.chain, Credentials(folder, "puma").pair.key)
-    found = [sealer.opened(KEY, envelope, b"") for envelope in forged(folder, sealer, mixed)]
+    mixed = KeyPair(cell.key_pair.chain, Credentials(folder, "puma").key_pair.key)
+    found = [sealer.open_message(KEY, envelope, b"") for envelope in forged(folder, sealer, mixed)]
     assert found == [Flaw.UNSIGNED] * 6
-    assert sealer.opened(KEY, sealer.seal(KEY, HEAD, b""), b"") == HEAD
+    assert sealer.open_message(KEY, sealer.seal(KEY, HEAD, b""), b"") == HEAD
 
 
 def test_a_seal_with_an_invalid_certificate_is_refused(
@@ -180,7 +180,7 @@ def test_a_seal_with_an_invalid_certificate_is_refused(
     make_credentials(tmp_path, {"cell": []}, 1)
     sealer = Sealer(Credentials(tmp_path, "cell"))
     envelope = sealer.seal(KEY, HEAD, b"")
-    assert sealer.opened(KEY, envelope, b"") == HEAD
+    assert sealer.open_message(KEY, envelope, b"") == HEAD
 
     class Later(datetime):
         """A clock after its end."""
@@ -190,19 +190,19 @@ def test_a_seal_with_an_invalid_certificate_is_refused(
             return datetime.now(UTC) + timedelta(days=2)
 
     monkeypatch.setattr(files, "datetime", Later)
-    assert sealer.opened(KEY, envelope, b"") is Flaw.UNSIGNED
+    assert sealer.open_message(KEY, envelope, b"") is Flaw.UNSIGNED
 
 
 def test_certificates_of_others_are_remembered_up_to_a_bound(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(files, "MOST_KNOWN", 2)
+    monkeypatch.setattr(files, "MAX_REMEMBERED", 2)
     own = Credentials(folder, "cell")
     make_credentials(folder / "more", {f"rack-{at}": [] for at in range(5)}, 1)
     own.authority = folder / "more/authority.pem"
     for at in range(5):
         other = Credentials(folder / "more", f"rack-{at}")
-        identity = own.identity(other.pair.chain)
+        identity = own.identify_sender(other.key_pair.chain)
         assert identity is not None
         assert identity.name == f"rack-{at}"
         assert 0 < len(own._known) <= 2
@@ -210,7 +210,7 @@ def test_certificates_of_others_are_remembered_up_to_a_bound(
 
 def test_flaws_are_counted_by_cause(sealer: Sealer) -> None:
     fits = bytes(MOST)
-    sealer = sealer.taking(MOST)
+    sealer = sealer.with_limit(MOST)
     sealer.flaws = dict.fromkeys(Flaw, 0)
     sealed = sealer.seal(KEY, HEAD, fits)
     for envelope, payload in (
@@ -218,15 +218,15 @@ def test_flaws_are_counted_by_cause(sealer: Sealer) -> None:
         (sealed, bytes(MOST + 1)),
         (None, fits),
         (sealed[: _HEAD.size], fits),
-        (sealed + bytes(MOST_ENVELOPE), fits),
+        (sealed + bytes(MAX_ENVELOPE_BYTES), fits),
         (b"RLN1" + sealed[4:], fits),
         (sealed, fits[1:]),
     ):
-        sealer.opened(KEY, envelope, payload)
+        sealer.open_message(KEY, envelope, payload)
     assert sealer.flaws == {Flaw.MALFORMED: 4, Flaw.UNSIGNED: 1, Flaw.OVERSIZED: 1}
     successor = Sealer()
-    successor.resume(sealer.flaws.values())
-    successor.opened(KEY, None, fits)
+    successor.resume_counts(sealer.flaws.values())
+    successor.open_message(KEY, None, fits)
     assert successor.flaws == {Flaw.MALFORMED: 5, Flaw.UNSIGNED: 1, Flaw.OVERSIZED: 1}
 
 

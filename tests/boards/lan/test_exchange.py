@@ -16,11 +16,11 @@ from rack.backplane.errors import SegmentError
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
-from rack.backplane.words import Block, Demand, System, switch
+from rack.backplane.words import Block, Demand, System, encode_switch
 from rack.boards import Rack
-from rack.boards.config.loader import loads
-from rack.boards.crate.clean import remove_dead
-from rack.boards.lan.link import UNREAD
+from rack.boards.config.loader import load_text
+from rack.boards.crate.clean import remove_dead_rack
+from rack.boards.lan.link import MAX_UNREAD
 from rack.levels.peer import Presence
 from tests.boards.lan.racks import (
     LAUNCH_S,
@@ -65,7 +65,7 @@ def attached(name: str) -> Segment:
 
 def written(segment: Segment, mailbox: str) -> np.ndarray:
     """Return the messages of a mailbox that its slots still hold."""
-    return MailboxRing(segment, mailbox).drain().rows["message"]
+    return MailboxRing(segment, mailbox).read_new_rows().rows["message"]
 
 
 def awaited(rack: RackProcess, since: int, kind: str, text: str) -> dict[str, Any]:
@@ -79,7 +79,7 @@ def awaited(rack: RackProcess, since: int, kind: str, text: str) -> dict[str, An
 
 def kill_adapter(segment: Segment) -> None:
     """Kill a rack's adapter, and wait until a new one exchanges."""
-    block, status = segment.block("lan"), open_observer(segment, "lan.status")
+    block, status = segment.get_block("lan"), open_observer(segment, "lan.status")
     pid = block[Block.PID]
     os.kill(pid, signal.SIGKILL)
     wait_until(lambda: block[Block.PID] != pid and not block[Block.LOST])
@@ -94,7 +94,7 @@ def names(rack_name: str) -> Iterator[tuple[str, str]]:
     found = f"{rack_name}-a", f"{rack_name}-b"
     yield found
     for name in found:
-        remove_dead(name)
+        remove_dead_rack(name)
 
 
 @pytest.mark.alone
@@ -171,8 +171,8 @@ def test_the_threads_of_the_network_have_core_and_priority_of_the_adapter(
         "board.pulse.priority=36",
     )
     with Rack(config) as rack:
-        pid = rack.segment.block("lan")[Block.PID]
-        core = rack.segment.layout.task("lan").core
+        pid = rack.segment.get_block("lan")[Block.PID]
+        core = rack.segment.layout.find_task("lan").core
         threads = [int(path.name) for path in Path(f"/proc/{pid}/task").iterdir()]
         assert len(threads) > 1
         for thread in threads:
@@ -205,14 +205,15 @@ max_age_ms = 1000
             # each.
             entry = newest(rack.segment, "lan.status")
             return (
-                entry.import_other["refused"] > 20 * UNREAD and entry.import_calm["superseded"] > 10
+                entry.import_other["refused"] > 20 * MAX_UNREAD
+                and entry.import_calm["superseded"] > 10
             )
 
         wait_until(goes_on)
         rows = written(rack.segment, "lan.status")
         stop(rack)
     refused = np.diff(rows["import_other"]["refused"].astype(int))
-    assert refused.max() == UNREAD
+    assert refused.max() == MAX_UNREAD
     assert (refused >= 0).all()
     assert rows["import_other"]["taken"][-1] == 0
 
@@ -224,7 +225,7 @@ def test_an_adapter_killed_in_lockstep_continues_its_counts_and_the_run_repeats(
     text += '[[fault]]\nkind = "kill"\nboard = "lan"\ntick = 100\n'
     ended = []
     for _ in range(2):
-        with Rack(loads(text)) as rack:
+        with Rack(load_text(text)) as rack:
             outcome = rack.run(1.5)
             ended.append(
                 (outcome.digest, int(newest(rack.segment, "lan.status").export_pulse["sent"]))
@@ -241,6 +242,6 @@ def words(demand_from: int, is_on: bool, rack: Rack) -> list[tuple[int, str]]:
     """Run a rack whose adapter switches its demand at a tick; return ticks and texts of what the
     arm must do."""
     with rack:
-        rack.segment.words[System.PEER_STOP] = switch(demand_from, is_on)
+        rack.segment.words[System.PEER_STOP] = encode_switch(demand_from, is_on)
         rack.run(0.5)
     return [(event.tick, event.text) for event in rack.events if event.code == "demand"]

@@ -5,12 +5,12 @@ from __future__ import annotations
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.config.loader import loads
+from rack.boards.config.loader import load_text
 from rack.boards.lan.entries import Export
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import out_key
-from rack.boards.lan.status import status_of
+from rack.boards.lan.status import build_status_class
 from tests.boards.lan.conftest import EVERY, LAUNCH, Network
 
 
@@ -18,7 +18,7 @@ class Exporting:
     """The adapter's export of `pulse.status`, and the level that writes it."""
 
     def __init__(self, segment: Segment) -> None:
-        config = loads(segment.config)
+        config = load_text(segment.config)
         assert config.adapter.lan is not None
         self.segment, self.table, self.network = (
             segment,
@@ -26,7 +26,7 @@ class Exporting:
             Network(),
         )
         self.writer = open_writer(segment, "pulse.status")
-        self.status = status_of(("pulse",), ()).zeros({})
+        self.status = build_status_class(("pulse",), ()).zeros({})
         self.open()
 
     def open(self) -> None:
@@ -37,21 +37,21 @@ class Exporting:
         """Return the heads of what was sent since the last call."""
         sent, self.network.sent = self.network.sent, []
         key = out_key(self.segment.rack, "pulse.status")
-        found = [Sealer().opened(key, envelope, payload) for payload, envelope in sent]
+        found = [Sealer().open_message(key, envelope, payload) for payload, envelope in sent]
         assert all(isinstance(head, Envelope) for head in found)
         return found  # type: ignore[return-value]
 
 
 def test_each_new_message_is_sent_once(segment: Segment) -> None:
     exporting = Exporting(segment)
-    exporting.entry.exchange(0)
+    exporting.entry.send_newest(0)
     assert exporting.heads() == []
     exporting.writer.write(0)
-    exporting.entry.exchange(8)
-    exporting.entry.exchange(16)
+    exporting.entry.send_newest(8)
+    exporting.entry.send_newest(16)
     exporting.writer.write(8)
     exporting.writer.write(16)
-    exporting.entry.exchange(24)
+    exporting.entry.send_newest(24)
     heads = exporting.heads()
     assert [(head.number, head.serial, head.tick) for head in heads] == [(1, 1, 0), (2, 3, 16)]
     assert heads[1].time_ns == 16 * 2_500_000
@@ -64,15 +64,15 @@ def test_the_last_message_before_a_restart_is_sent_again(
     exporting = Exporting(segment)
     for tick in (0, 8):
         exporting.writer.write(tick)
-        exporting.entry.exchange(tick + 8)
-    exporting.entry.fill(exporting.status.export_pulse)
+        exporting.entry.send_newest(tick + 8)
+    exporting.entry.write_counts(exporting.status.export_pulse)
     sent = exporting.heads()
     # Time has gone on meanwhile.
     exporting.writer.write(32)
     for died_after, again in ((16, sent[1:]), (24, [])):
         exporting.open()
-        exporting.entry.resume(exporting.status.export_pulse)
-        exporting.entry.recall(died_after, EVERY)
+        exporting.entry.restore_counts(exporting.status.export_pulse)
+        exporting.entry.resend_last(died_after, EVERY)
         assert exporting.heads() == again
         assert exporting.entry.count.sent == 2
 
@@ -80,10 +80,10 @@ def test_the_last_message_before_a_restart_is_sent_again(
 def test_a_rack_that_joins_gets_the_newest_message_again(segment: Segment) -> None:
     exporting = Exporting(segment)
     exporting.writer.write(0)
-    exporting.entry.exchange(8)
+    exporting.entry.send_newest(8)
     exporting.entry.is_asked = True
-    exporting.entry.exchange(16)
-    exporting.entry.exchange(24)
+    exporting.entry.send_newest(16)
+    exporting.entry.send_newest(24)
     # In lockstep nobody comes late, and nothing may depend on when a token comes.
     times = 1 if segment.words[System.LOCKSTEP] else 2
     assert [(head.number, head.serial) for head in exporting.heads()] == [(1, 1)] * times
@@ -94,13 +94,13 @@ def test_a_restarted_adapter_continues_the_numbers(segment: Segment) -> None:
     exporting = Exporting(segment)
     for tick in (0, 8, 16):
         exporting.writer.write(tick)
-        exporting.entry.exchange(tick + 8)
-    exporting.entry.fill(exporting.status.export_pulse)
+        exporting.entry.send_newest(tick + 8)
+    exporting.entry.write_counts(exporting.status.export_pulse)
     exporting.heads()
     exporting.open()
-    exporting.entry.resume(exporting.status.export_pulse)
-    exporting.entry.exchange(32)
+    exporting.entry.restore_counts(exporting.status.export_pulse)
+    exporting.entry.send_newest(32)
     assert exporting.heads() == []
     exporting.writer.write(32)
-    exporting.entry.exchange(40)
+    exporting.entry.send_newest(40)
     assert [(head.number, head.serial) for head in exporting.heads()] == [(4, 4)]

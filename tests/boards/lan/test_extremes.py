@@ -15,7 +15,7 @@ import pytest
 
 from rack.backplane.message import State
 from rack.boards.config import CONFIGS, load, resolve
-from rack.boards.config.cell import built_cell, cell_sizes
+from rack.boards.config.cell import build_rack_cell, compute_cell_sizes
 from rack.boards.config.schema import RackConfig
 from rack.levels.messages import Error
 from rack.levels.operator import Goal
@@ -29,7 +29,7 @@ from rack.levels.systems.coordination.messages import (
     Response,
 )
 from rack.levels.systems.coordination.shared_bodies import SharedBodies
-from rack.tools.viewer.window import free_port
+from rack.tools.viewer.window import find_free_port
 from tests.boards.lan.extreme_levels import Case, cases, message_class
 from tests.boards.lan.racks import Ended, run_together
 from tests.test_brown_network import configs
@@ -163,7 +163,7 @@ def run(rack: RackConfig, listen: int, senders: Sequence[Sender], folder: Path) 
     found = [rack]
     for k, sender in enumerate(senders):
         path = folder / f"sender-{k}.toml"
-        path.write_text(sender.text(free_port(), rack.name, [listen]))
+        path.write_text(sender.text(find_free_port(), rack.name, [listen]))
         found.append(load(path))
     seconds = max(sender.seconds for sender in senders) + 1.0
     return run_together(found, [seconds] * len(found))[0]
@@ -212,7 +212,7 @@ def test_no_extreme_of_an_order_ends_a_board_of_an_arm(
         is_of_action = case[0].split()[0] in action
         if is_of_action or action is POSE:
             orders.append((PLANNED if is_of_action and case[2] else 1, case))
-    listen, senders = free_port(), orders_and_bodies(rack_name, orders, ())
+    listen, senders = find_free_port(), orders_and_bodies(rack_name, orders, ())
     found = run(real("puma", rack_name, tmp_path, listen), listen, senders, tmp_path)
     check(found, {"orders": senders[0].streams[0].refused, "shared": 0})
 
@@ -234,14 +234,17 @@ def test_no_extreme_of_a_shared_body_ends_a_board_of_an_arm(rack_name: str, tmp_
         (one for one in found if one[0] != "bodies.position = 0.0"),
         key=lambda one: one[0].split()[0] not in first,
     )
-    listen, senders = free_port(), orders_and_bodies(rack_name, (), [(5, one) for one in tried])
+    listen, senders = (
+        find_free_port(),
+        orders_and_bodies(rack_name, (), [(5, one) for one in tried]),
+    )
     ended = run(real("puma", rack_name, tmp_path, listen), listen, senders, tmp_path)
     check(ended, {"orders": 0, "shared": senders[1].streams[0].refused})
 
 
 @pytest.mark.slow
 def test_no_extreme_of_a_report_ends_a_coordinator(rack_name: str, tmp_path: Path) -> None:
-    listen = free_port()
+    listen = find_free_port()
     cell = real("cell", rack_name, tmp_path, listen)
     checksum = CellProgram.model_validate(resolve(cell).config.task).checksum
     answer = {"program": checksum, "echo": 1000}
@@ -278,10 +281,10 @@ def brown(
     """Run a rack of brown with one that stands in for the other and sends what that one does;
     return how it ended, and how many messages it had to refuse, by port."""
     configs(rack_name, folder)
-    listen = free_port()
+    listen = find_free_port()
     rack = listening(folder / f"{file}.toml", listen)
     assert rack.adapter.lan is not None
-    sizes = cell_sizes(rack)
+    sizes = compute_cell_sizes(rack)
     streams = {
         port: Stream(
             entry.mailbox,
@@ -298,7 +301,7 @@ def brown(
 
 def asked_of_servo(mailbox: str, rack: RackConfig) -> Iterator[Mapping[str, Any]]:
     """Yield what the general machine sends in each of its cycles."""
-    cell = built_cell(rack)
+    cell = build_rack_cell(rack)
     still = Dynamics(cell).terms(cell.home, np.zeros(len(cell.home)))
     for cycle in count(1):
         yield {
@@ -330,13 +333,13 @@ def test_no_extreme_of_the_general_machine_ends_a_board_of_the_servo_rack(
     ]
     # The plain one was due when the run began.
     assert last["supervisor.status"]["reason"].startswith("rejected: a reference due in -")
-    home = built_cell(load("brown")).home
+    home = build_rack_cell(load("brown")).home
     assert last["arm.status"]["position"] == pytest.approx(home, abs=1e-3)
 
 
 def told_by_servo(mailbox: str, rack: RackConfig) -> Iterator[Mapping[str, Any]]:
     """Yield what the servo rack sends in each of its cycles."""
-    cell = built_cell(rack)
+    cell = build_rack_cell(rack)
     for cycle in count(1):
         yield {
             "supervisor.status": {

@@ -16,7 +16,7 @@ from rack.boards.lan.config import LanTable
 from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import LanLink
 from rack.levels.errors import LevelError
-from rack.tools.viewer.window import free_port
+from rack.tools.viewer.window import find_free_port
 from tests.boards.lan.test_strangers import OWN, Program, Site, at_home, friend, running
 from tests.processes import wait_until
 
@@ -56,7 +56,7 @@ def test_nothing_listens_unless_the_config_says_so() -> None:
 
 
 def test_it_listens_where_the_config_says_and_sends_no_datagram() -> None:
-    with home(listen=[f"tcp/127.0.0.1:{free_port()}"]) as program:
+    with home(listen=[f"tcp/127.0.0.1:{find_free_port()}"]) as program:
         assert program.state()["came"] == {}
         assert list(sockets(program.pid)) == [("tcp", LISTENS)]
 
@@ -81,7 +81,7 @@ def test_opening_waits_for_no_peer() -> None:
     there."""
 
     def opened_s() -> float:
-        with home(connect=[f"tcp/127.0.0.1:{free_port()}"]) as program:
+        with home(connect=[f"tcp/127.0.0.1:{find_free_port()}"]) as program:
             return float(program.state()["opened_s"])
 
     assert any(opened_s() < ZENOH_WAITS_S for _ in range(3))

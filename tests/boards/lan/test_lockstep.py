@@ -13,9 +13,9 @@ import pytest
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.crate import patience
-from rack.levels.peer import Presence, peer_port
+from rack.levels.peer import Presence, format_peer_port
 from rack.tools.monitor.holds import find_holds
-from rack.tools.monitor.newest_messages import Newest
+from rack.tools.monitor.newest_messages import NewestMessages
 from tests.boards.lan.racks import (
     Ended,
     configs,
@@ -91,7 +91,7 @@ def test_an_adapter_killed_at_a_tick_comes_back_and_the_run_repeats(
     assert digests(found[0]) == digests(found[1])
     other, struck = found[0]
     assert "rejoined" in struck.texts
-    assert other.last[f"lan.{peer_port(names[1])}"]["losses"] == 0
+    assert other.last[f"lan.{format_peer_port(names[1])}"]["losses"] == 0
     assert other.last["lan.status"]["import_other"]["missing"] == 0
     # It takes what was sent while it was away, of which the newest counts.
     assert struck.last["lan.status"]["import_other"]["missing"] == 0
@@ -112,14 +112,14 @@ def test_a_killed_rack_is_given_up_and_the_others_continue(
         other.await_event("start")
         watch([rack], until=lambda: rack.segment.words[System.HELD])
         assert rack.segment.words[System.HELD] == 200
-        adapter = Segment.attach(names[1]).block("lan")[Block.PID]
+        adapter = Segment.attach(names[1]).get_block("lan")[Block.PID]
         # Its boards die with the crate, and say nothing.
         os.kill(parent_of(adapter), signal.SIGKILL)
         wait_until(lambda: not runs(adapter))
         rack.segment.words[System.HOLD_AT] = 0
         watch([rack])
         assert ended(rack).outcome.cause == "time over"
-        assert ended(rack).last[f"lan.{peer_port(names[1])}"]["presence"] == Presence.LOST
+        assert ended(rack).last[f"lan.{format_peer_port(names[1])}"]["presence"] == Presence.LOST
 
 
 def test_a_rack_that_is_started_again_takes_no_part_and_says_why(
@@ -154,14 +154,14 @@ def test_racks_wait_for_each_other_and_a_stop_ends_the_wait(
     racks = configs(ring_texts(names[:2]), tmp_path, STEPPED)
     with running(racks[:1]) as (rack,):
         rack.start(1.0)
-        watch([rack], until=lambda: rack.segment.block("lan")[Block.AWAITS])
+        watch([rack], until=lambda: rack.segment.get_block("lan")[Block.AWAITS])
         reason = (
             f"waits for rack '{names[1]}': it has not connected yet,"
             " or its config does not name this rack"
         )
-        assert [hold.why for hold in find_holds(Newest(rack.segment)) if hold.level == "lan"] == [
-            reason
-        ]
+        assert [
+            hold.why for hold in find_holds(NewestMessages(rack.segment)) if hold.level == "lan"
+        ] == [reason]
         watch([rack], until=lambda: rack.events[-1].kind == "waiting")
         assert rack.segment.words[System.TICK] < CYCLE
         rack.stop("test")

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rack.backplane.watch.alarms import Alarm
-from rack.boards.lan.peers import REMEMBERED, PeerRack, Peers
+from rack.boards.lan.peers import MAX_LAUNCHES, PeerRack, Peers
 from rack.levels.peer import PeerPresence, Presence
 
 OLD, NEW = 11, 22
@@ -23,9 +23,9 @@ def alarms(peer: PeerRack) -> list[Alarm]:
 
 def test_a_partition_is_not_a_restart() -> None:
     peer = PeerRack("b")
-    peer.comes(OLD, 5)
-    peer.goes(OLD, 9)
-    peer.comes(OLD, 20)
+    peer.add_token(OLD, 5)
+    peer.remove_token(OLD, 9)
+    peer.add_token(OLD, 20)
     assert (peer.launches, peer.losses, peer.since) == (1, 1, 20)
     assert alarms(peer) == [Alarm.PEER_LOST, Alarm.PEER_BACK]
     assert peer.findings[-1].value == 11
@@ -33,16 +33,16 @@ def test_a_partition_is_not_a_restart() -> None:
 
 def test_a_new_launch_replaces_one_whose_token_has_not_expired() -> None:
     peer = PeerRack("b")
-    peer.comes(OLD, 5)
-    peer.comes(NEW, 9)
+    peer.add_token(OLD, 5)
+    peer.add_token(NEW, 9)
     assert (peer.launch, peer.launches, peer.losses) == (NEW, 2, 1)
     assert alarms(peer) == [Alarm.PEER_LOST, Alarm.PEER_RESTARTED]
-    peer.goes(OLD, 40)
-    assert (peer.launch, peer.is_there, peer.losses) == (NEW, True, 1)
-    assert peer.is_over(OLD)
-    assert not peer.is_over(NEW)
+    peer.remove_token(OLD, 40)
+    assert (peer.launch, peer.is_present, peer.losses) == (NEW, True, 1)
+    assert peer.is_superseded(OLD)
+    assert not peer.is_superseded(NEW)
     # A late token, as over another way through the network.
-    peer.comes(OLD, 41)
+    peer.add_token(OLD, 41)
     assert (peer.launch, peer.launches) == (NEW, 2)
 
 
@@ -54,14 +54,14 @@ def taken(changes: list[tuple[str, int, bool]]) -> Iterator[tuple[str, int, bool
 def restarted(peer: PeerRack, confirm_by: int) -> PeerRack:
     """Return the rack as a restarted adapter finds it in its mailbox."""
     message, after = PeerPresence.zeros({}), PeerRack("b")
-    peer.fill(message, is_lockstep=False)
-    after.resume(message, confirm_by)
+    peer.write_presence(message, is_lockstep=False)
+    after.restore_state(message, confirm_by)
     return after
 
 
 def test_a_restarted_adapter_continues_with_the_same_launch() -> None:
     peer = PeerRack("b")
-    peer.comes(OLD, 5)
+    peer.add_token(OLD, 5)
     after = restarted(peer, 100)
     assert (after.presence, after.launch, after.launches, after.since) == (
         Presence.THERE,
@@ -69,7 +69,7 @@ def test_a_restarted_adapter_continues_with_the_same_launch() -> None:
         1,
         5,
     )
-    after.comes(OLD, 50)
+    after.add_token(OLD, 50)
     assert (after.presence, after.launches, after.losses, alarms(after)) == (
         Presence.THERE,
         1,
@@ -82,22 +82,24 @@ def test_a_restarted_adapter_continues_with_the_same_launch() -> None:
 def test_a_rack_that_ended_during_a_restart_is_lost_in_time() -> None:
     peers = Peers(["b"])
     there = PeerRack("b")
-    there.comes(OLD, 5)
+    there.add_token(OLD, 5)
     message = PeerPresence.zeros({})
-    there.fill(message, is_lockstep=False)
-    peers["b"].resume(message, 100)
-    assert peers.look(99) == []
-    assert peers["b"].is_there
-    assert [finding.alarm for finding in peers.look(100)] == [Alarm.PEER_LOST]
-    assert peers.lost == ["b"]
-    assert peers.look(101) == []
+    there.write_presence(message, is_lockstep=False)
+    peers["b"].restore_state(message, 100)
+    assert peers.update_presence(99) == []
+    assert peers["b"].is_present
+    assert [finding.alarm for finding in peers.update_presence(100)] == [Alarm.PEER_LOST]
+    assert peers.lost_racks == ["b"]
+    assert peers.update_presence(101) == []
 
 
 def test_alarms_name_the_rack_by_its_number_and_strangers_are_no_peers() -> None:
     peers = Peers(["a", "b"])
     changes = [("b", OLD, True), ("stranger", 5, True), ("b", OLD, False)]
-    peers.watch(partial(taken, changes), is_lockstep=False)
-    assert [(finding.alarm, finding.subject) for finding in peers.look(7)] == [(Alarm.PEER_LOST, 1)]
+    peers.set_source(partial(taken, changes), is_lockstep=False)
+    assert [(finding.alarm, finding.subject) for finding in peers.update_presence(7)] == [
+        (Alarm.PEER_LOST, 1)
+    ]
     assert peers.arrivals == 2
     assert [peer.rack for peer in peers] == ["a", "b"]
 
@@ -110,13 +112,13 @@ def test_in_lockstep_the_message_of_a_peer_depends_on_ticks_alone_also_after_a_r
         for tick in range(0, 800, 8):
             if tick in (0, restarted_at):
                 peers, coming = Peers(["b"]), [("b", launch, True)]
-                peers.watch(partial(taken, coming), is_lockstep=True)
+                peers.set_source(partial(taken, coming), is_lockstep=True)
                 if tick:
-                    peers["b"].resume(message, tick + 80)
+                    peers["b"].restore_state(message, tick + 80)
             coming += [("b", launch, False)] if tick == 600 else []
-            found = peers.look(tick)
+            found = peers.update_presence(tick)
             assert [finding.alarm for finding in found] == [Alarm.PEER_LOST] * (tick == 600)
-            peers["b"].fill(message, is_lockstep=True)
+            peers["b"].write_presence(message, is_lockstep=True)
             rows.append(bytes(message.raw))
         assert (message.presence, message.since, message.launches, message.losses) == (
             Presence.LOST,
@@ -135,16 +137,16 @@ def test_a_rack_is_present_exactly_if_a_current_launch_is(
 ) -> None:
     peer, tokens = PeerRack("b"), set[int]()
     for tick, (launch, has_come) in enumerate(steps):
-        was_over = [old for old in range(1, 5) if peer.is_over(old)]
-        (peer.comes if has_come else peer.goes)(launch, tick)
+        was_over = [old for old in range(1, 5) if peer.is_superseded(old)]
+        (peer.add_token if has_come else peer.remove_token)(launch, tick)
         (tokens.add if has_come else tokens.discard)(launch)
-        living = {token for token in tokens if not peer.is_over(token)}
-        assert peer.is_there == bool(living)
-        assert not peer.is_there or peer.launch in living
+        living = {token for token in tokens if not peer.is_superseded(token)}
+        assert peer.is_present == bool(living)
+        assert not peer.is_present or peer.launch in living
         # What is over stays over.
-        assert all(peer.is_over(old) for old in was_over)
+        assert all(peer.is_superseded(old) for old in was_over)
         assert peer.launches <= 4
-        assert len(peer.tokens) <= REMEMBERED
+        assert len(peer.tokens) <= MAX_LAUNCHES
     back = sum(alarm in (Alarm.PEER_BACK, Alarm.PEER_RESTARTED) for alarm in alarms(peer))
     assert alarms(peer).count(Alarm.PEER_LOST) == peer.losses
     assert peer.losses - back == (peer.presence is Presence.LOST)
@@ -152,6 +154,6 @@ def test_a_rack_is_present_exactly_if_a_current_launch_is(
 
 def test_a_flood_of_tokens_is_bounded() -> None:
     peer = PeerRack("b")
-    for launch in range(1, 10 * REMEMBERED):
-        peer.comes(launch, launch)
-    assert len(peer.tokens) == REMEMBERED
+    for launch in range(1, 10 * MAX_LAUNCHES):
+        peer.add_token(launch, launch)
+    assert len(peer.tokens) == MAX_LAUNCHES

@@ -9,15 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import System
-from rack.boards.config import load, wire
+from rack.boards.config import load, resolve_layout
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.envelope import Envelope, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import estop_answer_key, estop_key
-from rack.boards.lan.link import Arrived, Question
-from rack.boards.lan.remote_estop import CHECK, ESTOP_KIND, Desk
+from rack.boards.lan.link import Question, ReceivedMessage
+from rack.boards.lan.remote_estop import CHECK_FLAG, ESTOP_KIND, EstopResponder
 from rack.levels.level import Finding
 from rack.tools.network.certificates import make_credentials
 from tests.boards.commanded_racks import COMMANDED
@@ -26,7 +26,7 @@ LAUNCH, SESSION = 77, 5
 ASKERS = {"operator": 1, "second": 2}
 
 
-class Line:
+class InputMailbox:
     """A link whose requests a test sends; answers are opened as an operator does."""
 
     def __init__(self, rack: str) -> None:
@@ -64,23 +64,23 @@ class Line:
     def put(self, asker: str, envelope: bytes | None, payload: bytes = b"") -> None:
 
         def reply(payload: bytes, envelope: bytes) -> None:
-            head = self.sealer.opened(estop_answer_key(self.rack, asker), envelope, payload)
+            head = self.sealer.open_message(estop_answer_key(self.rack, asker), envelope, payload)
             assert isinstance(head, Envelope)
             assert payload == b""
             self.answers.append(head)
 
         self._waiting.append(
-            Question(Arrived(estop_key(asker, self.rack), envelope, payload), reply)
+            Question(ReceivedMessage(estop_key(asker, self.rack), envelope, payload), reply)
         )
 
 
-class Bench:
+class BenchMessage:
     """A desk at the segment of a rack that is not running."""
 
     def __init__(self, segment: Segment) -> None:
         self.segment, self.findings, self.tick = segment, list[Finding](), 40
-        self.desk = Desk(segment, OwnGrid(segment, 8), ASKERS, self.findings)
-        self.line = Line(segment.rack)
+        self.desk = EstopResponder(segment, OwnGrid(segment, 8), ASKERS, self.findings)
+        self.line = InputMailbox(segment.rack)
         self.open()
 
     def open(self) -> None:
@@ -91,7 +91,7 @@ class Bench:
         """Let the desk have a cycle; return its answers."""
         self.tick += 8
         self.line.answers.clear()
-        self.desk.answer(self.tick)
+        self.desk.answer_requests(self.tick)
         return list(self.line.answers)
 
     @property
@@ -104,21 +104,25 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[Bench]:
+def bench(tmp_path: Path) -> Iterator[BenchMessage]:
     name = f"test-desk-{os.getpid()}"
     path = tmp_path / "rack.toml"
     path.write_text(COMMANDED)
-    segment = Segment.create(wire(load(path, [f"name={name}", "clock.mode=realtime"])), "")
+    segment = Segment.create(
+        resolve_layout(load(path, [f"name={name}", "clock.mode=realtime"])), ""
+    )
     try:
         # A rack's clock has set these before the first cycle of a board.
         segment.words[System.PERIOD_NS] = 2_500_000
-        yield Bench(segment)
+        yield BenchMessage(segment)
     finally:
         segment.close()
-        unlink(name)
+        unlink_segment(name)
 
 
-def test_a_stop_is_set_reported_once_and_answered_for_its_request_and_launch(bench: Bench) -> None:
+def test_a_stop_is_set_reported_once_and_answered_for_its_request_and_launch(
+    bench: BenchMessage,
+) -> None:
     for asker in ("second", "operator"):
         bench.line.ask(asker)
     answers = bench.cycle()
@@ -133,14 +137,14 @@ def test_a_stop_is_set_reported_once_and_answered_for_its_request_and_launch(ben
     assert bench.counts == (2, 0, 0)
 
 
-def test_a_check_is_answered_and_sets_nothing(bench: Bench) -> None:
-    bench.line.ask(flags=CHECK)
+def test_a_check_is_answered_and_sets_nothing(bench: BenchMessage) -> None:
+    bench.line.ask(flags=CHECK_FLAG)
     assert len(bench.cycle()) == 1
     assert not bench.is_stopped
     assert not bench.findings
 
 
-def test_forbidden_malformed_and_unsigned_requests_get_no_answer(bench: Bench) -> None:
+def test_forbidden_malformed_and_unsigned_requests_get_no_answer(bench: BenchMessage) -> None:
     line = bench.line
     line.ask("nobody")
     line.ask(payload=b"x")
@@ -154,7 +158,7 @@ def test_forbidden_malformed_and_unsigned_requests_get_no_answer(bench: Bench) -
     assert bench.counts == (0, 1, 6)
 
 
-def test_nobody_can_request_a_stop_under_another_name(bench: Bench, tmp_path: Path) -> None:
+def test_nobody_can_request_a_stop_under_another_name(bench: BenchMessage, tmp_path: Path) -> None:
     names = (bench.segment.rack, *ASKERS)
     make_credentials(tmp_path, dict.fromkeys(names, ()), 1)
     rack, operator, second = (Sealer(Credentials(tmp_path, name)) for name in names)
@@ -172,19 +176,19 @@ def test_nobody_can_request_a_stop_under_another_name(bench: Bench, tmp_path: Pa
 
 
 def test_counters_continue_after_a_restart_and_are_empty_in_lockstep(
-    bench: Bench,
+    bench: BenchMessage,
 ) -> None:
     group = np.zeros((), [("answered", "u4"), ("refused", "u4"), ("dropped", "u4")])
     bench.line.ask()
     bench.line.ask("nobody")
     bench.cycle()
-    bench.desk.fill(group)
+    bench.desk.write_counts(group)
     assert group.tolist() == (1, 1, 0)
     group["dropped"] = 7
     for is_lockstep, expected in ((0, (1, 1, 7)), (1, (0, 0, 0))):
         bench.segment.words[System.LOCKSTEP] = is_lockstep
-        successor = Desk(bench.segment, OwnGrid(bench.segment, 8), ASKERS, [])
-        successor.resume(group)
+        successor = EstopResponder(bench.segment, OwnGrid(bench.segment, 8), ASKERS, [])
+        successor.restore_counts(group)
         shown = np.zeros_like(group)
-        successor.fill(shown)
+        successor.write_counts(shown)
         assert shown.tolist() == expected

@@ -26,7 +26,7 @@ def taken(rack: str) -> int:
         segment = Segment.attach(rack)
         try:
             status = open_observer(segment, "lan.status").peek()
-            return int(status.message.import_other["taken"]) if status.is_there else 0
+            return int(status.message.import_other["taken"]) if status.has_message else 0
         finally:
             segment.close()
     return 0

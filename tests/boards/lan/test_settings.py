@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from rack.boards.lan.access import access_control
+from rack.boards.lan.access import build_access_control
 from rack.boards.lan.config import LanTable
-from rack.boards.lan.link import _settings
+from rack.boards.lan.link import _build_settings
 from tests.snapshots import Snapshots
 
 SNAPSHOTS = Snapshots(__file__)
@@ -34,7 +34,7 @@ TABLES: dict[str, dict[str, Any]] = {
 def test_the_session_settings_are_unchanged(name: str, is_operator: bool) -> None:
     table = LanTable.model_validate(TABLES[name])
     parts = {
-        "access": access_control("home", table, is_operator),
-        "settings": str(_settings("home", table, None, is_operator)),
+        "access": build_access_control("home", table, is_operator),
+        "settings": str(_build_settings("home", table, None, is_operator)),
     }
     SNAPSHOTS.check(f"{name}{', operator' if is_operator else ''}", parts)

@@ -17,7 +17,7 @@ import pytest
 from rack.boards.lan.credentials import Credentials
 from rack.boards.lan.keys import out_key
 from rack.tools.network.certificates import make_credentials
-from rack.tools.viewer.window import free_port
+from rack.tools.viewer.window import find_free_port
 from tests.processes import BOUND_S, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -117,7 +117,7 @@ def at_home(folder: Path, protocol: str = "tls") -> Iterator[Site]:
     for each in ("set", "forged"):
         addresses = {name: ["127.0.0.1"] for name in ("home", *NAMES)}
         make_credentials(folder / each, {**addresses, "impostor": ["127.9.9.9"]}, 1)
-    port, friends_port = free_port(), free_port()
+    port, friends_port = find_free_port(), find_free_port()
     entry = {"type": "lan_levels:PulseStatus", "max_age_ms": 100.0}
     table = {
         "listen": [f"{protocol}/127.0.0.1:{port}"],

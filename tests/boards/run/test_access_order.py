@@ -83,7 +83,7 @@ class RecordedWords:
 def accesses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """All accesses to mailboxes that are opened from here on."""
     made: list[str] = []
-    box_of, begin = Segment.box, Slots.__init__
+    box_of, begin = Segment.get_box, Slots.__init__
 
     def opened(slots: Any, *arguments: Any) -> None:
         begin(slots, *arguments)
@@ -91,7 +91,7 @@ def accesses(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         slots.heads = [RecordedWords(words, made) for words in slots.heads]
 
     monkeypatch.setattr(
-        Segment, "box", lambda segment, name: RecordedBox(box_of(segment, name), made)
+        Segment, "get_box", lambda segment, name: RecordedBox(box_of(segment, name), made)
     )
     monkeypatch.setattr(Slots, "__init__", opened)
     monkeypatch.setattr(Slots, "fence", staticmethod(lambda: made.append("fence")))
@@ -116,8 +116,8 @@ def of_python(segment: Segment, accesses: list[str]) -> dict[str, tuple[str, ...
     writer.write(1)
     found |= {
         "read": made(lambda: reader.read(2)),
-        "judge": made(lambda: reader.slots.keeps(2)),
-        "lose": made(writer.lose),
+        "judge": made(lambda: reader.slots.is_kept(2)),
+        "lose": made(writer.lose_message),
     }
     # A writer that dies before it publishes what it has filled.
     writer.slots.serial += 1
@@ -218,7 +218,7 @@ PATTERNS = (
 
 def instructions(function: str) -> list[str]:
     """Return the accesses in the machine code of a function, in their order."""
-    machine: Any = compiled_mailbox.access_ports.load()
+    machine: Any = compiled_mailbox.access_ports.load_machine_code()
     (text,) = machine.inspect_llvm().values()
     name = rf"compiled_mailbox\d+{function}B\w*"
     body = re.search(rf"^define linkonce_odr [^\n]*{name}\(.*?^}}", text, re.MULTILINE | re.DOTALL)
@@ -248,8 +248,8 @@ def of_machine_code() -> dict[str, tuple[str, ...]]:
 @pytest.fixture
 def compile_all(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], None]]:
     """Compile all functions of mailboxes, without the cache: what comes from there has no text."""
-    monkeypatch.setattr(compilation._Kept, "load_overload", lambda *_: None)
-    monkeypatch.setattr(compilation._Kept, "save_overload", lambda *_: None)
+    monkeypatch.setattr(compilation._CodeCache, "load_overload", lambda *_: None)
+    monkeypatch.setattr(compilation._CodeCache, "save_overload", lambda *_: None)
     functions = [one for one in vars(compiled_mailbox).values() if isinstance(one, compiled)]
     before = [one._machine for one in functions]
 

@@ -11,7 +11,7 @@ import pytest
 
 from rack.backplane.errors import MailboxError
 from rack.backplane.segment import Segment
-from rack.boards.run.board import CANNOT_GO_ON, SELF_TEST_FAILED, enter
+from rack.boards.run.board import SELF_TEST_FAILED, UNRECOVERABLE_STATUS, run_board
 from rack.levels.errors import CannotGoOn, LevelError
 from tests.backplane.bus import task
 from tests.backplane.conftest import MakeBus
@@ -35,7 +35,7 @@ def ended(segment: Segment, board: Callable[[Segment], int]) -> tuple[int, str]:
     def run() -> None:
         os.dup2(writing, 2)
         sys.stderr = os.fdopen(2, "w")  # pytest has one of its own
-        os._exit(enter(crate, "level", segment, board))
+        os._exit(run_board(crate, "level", segment, board))
 
     with forked(run) as pid:
         os.close(writing)
@@ -50,7 +50,7 @@ def ended(segment: Segment, board: Callable[[Segment], int]) -> tuple[int, str]:
     [
         (LevelError("no arm"), SELF_TEST_FAILED, "board 'level': no arm\n"),
         (MailboxError("taken"), SELF_TEST_FAILED, "board 'level': taken\n"),
-        (CannotGoOn("alone"), CANNOT_GO_ON, "board 'level': alone\n"),
+        (CannotGoOn("alone"), UNRECOVERABLE_STATUS, "board 'level': alone\n"),
     ],
 )
 def test_the_exit_status_gives_the_reason_why_a_board_ended(

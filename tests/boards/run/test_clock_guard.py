@@ -8,7 +8,7 @@ import pytest
 
 from rack.backplane.clock.driver import RealtimeDriver
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.backplane.words import System
 from rack.boards.run.task import ClockGuard
 from tests.backplane.bus import task
@@ -19,12 +19,12 @@ PERIOD_NS = 20_000_000
 
 def guard_of(segment: Segment) -> ClockGuard:
     """Return the guard of the task "level", as its process makes it."""
-    return ClockGuard(segment, AlarmWriter(segment, "level"), segment.block("level"))
+    return ClockGuard(segment, AlarmWriter(segment, "level"), segment.get_block("level"))
 
 
 def rung(segment: Segment) -> list[tuple[int, int, float]]:
     """Return tick, first tick skipped and count of each skip reported since the last call."""
-    rows, _ = alarm_ring(segment, "level").drain()
+    rows, _ = open_alarm_ring(segment, "level").read_new_rows()
     assert {int(row["code"]) for row in rows} <= {Alarm.CLOCK_SKIPPED}
     return [(int(row["tick"]), int(row["since"]), float(row["value"])) for row in rows]
 
@@ -89,5 +89,5 @@ def test_a_clock_is_late_from_half_a_tick_on(part: float, count: int, make_bus: 
     segment.words[System.TICK_NS] = 4 * PERIOD_NS + round(part * PERIOD_NS)
     guard.check_release(4)
     guard.check_release(4)
-    rows, _ = alarm_ring(segment, "level").drain()
+    rows, _ = open_alarm_ring(segment, "level").read_new_rows()
     assert [int(row["code"]) for row in rows] == [Alarm.CLOCK_LATE] * count

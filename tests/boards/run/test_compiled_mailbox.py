@@ -13,15 +13,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rack.backplane.address_map import MAILBOX_HEAD_SIZE, slot_stride
+from rack.backplane.address_map import MAILBOX_HEAD_SIZE, compute_slot_stride
 from rack.backplane.errors import MailboxError
 from rack.backplane.layout import Protocol
-from rack.backplane.mailbox.mailbox import GOOD, Reader, ReadStatistics, Writer
-from rack.backplane.mailbox.slots import Slots, claim
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.mailbox.mailbox import GOOD_OFFSET, Reader, ReadStatistics, Writer
+from rack.backplane.mailbox.slots import Slots, build_signature
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Block, Box, Slot
-from rack.boards.run.port_tables import WriteTable, address_of
+from rack.boards.run.port_tables import WriteTable, get_address
 from rack.boards.run.ports import OutputPorts
 from tests.backplane.bus import NAME, SIZES, Point, layout, mailbox, task
 from tests.backplane.conftest import MakeBus
@@ -89,7 +89,7 @@ class End:
             self.read()
 
     def _release(self, name: str) -> int:
-        every = self.segment.layout.task(name).every
+        every = self.segment.layout.find_task(name).every
         return self.tick - self.tick % every
 
     def advance(self, ticks: int) -> None:
@@ -106,14 +106,14 @@ class End:
 
     def restart_writer(self, copied: float) -> None:
         """Kill the writer when it has filled that part of its next slot, and start another."""
-        slots = Slots(self.segment, self.segment.layout.mailbox(NAME))
-        slots.fetch(slots.box[Box.HEAD])
+        slots = Slots(self.segment, self.segment.layout.find_mailbox(NAME))
+        slots.fetch_message(slots.box[Box.HEAD])
         slots.serial += 1
         size = 8 * round(copied * len(slots.record) / 8)
         slots.places[slots.serial & slots.mask][:size] = slots.record[:size]
         self._link.writer.close()
         self._link.writer = WritingTask(self.segment, self._is_compiled)
-        self._link.writer.ports.apply(self._link.active)
+        self._link.writer.ports.apply_faults(self._link.active)
 
     def restart_reader(self) -> None:
         """Start another reader."""
@@ -124,20 +124,20 @@ class End:
 
     def forge(self, ahead: int) -> None:
         """Publish in the writer's place, as another process."""
-        slots = Slots(self.segment, self.segment.layout.mailbox(NAME))
-        slots.resume(claim(slots.box[Box.EPOCH], STRANGER))
-        slots.publish(self.tick, self.tick + ahead, self.tick)
+        slots = Slots(self.segment, self.segment.layout.find_mailbox(NAME))
+        slots.resume_writing(build_signature(slots.box[Box.EPOCH], STRANGER))
+        slots.publish_message(self.tick, self.tick + ahead, self.tick)
 
     def lose_writer(self, is_lost: bool) -> None:
         """Have the writer marked as lost, or not."""
-        self.segment.block("writer")[Block.LOST] = self.tick + 1 if is_lost else 0
+        self.segment.get_block("writer")[Block.LOST] = self.tick + 1 if is_lost else 0
 
     def damage(self, back: int, bit: int) -> None:
         """Flip a bit of an earlier message, or of the head of its slot."""
-        box = self.segment.layout.mailbox(NAME)
-        serial = self.segment.box(NAME)[Box.HEAD] - back
+        box = self.segment.layout.find_mailbox(NAME)
+        serial = self.segment.get_box(NAME)[Box.HEAD] - back
         slot = self.segment.map.mailboxes[NAME] + MAILBOX_HEAD_SIZE
-        slot += (serial % box.depth) * slot_stride(box)
+        slot += (serial % box.depth) * compute_slot_stride(box)
         self.segment.bytes[slot + bit // 8] ^= 1 << bit % 8
 
     def damage_head(self, bit: int) -> None:
@@ -153,7 +153,7 @@ class End:
             "alarms": [self._link.rung(name) for name in ("writer", "reader")],
             "seen": self._link.reader.seen,
             "results": self.results,
-            "reader": reader.words[: GOOD // 8].tolist(),
+            "reader": reader.words[: GOOD_OFFSET // 8].tolist(),
             "good": bytes(reader.good[8 * (Slot.STAMP_NS + 1) :]),
             "statistics": [getattr(statistics, name) for name in ReadStatistics.__slots__],
             "troubles": self._link.reader.ports.task.troubles,
@@ -162,8 +162,8 @@ class End:
 
     def _content(self, name: str) -> bytes:
         """Return a mailbox, without the times at which its messages were published."""
-        box = self.segment.layout.mailbox(name)
-        stride = slot_stride(box)
+        box = self.segment.layout.find_mailbox(name)
+        stride = compute_slot_stride(box)
         start = self.segment.map.mailboxes[name]
         content = bytearray(self.segment.bytes[start : start + MAILBOX_HEAD_SIZE + stride * DEPTH])
         for at in range(DEPTH):
@@ -176,10 +176,10 @@ class End:
         for writer in self._answers.writers.values():
             writer.close()
         self._link.close()
-        unlink(self.segment.rack)
+        unlink_segment(self.segment.rack)
 
 
-SLOT_BITS = 8 * (64 + Point.message_type.dtype(SIZES).itemsize)
+SLOT_BITS = 8 * (64 + Point.message_type.build_dtype(SIZES).itemsize)
 STEPS = (
     st.tuples(st.just("cycle"), st.integers(1, DEPTH + 2)),
     st.tuples(st.just("write"), st.sampled_from([0, 0, 1, 6])),
@@ -256,6 +256,6 @@ def test_a_message_rests_on_the_oldest_of_its_sources_that_have_come(make_bus: M
 
 def test_memory_that_is_not_aligned_to_words_is_refused() -> None:
     memory = memoryview(bytearray(64))
-    assert address_of(memory[8:]) == address_of(memory) + 8
+    assert get_address(memory[8:]) == get_address(memory) + 8
     with pytest.raises(MailboxError, match=r"^memory at 0x[0-9a-f]+ is not aligned to 8 bytes"):
-        address_of(memory[4:])
+        get_address(memory[4:])

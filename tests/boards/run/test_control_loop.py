@@ -10,9 +10,9 @@ import pytest
 from rack.backplane.fault_table import FaultTable, Injection, Stage
 from rack.backplane.mailbox.protocols import MailboxLock
 from rack.backplane.mailbox.slots import Slots
-from rack.backplane.segment import Segment, unlink
-from rack.backplane.trace import Flag, trace_ring
-from rack.backplane.watch.alarms import Alarm, alarm_ring
+from rack.backplane.segment import Segment, unlink_segment
+from rack.backplane.trace import Flag, open_trace_ring
+from rack.backplane.watch.alarms import Alarm, open_alarm_ring
 from rack.backplane.words import Block, Slot, System
 from rack.boards.classes import find_class
 from rack.boards.config import Resolved, resolve
@@ -57,7 +57,7 @@ class Bench:
         """Return the trouble in every cycle of a task so far."""
         return [
             Flag(int(flags)) & TROUBLE
-            for flags in trace_ring(self.segment, name).drain().rows["flags"]
+            for flags in open_trace_ring(self.segment, name).read_new_rows().rows["flags"]
         ]
 
 
@@ -71,7 +71,7 @@ def bench(config: MakeConfig) -> Iterator[MakeBench]:
 
     yield make
     for found in made:
-        unlink(found.segment.rack)
+        unlink_segment(found.segment.rack)
         found.segment.close()
 
 
@@ -89,8 +89,8 @@ def test_a_damaged_message_shows_in_the_trace_of_its_reader(bench: MakeBench) ->
     rack = bench()
     wave, watch = rack.task("wave"), rack.task("watch")
     wave.cycle(0)
-    slots = Slots(rack.segment, rack.segment.layout.mailbox("wave.status"))
-    assert slots.fetch(1)
+    slots = Slots(rack.segment, rack.segment.layout.find_mailbox("wave.status"))
+    assert slots.fetch_message(1)
     for place in slots.places:
         place[:] = bytes(b ^ 0x80 for b in place)
     rack.to(8)
@@ -100,7 +100,7 @@ def test_a_damaged_message_shows_in_the_trace_of_its_reader(bench: MakeBench) ->
     rack.to(16)
     watch.cycle(16)
     assert rack.flags("watch") == [Flag.CORRUPT, Flag(0)]
-    assert rack.segment.block("watch")[Block.CORRUPT] == 1
+    assert rack.segment.get_block("watch")[Block.CORRUPT] == 1
 
 
 def test_an_access_that_times_out_is_traced_and_the_cycle_continues(bench: MakeBench) -> None:
@@ -117,7 +117,7 @@ def test_an_access_that_times_out_is_traced_and_the_cycle_continues(bench: MakeB
     assert rack.flags("watch") == [Flag(0), Flag.BUS_ERROR]
     # A failed write is a missed deadline.
     assert rack.flags("wave") == [Flag(0), Flag.BUS_ERROR | Flag.MISSED]
-    assert [rack.segment.block(name)[Block.BUS_ERRORS] for name in ("wave", "watch")] == [1, 1]
+    assert [rack.segment.get_block(name)[Block.BUS_ERRORS] for name in ("wave", "watch")] == [1, 1]
 
 
 def test_a_status_carries_the_tick_of_its_oldest_information(bench: MakeBench) -> None:
@@ -128,8 +128,8 @@ def test_a_status_carries_the_tick_of_its_oldest_information(bench: MakeBench) -
         wave.cycle(tick)
     rack.to(8)
     watch.cycle(8)
-    slots = Slots(rack.segment, rack.segment.layout.mailbox("watch.status"))
-    assert slots.fetch(1)
+    slots = Slots(rack.segment, rack.segment.layout.find_mailbox("watch.status"))
+    assert slots.fetch_message(1)
     assert (slots.tick, slots.words[Slot.BASIS]) == (8, 3)
 
 
@@ -143,7 +143,7 @@ def test_the_update_of_a_plan_is_stamped_inside_the_critical_section(
         control_loop, "set_priority", lambda priority: called.append(time.monotonic_ns())
     )
     rack.task("wave.planner").cycle(0)
-    (row,) = trace_ring(rack.segment, "wave.planner").drain().rows
+    (row,) = open_trace_ring(rack.segment, "wave.planner").read_new_rows().rows
     entered, left = called
     assert entered <= row["process_ns"] <= row["end_ns"] <= left
 
@@ -154,10 +154,10 @@ def test_a_planner_traces_plans_but_not_idle_cycles(bench: MakeBench) -> None:
     for tick in (0, 4, 5, 6, 8):
         rack.to(tick)
         planner.cycle(tick)
-    rows = trace_ring(rack.segment, "wave.planner").drain().rows
+    rows = open_trace_ring(rack.segment, "wave.planner").read_new_rows().rows
     assert rows["tick"].tolist() == [0, 4, 8]
     assert (rows["flags"] & Flag.PLANNED).all()
-    block = rack.segment.block("wave.planner")
+    block = rack.segment.get_block("wave.planner")
     assert [block[w] for w in (Block.CYCLES, Block.PLANS, Block.DONE, Block.MISSED)] == [5, 3, 8, 0]
 
 
@@ -173,7 +173,7 @@ def test_a_release_without_a_plan_is_traced_after_skipped_ones(
     rack.to(now)
     planner.cycle(5)
     assert rack.flags("wave.planner") == [Flag(0), trouble]
-    block = rack.segment.block("wave.planner")
+    block = rack.segment.get_block("wave.planner")
     assert [block[w] for w in (Block.CYCLES, Block.PLANS, Block.DONE, Block.SKIPPED)] == [
         2,
         1,
@@ -202,9 +202,9 @@ def test_the_load_of_a_fault_is_computed_in_its_cycle(bench: MakeBench) -> None:
     wave = rack.task("wave")
     at = [task.name for task in rack.segment.layout.processes].index("wave")
     kind = KINDS["overrun"]
-    entry = FaultTable(rack.segment).add(Injection(kind.number, at, parameters=(0.0, 0.0)))
+    entry = FaultTable(rack.segment).add_fault(Injection(kind.number, at, parameters=(0.0, 0.0)))
     entry.stage = Stage.ACTIVE
-    wave.faults.refresh(0)
+    wave.faults.refresh_faults(0)
     rack.to(0)
     wave.cycle(0)
     assert entry.count == 1
@@ -218,7 +218,7 @@ def test_a_user_defined_finding_raises_one_alarm_per_episode(bench: MakeBench) -
     for tick in range(110):
         rack.to(tick)
         wave.cycle(tick)
-    rows = alarm_ring(rack.segment, "wave").drain().rows
+    rows = open_alarm_ring(rack.segment, "wave").read_new_rows().rows
     assert set(rows["code"]) == {Alarm.OWN}
     # It begins anew when it was not found for more than 20 cycles.
     assert [(int(row["tick"]), bytes(row["text"]).decode()) for row in rows] == [

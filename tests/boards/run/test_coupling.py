@@ -9,7 +9,7 @@ import pytest
 from rack.backplane.words import Block
 from rack.boards import Rack
 from tests.boards.conftest import LOOSE, MakeConfig
-from tests.boards.messages import Written
+from tests.boards.messages import WrittenMessages
 from tests.boards.runs import stop
 from tests.machine import needs_fifo
 from tests.processes import wait_until
@@ -35,20 +35,20 @@ def test_executor_and_planner_are_two_processes(
     config: MakeConfig, mode: str, coupling: tuple[str, ...]
 ) -> None:
     with Rack(config(f"clock.mode={mode}", *coupling)) as rack:
-        tasks = [rack.segment.layout.task(name) for name in ("wave", "wave.planner")]
-        pids = [rack.segment.block(task.name)[Block.PID] for task in tasks]
+        tasks = [rack.segment.layout.find_task(name) for name in ("wave", "wave.planner")]
+        pids = [rack.segment.get_block(task.name)[Block.PID] for task in tasks]
         assert len({*pids, os.getpid()}) == 3
         assert [task.slot for task in tasks] == ([2, 9] if coupling else [2, 2])
         rack.start()
         # Others of this machine may have the core for a while.
-        wait_until(lambda: rack.segment.block("wave.planner")[Block.PLANS] > 0)
+        wait_until(lambda: rack.segment.get_block("wave.planner")[Block.PLANS] > 0)
         assert stop(rack).cause == "stopped"
 
 
 def test_a_plan_takes_effect_at_the_end_of_its_slice(config: MakeConfig) -> None:
     with Rack(config()) as rack:
         rack.run(SECONDS)
-        found = Written.on(rack.segment)
+        found = WrittenMessages.on(rack.segment)
     plans, wave = found.messages["wave.plan"], found.messages["wave.status"]
     # A plan is wanted in every cycle: the next one begins where a slice ends.
     assert plans["tick"].tolist() == list(range(0, TICKS, 4))
@@ -64,7 +64,7 @@ def test_a_plan_takes_effect_at_the_end_of_its_slice(config: MakeConfig) -> None
 def test_a_planner_is_asked_again_as_soon_as_it_may_plan(config: MakeConfig, every: int) -> None:
     with Rack(config(f"board.wave.params.plan_every={every}")) as rack:
         rack.run(SECONDS)
-        found = Written.on(rack.segment).messages["wave.plan"]["tick"].tolist()
+        found = WrittenMessages.on(rack.segment).messages["wave.plan"]["tick"].tolist()
     expected = [0]
     # Asked at every tick that no plan is being made in, four ticks each.
     while (following := next(t for t in range(expected[-1] + 4, 10_000) if t % every == 0)) < TICKS:
@@ -78,13 +78,14 @@ def test_a_tight_planner_runs_below_its_executor(config: MakeConfig, protocol: s
     settings = (*PRIORITIES, "board.wave.planner_priority=5", f"protocol.default={protocol}")
     with Rack(config("clock.mode=realtime", *settings)) as rack:
         pids = {
-            name: rack.segment.block(name)[Block.PID] for name in ("wave", "wave.planner", "watch")
+            name: rack.segment.get_block(name)[Block.PID]
+            for name in ("wave", "wave.planner", "watch")
         }
         assert {name: os.sched_getscheduler(pid) for name, pid in pids.items()} == dict.fromkeys(
             pids, os.SCHED_FIFO
         )
         got = {name: os.sched_getparam(pid).sched_priority for name, pid in pids.items()}
         assert got == {"wave": 20, "wave.planner": 5, "watch": 19}
-        assert got == {name: rack.segment.block(name)[Block.PRIORITY] for name in pids}
+        assert got == {name: rack.segment.get_block(name)[Block.PRIORITY] for name in pids}
         assert rack.run(SECONDS).cause == "time over"
-        assert rack.segment.block("wave.planner")[Block.PLANS] > 0
+        assert rack.segment.get_block("wave.planner")[Block.PLANS] > 0

@@ -15,7 +15,7 @@ from rack.boards.errors import ConfigError
 from rack.boards.exchange import PortAge
 from rack.tools.monitor.snapshot import RackMonitor
 from tests.boards.conftest import CLOCK, MakeConfig
-from tests.boards.messages import Written
+from tests.boards.messages import WrittenMessages
 from tests.boards.runs import faulty, kill
 
 WAVE, NOTES = (2, 1), (3, 2)
@@ -44,10 +44,10 @@ TICKS = 100
 SECONDS = 0.25
 
 
-def written(rack: Rack, seconds: float = SECONDS) -> Written:
+def written(rack: Rack, seconds: float = SECONDS) -> WrittenMessages:
     with rack:
         rack.run(seconds)
-        return Written.on(rack.segment)
+        return WrittenMessages.on(rack.segment)
 
 
 def newest(tick: int, delay: int) -> int:
@@ -82,8 +82,8 @@ def test_ages_and_arrivals_follow_the_configured_exchange_and_runs_repeat(
 ) -> None:
     with Rack(config(text=TEXT)) as rack:
         digest = rack.run(SECONDS).digest
-        found = Written.on(rack.segment).messages
-        looked = RackMonitor(rack.segment).look()
+        found = WrittenMessages.on(rack.segment).messages
+        looked = RackMonitor(rack.segment).take_snapshot()
     seen, record = found["notes.status"], found["notes.exchange"]
     for at, port in enumerate(("plain", "sparse", "early")):
         assert ages(record, port) == model(port)
@@ -124,7 +124,7 @@ def test_a_queue_is_emptied_at_every_exchange_without_refused_messages(
     with Rack(config(*QUEUE, text=NO_TABLE)) as rack:
         rack.run(1.5)
         assert [event for event in rack.events if event.kind == "detection"] == []
-        found = Written.on(rack.segment).messages
+        found = WrittenMessages.on(rack.segment).messages
     (every, phase), (cycles, first) = NOTES, SPARSE
     taken, sent = found["wave.status_taken"], found["wave.status"]
     assert taken["tick"].tolist() == list(range(phase + every * first, 600, every * cycles))

@@ -13,7 +13,7 @@ from rack.boards import Rack
 from rack.boards.faults.config import FaultConfig
 from tests.boards.conftest import MakeConfig
 from tests.boards.interrupt_levels import BOARDS
-from tests.boards.messages import Written
+from tests.boards.messages import WrittenMessages
 
 pytestmark = pytest.mark.slow
 
@@ -65,14 +65,14 @@ class Heard(NamedTuple):
     counts: tuple[int, int, int]
     full: list[str]
     service_ns: int
-    written: Written
+    written: WrittenMessages
 
 
 def run(config: MakeConfig, *settings: str, faults: tuple[FaultConfig, ...] = ()) -> Heard:
     found = config(*settings, text=RACK).model_copy(update={"fault": faults})
     with Rack(found) as rack:
         outcome = rack.run(SECONDS)
-        written, block = Written.on(rack.segment), rack.segment.block("hub")
+        written, block = WrittenMessages.on(rack.segment), rack.segment.get_block("hub")
         heard = written.messages["hub.status"]["message"]
         counts = (
             block[Block.INTERRUPTS],
@@ -80,7 +80,7 @@ def run(config: MakeConfig, *settings: str, faults: tuple[FaultConfig, ...] = ()
             block[Block.INTERRUPTS_WAITING],
         )
         full = [event.text for event in rack.events if event.code == "inbox_full"]
-        interrupt = rack.segment.layout.mailbox("figure0.status").interrupt
+        interrupt = rack.segment.layout.find_mailbox("figure0.status").interrupt
         assert interrupt is not None
     return Heard(
         outcome.digest, heard["cycle"], heard["lost"], counts, full, interrupt.service_ns, written

@@ -12,7 +12,7 @@ from rack.backplane.trace import Flag
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from tests.boards.conftest import LOOSE, PLAIN, PLANNED, MakeConfig
-from tests.boards.messages import Written
+from tests.boards.messages import WrittenMessages
 from tests.machine import needs_two_cores
 
 SECONDS = 0.25
@@ -24,11 +24,11 @@ SLOW = ("clock.mode=realtime", "clock.speed=0.5")
 LATE = "board.wave.params={ trouble = 'late', at = 40, ticks = 9 }"
 
 
-def written(rack: Rack, seconds: float = SECONDS) -> Written:
+def written(rack: Rack, seconds: float = SECONDS) -> WrittenMessages:
     """Run a rack, and return what it wrote."""
     with rack:
         rack.run(seconds)
-        return Written.on(rack.segment)
+        return WrittenMessages.on(rack.segment)
 
 
 def digest(rack: Rack, seconds: float = SECONDS) -> str:
@@ -36,12 +36,12 @@ def digest(rack: Rack, seconds: float = SECONDS) -> str:
         return rack.run(seconds).digest
 
 
-RUNS: dict[tuple[str, ...], tuple[Rack, Written]] = {}
+RUNS: dict[tuple[str, ...], tuple[Rack, WrittenMessages]] = {}
 
 
 def first_run(
     config: MakeConfig, *settings: str, text: str = PLANNED, seconds: float = SECONDS
-) -> tuple[Rack, Written]:
+) -> tuple[Rack, WrittenMessages]:
     """Return a rack that has run, and what it wrote; all tests of this file share it."""
     key = (*settings, text)
     if key not in RUNS:
@@ -123,11 +123,13 @@ def test_real_time_is_lockstep_up_to_its_first_miss(
 def counted(rack: Rack, *words: int) -> int:
     """Return the sum of these words over all tasks."""
     return sum(
-        rack.segment.block(task.name)[word] for task in rack.segment.layout.tasks for word in words
+        rack.segment.get_block(task.name)[word]
+        for task in rack.segment.layout.tasks
+        for word in words
     )
 
 
-def late_tick(found: Written, task: str) -> int:
+def late_tick(found: WrittenMessages, task: str) -> int:
     """Return the tick of the late cycle: the first from tick 40 on that was not skipped."""
     ticks = found.cycles[task]["tick"]
     return int(ticks[ticks >= 40][0])
@@ -144,7 +146,7 @@ def test_a_late_cycle_is_counted_and_the_board_rejoins_the_grid(config: MakeConf
     # Nine ticks of simulated time take four and a half here.
     assert ticks[at + 1] >= late + 4
     assert cycles["flags"][at + 1] & Flag.SKIPPED
-    block = rack.segment.block("wave")
+    block = rack.segment.get_block("wave")
     assert block[Block.SKIPPED] == np.sum(np.diff(ticks) - 1) + ticks[0]
     assert block[Block.MISSED] == np.count_nonzero(cycles["flags"] & Flag.MISSED)
     assert (cycles["release_ns"] == words[System.EPOCH_NS] + ticks * words[System.PERIOD_NS]).all()
@@ -172,8 +174,8 @@ def test_a_late_plan_is_counted_and_shows_later(config: MakeConfig) -> None:
     assert flags & Flag.MISSED
     assert flags & Flag.PLANNED
     assert plans[plans["tick"] == tick]["visible_at"][0] > tick + 4
-    assert rack.segment.block("wave.planner")[Block.MISSED] >= 1
-    assert rack.segment.block("wave.planner")[Block.PLANS] == len(plans)
+    assert rack.segment.get_block("wave.planner")[Block.MISSED] >= 1
+    assert rack.segment.get_block("wave.planner")[Block.PLANS] == len(plans)
 
 
 @pytest.mark.slow
@@ -197,8 +199,8 @@ def test_boards_write_the_same_however_they_wait(config: MakeConfig) -> None:
 def test_a_board_keeps_the_grid_in_real_time(config: MakeConfig, wake: Wake) -> None:
     with Rack(config(f"board.wave.wake={wake}", *SLOW, text=PLAIN)) as rack:
         assert rack.run(SECONDS).ticks == TICKS
-        block = rack.segment.block("wave")
+        block = rack.segment.get_block("wave")
         # A board whose core was taken away during the very last cycles does not see those any more.
         assert TICKS - 8 <= block[Block.CYCLES] + block[Block.SKIPPED] <= TICKS
-        cycles = Written.on(rack.segment).cycles["wave"]
+        cycles = WrittenMessages.on(rack.segment).cycles["wave"]
     assert (cycles["start_ns"] >= cycles["release_ns"]).all()

@@ -35,7 +35,7 @@ def test_no_page_fault_comes_in_a_cycle_after_the_first_ones(config: MakeConfig)
     with rack:
         words = rack.segment.words
         # The fast board: slower ones have time for page faults.
-        pids = {"wave": rack.segment.block("wave")[Block.PID]}
+        pids = {"wave": rack.segment.get_block("wave")[Block.PID]}
 
         def count() -> None:
             for ticks in (FIRST, FIRST + LATER):

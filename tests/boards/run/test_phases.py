@@ -9,11 +9,11 @@ import pytest
 
 from rack.backplane.words import Block
 from rack.boards import Rack
-from rack.boards.config import wire
-from rack.boards.config.timing import rack_timing
-from rack.boards.timing.schedule import simulate
+from rack.boards.config import resolve_layout
+from rack.boards.config.timing import build_rack_timing
+from rack.boards.timing.schedule import simulate_schedule
 from tests.boards.conftest import CLOCK, MakeConfig
-from tests.boards.messages import Written
+from tests.boards.messages import WrittenMessages
 from tests.boards.runs import faulty, kill
 
 BOARD = """
@@ -48,10 +48,10 @@ def cyclic(phases: bool = True) -> str:
     return f"{CLOCK}{''.join(boards)}\n[timing]\ncontext_switch_ms = 0.0\n"
 
 
-def written(rack: Rack, seconds: float = 0.25) -> Written:
+def written(rack: Rack, seconds: float = 0.25) -> WrittenMessages:
     with rack:
         rack.run(seconds)
-        return Written.on(rack.segment)
+        return WrittenMessages.on(rack.segment)
 
 
 @pytest.mark.slow
@@ -84,8 +84,8 @@ def test_the_schedule_with_phases_has_no_preemption_and_without_them_it_has(
 ) -> None:
     def is_whole(phases: bool) -> bool:
         rack = config("board.wave.priority=2", "board.left.priority=1", text=cyclic(phases))
-        chart = simulate(rack_timing(rack, wire(rack)).tasks, 400_000_000)
-        assert not any(chart.late(name) for name in MINOR)
+        chart = simulate_schedule(build_rack_timing(rack, resolve_layout(rack)).tasks, 400_000_000)
+        assert not any(chart.list_late_jobs(name) for name in MINOR)
         spans = [(span.task, span.release_ns) for span in chart.spans]
         waits = any(span.start_ns > span.release_ns for span in chart.spans)
         assert all(one.end_ns <= other.start_ns for one, other in pairwise(chart.spans))
@@ -113,7 +113,7 @@ def test_real_time_releases_each_board_on_its_phase(config: MakeConfig) -> None:
     rack = Rack(config("clock.mode=realtime", text=cyclic()))
     found = written(rack)
     for name, (every, phase, _) in MINOR.items():
-        rows, block = found.cycles[name], rack.segment.block(name)
+        rows, block = found.cycles[name], rack.segment.get_block(name)
         assert len(rows)
         assert {int(tick) % every for tick in rows["tick"]} == {phase % every}
         # What was not taken was skipped, and counted.

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from rack.backplane.watch.alarms import CLEAN_READS, Alarm
-from rack.boards.faults.message_steps import forge
+from rack.boards.faults.message_steps import forge_message
 from rack.levels.level import Output
 from tests.backplane.bus import NAME, Point
 from tests.link import MakeLink, links
@@ -66,7 +66,7 @@ def test_a_writer_reports_a_forged_message_once_per_episode(
     for first in (10, 10 + 3 * CLEAN_READS):
         # What another process writes shows at the task's next message.
         for tick in (first, first + 1):
-            forge(rack.segment, NAME, tick)
+            forge_message(rack.segment, NAME, tick)
             rack.writer.cycle(tick)
         for tick in range(first + 2, first + 3 * CLEAN_READS):
             rack.writer.cycle(tick)

@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rack.backplane.fault_table import FaultEntry, FaultTable, Injection
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.trace import FIELDS, TraceWriter
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.boards.faults import message_steps as messages
 from rack.boards.faults.kind import KINDS
 from rack.boards.run.ports import InputPorts, OutputPorts
@@ -34,7 +34,7 @@ class QueueLink:
 
     def __init__(self, segment: Segment, sends: bool = True) -> None:
         self.segment = segment
-        self.rates = tuple(segment.layout.task(name).every for name in ("writer", "reader"))
+        self.rates = tuple(segment.layout.find_task(name).every for name in ("writer", "reader"))
         self.writing, self.reading = BareLevel(), BareLevel()
         heard = AlarmWriter(segment, "reader")
         self._sent = ("point",) if sends else ()
@@ -44,7 +44,7 @@ class QueueLink:
         self.serial = 0
         self.taken: list[int] = []
         self.refused: list[int] = []
-        self._rings = {name: alarm_ring(segment, name) for name in ("writer", "reader")}
+        self._rings = {name: open_alarm_ring(segment, name) for name in ("writer", "reader")}
 
     def _open_writer(self) -> None:
         alarms = AlarmWriter(self.segment, "writer")
@@ -96,11 +96,11 @@ class QueueLink:
 
     def alarms(self, name: str) -> list[Alarm]:
         """Return what a task has rung since the last call."""
-        return [Alarm(row["code"]) for row in self._rings[name].drain().rows]
+        return [Alarm(row["code"]) for row in self._rings[name].read_new_rows().rows]
 
     def fault(self, kind: str, *parameters: float) -> FaultEntry:
         values = [p.default or 0.0 for p in KINDS[kind].parameters]
-        entry = FaultTable(self.segment).add(
+        entry = FaultTable(self.segment).add_fault(
             Injection(
                 KINDS[kind].number,
                 0,
@@ -109,7 +109,7 @@ class QueueLink:
                 parameters=(*parameters, *values[len(parameters) :]),
             )
         )
-        self.ports.apply([entry])
+        self.ports.apply_faults([entry])
         return entry
 
     def close(self) -> None:
@@ -118,7 +118,7 @@ class QueueLink:
         for reader in self.reads.readers.values():
             reader.close()  # type: ignore[attr-defined]
         self.segment.close()
-        unlink(self.segment.rack)
+        unlink_segment(self.segment.rack)
 
 
 MakeQueue = Callable[..., QueueLink]
@@ -219,7 +219,7 @@ def test_a_message_fault_is_detected_and_later_messages_are_read(
     rack.run(0, 16, lambda tick: 2)
     rack.fault(kind, *parameters)
     rack.run(16, 48, lambda tick: 2)
-    rack.ports.apply([])
+    rack.ports.apply_faults([])
     rack.run(48, 96, lambda tick: 1)
     rack.run(96, 128, lambda tick: 0)
     assert rack.alarms("reader") == [alarm]
@@ -238,7 +238,7 @@ def test_an_undetectable_fault_is_not_applied_to_a_queue(link: MakeQueue, kind: 
 
 
 def forge(rack: QueueLink, tick: int) -> None:
-    assert exit_status(fork(lambda: messages.forge(rack.segment, NAME, tick))) == 0
+    assert exit_status(fork(lambda: messages.forge_message(rack.segment, NAME, tick))) == 0
 
 
 def test_a_forged_message_is_not_read_and_displaces_no_message(link: MakeQueue) -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from rack.backplane.message import State, Status, field
 from rack.backplane.segment import Segment
-from rack.backplane.semaphores import done_semaphore
-from rack.backplane.trace import SKIPPED_SHIFT, Flag, trace_ring
+from rack.backplane.semaphores import get_done_semaphore
+from rack.backplane.trace import SKIPPED_SHIFT, Flag, open_trace_ring
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Block, System
 from rack.boards.run.ports import InputPorts, OutputPorts
@@ -39,23 +39,23 @@ class Site:
             segment, self.level, {"status": "level.status"}, alarms, self.inputs
         )
         self.watch = Stopwatch(segment, "level", self.inputs, self.outputs)
-        self.block = segment.block("level")
-        self._ring = trace_ring(segment, "level")
+        self.block = segment.get_block("level")
+        self._ring = open_trace_ring(segment, "level")
 
     def cycle(
         self, tick: int, skipped: int = 0, *, in_time: bool = True, ends_after_ns: int = 0
     ) -> None:
         """Do a cycle that ends so long after its grid point, or at once."""
         watch = self.watch
-        watch.start(tick, skipped)
+        watch.start_cycle(tick, skipped)
         watch.read_ns = watch.process_ns = watch.end_ns = (
             watch._release_ns + ends_after_ns if ends_after_ns else watch.start_ns
         )
-        watch.finish(in_time, tick + 1, tick)
+        watch.finish_cycle(in_time, tick + 1, tick)
 
     def traced(self) -> dict[str, Any]:
         """Return the newest record."""
-        row = self._ring.drain().rows[-1]
+        row = self._ring.read_new_rows().rows[-1]
         return dict(zip(row.dtype.names, row.tolist(), strict=True))
 
     def counts(self, *words: int) -> list[int]:
@@ -88,7 +88,7 @@ def stepped(site: Site) -> Site:
 def test_a_cycle_is_traced_with_its_grid_point_and_its_own_processor_time(site: Site) -> None:
     # Before it begins: what is added up below is all within.
     began = time.thread_time_ns()
-    site.watch.begin()
+    site.watch.start_counting()
     begun = time.thread_time_ns()
     while time.thread_time_ns() - begun < 2_000_000:
         continue
@@ -129,10 +129,10 @@ def test_skipped_releases_are_counted_and_recorded_in_the_flags(site: Site) -> N
 
 def test_a_cycle_is_late_if_it_is_the_first_follows_skipped_ones_or_begins_late(site: Site) -> None:
     ahead = (time.monotonic_ns() - site.segment.words[System.EPOCH_NS]) // PERIOD_NS + 1000
-    site.watch.start(ahead, 0)
+    site.watch.start_cycle(ahead, 0)
     assert site.watch.is_late
     site.cycle(ahead)
-    site.watch.start(ahead + 1, 0)
+    site.watch.start_cycle(ahead + 1, 0)
     assert not site.watch.is_late
     site.watch.start(ahead + 1, 1)
     assert site.watch.is_late
@@ -153,15 +153,15 @@ def test_a_change_of_the_levels_state_has_its_tick(site: Site) -> None:
 
 
 def test_in_lockstep_a_cycle_has_no_deadline_and_is_reported(stepped: Site) -> None:
-    done = done_semaphore(stepped.segment, "level")
+    done = get_done_semaphore(stepped.segment, "level")
     before = time.monotonic_ns()
     stepped.cycle(5, ends_after_ns=100 * PERIOD_NS)
     record = stepped.traced()
     assert record["flags"] == 0
     assert before <= record["release_ns"] == record["start_ns"]
     assert (done.value, stepped.counts(Block.DONE)) == (1, [5])
-    stepped.watch.start(6, 0)
-    stepped.watch.idle()
+    stepped.watch.start_cycle(6, 0)
+    stepped.watch.finish_idle_cycle()
     assert (done.value, stepped.counts(Block.DONE, Block.CYCLES)) == (2, [6, 2])
     stepped.watch.notify_clock()
     assert done.value == 3
@@ -169,7 +169,7 @@ def test_in_lockstep_a_cycle_has_no_deadline_and_is_reported(stepped: Site) -> N
 
 def test_several_releases_given_at_once_are_reported_once(stepped: Site) -> None:
     stepped.block[Block.RELEASED] = 7
-    done = done_semaphore(stepped.segment, "level")
+    done = get_done_semaphore(stepped.segment, "level")
     for tick, reports in ((5, 0), (6, 0), (7, 1)):
         stepped.cycle(tick)
         assert (stepped.counts(Block.DONE), done.value) == ([tick], reports)
@@ -177,22 +177,22 @@ def test_several_releases_given_at_once_are_reported_once(stepped: Site) -> None
 
 def test_no_report_is_posted_in_real_time(site: Site) -> None:
     site.cycle(5)
-    site.watch.idle()
+    site.watch.finish_idle_cycle()
     site.watch.notify_clock()
-    assert done_semaphore(site.segment, "level").value == 0
+    assert get_done_semaphore(site.segment, "level").value == 0
 
 
 def test_the_clock_is_asked_once_the_deadline_may_have_come(site: Site) -> None:
     words = site.segment.words
     words[System.EPOCH_NS] = time.monotonic_ns() - 1000 * PERIOD_NS
-    site.watch.start(10, 0)
+    site.watch.start_cycle(10, 0)
     site.watch.process_ns = site.watch._release_ns + PERIOD_NS - 1
-    assert site.watch.now(11) is None
+    assert site.watch.find_late_tick(11) is None
     site.watch.process_ns += 1
-    now = site.watch.now(11)
+    now = site.watch.find_late_tick(11)
     assert now is not None
     assert now >= 1000
-    assert site.watch.now(now + 10**6) is None
+    assert site.watch.find_late_tick(now + 10**6) is None
 
 
 def test_failed_reads_are_counted_and_flagged_once(site: Site) -> None:
@@ -214,7 +214,7 @@ def test_failed_reads_are_counted_and_flagged_once(site: Site) -> None:
 
 
 def test_bus_counters_are_updated_periodically(site: Site) -> None:
-    size = site.segment.layout.mailbox("level.status").size
+    size = site.segment.layout.find_mailbox("level.status").size
     for tick in range(1000, 1000 + BUS_COUNT_CYCLES):
         site.inputs.read(tick)
         site.outputs.write(tick, None)
@@ -226,9 +226,9 @@ def test_bus_counters_are_updated_periodically(site: Site) -> None:
         0,
         BUS_COUNT_CYCLES * size,
     ]
-    site.watch.count_bus()
+    site.watch.update_bus_counters()
     assert site.counts(Block.READS, Block.WRITES) == [BUS_COUNT_CYCLES] * 2
     # A restarted task does not count again what its predecessor wrote.
     site.outputs.writers["status"].close()
-    Site(site.segment).watch.count_bus()
+    Site(site.segment).watch.update_bus_counters()
     assert site.counts(Block.READS, Block.WRITES) == [BUS_COUNT_CYCLES] * 2

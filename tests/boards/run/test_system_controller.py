@@ -18,10 +18,10 @@ from rack.backplane.operator_table import (
     RequestStage,
 )
 from rack.backplane.segment import Segment
-from rack.backplane.watch.alarms import Alarm, AlarmWriter, alarm_ring
-from rack.backplane.words import Block, Demand, System, TaskState, switch
-from rack.boards.config.layout import field_specs
-from rack.boards.operator import hold
+from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
+from rack.backplane.words import Block, Demand, System, TaskState, encode_switch
+from rack.boards.config.layout import build_field_specs
+from rack.boards.operator import build_hold_command
 from rack.boards.run.system_controller import EndOfRun, SystemController
 from rack.boards.wiring import ClockWiring
 from rack.levels.messages import TaskStatus
@@ -61,9 +61,9 @@ class Controlled:
     def __init__(self, segment: Segment, **changed: object) -> None:
         self.words = segment.words
         self.words[System.PERIOD_NS] = 2_500_000
-        self.alarms = alarm_ring(segment, "clock")
+        self.alarms = open_alarm_ring(segment, "clock")
         self.driver = RealtimeDriver(segment, lambda tick: None, AlarmWriter(segment, "clock"))
-        self.blocks = {name: segment.block(name) for name in ("left", "right")}
+        self.blocks = {name: segment.get_block(name) for name in ("left", "right")}
         for block in self.blocks.values():
             block[Block.STATE] = TaskState.RUNNING
         given = wiring(**changed)
@@ -82,7 +82,7 @@ class Controlled:
 
     def demand(self, tick: int) -> Demand:
         """Return the demand on the arm after the clock's work at a tick."""
-        self.controller.begin(tick)
+        self.controller.begin_tick(tick)
         return Demand(self.words[System.DEMAND])
 
 
@@ -101,7 +101,7 @@ def test_the_strongest_demand_of_all_lost_boards_holds(make_bus: MakeBus) -> Non
     rack.blocks["left"][Block.STATE] = TaskState.READY
     assert rack.demand(9) is Demand.NONE
     # Rejoined after two ticks, and after six.
-    values = rack.alarms.drain().rows["value"].tolist()
+    values = rack.alarms.read_new_rows().rows["value"].tolist()
     assert values == [Demand.STOP, Demand.BRAKE, 2, Demand.STOP, 6, Demand.NONE]
 
 
@@ -115,7 +115,7 @@ def test_a_loss_counts_from_its_tick_however_slowly_the_crate_records_it(
     if not is_lost_first:
         # Nothing is lost yet, but the controller must look again at every tick.
         assert rack.demand(1) is Demand.NONE
-        assert rack.controller.rests_until(1) == 2
+        assert rack.controller.find_next_work_tick(1) == 2
     rack.set_lost("left", 2)
     assert rack.demand(2) is Demand.STOP
     rack.words[System.LOSSES] += 1
@@ -124,12 +124,12 @@ def test_a_loss_counts_from_its_tick_however_slowly_the_crate_records_it(
 
 def test_the_clock_follows_the_network_adapter_at_its_tick(make_bus: MakeBus) -> None:
     rack = Controlled(make_bus(*BOARDS))
-    rack.words[System.PEER_STOP] = switch(5, True)
+    rack.words[System.PEER_STOP] = encode_switch(5, True)
     assert [rack.demand(tick) for tick in (4, 5, 6)] == [Demand.NONE, Demand.STOP, Demand.STOP]
-    rack.words[System.PEER_STOP] = switch(9, False)
+    rack.words[System.PEER_STOP] = encode_switch(9, False)
     assert rack.demand(8) is Demand.STOP
     # A switch that lies ahead is waited for tick by tick.
-    assert rack.controller.rests_until(8) == 9
+    assert rack.controller.find_next_work_tick(8) == 9
     assert rack.demand(9) is Demand.NONE
 
 
@@ -139,21 +139,21 @@ def test_a_command_whose_client_has_died_is_not_issued_and_says_so(make_bus: Mak
     rack, table = Controlled(segment), OperatorTable(segment)
 
     def wait_for_ever() -> None:
-        with table.claim(Request(0, b"", tick=2)):
+        with table.claim_request(Request(0, b"", tick=2)):
             signal.pause()
 
     with forked(wait_for_ever) as client:
-        wait_until(table.waiting)
-        (entry,) = table.waiting()
-        rack.controller.begin(1)
+        wait_until(table.list_waiting)
+        (entry,) = table.list_waiting()
+        rack.controller.begin_tick(1)
         os.kill(client, signal.SIGKILL)
-        wait_until(lambda: not table.client_lives(entry))
-    rack.controller.begin(2)
+        wait_until(lambda: not table.is_client_alive(entry))
+    rack.controller.begin_tick(2)
     assert entry.given_tick == -1
     assert entry.stage == RequestStage.WAITING
     assert segment.words[System.COMMANDED] == 0
     # Left out for good: the clock has no more to do with it.
-    assert not table.waiting()
+    assert not table.list_waiting()
 
 
 @pytest.mark.parametrize("is_released", [False, True])
@@ -161,31 +161,31 @@ def test_a_command_whose_client_has_died_is_not_issued_and_says_so(make_bus: Mak
 def test_a_level_holds_once_its_operator_has_gone_unless_the_lease_was_released(
     make_bus: MakeBus, is_released: bool, is_restarted: bool
 ) -> None:
-    fields = field_specs(OperatorCommand.message_type, {})
-    size = OperatorCommand.message_type.dtype({}).itemsize
+    fields = build_field_specs(OperatorCommand.message_type, {})
+    size = OperatorCommand.message_type.build_dtype({}).itemsize
     box = replace(mailbox(name="left.operator", writer="clock"), fields=fields, size=size)
     segment = make_bus(box, *BOARDS)
     rack, table = Controlled(segment), OperatorTable(segment)
     operator = open_observer(segment, "left.operator")
-    goto = hold(box)
+    goto = build_hold_command(box)
     goto.what = Operation.GOTO
-    with table.claim(Request(0, bytes(goto.raw)), Client.LEASES) as entry:
+    with table.claim_request(Request(0, bytes(goto.raw)), Client.LEASES) as entry:
         for tick in (1, 2, 3):
-            rack.controller.begin(tick)
+            rack.controller.begin_tick(tick)
         assert operator.peek().message.what == Operation.GOTO
         if is_restarted:
             for writer in rack.controller._desk._writers.values():
                 writer.close()
             rack = Controlled(segment)
         if is_released:
-            table.release(entry)
+            table.release_lease(entry)
     for tick in (4, 5, 6):
-        rack.controller.begin(tick)
-    codes = rack.alarms.drain().rows["code"].tolist()
+        rack.controller.begin_tick(tick)
+    codes = rack.alarms.read_new_rows().rows["code"].tolist()
     assert codes.count(Alarm.OPERATOR_GONE) == (not is_released)
     last = Operation.GOTO if is_released else Operation.HOLD
     assert operator.peek().message.what == last
-    assert not table.leased()
+    assert not table.list_leased()
 
 
 def test_a_board_given_up_sets_the_latch_and_ends_the_run_after_the_arm_has_come_to_rest(
@@ -207,16 +207,16 @@ def test_the_next_work_tick_is_the_end_of_the_run_unless_there_is_work(make_bus:
     status = replace(box(TaskStatus, "task.status"), every=8, delay=8)
     bus = make_bus(*BOARDS, task("task", every=8, slot=4), status)
     rack = Controlled(bus, ends_run="task.status")
-    assert rack.controller.rests_until(0) == 1
+    assert rack.controller.find_next_work_tick(0) == 1
     rack.demand(0)
     rack.end_of_run(3)
-    assert rack.controller.rests_until(3) == 9
+    assert rack.controller.find_next_work_tick(3) == 9
     rack.lose("left", 3)
     rack.demand(4)
-    assert rack.controller.rests_until(4) == 5
+    assert rack.controller.find_next_work_tick(4) == 5
     rack.blocks["left"][Block.STATE] = TaskState.READY
     rack.demand(5)
-    assert rack.controller.rests_until(5) == 9
+    assert rack.controller.find_next_work_tick(5) == 9
 
 
 def ends_at(

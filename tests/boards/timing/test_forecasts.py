@@ -9,13 +9,13 @@ from collections.abc import Iterable
 import pytest
 
 from rack.boards.config import load, resolve
-from rack.boards.config.timing import rack_timing
-from rack.boards.timing.command_path import command_paths
+from rack.boards.config.timing import build_rack_timing
+from rack.boards.timing.command_path import find_command_paths
 from rack.boards.timing.forecast import Forecast
-from rack.boards.timing.frames import core_frames
+from rack.boards.timing.frames import compute_core_frames
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.response_time import load_of, task_responses
-from rack.boards.timing.schedule import simulate
+from rack.boards.timing.response_time import compute_loads, compute_task_responses
+from rack.boards.timing.schedule import simulate_schedule
 from rack.boards.timing.tasks import Budget
 from tests.snapshots import QUICK, ROOT, SHIPPED, Snapshots
 
@@ -47,24 +47,24 @@ def model(rack: RackTiming) -> Iterable[object]:
     """Return all that the model says."""
     cycles_ns = [task.every_ns * task.within_cycles for task in rack.tasks]
     until_ns = PERIODS * max(cycles_ns, default=rack.clock_ns)
-    chart = simulate(rack.tasks, min(until_ns, 2_000_000_000), rack.context_switch_ns)
+    chart = simulate_schedule(rack.tasks, min(until_ns, 2_000_000_000), rack.context_switch_ns)
     return [
-        Forecast.of(rack).document(),
-        Forecast.of(rack, has_cores=False).notes,
+        Forecast.from_rack(rack).to_document(),
+        Forecast.from_rack(rack, has_cores=False).notes,
         rack.tasks,
-        [frames.document() for frames in core_frames(rack)],
+        [frames.to_document() for frames in compute_core_frames(rack)],
         {
             found.task: found.response_ns
-            for found in task_responses(rack.tasks, rack.context_switch_ns)
+            for found in compute_task_responses(rack.tasks, rack.context_switch_ns)
         },
-        load_of(rack.tasks, rack.context_switch_ns),
+        compute_loads(rack.tasks, rack.context_switch_ns),
         chart,
-        chart.window(until_ns // 5, until_ns // 2),
-        [chart.late(task.name) for task in rack.tasks],
+        chart.cut_window(until_ns // 5, until_ns // 2),
+        [chart.list_late_jobs(task.name) for task in rack.tasks],
         rack.longest_cycles,
         rack.ranks,
         rack.cores,
-        [chains.text for chains in rack.parallel],
+        [chains.text for chains in rack.chain_groups],
     ]
 
 
@@ -77,9 +77,9 @@ def test_the_timing_of_a_shipped_rack_is_as_before(
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2, 3})
     plan = resolve(load(ROOT / "configs" / name))
-    rack = rack_timing(plan.config, plan.layout)
-    parts: dict[str, object] = {"own": model(rack), "paths": command_paths(rack, plan.layout)}
+    rack = build_rack_timing(plan.config, plan.layout)
+    parts: dict[str, object] = {"own": model(rack), "paths": find_command_paths(rack, plan.layout)}
     for share in SHARES:
-        found = rack_timing(plan.config, plan.layout, budgets(rack, share))
+        found = build_rack_timing(plan.config, plan.layout, budgets(rack, share))
         parts[f"share {share:g}"] = model(found)
     SNAPSHOTS.check(name, parts)

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import pytest
 
-from rack.boards.timing.chains import spanned
+from rack.boards.timing.chains import format_names
 from rack.boards.timing.forecast import NO_BUDGET, Forecast
 from rack.boards.timing.level import BoardTiming
 from rack.boards.timing.rack import RackTiming
 from rack.boards.timing.tasks import Budget, Part, TimedTask, Unit
-from rack.boards.timing.verdicts import verdicts
+from rack.boards.timing.verdicts import judge_rack
 
 MS = 1_000_000
 CLOCK = TimedTask("clock", "clock", "clock", 0, 90, 2 * MS, ())
@@ -60,13 +60,13 @@ def board(name: str, every: int, above: str = "", below: str = "") -> BoardTimin
 def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
     failing = {
         (verdict.equation, verdict.subject)
-        for verdict in verdicts(rack(FIGURE_3))
+        for verdict in judge_rack(rack(FIGURE_3))
         if not verdict.holds
     }
     assert failing == {("3.8", "level"), ("response time", "level.planner"), ("load", "core 1")}
     # The paper's own way out: cycles of 8 ms, figure 2.
-    longer = rack(FIGURE_3).changed("level", every=4, within_cycles=2)
-    assert all(verdict.holds for verdict in verdicts(longer))
+    longer = rack(FIGURE_3).replace_board("level", every=4, within_cycles=2)
+    assert all(verdict.holds for verdict in judge_rack(longer))
 
 
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
@@ -91,7 +91,7 @@ def test_response_is_the_sum_of_the_cycles_and_of_the_waits_for_the_grid(
 ) -> None:
     names = [f"b{cycle}" for cycle in cycles]
     boards = [board(name, cycle) for name, cycle in zip(names, cycles, strict=True)]
-    assert rack(*boards).response_ticks(names) == ticks
+    assert rack(*boards).compute_response_ticks(names) == ticks
 
 
 JOINTS = tuple(f"joint{k}" for k in range(1, 7))
@@ -112,13 +112,13 @@ def arm_of(*joints: str) -> RackTiming:
 def test_one_board_per_joint_forms_one_group_of_parallel_chains() -> None:
     timing = arm_of(*JOINTS)
     assert timing.chains == tuple(("plan", "path", joint, "arm") for joint in JOINTS)
-    (together,) = timing.parallel
+    (together,) = timing.chain_groups
     assert timing.hierarchy == together
     assert together.text == "plan > path > joint1 ... joint6 > arm"
     assert timing.ranks == (("plan",), ("path",), JOINTS, ("arm",))
     assert set(timing.longest_cycles.values()) == {200, 500}
     # 200 + 20 + 4 + 2 ticks of 2 ms, for all joints in one line.
-    (eq_3_3,) = [verdict for verdict in verdicts(timing) if verdict.equation == "3.3"]
+    (eq_3_3,) = [verdict for verdict in judge_rack(timing) if verdict.equation == "3.3"]
     assert (eq_3_3.subject, eq_3_3.left) == ("system", 226 * 2 * MS)
 
 
@@ -134,12 +134,12 @@ def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
         FIGURE_3, name="silent", budget=replace(FIGURE_3.budget, plan_ns=0), core=2, planner_core=2
     )
     plain = replace(silent, name="plain", has_planner=False, core=3)
-    found = Forecast.of(rack(FIGURE_3, silent, plain, board("unknown", 4))).uncounted
+    found = Forecast.from_rack(rack(FIGURE_3, silent, plain, board("unknown", 4))).uncounted
     assert found.keys() - {CLOCK.name} == {"silent.planner", "unknown", "unknown.planner"}
     assert {why for name, why in found.items() if name != CLOCK.name} == {NO_BUDGET}
-    assert not Forecast.of(rack(FIGURE_3, plain)).uncounted.keys() - {CLOCK.name}
+    assert not Forecast.from_rack(rack(FIGURE_3, plain)).uncounted.keys() - {CLOCK.name}
     # Without any budget only the system is judged.
-    forecast = Forecast.of(rack(board("top", 40, below="a"), board("a", 4, "top")))
+    forecast = Forecast.from_rack(rack(board("top", 40, below="a"), board("a", 4, "top")))
     assert {verdict.subject for verdict in forecast.verdicts} == {"system"}
     assert {"top", "a"} <= forecast.uncounted.keys()
 
@@ -148,8 +148,8 @@ def test_a_forecast_notes_exactly_what_it_leaves_out() -> None:
     fast = TimedTask("clock", "clock", "clock", 0, 90, 2 * MS, (Part(Unit.PROCESS, MS // 10),))
     counted = replace(rack(FIGURE_3), clock=fast)
     ordinary = replace(FIGURE_3, planner_priority=70)
-    assert Forecast.of(replace(counted, boards={"level": ordinary})).notes == ()
-    notes = Forecast.of(replace(counted, is_lockstep=True, speed=2.0), has_cores=False).notes
+    assert Forecast.from_rack(replace(counted, boards={"level": ordinary})).notes == ()
+    notes = Forecast.from_rack(replace(counted, is_lockstep=True, speed=2.0), has_cores=False).notes
     expected = (
         "in lockstep",
         "times are wall-clock times: speed 2",
@@ -157,16 +157,21 @@ def test_a_forecast_notes_exactly_what_it_leaves_out() -> None:
     )
     assert len(notes) == len(expected)
     assert all(note.startswith(start) for note, start in zip(notes, expected, strict=True))
-    queued = Forecast.of(arm_of(*JOINTS).changed("path", queues=("plan.requests",))).notes
+    queued = Forecast.from_rack(
+        arm_of(*JOINTS).replace_board("path", queues=("plan.requests",))
+    ).notes
     assert queued[0] == "the system response assumes that these queues are empty: plan.requests"
     # Without a budget there is nothing to say about times.
-    bare = Forecast.of(
+    bare = Forecast.from_rack(
         replace(rack(board("bare", 4)), is_lockstep=True, speed=2.0), has_cores=False
     ).notes
     assert bare == ()
     # Two ordinary tasks that compute share a core; one has it to itself.
     both = replace(FIGURE_3, priority=0, planner_priority=0)
-    assert "ordinary scheduling" in Forecast.of(replace(counted, boards={"level": both})).notes[-1]
+    assert (
+        "ordinary scheduling"
+        in Forecast.from_rack(replace(counted, boards={"level": both})).notes[-1]
+    )
 
 
 @pytest.mark.parametrize(
@@ -187,4 +192,4 @@ def test_a_forecast_notes_exactly_what_it_leaves_out() -> None:
 def test_numbered_names_are_shortened_only_if_none_is_left_out(
     names: tuple[str, ...], text: str
 ) -> None:
-    assert spanned(names) == text
+    assert format_names(names) == text

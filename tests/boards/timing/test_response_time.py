@@ -10,11 +10,11 @@ from typing import NamedTuple
 import pytest
 
 from rack.boards.timing.response_time import (
-    Load,
-    blocking_ns,
-    load_of,
-    response_time,
-    task_responses,
+    Demand,
+    compute_blocking_ns,
+    compute_loads,
+    compute_response_time,
+    compute_task_responses,
 )
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
@@ -55,16 +55,16 @@ def seen(tasks: list[Plain], blocked: int = 0) -> list[int]:
 
 def response(
     cost: int,
-    above: Sequence[Load],
+    above: Sequence[Demand],
     blocking: int = 0,
-    sharing: Sequence[Load] = (),
+    sharing: Sequence[Demand] = (),
     horizon: int = 10**5,
 ) -> int | None:
-    return response_time(cost, above, blocking, sharing=sharing, horizon=horizon)
+    return compute_response_time(cost, above, blocking, sharing=sharing, horizon=horizon)
 
 
 def response_times(tasks: Sequence[TimedTask], switch_ns: int = 0) -> dict[str, int | None]:
-    return {found.task: found.response_ns for found in task_responses(tasks, switch_ns)}
+    return {found.task: found.response_ns for found in compute_task_responses(tasks, switch_ns)}
 
 
 def analysed(tasks: list[Plain], blocked: int = 0) -> list[int | None]:
@@ -126,7 +126,7 @@ def test_response_times_agree_with_simulated_schedules(full: bool, most_blocked:
     [[(2, 4), (3, 6)], [(2, 4), (4, 6)]],
     ids=["full above", "overloaded above"],
 )
-def test_overload_has_no_bound(above: list[Load]) -> None:
+def test_overload_has_no_bound(above: list[Demand]) -> None:
     assert response(2, above) is None
 
 
@@ -145,7 +145,7 @@ def test_every_job_includes_two_context_switches() -> None:
     tasks = [timed("high", 0, 20, 10, computing(2)), timed("low", 0, 10, 40, computing(9))]
     # 9 + 2 and two jobs of 2 + 2.
     assert response_times(tasks, 1) == {"high": 4, "low": 19}
-    assert load_of(tasks, context_switch_ns=1) == {0: pytest.approx(4 / 10 + 11 / 40)}
+    assert compute_loads(tasks, context_switch_ns=1) == {0: pytest.approx(4 / 10 + 11 / 40)}
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_only_a_ceiling_at_its_priority_or_above_blocks_a_task() -> None:
         for name, priority in (("above", 21), ("own", 20), ("low", 4))
     ]
     tasks.append(planner)
-    assert {task.name: blocking_ns(task, tasks) for task in tasks} == {
+    assert {task.name: compute_blocking_ns(task, tasks) for task in tasks} == {
         "above": 0,
         "own": 3,
         "low": 0,

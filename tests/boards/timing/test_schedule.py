@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from rack.boards.timing.schedule import Chart, simulate
+from rack.boards.timing.schedule import Chart, simulate_schedule
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 C, R, X, W, P, U = Unit
@@ -51,41 +51,41 @@ FIG_4 = (executor("C1 R1 X2 W1", 6), planner("P6 U1", 6, 2, core=2, ceiling=0))
 
 
 def test_figure_2_is_as_in_the_paper() -> None:
-    assert row(simulate(FIG_2, 32)) == "RXXWPPPPRXXWPPU-" * 2
+    assert row(simulate_schedule(FIG_2, 32)) == "RXXWPPPPRXXWPPU-" * 2
     # An executor of 3, then 2 ms fills two cycles to the millisecond.
-    chart = simulate(FIG_2, 32, variants={"level": (parts("R1 X3 W1"), parts("R1 X2 W1"))})
+    chart = simulate_schedule(FIG_2, 32, variants={"level": (parts("R1 X3 W1"), parts("R1 X2 W1"))})
     assert row(chart) == "RXXXWPPPRXXWPPPU" * 2
-    assert not chart.late("level.planner")
+    assert not chart.list_late_jobs("level.planner")
 
 
 def test_figure_4_works_on_two_processors_with_waste() -> None:
-    chart = simulate(FIG_4, 24)
+    chart = simulate_schedule(FIG_4, 24)
     assert row(chart, 1) == "CRXXW-" * 4
     assert row(chart, 2) == "PPPPPPU-----" * 2
-    assert not chart.late("level")
-    assert not chart.late("level.planner")
+    assert not chart.list_late_jobs("level")
+    assert not chart.list_late_jobs("level.planner")
     # A longer executor misses every cycle.
-    chart = simulate((executor("C1 R1 X4 W1", 6), FIG_4[1]), 60)
+    chart = simulate_schedule((executor("C1 R1 X4 W1", 6), FIG_4[1]), 60)
     assert row(chart, 1) == ("CRXXXXW" * 9)[:60]
-    assert len(chart.late("level")) == 10
+    assert len(chart.list_late_jobs("level")) == 10
 
 
 def test_figure_3_has_no_plan_within_three_cycles() -> None:
-    chart = simulate(FIG_3, 180)
+    chart = simulate_schedule(FIG_3, 180)
     assert row(chart)[:24] == "RXXWPPRXXWPPRXXWPPRXXWUP"
     plans = [job for job in chart.jobs if job.task == "level.planner"]
     assert len(plans) == 9
-    assert chart.late("level.planner") == plans
-    assert not chart.late("level")
+    assert chart.list_late_jobs("level.planner") == plans
+    assert not chart.list_late_jobs("level")
 
 
 def test_every_job_costs_two_context_switches() -> None:
-    chart = simulate(FIG_2, 16, context_switch_ns=1)
+    chart = simulate_schedule(FIG_2, 16, context_switch_ns=1)
     # in, R X W, out; in, P; in, R X W, out; P: the rest of two cycles is six units, one of them a
     # switch.
     assert row(chart) == "-RXXW--P-RXXW-PP"
     assert ends(chart, "level") == [(0, 5), (8, 13)]
-    assert [job.end_ns for job in chart.late("level.planner")] == [None]
+    assert [job.end_ns for job in chart.list_late_jobs("level.planner")] == [None]
 
 
 def random_tasks(seed: int) -> list[TimedTask]:
@@ -159,7 +159,7 @@ def place(
 def test_a_schedule_equals_a_simulation_unit_by_unit(seed: int) -> None:
     for number in range(10):
         tasks, until = random_tasks(1000 * seed + number), 300
-        chart = simulate(tasks, until)
+        chart = simulate_schedule(tasks, until)
         expected, ended = step_by_step(tasks, until)
         found = ["-"] * until
         for span in chart.spans:

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from rack.backplane.layout import TickGrid
-from rack.boards.config import load, rack_timing, wire
-from rack.boards.timing.command_path import CommandPath, command_paths
+from rack.boards.config import build_rack_timing, load, resolve_layout
+from rack.boards.timing.command_path import CommandPath, find_command_paths
 
 
 def path_of(
@@ -39,8 +39,8 @@ NASREM = path_of(
     ],
 )
 def test_a_command_is_followed_from_release_to_release(given: int, sampled: int, acts: int) -> None:
-    assert NASREM.samples_at(given + 1) == sampled
-    assert NASREM.acts_at(given + 1) == acts
+    assert NASREM.find_reading_release(given + 1) == sampled
+    assert NASREM.find_acting_release(given + 1) == acts
 
 
 def test_bounds_follow_the_paper_and_the_releases() -> None:
@@ -55,7 +55,10 @@ def test_bounds_follow_the_paper_and_the_releases() -> None:
 def test_the_longest_response_is_reached_and_never_exceeded(cycles: tuple[int, ...]) -> None:
     path = path_of([str(cycle) for cycle in cycles], [TickGrid(cycle) for cycle in cycles])
     grid = int(np.lcm.reduce(cycles))
-    found = [path.response(given, path.acts_at(given + 1)) for given in range(2 * grid)]
+    found = [
+        path.compute_response(given, path.find_acting_release(given + 1))
+        for given in range(2 * grid)
+    ]
     assert max(found) <= path.longest
     if len(cycles) <= 2:
         assert max(found) == path.longest
@@ -63,8 +66,8 @@ def test_the_longest_response_is_reached_and_never_exceeded(cycles: tuple[int, .
 
 def test_paths_begin_at_every_level_that_can_be_commanded() -> None:
     config = load("nasrem")
-    layout = wire(config)
-    found = command_paths(rack_timing(config, layout), layout)
+    layout = resolve_layout(config)
+    found = find_command_paths(build_rack_timing(config, layout), layout)
     assert found["task"] == NASREM
     assert found["primitive"] == path_of(("primitive", "servo"), [TickGrid(8), TickGrid(1)])
     assert list(found) == ["task", "elemental_move", "primitive", "servo"]

@@ -8,9 +8,9 @@ import pytest
 
 from rack.backplane.layout import TickGrid
 from rack.boards.timing.level import LevelTiming
-from rack.boards.timing.rack import RackTiming, grid_wait
+from rack.boards.timing.rack import RackTiming, compute_grid_wait
 from rack.boards.timing.tasks import TimedTask
-from rack.boards.timing.verdicts import EquationVerdict, Sign, level_verdicts
+from rack.boards.timing.verdicts import EquationVerdict, Sign, judge_level
 
 MS = 1_000_000
 TIGHT = LevelTiming(
@@ -38,7 +38,7 @@ def judged(
     """Return both sides of an equation, ms or shares, and its sign; with ! if it fails."""
     clock = TimedTask("clock", "clock", "clock", 0, 90, tick_ns, ())
     rack = RackTiming(False, 1.0, tick_ns, clock, {}, switch_ns, 0.1, None, {}, None)
-    (found,) = [found for found in level_verdicts(rack, level) if found.equation == equation]
+    (found,) = [found for found in judge_level(rack, level) if found.equation == equation]
     unit = 1 if found.unit == "1" else MS
     return found.left / unit, found.sign + "!" * (not found.holds), found.right / unit
 
@@ -59,7 +59,7 @@ def test_an_equation_holds_if_its_sides_satisfy_it(
 ) -> None:
     verdict = EquationVerdict("3.1", "level", left, sign, right, "")
     assert (verdict.holds, verdict.margin) == (holds, right - left)
-    assert verdict.document()["holds"] == holds
+    assert verdict.to_document()["holds"] == holds
 
 
 FIGURE_3 = {"cycle_ns": 6 * MS}
@@ -115,6 +115,6 @@ def test_two_context_switches_shorten_the_residual_and_lengthen_the_cycle() -> N
 
 
 def test_a_message_waits_for_the_next_read_on_the_grid() -> None:
-    assert grid_wait(TickGrid(8), TickGrid(4)) == 0
-    assert grid_wait(TickGrid(100), TickGrid(8)) == 4
-    assert grid_wait(TickGrid(4, 1), TickGrid(8, 2)) == 5
+    assert compute_grid_wait(TickGrid(8), TickGrid(4)) == 0
+    assert compute_grid_wait(TickGrid(100), TickGrid(8)) == 4
+    assert compute_grid_wait(TickGrid(4, 1), TickGrid(8, 2)) == 5

@@ -14,7 +14,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
 from rack.levels.messages import ArmState
-from rack.levels.robot.cell import Cell, sizes
+from rack.levels.robot.cell import Cell, compute_sizes
 from rack.levels.robot.dynamics import Dynamics
 from tests.levels.arms import CLOCK_NS, cell, config
 
@@ -73,7 +73,7 @@ def test_an_arm_restored_with_engaged_brakes_continues_bit_for_bit() -> None:
     arm.brake()
     arm.step(30)
     arm.brake()
-    saved = ArmState.zeros(sizes(made))
+    saved = ArmState.zeros(compute_sizes(made))
     arm.save(saved)
     again = SimulatedArm(cell("puma560"), config("puma560")[1], CLOCK_NS)
     again._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)

@@ -17,7 +17,7 @@ from rack.levels.arm import SimulatedArm, drives, sensors, substeps
 from rack.levels.compiled import compiled
 from rack.levels.messages import ArmState, Scene
 from rack.levels.robot import dynamics
-from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.robot.cell import Cell, build_cell, compute_sizes
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.robot.limits import Encoders
 from tests.levels.arms import CLOCK_NS, cell, config, four_bar
@@ -33,22 +33,22 @@ def drive_cycles(arm: SimulatedArm, made: Cell, ticks: int) -> Message:
         bias = arm.dynamics.terms(sensed.position, sensed.velocity).bias
         arm.drive(bias + 0.3 * made.bounds.torque * np.sin(0.1 * tick + np.arange(len(bias))), 10.0)
         arm.step(1)
-    state = ArmState.zeros(sizes(made))
+    state = ArmState.zeros(compute_sizes(made))
     arm.save(state)
     return state
 
 
 def scene(arm: SimulatedArm, made: Cell) -> Message:
-    seen = Scene.zeros(sizes(made))
+    seen = Scene.zeros(compute_sizes(made))
     arm.look(seen)
     return seen
 
 
 def use_python(arm: SimulatedArm) -> None:
     """Replace an arm's compiled functions by their Python."""
-    arm._advance, arm._copy_state = substeps.advance, substeps.copy_state
+    arm._advance, arm._copy_state = substeps.make_steps, substeps.copy_state
     arm._gate._is_clear = drives.is_clear
-    arm.dynamics._evaluate, arm.dynamics._carry = dynamics.evaluate, dynamics.carry
+    arm.dynamics._evaluate, arm.dynamics._carry = dynamics.evaluate_terms, dynamics.add_payload
 
 
 @pytest.mark.slow
@@ -66,7 +66,7 @@ def test_an_arm_moves_bit_for_bit_as_in_python(name: str) -> None:
 def test_the_equation_of_motion_is_the_same_as_in_python(name: str) -> None:
     made = cell(name)
     one, other = Dynamics(made), Dynamics(made)
-    other._evaluate, other._carry = dynamics.evaluate, dynamics.carry
+    other._evaluate, other._carry = dynamics.evaluate_terms, dynamics.add_payload
     for q, qd in RNG.uniform(-1.0, 1.0, (20, 2, len(made.qpos))):
         for payload in (None, Payload(1.5, OFFSET)):
             for mine, theirs in zip(
@@ -78,13 +78,13 @@ def test_the_equation_of_motion_is_the_same_as_in_python(name: str) -> None:
 def test_solutions_and_coarse_samples_are_the_same_as_in_python() -> None:
     square = RNG.normal(size=(6, 6))
     inertia, load = square.T @ square + np.eye(6), RNG.normal(size=6)
-    solution = drives.cholesky_solve.load()(inertia, load)
+    solution = drives.cholesky_solve.load_machine_code()(inertia, load)
     assert np.array_equal(solution, drives.cholesky_solve(inertia, load))
     assert solution == pytest.approx(np.linalg.solve(inertia, load))
     rules = np.full((2, 6), 1e-3), np.array([[1e-4] * 6, [0.0] * 6])
     for tick in range(50):
         one, other = np.ones((2, 6)), np.ones((2, 6))
-        sensors.sense_coarsely.load()(one, tick, 7, *rules)
+        sensors.sense_coarsely.load_machine_code()(one, tick, 7, *rules)
         sensors.sense_coarsely(other, tick, 7, *rules)
         assert np.array_equal(one, other)
 
@@ -114,8 +114,8 @@ def test_preloading_leaves_nothing_to_be_compiled_in_a_cycle(tmp_path: Path) -> 
         scene(arm, made)
     draw_samples(1)
     functions: list[compiled[..., Any]] = [
-        *(dynamics.evaluate, dynamics.carry, substeps.advance, substeps.copy_state),
+        *(dynamics.evaluate_terms, dynamics.add_payload, substeps.make_steps, substeps.copy_state),
         *(drives.is_clear, sensors.sense_coarsely),
     ]
-    machines: list[Callable[..., Any]] = [function.load() for function in functions]
+    machines: list[Callable[..., Any]] = [function.load_machine_code() for function in functions]
     assert [len(machine.signatures) for machine in machines] == [1] * len(machines)  # type: ignore[attr-defined]

@@ -111,7 +111,7 @@ def test_a_motor_that_is_off_is_detectable_later_if_a_resting_arm_carries_a_load
     made, acted = cell("puma560"), dict[int, bool]()
     arm = SimulatedArm(made, config("puma560")[1], CLOCK_NS)
     lay_against_a_finger(made, arm, blocks)
-    assert (arm.holds, arm.leans) == (blocks > 0, blocks > 1)
+    assert (arm.is_holding_object, arm.is_touching_surroundings) == (blocks > 0, blocks > 1)
     link = FaultyLink(arm, acted, holds=lambda: says_held)
     link.inject([build_fault("actuator-off", joint=1)])
     link.drive(HOLDING + np.array([0.0, more, 0.0, 0.0, 0.0, 0.0]), 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.watch.alarms import Alarm
-from rack.boards.config import load, wire
+from rack.boards.config import load, resolve_layout
 from rack.boards.errors import ConfigError
 from rack.levels.algebra import Array
 from rack.levels.arm import Arm, Sensed
@@ -46,10 +46,12 @@ class CoarseArm(IdealArm):
     def sense(self) -> Sensed:
         sample = super().sense()
         encoders = self.cell.encoders
-        way = np.where(np.random.default_rng(self.tick).random((2, len(encoders.off))) < 0.5, -1, 1)
+        way = np.where(
+            np.random.default_rng(self.tick).random((2, len(encoders.position_error))) < 0.5, -1, 1
+        )
         return sample._replace(
-            position=sample.position + way[0] * encoders.off,
-            velocity=sample.velocity + way[1] * encoders.speed_off,
+            position=sample.position + way[0] * encoders.position_error,
+            velocity=sample.velocity + way[1] * encoders.velocity_error,
         )
 
 
@@ -91,7 +93,7 @@ def test_an_arm_with_the_coarsest_permitted_encoders_keeps_its_limits(tmp_path: 
     robot = pendulum(tmp_path)
     sensors = SensorConfig(resolution=2e-3, noise=3e-4)
     cell = build_cell(robot.model_copy(update={"sensors": sensors}), SceneConfig(), CLOCK_NS)
-    assert cell.encoders.off.min() > 2e-3
+    assert cell.encoders.position_error.min() > 2e-3
     arm = CoarseArm(cell, SceneConfig(), CLOCK_NS)
     guard = GuardedArm(arm, TICK_S)
     assert max(compute_excess(cell, drive_cycles(guard, arm, random_torques(cell, 0, 800)))) <= 0.0
@@ -231,7 +233,7 @@ def test_during_bring_up_torques_keep_the_reduced_speed(tmp_path: Path) -> None:
     _, slow = drive_cycles(guard, arm, random_torques(cell, 0, 800))
     assert (np.abs(slow) / cell.bounds.velocity).max() <= 0.1
     assert (arm.violations, arm.clipped > 50) == (0, True)
-    guard.permit(1.0)
+    guard.permit_speed(1.0)
     motion = drive_cycles(guard, arm, random_torques(cell, 0, 800))
     assert (np.abs(motion[1]) / cell.bounds.velocity).max() > 0.1
     assert max(compute_excess(cell, motion)) <= 0.0
@@ -240,7 +242,7 @@ def test_during_bring_up_torques_keep_the_reduced_speed(tmp_path: Path) -> None:
 def test_a_config_whose_arm_cannot_be_guarded_is_refused_before_the_launch() -> None:
     config = load(EXAMPLE / "hardware.toml", ["robot.bring_up=0.001"])
     with pytest.raises(ConfigError) as refused:
-        wire(config)
+        resolve_layout(config)
     (mistake,) = refused.value.mistakes
     assert (mistake.place, mistake.value) == ("board.servo.params.arm", "hardware_arm:HardwareArm")
     assert mistake.why == (

@@ -12,7 +12,7 @@ import pytest
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import Sensed, SimulatedArm
-from rack.levels.arm.drivable import copied
+from rack.levels.arm.drivable import copy_sample
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.latency_compensation import PresentLink
 from rack.levels.messages import Error
@@ -54,9 +54,9 @@ class LateArm(IdealArm):
             self._samples.append(super().sense())
 
     def sense(self) -> Sensed:
-        sample = copied(self._samples[0])
+        sample = copy_sample(self._samples[0])
         if self.tick >= self.stuck_from:
-            self._stuck = self._stuck or copied(sample)
+            self._stuck = self._stuck or copy_sample(sample)
             sample.position[0] = self._stuck.position[0]
             sample.velocity[0] = self._stuck.velocity[0]
         return sample
@@ -92,7 +92,7 @@ def test_a_sample_is_extrapolated_to_the_present_if_it_is_not_too_old(
     link = PresentLink(own, TICK_S)
     brought, as_sensed = [], []
     for torque in random_torques(cell, 3, 400):
-        raw, sample, _ = link.look()
+        raw, sample, _ = link.estimate_present()
         assert sample.tick == (own.tick if own.tick - raw.tick <= ticks else raw.tick)
         if own.tick > age:
             brought.append(np.abs(sample.position - own._q))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import Message
-from rack.boards.config import load, wire
+from rack.boards.config import load, resolve_layout
 from rack.boards.errors import ConfigError
 from rack.levels.algebra import Array, solve
 from rack.levels.arm import Arm, Sensed
@@ -92,7 +92,7 @@ def test_an_arm_named_in_the_config_is_driven_and_follows_its_set_points(rig: Se
     assert (rig.status.touches, rig.status.violations, rig.status.clipped) == (0, 0, 0)
     # The default scene shows the tool where the sensed joints put it.
     scene = rig.rack.read("servo.scene")
-    tool = InverseKinematics(rig.servo.arm.cell, 0).tool_at(rig.positions[-2])
+    tool = InverseKinematics(rig.servo.arm.cell, 0).compute_tool_pose(rig.positions[-2])
     assert np.abs(scene.tool_position - tool.position).max() < 1e-3
 
 
@@ -123,7 +123,7 @@ def test_a_restarted_board_restores_the_arm(rig: ServoRig) -> None:
 )
 def test_a_class_that_is_no_arm_is_refused_before_launch(reference: str, why: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        wire(load("nasrem", [f"board.servo.params.arm={reference!r}"]))
+        resolve_layout(load("nasrem", [f"board.servo.params.arm={reference!r}"]))
     (mistake,) = caught.value.mistakes
     assert mistake.place == "board.servo.params.arm"
     assert mistake.why.startswith(why)

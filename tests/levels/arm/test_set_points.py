@@ -19,7 +19,7 @@ from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.simulated import CascadedDrives
 from rack.levels.level import Finding
 from rack.levels.messages import ArmState
-from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.robot.cell import Cell, build_cell, compute_sizes
 from rack.levels.tables import Interface, SceneConfig
 from tests.levels.arm.test_own_arm import SUBSTEPS, IdealArm
 from tests.levels.arms import CLOCK_NS, config, pendulum
@@ -53,7 +53,9 @@ class ServoArm(IdealArm):
             if self.waited >= self.patience:
                 self.brake()
             for step in range(0 if self.braked else SUBSTEPS):
-                torque = self._servos.torque(self._q, self._qd, SUBSTEPS * self.waited + step)
+                torque = self._servos.compute_torque(
+                    self._q, self._qd, SUBSTEPS * self.waited + step
+                )
                 inertia, bias = self._dynamics.terms(self._q, self._qd)
                 self._qd += self._step_s * solve(inertia, torque - bias)
                 self._q += self._step_s * self._qd
@@ -109,12 +111,12 @@ def draw_hostile_targets(
 
 def compute_load(cell: Cell) -> Array:
     """Return the torques, N m, that hold the arm at home."""
-    data = cell.start()
+    data = cell.build_start_data()
     return np.asarray(data.qfrc_bias - data.qfrc_passive)[cell.dof]
 
 
 def save_state(arm: SimulatedArm) -> Message:
-    state = ArmState.zeros(sizes(arm.cell))
+    state = ArmState.zeros(compute_sizes(arm.cell))
     arm.save(state)
     return state
 

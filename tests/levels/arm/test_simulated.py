@@ -13,10 +13,10 @@ import pytest
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm, substeps
-from rack.levels.arm.simulation import obstacle_position
+from rack.levels.arm.simulation import compute_obstacle_position
 from rack.levels.messages import ArmState, Scene
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.robot.cell import Cell, sizes
+from rack.levels.robot.cell import Cell, compute_sizes
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.tables import MotionConfig, SceneConfig
 from tests.levels.arms import CLOCK_NS, cell, config
@@ -31,7 +31,7 @@ def build_arm(name: str) -> tuple[SimulatedArm, Cell]:
 
 
 def save_state(arm: SimulatedArm, made: Cell) -> Message:
-    state = ArmState.zeros(sizes(made))
+    state = ArmState.zeros(compute_sizes(made))
     arm.save(state)
     return state
 
@@ -79,7 +79,7 @@ def watched(monkeypatch: pytest.MonkeyPatch) -> Watch:
             extremes.look(arm._data)
 
         monkeypatch.setattr(substeps, "mj_step", stepping)
-        monkeypatch.setattr(arm, "_advance", substeps.advance)
+        monkeypatch.setattr(arm, "_advance", substeps.make_steps)
         return extremes
 
     return watch
@@ -97,7 +97,7 @@ def test_simulated_time_is_the_tick_times_the_period_exactly() -> None:
 
 def test_a_restored_arm_continues_bit_for_bit() -> None:
     arm, made = build_arm("puma560")
-    torque, middle = build_wobble(made), ArmState.zeros(sizes(made))
+    torque, middle = build_wobble(made), ArmState.zeros(compute_sizes(made))
     for tick in range(200):
         if tick == 120:
             arm.save(middle)
@@ -177,7 +177,7 @@ def test_obstacle_motion_is_a_function_of_time_and_moves_follow_each_other() -> 
     start = np.zeros(3)
     expected = {0.0: 0.0, 1.0: 0.0, 2.0: 0.5, 4.9: 1.95, 5.0: 2.0, 5.5: 1.5, 9.0: 0.0}
     for time_s in (9.0, 2.0, 5.5, 0.0, 4.9, 1.0, 5.0):
-        assert obstacle_position(start, moves, time_s) == pytest.approx(
+        assert compute_obstacle_position(start, moves, time_s) == pytest.approx(
             [expected[time_s], 0.0, 0.0]
         )
     # One that is cut short by the next goes on from where it was.
@@ -185,7 +185,7 @@ def test_obstacle_motion_is_a_function_of_time_and_moves_follow_each_other() -> 
         MotionConfig(body="post", at=0.0, to=(2.0, 0.0, 0.0), speed=0.5),
         MotionConfig(body="post", at=2.0, to=(1.0, 3.0, 0.0), speed=1.0),
     )
-    assert obstacle_position(start, moves, 3.0) == pytest.approx([1.0, 1.0, 0.0])
+    assert compute_obstacle_position(start, moves, 3.0) == pytest.approx([1.0, 1.0, 0.0])
 
 
 def test_the_scene_shows_moving_obstacles_objects_and_the_tool_where_they_are() -> None:
@@ -196,11 +196,11 @@ def test_the_scene_shows_moving_obstacles_objects_and_the_tool_where_they_are() 
     )
     arm = SimulatedArm(made, soon, CLOCK_NS)
     arm.step(240)
-    seen = Scene.zeros(sizes(made))
+    seen = Scene.zeros(compute_sizes(made))
     arm.look(seen)
     post = len(scene.objects)
     assert seen.position[post] == pytest.approx([0.62, 0.85 - 0.25 * (239 * TICK_S - 0.1), 0.9])
     assert seen.position[0] == pytest.approx([0.5, 0.3, 0.475], abs=1e-3)
-    tool = InverseKinematics(made, 0).tool_at(arm.sense().position)
+    tool = InverseKinematics(made, 0).compute_tool_pose(arm.sense().position)
     assert seen.tool_position == pytest.approx(tool.position, abs=1e-12)
     assert seen.tool_quaternion == pytest.approx(tool.quaternion, abs=1e-12)

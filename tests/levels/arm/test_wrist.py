@@ -11,7 +11,7 @@ import pytest
 from rack.levels.algebra import Array
 from rack.levels.arm import SimulatedArm
 from rack.levels.messages import ArmState
-from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.robot.cell import build_cell, compute_sizes
 from rack.levels.systems.force.arm_executor import ContactWrench
 from tests.levels.systems.force.pad import pad
 
@@ -31,7 +31,7 @@ def find_contact(arm: SimulatedArm) -> ContactWrench:
 
 
 def sense_wrist(arm: SimulatedArm) -> Array:
-    sample = arm.feel()
+    sample = arm.sense_wrist()
     assert sample is not None
     return sample
 
@@ -65,7 +65,7 @@ def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
         push(arm, force, torque)
         arm.step(1)
     contact = find_contact(arm)
-    contact.take(sense_wrist(arm), np.array(arm._state), STILL)
+    contact.take_sample(sense_wrist(arm), np.array(arm._state), STILL)
     assert np.allclose(contact.wrench, (*force, *torque), atol=0.02)
     jacobian = np.zeros((6, arm.cell.model.nv))
     mujoco.mj_jacSite(arm.cell.model, arm._data, jacobian[:3], jacobian[3:], arm.cell.tool)
@@ -75,7 +75,7 @@ def test_a_push_on_the_tool_is_the_wrench_of_the_contact(
 
 def test_a_restored_arm_senses_the_same_bits(tmp_path: Path) -> None:
     arms = [build_arm(tmp_path, noise=0.2) for _ in range(2)]
-    state = ArmState.zeros(sizes(arms[0].cell))
+    state = ArmState.zeros(compute_sizes(arms[0].cell))
     for _ in range(40):
         arms[0].drive(arms[0].dynamics.terms(*arms[0]._state).bias, 0.0)
         arms[0].step(1)

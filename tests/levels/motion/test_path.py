@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.levels.motion.path import BlendedPath, points_at, set_point
+from rack.levels.motion.path import BlendedPath, compute_point, compute_points
 
 CORNERED = np.array([[0.0, 0.0, 0.0], [1.0, 0.2, -0.3], [1.2, 1.0, 0.1], [0.4, 1.1, 0.9]])
 BLEND = np.array([0.0, 0.3, 0.25, 0.0])
@@ -85,15 +85,15 @@ def test_compiled_points_have_the_bits_of_plain_python() -> None:
     path = BlendedPath(CORNERED, BLEND)
     plain = np.zeros((3, 3))
     for s in [*np.linspace(0.0, path.length, 997), *path.breaks]:
-        set_point(path._marks, path._table, s, plain)
+        compute_point(path._marks, path._table, s, plain)
         assert np.array_equal(path.evaluate(s), plain)
 
 
 def test_samples_are_the_points_of_the_path_both_ends_included() -> None:
     path = BlendedPath(CORNERED, BLEND)
-    samples = path.sample(0.01)
+    samples = path.sample_points(0.01)
     places = np.linspace(0.0, path.length, len(samples))
     assert np.array_equal(samples, evaluate_points(path, places)[0])
-    assert np.array_equal(samples, points_at(path._marks, path._table, places))
+    assert np.array_equal(samples, compute_points(path._marks, path._table, places))
     assert np.linalg.norm(np.diff(samples, axis=0), axis=1).max() <= 0.01
-    assert BlendedPath(CORNERED[:1], [0.0]).sample(0.01).tolist() == CORNERED[:1].tolist()
+    assert BlendedPath(CORNERED[:1], [0.0]).sample_points(0.01).tolist() == CORNERED[:1].tolist()

@@ -10,9 +10,9 @@ import pytest
 
 from rack.levels.compiled import preload
 from rack.levels.planning import collision
-from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker, first_blocked
+from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker, find_first_blocked
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.planning.pose import Pose, pointing, pose
+from rack.levels.planning.pose import Pose, build_pointing_quaternion, make_pose
 from rack.levels.robot.cell import Cell
 from tests.levels.arms import cell, config
 
@@ -36,11 +36,11 @@ def checker(puma: Cell) -> CollisionChecker:
 
 
 def tool_down(x: float, y: float, z: float) -> Pose:
-    return pose((x, y, z), pointing(DOWN))
+    return make_pose((x, y, z), build_pointing_quaternion(DOWN))
 
 
 def at(ik: InverseKinematics, puma: Cell, x: float, y: float, z: float) -> np.ndarray:
-    found = ik.reachable(tool_down(x, y, z), puma.home)
+    found = ik.find_solutions(tool_down(x, y, z), puma.home)
     assert found
     return found[0]
 
@@ -48,13 +48,13 @@ def at(ik: InverseKinematics, puma: Cell, x: float, y: float, z: float) -> np.nd
 def test_arm_in_the_wall_is_not_free_and_the_wall_is_named(
     puma: Cell, ik: InverseKinematics, checker: CollisionChecker
 ) -> None:
-    assert checker.free(puma.home)
-    assert checker.why(puma.home) == ""
-    assert checker.room(puma.home) == checker.clearance
+    assert checker.is_free(puma.home)
+    assert checker.describe_collision(puma.home) == ""
+    assert checker.find_clearance(puma.home) == checker.clearance
     q = at(ik, puma, 0.5, 0.0, 0.7)
-    assert not checker.free(q)
-    assert "'wall'" in checker.why(q)
-    assert checker.room(q) < 0
+    assert not checker.is_free(q)
+    assert "'wall'" in checker.describe_collision(q)
+    assert checker.find_clearance(q) < 0
 
 
 def test_clearance_decides_near_the_table_and_may_be_lowered(
@@ -62,26 +62,26 @@ def test_clearance_decides_near_the_table_and_may_be_lowered(
 ) -> None:
     # The fingers end 20 mm below the tool and the table is 0.45 m high: 10 mm are left.
     q = at(ik, puma, 0.45, -0.4, 0.48)
-    assert not checker.free(q)
-    assert checker.free(q, clearance=0.009)
-    assert not checker.free(q, clearance=0.011)
-    assert checker.room(q) == pytest.approx(0.010, abs=1e-4)
+    assert not checker.is_free(q)
+    assert checker.is_free(q, clearance=0.009)
+    assert not checker.is_free(q, clearance=0.011)
+    assert checker.find_clearance(q) == pytest.approx(0.010, abs=1e-4)
 
 
 def test_the_gripper_may_only_touch_the_intended_block(
     puma: Cell, ik: InverseKinematics, checker: CollisionChecker
 ) -> None:
     q = at(ik, puma, 0.5, 0.3, 0.475)
-    assert not checker.free(q)
-    checker.permit(BLOCK1)
-    assert checker.free(q)
-    checker.permit(BLOCK2)
-    assert not checker.free(q)
-    checker.permit(BLOCK1, touch=False)
-    assert not checker.free(q)
+    assert not checker.is_free(q)
+    checker.permit_contact(BLOCK1)
+    assert checker.is_free(q)
+    checker.permit_contact(BLOCK2)
+    assert not checker.is_free(q)
+    checker.permit_contact(BLOCK1, touch=False)
+    assert not checker.is_free(q)
     # Open fingers must not go through it.
-    checker.permit(BLOCK1)
-    assert "'block1'" in checker.why(at(ik, puma, 0.5, 0.3 + 0.02, 0.475))
+    checker.permit_contact(BLOCK1)
+    assert "'block1'" in checker.describe_collision(at(ik, puma, 0.5, 0.3 + 0.02, 0.475))
 
 
 def test_held_block_is_carried_and_keeps_clear_of_the_wall(
@@ -90,23 +90,23 @@ def test_held_block_is_carried_and_keeps_clear_of_the_wall(
     # The tool is as far from the wall as the palm needs, a block held 80 mm below it would stand in
     # the wall's top.
     q = at(ik, puma, 0.5, 0.0, 0.80)
-    assert checker.free(q)
-    checker.hold(BLOCK1, (0.0, 0.0, 0.05))
-    assert not checker.free(q)
-    assert "'block1'" in checker.why(q)
-    checker.hold(None)
-    assert checker.free(q)
+    assert checker.is_free(q)
+    checker.hold_object(BLOCK1, (0.0, 0.0, 0.05))
+    assert not checker.is_free(q)
+    assert "'block1'" in checker.describe_collision(q)
+    checker.hold_object(None)
+    assert checker.is_free(q)
 
 
 def test_a_held_block_may_touch_the_table_only_if_intended_and_not_sink_into_it(
     puma: Cell, ik: InverseKinematics, checker: CollisionChecker
 ) -> None:
-    checker.hold(BLOCK1)
+    checker.hold_object(BLOCK1)
     on_table = at(ik, puma, 0.5, -0.2, 0.475)
-    assert not checker.free(on_table)
-    checker.permit(BLOCK1)
-    assert checker.free(on_table)
-    assert not checker.free(at(ik, puma, 0.5, -0.2, 0.475 - MAX_HELD_DEPTH_M - 0.002))
+    assert not checker.is_free(on_table)
+    checker.permit_contact(BLOCK1)
+    assert checker.is_free(on_table)
+    assert not checker.is_free(at(ik, puma, 0.5, -0.2, 0.475 - MAX_HELD_DEPTH_M - 0.002))
 
 
 def test_objects_are_where_they_are_placed(
@@ -115,29 +115,29 @@ def test_objects_are_where_they_are_placed(
     q = at(ik, puma, 0.7, 0.2, 0.55)
     positions, quaternions = np.zeros((3, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
     positions[:] = [[0.5, 0.3, 0.475], [0.6, 0.3, 0.475], [0.5, -0.3, 0.5]]
-    checker.place(positions, quaternions)
-    assert checker.free(q)
+    checker.place_bodies(positions, quaternions)
+    assert checker.is_free(q)
     positions[PEG] = [0.7, 0.246, 0.5]
-    checker.place(positions, quaternions)
-    assert "'peg'" in checker.why(q)
+    checker.place_bodies(positions, quaternions)
+    assert "'peg'" in checker.describe_collision(q)
 
 
 @pytest.mark.parametrize("held", [None, BLOCK1])
 def test_compiled_checks_agree_with_python_and_are_preloaded(puma: Cell, held: int | None) -> None:
     preload(collision)
-    loaded = list(first_blocked.load().signatures)  # type: ignore[attr-defined]
+    loaded = list(find_first_blocked.load_machine_code().signatures)  # type: ignore[attr-defined]
     checker, under_python = (CollisionChecker(puma, config("puma560")[1]) for _ in range(2))
-    under_python._first_blocked = partial(first_blocked, *under_python._first_blocked.args)
+    under_python._first_blocked = partial(find_first_blocked, *under_python._first_blocked.args)
     rng, decided = np.random.default_rng(4), set()
     for one in (checker, under_python):
-        one.hold(held, (0.0, 0.0, 0.02), (0.0, 1.0, 0.0, 0.0))
+        one.hold_object(held, (0.0, 0.0, 0.02), (0.0, 1.0, 0.0, 0.0))
     for q in puma.home + rng.normal(0.0, 0.6, (100, len(puma.home))):
-        free = checker.free(q)
-        assert under_python.free(q) == free == (checker.why(q) == "")
+        free = checker.is_free(q)
+        assert under_python.is_free(q) == free == (checker.describe_collision(q) == "")
         assert np.array_equal(checker._data.qpos, under_python._data.qpos)
         decided.add(free)
     assert decided == {True, False}
-    assert list(first_blocked.load().signatures) == loaded  # type: ignore[attr-defined]
+    assert list(find_first_blocked.load_machine_code().signatures) == loaded  # type: ignore[attr-defined]
 
 
 def test_a_close_pair_counts_even_if_its_bodies_have_several_geoms(puma: Cell) -> None:
@@ -146,20 +146,20 @@ def test_a_close_pair_counts_even_if_its_bodies_have_several_geoms(puma: Cell) -
     thorough._model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
     rng, (low, high) = np.random.default_rng(1), puma.limits.position.T
     for q in rng.uniform(low, high, (20_000, len(low))):
-        assert usual.free(q) == thorough.free(q), thorough.why(q)
+        assert usual.is_free(q) == thorough.is_free(q), thorough.describe_collision(q)
 
 
 @pytest.mark.parametrize("held", [None, BLOCK1])
 def test_pairs_that_mujoco_skips_do_not_change_the_result(puma: Cell, held: int | None) -> None:
     checker, with_all = (CollisionChecker(puma, config("puma560")[1], 1e-3) for _ in range(2))
     for one in (checker, with_all):
-        one.hold(held, (0.0, 0.0, 0.02), (0.0, 1.0, 0.0, 0.0))
+        one.hold_object(held, (0.0, 0.0, 0.02), (0.0, 1.0, 0.0, 0.0))
     with_all._model.geom_contype[:] = with_all._model.geom_contype != 0
     with_all._model.geom_conaffinity[:] = 1
     rng, fewer = np.random.default_rng(5), 0
     for q in puma.home + rng.normal(0.0, 0.6, (300, len(puma.home))):
-        assert checker.free(q) == with_all.free(q)
-        assert checker.nearest() == with_all.nearest()
+        assert checker.is_free(q) == with_all.is_free(q)
+        assert checker.describe_worst_pair() == with_all.describe_worst_pair()
         fewer += checker._data.ncon < with_all._data.ncon
-        assert checker.room(q) == with_all.room(q)
+        assert checker.find_clearance(q) == with_all.find_clearance(q)
     assert fewer == (0 if held is None else 300)

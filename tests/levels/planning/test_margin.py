@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from rack.levels.planning.collision import CollisionChecker
-from rack.levels.planning.motion_planner import MAX_STRAY_M, MotionPlanner
+from rack.levels.planning.motion_planner import MAX_DEVIATION_M, MotionPlanner
 from rack.levels.planning.moves import Situation
 from rack.levels.planning.payload import GAP_M, FixedJaw, Payloads, find_fixed_jaw
-from rack.levels.planning.pose import Pose, pointing
+from rack.levels.planning.pose import Pose, build_pointing_quaternion
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import SceneConfig
 from rack.levels.task.actions import Handling
@@ -39,12 +39,12 @@ def hinged(folder: Path, apart: float) -> tuple[Cell, SceneConfig]:
 def test_links_keep_the_margin_only_in_planning(tmp_path: Path) -> None:
     made, scene = hinged(tmp_path, 0.004)
     lifted = np.array([-0.0032 / 0.2, 0.5])  # 0.8 mm are left
-    assert CollisionChecker(made, scene).free(lifted)
-    planned = CollisionChecker(made, scene, MAX_STRAY_M)
-    assert planned.free(made.home)
-    assert not planned.free(lifted)
-    assert 0.0 < planned.room(lifted) < MAX_STRAY_M
-    assert planned.free(lifted, planned.room(lifted))
+    assert CollisionChecker(made, scene).is_free(lifted)
+    planned = CollisionChecker(made, scene, MAX_DEVIATION_M)
+    assert planned.is_free(made.home)
+    assert not planned.is_free(lifted)
+    assert 0.0 < planned.find_clearance(lifted) < MAX_DEVIATION_M
+    assert planned.is_free(lifted, planned.find_clearance(lifted))
 
 
 def lowest_grasp(folder: Path, length: float) -> float:
@@ -55,10 +55,10 @@ def lowest_grasp(folder: Path, length: float) -> float:
     pad = f'size=".012 .006 {length / 2}" pos="0 0 {0.01 + length / 2}"'
     model.write_text(model.read_text().replace('size=".012 .006 .04" pos="0 0 .05"', pad))
     made = build_cell(robot, scene, CLOCK_NS)
-    poses = made.start().qpos[made.object_qpos[:, None] + np.arange(7)]
+    poses = made.build_start_data().qpos[made.object_qpos[:, None] + np.arange(7)]
     situation = Situation(poses[:, :3].copy(), poses[:, 3:].copy())
     rehearsal = Rehearsal(MotionPlanner(made, scene, 1), made.home, situation)
-    takes = next(Handling(rehearsal, 0, 0.1).takes())
+    takes = next(Handling(rehearsal, 0, 0.1).find_takes())
     return float(takes[0].tool.position[2] - situation.positions[0, 2])
 
 
@@ -90,8 +90,8 @@ def test_the_jaw_is_placed_next_to_an_object_of_any_width(tmp_path: Path, half: 
     jaw = jaw_of(made)
     assert jaw is not None
     seen = Pose(np.array([0.5, 0.2, 0.475]), np.array([1.0, 0.0, 0.0, 0.0]))
-    tool = Pose(seen.position, pointing(DOWN))
-    moved = tool.inverse() @ jaw.beside(tool, 0, seen)
+    tool = Pose(seen.position, build_pointing_quaternion(DOWN))
+    moved = tool.inverse() @ jaw.move_beside(tool, 0, seen)
     assert moved.position == pytest.approx([0.0, JAW_M - half - GAP_M, 0.0], abs=2e-4)
 
 
@@ -99,9 +99,9 @@ def test_an_object_that_the_jaw_cannot_meet_does_not_move_the_tool(tmp_path: Pat
     made = one_finger(tmp_path)
     jaw = jaw_of(made)
     assert jaw is not None
-    tool = Pose(np.array([0.5, 0.2, 0.475]), pointing(DOWN))
-    below = tool.raised(-0.2)
-    assert jaw.beside(tool, 0, below) is tool
+    tool = Pose(np.array([0.5, 0.2, 0.475]), build_pointing_quaternion(DOWN))
+    below = tool.raise_by(-0.2)
+    assert jaw.move_beside(tool, 0, below) is tool
 
 
 def test_fingers_that_both_move_have_no_fixed_jaw(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from rack.levels.planning import path_planner
 from rack.levels.planning.collision import CollisionChecker
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.path_planner import PathPlanner
-from rack.levels.planning.pose import pointing, pose
+from rack.levels.planning.pose import build_pointing_quaternion, make_pose
 from rack.levels.robot.cell import Cell
 from tests.levels.arms import cell, config
 
@@ -40,15 +40,21 @@ def planner(puma: Cell) -> PathPlanner:
 def sides(puma: Cell, checker: CollisionChecker) -> tuple[np.ndarray, np.ndarray]:
     """Configurations low on either side of the wall."""
     ik = InverseKinematics(puma, SEED)
-    left = ik.solutions(pose((0.5, 0.3, 0.6), pointing((0, 0, -1))), puma.home, checker.free)[0]
-    return left, ik.solutions(pose((0.5, -0.2, 0.6), pointing((0, 0, -1))), left, checker.free)[0]
+    left = ik.find_free_solutions(
+        make_pose((0.5, 0.3, 0.6), build_pointing_quaternion((0, 0, -1))),
+        puma.home,
+        checker.is_free,
+    )[0]
+    return left, ik.find_free_solutions(
+        make_pose((0.5, -0.2, 0.6), build_pointing_quaternion((0, 0, -1))), left, checker.is_free
+    )[0]
 
 
 @pytest.fixture(scope="module")
 def around(
     planner: PathPlanner, checker: CollisionChecker, sides: tuple[np.ndarray, np.ndarray]
 ) -> Path:
-    path = planner.plan(*sides, checker.first_blocked)
+    path = planner.plan(*sides, checker.find_first_blocked)
     assert path is not None
     return path
 
@@ -65,7 +71,10 @@ def test_path_around_the_wall_is_free_between_its_checks_too(
     assert 3 <= len(around.waypoints) <= WAYPOINTS
     # Between two checks no point moves farther than half the clearance: half of that may be lost.
     least = 0.74 * SCENE.clearance
-    assert all(checker.free(q, least) for q in BlendedPath(*around).sample(0.13 * planner.step_rad))
+    assert all(
+        checker.is_free(q, least)
+        for q in BlendedPath(*around).sample_points(0.13 * planner.step_rad)
+    )
 
 
 @pytest.mark.slow
@@ -73,17 +82,17 @@ def test_equal_requests_get_equal_paths_whatever_was_planned_before(
     puma: Cell, checker: CollisionChecker, around: Path, sides: tuple[np.ndarray, np.ndarray]
 ) -> None:
     fresh = PathPlanner(puma, SCENE.clearance, SEED)
-    fresh.plan(sides[1], sides[0], checker.first_blocked)
-    again = fresh.plan(*sides, checker.first_blocked)
+    fresh.plan(sides[1], sides[0], checker.find_first_blocked)
+    again = fresh.plan(*sides, checker.find_first_blocked)
     assert again is not None
     assert np.array_equal(again.waypoints, around.waypoints)
     assert np.array_equal(again.blend, around.blend)
-    other = fresh.plan(*sides, checker.first_blocked, attempt=1)
+    other = fresh.plan(*sides, checker.find_first_blocked, attempt=1)
     assert other is not None
     assert not np.array_equal(other.waypoints[1], around.waypoints[1])
-    hasty = fresh.plan(*sides, checker.first_blocked, searches=1)
+    hasty = fresh.plan(*sides, checker.find_first_blocked, searches=1)
     assert hasty is not None
-    assert fresh.duration(hasty) >= fresh.duration(around)
+    assert fresh.compute_duration(hasty) >= fresh.compute_duration(around)
 
 
 def test_no_path_where_goal_or_start_is_blocked(
@@ -92,11 +101,11 @@ def test_no_path_where_goal_or_start_is_blocked(
     puma: Cell,
     sides: tuple[np.ndarray, np.ndarray],
 ) -> None:
-    in_the_wall = InverseKinematics(puma, SEED).reachable(
-        pose((0.5, 0.0, 0.65), pointing((0, 0, -1))), puma.home
+    in_the_wall = InverseKinematics(puma, SEED).find_solutions(
+        make_pose((0.5, 0.0, 0.65), build_pointing_quaternion((0, 0, -1))), puma.home
     )[0]
-    assert planner.plan(puma.home, in_the_wall, checker.first_blocked) is None
-    assert planner.plan(in_the_wall, puma.home, checker.first_blocked) is None
+    assert planner.plan(puma.home, in_the_wall, checker.find_first_blocked) is None
+    assert planner.plan(in_the_wall, puma.home, checker.find_first_blocked) is None
 
 
 def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(
@@ -108,10 +117,10 @@ def test_blend_shrinks_to_a_stop_where_the_inside_of_the_corner_is_blocked(
         off = configurations[:, :2].min(axis=1) >= 1e-3
         return int(np.argmax(off)) if off.any() else len(off)
 
-    path = planner.rounded(corner, on_the_polyline)
+    path = planner.round_corners(corner, on_the_polyline)
     assert path.blend[1] == 0.0
-    assert planner.blocked_at(path, on_the_polyline) is None
-    assert planner.rounded(corner, len).blend[1] > 0.5
+    assert planner.find_blocked_configuration(path, on_the_polyline) is None
+    assert planner.round_corners(corner, len).blend[1] > 0.5
 
 
 def test_a_search_frees_its_memory(
@@ -128,6 +137,6 @@ def test_a_search_frees_its_memory(
             alive.remove(self._free)
 
     monkeypatch.setattr(path_planner, "MotionCheck", Counted)
-    assert planner._search(np.array(sides), len, 1, 100)[1] > 1
+    assert planner._search_once(np.array(sides), len, 1, 100)[1] > 1
     gc.collect()
     assert alive == []

@@ -12,9 +12,9 @@ from rack.levels.messages import Error, Verb
 from rack.levels.planning.motion_planner import MotionPlanner
 from rack.levels.planning.moves import Move, Situation
 from rack.levels.planning.payload import Payloads
-from rack.levels.planning.pose import Pose, pose
+from rack.levels.planning.pose import Pose, make_pose
 from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.task.grasps import grasps
+from rack.levels.task.grasps import find_grasps
 from tests.levels.arms import CLOCK_NS, cell, config, four_bar
 
 ROBOT, SCENE = config("puma560")
@@ -29,21 +29,21 @@ def weighing(kilograms: float) -> Cell:
 
 
 def situation_of(made: Cell) -> Situation:
-    data = made.start()
+    data = made.build_start_data()
     return Situation(data.xpos[made.bodies].copy(), data.xquat[made.bodies].copy())
 
 
 def grip_of(made: Cell, row: int) -> Pose:
     """Return the grip of the first grasp of an object."""
     at = situation_of(made)
-    return next(iter(grasps(made, at, row)))[0].inverse() @ at.object_pose(row)
+    return next(iter(find_grasps(made, at, row)))[0].inverse() @ at.object_pose(row)
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi / 2])
 def test_grip_is_weighed_against_friction_with_both_forces(turn: float) -> None:
     # 40 N at one finger are 20 N at each pad, whose friction is 1.2: 48 N.
     made = weighing(6.0)
-    turned = grip_of(made, BLOCK1) @ pose(
+    turned = grip_of(made, BLOCK1) @ make_pose(
         np.zeros(3), (np.cos(turn / 2), 0.0, 0.0, np.sin(turn / 2))
     )
     with pytest.raises(
@@ -54,7 +54,7 @@ def test_grip_is_weighed_against_friction_with_both_forces(turn: float) -> None:
     light = weighing(3.2)
     Payloads(light, SCENE.objects).check_grip(BLOCK1, turned)
     # What the fingers do not meet is not judged.
-    aside = grip_of(made, BLOCK1) @ pose((0.3, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+    aside = grip_of(made, BLOCK1) @ make_pose((0.3, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
     Payloads(made, SCENE.objects).check_grip(BLOCK1, aside)
 
 
@@ -84,7 +84,7 @@ def test_every_move_with_a_held_object_is_checked_for_its_weight() -> None:
         0,
         Verb.MOVE_JOINTS,
         None,
-        pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0)),
+        make_pose(np.zeros(3), (1.0, 0.0, 0.0, 0.0)),
         made.home + 0.3,
         False,
         0.0,
@@ -94,5 +94,5 @@ def test_every_move_with_a_held_object_is_checked_for_its_weight() -> None:
     with pytest.raises(
         Refused, match=r"payload 'block1' 40 kg needs \d+\.\d N m of 'j\d'; its motor carries"
     ) as got:
-        motion.plan(move, made.home, empty.holding(BLOCK1, grip_of(made, BLOCK1)))
+        motion.plan(move, made.home, empty.with_object_held(BLOCK1, grip_of(made, BLOCK1)))
     assert got.value.code == Error.OVERLOAD

@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.levels.planning.pose import Pose, pointing, pose
+from rack.levels.planning.pose import Pose, build_pointing_quaternion, make_pose
 
 
 def random_pose(rng: np.random.Generator) -> Pose:
-    return pose(rng.normal(size=3), rng.normal(size=4))
+    return make_pose(rng.normal(size=3), rng.normal(size=4))
 
 
 def rotated(vector: list[float], quaternion: np.ndarray) -> np.ndarray:
@@ -29,22 +29,25 @@ def test_a_pose_times_its_inverse_is_the_identity() -> None:
 def test_interpolation_between_poses_is_straight_with_a_constant_turn_rate() -> None:
     rng = np.random.default_rng(2)
     a, b = random_pose(rng), random_pose(rng)
-    whole = a.angle_to(b)
+    whole = a.compute_angle(b)
     for part in (0.0, 0.25, 0.5, 1.0):
-        between = a.towards(b, part)
+        between = a.interpolate_to(b, part)
         assert between.position == pytest.approx((1 - part) * a.position + part * b.position)
-        assert a.angle_to(between) == pytest.approx(part * whole, abs=1e-9)
-        assert between.angle_to(b) == pytest.approx((1 - part) * whole, abs=1e-9)
+        assert a.compute_angle(between) == pytest.approx(part * whole, abs=1e-9)
+        assert between.compute_angle(b) == pytest.approx((1 - part) * whole, abs=1e-9)
 
 
 @pytest.mark.parametrize("direction", [(0, 0, 1), (0, 0, -1), (1, 0, 0), (0.3, -2.0, 0.4)])
 @pytest.mark.parametrize("yaw", [0.0, 1.0, -2.5])
 def test_pointing_turns_the_z_axis_to_the_direction(direction: tuple, yaw: float) -> None:
-    assert rotated([0, 0, 1], pointing(direction, yaw)) == pytest.approx(
+    assert rotated([0, 0, 1], build_pointing_quaternion(direction, yaw)) == pytest.approx(
         direction / np.linalg.norm(direction)
     )
 
 
 def test_yaw_about_a_direction_turns_the_tool_about_its_own_z_axis() -> None:
-    still, turned = pose((0, 0, 0), pointing((0, 1, 1))), pose((0, 0, 0), pointing((0, 1, 1), 0.7))
-    assert still.angle_to(turned) == pytest.approx(0.7)
+    still, turned = (
+        make_pose((0, 0, 0), build_pointing_quaternion((0, 1, 1))),
+        make_pose((0, 0, 0), build_pointing_quaternion((0, 1, 1), 0.7)),
+    )
+    assert still.compute_angle(turned) == pytest.approx(0.7)

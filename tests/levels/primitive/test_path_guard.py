@@ -13,7 +13,7 @@ from rack.levels.messages import SegmentKind, WorldState
 from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.trajectory import make_trajectory
 from rack.levels.primitive.motion_segment import MotionSegment
-from rack.levels.primitive.path_guard import Guard
+from rack.levels.primitive.path_guard import PathGuard
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import MotionConfig
 from tests.levels import arms
@@ -81,15 +81,15 @@ def test_a_blocked_arm_continues_when_the_obstacle_has_left() -> None:
     assert rack.servo.touches == 0
 
 
-class Watched:
+class MailboxWatcher:
     """A guard of a path in the crossing cell, with its world model."""
 
     def __init__(self, waypoints: np.ndarray, held: int = -1) -> None:
         _, scene = arms.config(CROSSING)
         self.cell: Cell = arms.cell(CROSSING)
-        self.guard = Guard(self.cell, scene, lookahead_s=2.0, delay_s=0.0)
+        self.guard = PathGuard(self.cell, scene, lookahead_s=2.0, delay_s=0.0)
         self.world = WorldState.zeros({"bodies": len(self.cell.bodies)})
-        start = self.cell.start()
+        start = self.cell.build_start_data()
         for row, body in enumerate(self.cell.bodies):
             self.world.position[row] = start.xpos[body]
             self.world.quaternion[row] = start.xquat[body]
@@ -100,7 +100,7 @@ class Watched:
         self.segment.object = held
 
     def watch(self) -> None:
-        self.guard.watch(self.segment, self.path, 0.04, self.world)
+        self.guard.watch_path(self.segment, self.path, 0.04, self.world)
 
     def clear(self, time_s: float = 0.0, cycles: int = 60) -> bool:
         """Return True if the path stays clear for `cycles` in which nothing moves."""
@@ -118,7 +118,7 @@ class Watched:
 
 
 def test_resting_obstacle_anywhere_on_the_path_is_found() -> None:
-    watched = Watched(np.array([NEAR, NEAR + SWEEP]))
+    watched = MailboxWatcher(np.array([NEAR, NEAR + SWEEP]))
     watched.watch()
     assert watched.clear()
     for part in (0.3, 0.6, 0.95):
@@ -127,10 +127,10 @@ def test_resting_obstacle_anywhere_on_the_path_is_found() -> None:
 
 
 def test_an_obstacle_that_moves_into_the_path_is_found_before_it_arrives() -> None:
-    watched = Watched(np.array([NEAR, NEAR + SWEEP]))
+    watched = MailboxWatcher(np.array([NEAR, NEAR + SWEEP]))
     watched.watch()
     arrival_s = 0.6 * watched.trajectory.duration
-    meets = watched.tool_at(watched.path.evaluate(watched.trajectory.at(arrival_s).s).q)
+    meets = watched.tool_at(watched.path.evaluate(watched.trajectory.evaluate_at(arrival_s).s).q)
     velocity = np.array([-0.25, 0.0, 0.0])
     watched.world.position[-1] = meets - velocity * arrival_s
     assert watched.clear()
@@ -139,12 +139,12 @@ def test_an_obstacle_that_moves_into_the_path_is_found_before_it_arrives() -> No
 
 
 def test_work_of_the_guard_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    watched = Watched(np.array([NEAR, NEAR + SWEEP, NEAR, NEAR + SWEEP, NEAR]))
+    watched = MailboxWatcher(np.array([NEAR, NEAR + SWEEP, NEAR, NEAR + SWEEP, NEAR]))
     watched.watch()
     checks = []
-    free = watched.guard._checker.free
+    free = watched.guard._checker.is_free
     monkeypatch.setattr(
-        watched.guard._checker, "free", lambda *args: checks.append(1) or free(*args)
+        watched.guard._checker, "is_free", lambda *args: checks.append(1) or free(*args)
     )
     counts = [0]
     for _ in range(40):

@@ -125,7 +125,7 @@ def test_a_motion_that_resumes_at_the_end_of_its_path_is_finished() -> None:
         line = BlendedPath([[0.0], [length]], [0.0, 0.0])
         motion = PathMotion(line, Limits(*np.ones((4, 1))), bridging_s=0.5)
         motion.rest_near(np.array([length]), progress=1.0)
-        assert motion.finished
+        assert motion.is_finished
 
 
 def test_a_silent_servo_is_an_error_until_a_status_arrives() -> None:

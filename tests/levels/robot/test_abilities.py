@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rack.boards.config import load
-from rack.boards.config.cell import built_cell
-from rack.levels.robot.abilities import Abilities, Statics, abilities
+from rack.boards.config.cell import build_rack_cell
+from rack.levels.robot.abilities import Abilities, Statics, compute_abilities
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 
@@ -16,12 +16,12 @@ from rack.levels.robot.dynamics import Dynamics, Payload
 def cell() -> Cell:
     config = load("nasrem")
     assert config.robot is not None
-    return built_cell(config)
+    return build_rack_cell(config)
 
 
 @pytest.fixture(scope="module")
 def find_abilities(cell: Cell) -> Abilities:
-    return abilities(cell)
+    return compute_abilities(cell)
 
 
 def find_worst_load(cell: Cell, payload: float = 0.0) -> tuple[float, int]:
@@ -29,10 +29,10 @@ def find_worst_load(cell: Cell, payload: float = 0.0) -> tuple[float, int]:
     model, and the joint."""
     statics = Statics(cell)
     dynamics = Dynamics(cell)
-    poses = statics.poses()
+    poses = statics.draw_poses()
     still = np.zeros(len(cell.dof))
     held = Payload(payload, np.zeros(3))
-    poses.append(statics.stretched(max(poses, key=statics.distance)))
+    poses.append(statics.stretch_out(max(poses, key=statics.compute_reach)))
     parts = [
         np.abs(dynamics.terms(position, still, held).bias) / cell.bounds.torque
         for position in poses
@@ -43,7 +43,7 @@ def find_worst_load(cell: Cell, payload: float = 0.0) -> tuple[float, int]:
 
 def test_the_payload_uses_up_the_torque_of_one_joint(cell: Cell, find_abilities: Abilities) -> None:
     part, joint = find_worst_load(cell)
-    assert find_abilities.left == pytest.approx(1.0 - part, abs=1e-9)
+    assert find_abilities.torque_left == pytest.approx(1.0 - part, abs=1e-9)
     assert find_abilities.joint == joint
     assert find_worst_load(cell, find_abilities.payload)[0] == pytest.approx(1.0, abs=1e-6)
     assert find_worst_load(cell, 0.99 * find_abilities.payload)[0] < 1.0
@@ -57,10 +57,10 @@ def test_no_single_joint_extends_the_reach_of_a_stretched_arm(
     wrist = 0.4318 + np.hypot(0.4331, 0.0203)
     assert np.hypot(wrist, 0.15) < find_abilities.reach < np.hypot(wrist + 0.25, 0.15)
     statics = Statics(cell)
-    poses = statics.poses()
-    far = statics.stretched(max(poses, key=statics.distance))
-    assert statics.distance(far) == pytest.approx(find_abilities.reach)
-    assert find_abilities.reach >= max(map(statics.distance, poses))
+    poses = statics.draw_poses()
+    far = statics.stretch_out(max(poses, key=statics.compute_reach))
+    assert statics.compute_reach(far) == pytest.approx(find_abilities.reach)
+    assert find_abilities.reach >= max(map(statics.compute_reach, poses))
     low, high = cell.limits.position.T
     assert ((low - 1e-12 <= far) & (far <= high + 1e-12)).all()
     assert all(((low <= position) & (position <= high)).all() for position in poses)

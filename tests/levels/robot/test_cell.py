@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rack.levels.errors import RobotError
-from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.robot.cell import Cell, build_cell, compute_sizes
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
 from tests.levels.arms import BLOCK, CLOCK_NS, MOTORS, cell, config, pendulum
 
@@ -24,17 +24,17 @@ def build(robot: RobotConfig, scene: SceneConfig = EMPTY) -> Cell:
 def test_every_arm_of_the_project_builds_and_starts_at_home_without_a_touch(name: str) -> None:
     robot, scene = config(name)
     made = build(robot, scene)
-    data = made.start()
+    data = made.build_start_data()
     assert data.qpos[made.qpos] == pytest.approx(robot.home)
-    assert sizes(made)["joints"] == len(robot.joints)
-    assert sizes(made)["bodies"] == max(1, len(scene.bodies))
+    assert compute_sizes(made)["joints"] == len(robot.joints)
+    assert compute_sizes(made)["bodies"] == max(1, len(scene.bodies))
     assert made.model.opt.timestep == pytest.approx(CLOCK_NS * 1e-9 / robot.substeps)
 
 
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
 def test_the_tool_points_down_at_home_away_from_singularities(name: str) -> None:
     made = cell(name)
-    data = made.start()
+    data = made.build_start_data()
     jacobian = np.zeros((6, made.model.nv))
     mujoco.mj_jacSite(made.model, data, jacobian[:3], jacobian[3:], made.tool)
     assert data.site_xmat[made.tool].reshape(3, 3)[:, 2] == pytest.approx([0, 0, -1], abs=1e-3)
@@ -48,7 +48,7 @@ def test_a_free_body_listed_before_the_arm_shifts_no_index(tmp_path: Path) -> No
     assert made.qpos.tolist() == [7, 8]
     assert made.dof.tolist() == [6, 7]
     assert made.object_qpos.tolist() == [0]
-    assert made.start().qpos[made.qpos] == pytest.approx([0.0, 0.5])
+    assert made.build_start_data().qpos[made.qpos] == pytest.approx([0.0, 0.5])
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_any_drive_of_a_joint_becomes_a_torque_motor_with_its_limit(
     assert made.model.nu == 2
     assert made.model.na == 0
     assert made.bounds.torque == pytest.approx([limit, 20.0])
-    data = made.start()
+    data = made.build_start_data()
     data.ctrl[made.actuators] = [1.5, -2.5]
     mujoco.mj_forward(made.model, data)
     assert data.qfrc_actuator[made.dof] == pytest.approx([1.5, -2.5])
@@ -102,7 +102,7 @@ def test_the_config_may_give_torques_ranges_armature_and_a_body_as_tool(tmp_path
     assert made.bounds.position.tolist() == [[-1.0, 2.0], [-2.0, 1.0]]
     assert made.model.dof_armature[made.dof] == pytest.approx([0.07, 0.07])
     assert cell("puma560").model.dof_armature[0] == pytest.approx(0.784029968642)
-    data = made.start()
+    data = made.build_start_data()
     assert data.site_xpos[made.tool] == pytest.approx(data.body("lower").xpos)
 
 

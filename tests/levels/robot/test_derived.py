@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rack.boards.config import load
-from rack.boards.config.cell import built_cell
+from rack.boards.config.cell import build_rack_cell
 from rack.boards.errors import ConfigError
 from tests.tools.command_line import ROOT
 
@@ -57,11 +57,11 @@ def test_a_model_without_actuators_must_have_its_joints_named(tmp_path: Path) ->
 
 def test_a_tool_may_be_a_body_and_an_offset(tmp_path: Path) -> None:
     offset = 'tool = "flange"\n[robot.tool_offset]\nposition = [0.0, 0.0, 0.13]'
-    own = built_cell(config(tmp_path, offset))
-    site = built_cell(config(tmp_path))
-    ends = [built.start().site_xpos[built.tool] for built in (own, site)]
+    own = build_rack_cell(config(tmp_path, offset))
+    site = build_rack_cell(config(tmp_path))
+    ends = [built.build_start_data().site_xpos[built.tool] for built in (own, site)]
     assert np.linalg.norm(ends[0] - ends[1]) == pytest.approx(0.1)
     with pytest.raises(Exception, match=r"no site 'tcp' in the model; it has: tip; bodies: world"):
-        built_cell(config(tmp_path, 'tool = "tcp"'))
+        build_rack_cell(config(tmp_path, 'tool = "tcp"'))
     with pytest.raises(ConfigError, match=r"'velocities' is not a key of \[robot\]"):
         config(tmp_path, 'guessed = ["home", "velocities"]')

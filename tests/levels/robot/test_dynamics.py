@@ -13,7 +13,7 @@ import pytest
 
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.robot.dynamics import OFF, Dynamics, Payload
+from rack.levels.robot.dynamics import DISABLED_PARTS, Dynamics, Payload
 from rack.levels.tables import SceneConfig
 from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config
 
@@ -47,7 +47,7 @@ def puma(tmp_path_factory: pytest.TempPathFactory) -> Cell:
 
 @pytest.mark.parametrize("pose", PUMA)
 def test_puma_kinematics_match_the_robotics_toolbox(puma: Cell, pose: str) -> None:
-    tool = InverseKinematics(puma, 0).tool_at(np.array(PUMA[pose]["q"]))
+    tool = InverseKinematics(puma, 0).compute_tool_pose(np.array(PUMA[pose]["q"]))
     wanted, rotation = np.array(PUMA[pose]["T"]), np.zeros(9)
     mujoco.mju_quat2Mat(rotation, tool.quaternion)
     assert tool.position == pytest.approx(wanted[:3, 3], abs=1e-12)
@@ -82,7 +82,7 @@ def test_torques_from_the_equation_of_motion_give_the_requested_acceleration(nam
     joints = len(made.qpos)
     qd, wanted = rng.uniform(-1, 1, joints), rng.uniform(-2, 2, joints)
     inertia, bias = dynamics.terms(made.home, qd)
-    data = made.start()
+    data = made.build_start_data()
     data.qvel[made.dof] = qd
     data.ctrl[made.actuators] = (
         inertia @ wanted + bias + made.model.dof_frictionloss[made.dof] * np.sign(qd)
@@ -113,8 +113,12 @@ def test_terms_do_not_depend_on_earlier_evaluations(puma: Cell) -> None:
 @pytest.mark.parametrize("name", ["puma560", "k1607"])
 def test_terms_equal_a_full_forward_pass_bit_for_bit(name: str) -> None:
     made, rng = cell(name), np.random.default_rng(9)
-    dynamics, data, full = Dynamics(made), made.start(), np.zeros((made.model.nv, made.model.nv))
-    made.model.opt.disableflags |= int(OFF)
+    dynamics, data, full = (
+        Dynamics(made),
+        made.build_start_data(),
+        np.zeros((made.model.nv, made.model.nv)),
+    )
+    made.model.opt.disableflags |= int(DISABLED_PARTS)
     for _ in range(5):
         data.qpos[made.qpos], data.qvel[made.dof] = rng.uniform(-1, 1, (2, len(made.qpos)))
         inertia, bias = dynamics.terms(data.qpos[made.qpos], data.qvel[made.dof])

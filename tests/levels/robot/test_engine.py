@@ -6,15 +6,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.levels.robot.engine import contact_views, mj_step
+from rack.levels.robot.engine import build_contact_views, mj_step
 from tests.levels.arms import cell
 
 
 @pytest.mark.parametrize("name", ["puma560", "puma560_crossing"])
 def test_views_of_contacts_show_those_of_every_step(name: str) -> None:
     made = cell(name)
-    data, other, seen = made.start(), made.start(), set()
-    views = contact_views(made.model, data)
+    data, other, seen = made.build_start_data(), made.build_start_data(), set()
+    views = build_contact_views(made.model, data)
     for _ in range(600):
         mj_step(made.model._address, data._address)
         mujoco.mj_step(made.model, other)

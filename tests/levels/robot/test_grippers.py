@@ -36,13 +36,13 @@ def close_gripper(
     table = arm[0].gripper
     assert made.gripper is not None
     assert table is not None
-    data = made.start()
+    data = made.build_start_data()
     grip = Grip(table)
     grip._opening = table.closed
     for _ in range(round(seconds / (CLOCK_NS * 1e-9))):
         data.qpos[made.qpos], data.qvel[made.dof] = made.home, 0.0
         opening = data.qpos[made.gripper.linkage.driven]
-        data.ctrl[made.gripper.actuator] = grip.force(opening, data.qvel[made.gripper.dof])
+        data.ctrl[made.gripper.actuator] = grip.compute_force(opening, data.qvel[made.gripper.dof])
         mujoco.mj_step(made.model, data, arm[0].substeps)
     return made, data
 
@@ -77,7 +77,7 @@ def test_soft_couplings_are_posed_where_the_simulation_settles(tmp_path: Path) -
     assert made.gripper is not None
     assert made.gripper.linkage.yields
     posed = np.array(data.qpos)
-    made.gripper.linkage.set(posed, float(data.qpos[made.gripper.linkage.driven]))
+    made.gripper.linkage.set_opening(posed, float(data.qpos[made.gripper.linkage.driven]))
     tips = [int(made.model.joint(f"tip_{side}").qposadr[0]) for side in ("left", "right")]
     assert posed[tips] == pytest.approx(data.qpos[tips], abs=0.02)
 
@@ -101,7 +101,7 @@ def test_a_light_drive_gets_the_inertia_that_its_loop_needs(tmp_path: Path) -> N
     assert puma.gripper is not None
     assert puma.model.dof_armature[puma.gripper.dof] == 0.1
     assert table is not None
-    assert (table.gains, table.still) == ((2000.0, 60.0), 0.002)
+    assert (table.gains, table.rest_threshold) == ((2000.0, 60.0), 0.002)
 
 
 @pytest.mark.thorough

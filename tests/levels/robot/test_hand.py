@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rack.levels.errors import RobotError
-from rack.levels.robot.cell import Cell, build_cell, sizes
+from rack.levels.robot.cell import Cell, build_cell, compute_sizes
 from rack.levels.tables import RobotConfig
 from tests.levels.arms import ROBOTS, config
 
@@ -47,8 +47,8 @@ def test_the_hand_has_four_fingers_and_sixteen_joints_with_two_tendons_each() ->
     made = build(config("utah_mit")[0])
     hand = made.hand
     assert hand is not None
-    assert sizes(made)["fingers"] == 4
-    assert sizes(made)["joints"] == 16
+    assert compute_sizes(made)["fingers"] == 4
+    assert compute_sizes(made)["joints"] == 16
     assert len(np.unique(hand.actuators)) == 32 == made.model.nu
     assert (hand.fingers.sum(axis=0) == 1).all()
     assert (hand.fingers.sum(axis=1) == 4).all()
@@ -59,7 +59,7 @@ def test_the_hand_has_four_fingers_and_sixteen_joints_with_two_tendons_each() ->
 def test_a_tension_turns_its_joint_and_no_other() -> None:
     made = build(config("utah_mit")[0])
     assert made.hand is not None
-    data = made.start()
+    data = made.build_start_data()
     for row, sign in enumerate((1.0, -1.0)):
         for joint, actuator in enumerate(made.hand.actuators[row]):
             data.act[:] = 0.0

@@ -26,7 +26,7 @@ def settle_gripper(made: Cell, force: float) -> mujoco.MjData:
     """Return the simulated cell after a second with `force` on the gripper, its arm held at
     home."""
     assert made.gripper is not None
-    data = made.start()
+    data = made.build_start_data()
     data.ctrl[made.gripper.actuator] = force
     for _ in range(2000):
         data.qpos[made.qpos], data.qvel[made.dof] = made.home, 0.0
@@ -39,7 +39,7 @@ def compute_deviation(made: Cell, data: mujoco.MjData) -> float:
     rad."""
     assert made.gripper is not None
     posed = np.array(data.qpos)
-    made.gripper.linkage.set(posed, float(data.qpos[made.gripper.linkage.driven]))
+    made.gripper.linkage.set_opening(posed, float(data.qpos[made.gripper.linkage.driven]))
     return float(np.max(np.abs(posed - data.qpos)[made.gripper.linkage.joints]))
 
 
@@ -47,10 +47,10 @@ def test_closed_loops_are_posed_as_the_simulation_settles(tmp_path: Path) -> Non
     made = build_linkage_cell(tmp_path)
     assert made.gripper is not None
     assert len(made.gripper.linkage.joints) == 5
-    assert compute_deviation(made, made.start()) == 0.0
-    data = made.start()
+    assert compute_deviation(made, made.build_start_data()) == 0.0
+    data = made.build_start_data()
     data.qpos[made.gripper.linkage.driven] = 0.35
-    made.gripper.linkage.set(data.qpos, 0.35)
+    made.gripper.linkage.set_opening(data.qpos, 0.35)
     mujoco.mj_forward(made.model, data)
     equality = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
     assert np.abs(data.efc_pos[equality]).max() < 1e-5

@@ -11,7 +11,7 @@ import pytest
 
 from rack.levels.errors import RobotError
 from rack.levels.robot.model import compile_spec, load_spec
-from rack.levels.robot.model_file import MOST_PARTS
+from rack.levels.robot.model_file import MAX_PARTS
 
 PART = '<body><joint/><geom size=".1"/></body>'
 FREE = '<body name="b"><freejoint/><geom size=".1"/>{}</body>'
@@ -42,7 +42,7 @@ def asset(text: str) -> str:
 
 STRIP = '<compiler strippath="true"/>'
 NUMBER = "it must be finite numbers"
-PARTS = f"more than {MOST_PARTS} bodies, joints, geoms and sites, with all replicas"
+PARTS = f"more than {MAX_PARTS} bodies, joints, geoms and sites, with all replicas"
 REFUSED = {
     "replicate": (scene(f'<replicate count="100000">{PART}</replicate>'), PARTS),
     "nested replicate": (
@@ -51,7 +51,7 @@ REFUSED = {
     ),
     "composite": (scene('<composite type="cable" count="20000 1 1" size="1"/>'), PARTS),
     "flexcomp": (scene('<flexcomp name="f" type="grid" count="100 100 10"/>'), PARTS),
-    "flat": (scene(PART * (MOST_PARTS // 3 + 1)), PARTS),
+    "flat": (scene(PART * (MAX_PARTS // 3 + 1)), PARTS),
     "deep": (scene("<body>" * 301 + "</body>" * 301), "more than 300 elements within each other"),
     "include loop": ('<mujoco><include file="bad.xml"/></mujoco>', "does one include itself?"),
     "doubled include": (

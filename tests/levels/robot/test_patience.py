@@ -8,11 +8,11 @@ import pytest
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.robot.limits import (
-    LEAST_CYCLES,
     MAX_PATIENCE_S,
-    PATIENCE_PART,
+    MIN_PATIENCE_CYCLES,
+    PATIENCE_FRACTION,
     MotorPatience,
-    patience_of,
+    compute_patience,
 )
 from rack.levels.tables import RobotConfig
 from tests.levels.arms import CLOCK_NS, cell, config
@@ -29,20 +29,22 @@ def test_motors_add_at_most_a_fraction_of_the_energy_that_the_brakes_absorb(
     kinetic = 0.5 * speed @ Dynamics(made).terms(made.home, 0.0 * speed).inertia @ speed
     # The fingers of `Dynamics` are open, those of the model at its reference.
     assert patience.seconds * (speed @ made.bounds.torque) == pytest.approx(
-        PATIENCE_PART * kinetic, rel=0.01
+        PATIENCE_FRACTION * kinetic, rel=0.01
     )
     assert (
-        patience.seconds * speed <= PATIENCE_PART * 0.5 * speed**2 / config(arm)[0].acceleration
+        patience.seconds * speed <= PATIENCE_FRACTION * 0.5 * speed**2 / config(arm)[0].acceleration
     ).all()
 
 
 def test_an_arm_with_weak_motors_is_bounded_by_the_angle_and_by_the_longest_time() -> None:
     bounds = cell("puma560").bounds
     hard = ROBOT.model_copy(update={"acceleration": (200.0,) * 6})
-    assert patience_of(hard, bounds, 1e6).seconds == pytest.approx(
-        PATIENCE_PART * 0.5 * 1.51 / 200.0
+    assert compute_patience(hard, bounds, 1e6).seconds == pytest.approx(
+        PATIENCE_FRACTION * 0.5 * 1.51 / 200.0
     )
-    assert patience_of(ROBOT, bounds, 1e6) == MotorPatience(MAX_PATIENCE_S, LEAST_CYCLES)
+    assert compute_patience(ROBOT, bounds, 1e6) == MotorPatience(
+        MAX_PATIENCE_S, MIN_PATIENCE_CYCLES
+    )
     # The PUMA: 5 ms at 400 Hz and at 1 kHz.
     patience = cell("puma560").patience
     rates = ((1, 0.0025), (1, 0.001), (5, 0.001))

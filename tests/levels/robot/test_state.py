@@ -8,9 +8,9 @@ import pytest
 
 from rack.backplane.message import Message
 from rack.levels.arm import SimulatedArm
-from rack.levels.arm.simulation import sleeping
+from rack.levels.arm.simulation import enable_sleep
 from rack.levels.messages import ArmState
-from rack.levels.robot.cell import sizes
+from rack.levels.robot.cell import compute_sizes
 from rack.levels.robot.engine import SLEEP
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 from tests.levels.arms import CLOCK_NS, cell, config
@@ -32,7 +32,7 @@ def build_arm(kind: type[SimulatedArm] = SimulatedArm) -> SimulatedArm:
 
 
 def save_state(arm: SimulatedArm) -> Message:
-    message = ArmState.zeros(sizes(arm.cell))
+    message = ArmState.zeros(compute_sizes(arm.cell))
     arm.save(message)
     return message
 
@@ -89,8 +89,8 @@ def test_nothing_sleeps_where_an_obstacle_moves() -> None:
     moving = SceneConfig(
         obstacles=(name,), motion=(MotionConfig(body=name, at=0.0, to=(0.0, 0.0, 0.0), speed=0.1),)
     )
-    assert not sleeping(made.model, moving).opt.enableflags & SLEEP
-    assert sleeping(made.model, SceneConfig()).opt.enableflags & SLEEP
+    assert not enable_sleep(made.model, moving).opt.enableflags & SLEEP
+    assert enable_sleep(made.model, SceneConfig()).opt.enableflags & SLEEP
     assert not made.model.opt.enableflags & SLEEP
 
 
@@ -103,7 +103,7 @@ def test_nothing_sleeps_in_a_model_for_which_mujoco_would_end_the_process() -> N
         <tendon><fixed name="t"><joint joint="a" coef="1"/></fixed>
           <fixed name="u"><joint joint="b" coef="1"/></fixed></tendon>
         <equality><tendon tendon1="t" tendon2="u"/></equality></mujoco>""")
-    assert not sleeping(tied, SceneConfig()).opt.enableflags & SLEEP
+    assert not enable_sleep(tied, SceneConfig()).opt.enableflags & SLEEP
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_nothing_sleeps_where_it_would_at_the_turning_point_of_its_flight(
     falling = mujoco.MjModel.from_xml_string(f"""
         <mujoco><option timestep="{timestep}" gravity="0 0 {-gravity}"/><worldbody>
           <body><freejoint/><geom size=".1"/></body></worldbody></mujoco>""")
-    model = sleeping(falling, SceneConfig())
+    model = enable_sleep(falling, SceneConfig())
     assert bool(model.opt.enableflags & SLEEP) is sleeps
     data = mujoco.MjData(model)
     data.qvel[2] = 0.2 * gravity

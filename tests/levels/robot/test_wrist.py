@@ -18,7 +18,11 @@ CLOCK_NS = 1_000_000
 def test_range_limits_and_noise_come_from_model_and_config(tmp_path: Path) -> None:
     wrist = build_cell(*pad(tmp_path, noise=0.3), CLOCK_NS).wrist
     assert wrist is not None
-    assert (wrist.range, wrist.most, wrist.noise) == ((150.0, 20.0), (60.0, 8.0), (0.3, 0.03))
+    assert (wrist.range, wrist.contact_limits, wrist.noise) == (
+        (150.0, 20.0),
+        (60.0, 8.0),
+        (0.3, 0.03),
+    )
     assert np.array_equal(wrist.addresses, np.arange(6))
 
 

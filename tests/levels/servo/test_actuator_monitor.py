@@ -12,7 +12,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
-from rack.levels.robot.limits import MAX_CONTACT_PART
+from rack.levels.robot.limits import MAX_CONTACT_FRACTION
 from rack.levels.servo.actuator_monitor import SURE_CYCLES, ActuatorMonitor
 from tests.levels.arms import cell, config
 from tests.levels.servo.rig import TICK_S, Course, ServoRig
@@ -147,13 +147,13 @@ HELD_BY_FRICTION = math.tanh(2.0) * CELL.model.dof_frictionloss[CELL.dof]
 """Torques that dry friction absorbs at rest, N m."""
 
 
-class Bench:
+class BenchMessage:
     """An arm at rest at home, with unexplained torques that the test sets."""
 
     def __init__(self) -> None:
         self.monitor = ActuatorMonitor(CELL, following=0.02, period_s=TICK_S)
         self.terms = Dynamics(CELL).terms(CELL.home, REST)
-        self.monitor.look(RESTING, RESTING, self.terms, False)
+        self.monitor.judge_cycle(RESTING, RESTING, self.terms, False)
 
     def leave(self, cycles: int, holds: bool = False, **left: float) -> list[Finding]:
         """Leave these torques over, N m, by joint from `j1` on, for some cycles; return what is
@@ -165,13 +165,13 @@ class Bench:
         for _ in range(cycles):
             taken = np.where(over, np.copysign(HELD_BY_FRICTION, over), 0.0)
             self.monitor.torque[:] = self.terms.bias + over + taken
-            self.monitor.begin()
-            found.append(self.monitor.look(RESTING, RESTING, self.terms, holds))
+            self.monitor.begin_cycle()
+            found.append(self.monitor.judge_cycle(RESTING, RESTING, self.terms, holds))
         return [finding for finding in found if finding is not None]
 
 
 def test_pressing_a_part_on_its_support_is_not_a_motor_fault() -> None:
-    bench = Bench()
+    bench = BenchMessage()
     assert bench.leave(10, j2=-20.0, j3=-3.9, j5=1.1) == []
     # The arm has turned to it: only the wrist still presses, commanded a little more in every
     # cycle.
@@ -180,8 +180,8 @@ def test_pressing_a_part_on_its_support_is_not_a_motor_fault() -> None:
 
 
 def test_a_motor_that_lacks_more_than_a_contact_explains_is_found_while_pressing() -> None:
-    bench = Bench()
+    bench = BenchMessage()
     bench.leave(10, j2=-2.5, j3=-1.4, j5=2.2)
-    much = (MAX_CONTACT_PART + 0.01) * CELL.bounds.torque[1]
+    much = (MAX_CONTACT_FRACTION + 0.01) * CELL.bounds.torque[1]
     found = bench.leave(SURE_CYCLES, j2=much, j3=-9.8, j5=0.4)
     assert [finding.subject for finding in found] == [1]

@@ -150,7 +150,7 @@ def test_compiled_code_gives_the_bits_of_numpy(name: str) -> None:
         )
         verdict = FUNCTIONS[name](*under_numpy)
         verdicts.add(verdict)
-        assert FUNCTIONS[name].load()(*compiled_) == verdict
+        assert FUNCTIONS[name].load_machine_code()(*compiled_) == verdict
         for expected, found in zip(under_numpy, compiled_, strict=True):
             np.testing.assert_array_equal(plain(found), plain(expected))
     assert len(verdicts) == VERDICTS.get(name, 1)
@@ -158,7 +158,7 @@ def test_compiled_code_gives_the_bits_of_numpy(name: str) -> None:
 
 def signatures() -> dict[str, list[Any]]:
     """Return the types that the functions are compiled for."""
-    return {name: list(f.load().signatures) for name, f in FUNCTIONS.items()}  # type: ignore[attr-defined]
+    return {name: list(f.load_machine_code().signatures) for name, f in FUNCTIONS.items()}  # type: ignore[attr-defined]
 
 
 def test_no_cycle_waits_for_a_compiler() -> None:

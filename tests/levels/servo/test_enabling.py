@@ -191,7 +191,7 @@ def test_offsets_convert_drive_positions_to_joint_positions(
     assert np.abs(own.servo.arm._q - GOAL).max() < 5e-3  # type: ignore[attr-defined]
     assert np.abs(simulated.servo.arm._state[0] - GOAL).max() < 5e-3  # type: ignore[attr-defined]
     scene = own.rack.read("servo.scene")
-    tool = InverseKinematics(own.servo.cell, 0).tool_at(own.servo.arm._q)  # type: ignore[attr-defined]
+    tool = InverseKinematics(own.servo.cell, 0).compute_tool_pose(own.servo.arm._q)  # type: ignore[attr-defined]
     assert np.abs(scene.tool_position - tool.position).max() < 1e-3
 
 
@@ -230,7 +230,7 @@ def test_the_levels_above_wait_and_plan_from_where_the_arm_is_enabled() -> None:
     assert rack.task.reason.startswith("waiting for servo: disabled; to enable:")
     # By hand, once the first path is planned.
     arm._data.qpos[arm.cell.qpos[0]] -= 0.5
-    arm._refresh()
+    arm._read_joint_state()
     arm._rest[:] = arm._state[0]
     rack.run(0.5)
     operator.say("servo", Operation.ENABLE)

@@ -12,8 +12,8 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import Arm, SimulatedArm
 from rack.levels.errors import RobotError
 from rack.levels.messages import Error
-from rack.levels.robot.cell import build_cell, sensed_by
-from rack.levels.servo.sensor_monitor import tolerance
+from rack.levels.robot.cell import build_cell, replace_encoders
+from rack.levels.servo.sensor_monitor import compute_tolerance
 from rack.levels.tables import RobotConfig, SceneConfig, SensorConfig
 from tests.levels.arms import CLOCK_NS, config, pendulum
 from tests.levels.servo.rig import Course, ServoRig
@@ -82,7 +82,7 @@ def test_a_fault_of_a_coarse_sensor_is_not_taken_for_a_motor_fault(
 def test_the_tolerance_follows_from_the_encoders(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
     cell = build_cell(robot, SceneConfig(), CLOCK_NS)
-    exact = tolerance(cell)
+    exact = compute_tolerance(cell)
     with pytest.raises(
         RobotError,
         match=r"robot.sensors.noise: has 3 values but needs one for all joints, or one per joint",
@@ -90,11 +90,11 @@ def test_the_tolerance_follows_from_the_encoders(tmp_path: Path) -> None:
         build_cell(
             pendulum(tmp_path, sensors=SensorConfig(noise=(0.1, 0.1, 0.1))), SceneConfig(), CLOCK_NS
         )
-    own = tolerance(sensed_by(cell, robot, Arm.sensors))
+    own = compute_tolerance(replace_encoders(cell, robot, Arm.sensors))
     assert exact.position.tolist() == [2.5e-5, 2.5e-5]
     assert own.position == pytest.approx([3.75e-4, 3.75e-4])
     assert own.velocity == pytest.approx([3.5e-3, 3.5e-3])
     # The joint that is faster, 3 rad/s.
     assert own.jitter_s == pytest.approx(0.125e-3)
     given = robot.model_copy(update={"sensors": SensorConfig()})
-    assert tolerance(sensed_by(cell, given, Arm.sensors)).jitter_s == exact.jitter_s
+    assert compute_tolerance(replace_encoders(cell, given, Arm.sensors)).jitter_s == exact.jitter_s

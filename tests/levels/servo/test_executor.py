@@ -38,7 +38,7 @@ def steps_of(values: list[Array]) -> Array:
 def test_a_bridge_needs_most_acceleration_at_its_ends() -> None:
     rest = Curve(np.zeros(2), duration_s=1.0)
     bridge = Bridge(rest, 0.5, (np.array([1.0, 0.0]), np.zeros(2)), duration_s=1.0)
-    assert bridge.at(0.5).position == pytest.approx([0.5, 0.0])
+    assert bridge.compute_motion(0.5).position == pytest.approx([0.5, 0.0])
     assert [bridge.is_within(np.full(2, most)) for most in (5.9, 6.1)] == [False, True]
 
 

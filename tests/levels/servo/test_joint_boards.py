@@ -56,24 +56,24 @@ def readings(fast: Message, slow: Message) -> dict[str, Reading]:
 
 def test_loads_are_interpolated_between_references() -> None:
     loads = JointLoads(cell("puma560"))
-    loads.take(reference(due=20, inertia=2.0, load=5.0), tick=0)
-    loads.take(reference(due=40, inertia=4.0, load=9.0), tick=20)
+    loads.take_reference(reference(due=20, inertia=2.0, load=5.0), tick=0)
+    loads.take_reference(reference(due=40, inertia=4.0, load=9.0), tick=20)
     begin, end = loads.table[AT], loads.table[DUE]
-    assert [loads.part(tick) for tick in (20, 25, 40, 60)] == [0.0, 0.25, 1.0, 1.0]
+    assert [loads.compute_passed_part(tick) for tick in (20, 25, 40, 60)] == [0.0, 0.25, 1.0, 1.0]
     assert (begin[:, 0].tolist(), end[:, 0].tolist()) == ([2.0, 5.0], [4.0, 9.0])
 
 
 def test_loads_of_a_holding_arm_are_computed_again_only_after_it_has_moved() -> None:
     puma = cell("puma560")
     loads, still = JointLoads(puma), np.zeros(6)
-    loads.hold(puma.home)
+    loads.compute_at_rest(puma.home)
     at_home = loads.table.copy()
     expected = Dynamics(puma).terms(puma.home, still)
     assert np.array_equal(at_home[1], expected.bias)
     assert np.array_equal(at_home[0], np.diagonal(expected.inertia))
-    loads.hold(puma.home + 0.005)
+    loads.compute_at_rest(puma.home + 0.005)
     assert np.array_equal(loads.table, at_home)
-    loads.hold(puma.home + 0.02)
+    loads.compute_at_rest(puma.home + 0.02)
     assert not np.array_equal(loads.table, at_home)
 
 
@@ -93,9 +93,9 @@ def test_a_reference_that_asks_for_more_than_the_arm_can_do_is_named(
     loads = JointLoads(puma)
     message = reference(20, 1.0, 1.0)
     message.position = puma.home
-    assert loads.misfit(message) == ""
+    assert loads.find_misfit(message) == ""
     setattr(message, field, value)
-    assert loads.misfit(message) == field
+    assert loads.find_misfit(message) == field
 
 
 def test_torques_of_all_boards_are_added_up() -> None:
@@ -107,8 +107,8 @@ def test_torques_of_all_boards_are_added_up() -> None:
         4,
     )
     read = readings(fast, slow)
-    assert torques.missing(read, TICK, since=0) == ""
-    torques.add_up(read)
+    assert torques.find_missing(read, TICK, since=0) == ""
+    torques.sum_commands(read)
     assert torques.torque.tolist() == [7.0, 0.0, 0.0, 0.0, 0.0, -3.0]
     assert torques.wanted.position.tolist() == [0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
     assert (torques.moves, torques.rests_on, torques.grip_force) == (True, 4, 12.0)
@@ -149,4 +149,4 @@ def test_a_missing_or_invalid_torque_is_reported_with_its_board(case: str) -> No
     spoil, since, reason = MISSING[case]
     read = readings(torque(TICK - 2, 0, 7.0), torque(TICK - 3, 5, -3.0))
     spoil(read)
-    assert joint_torques().missing(read, TICK, since) == reason
+    assert joint_torques().find_missing(read, TICK, since) == reason

@@ -111,7 +111,7 @@ class SetsNothing(Modification):
         pass
 
 
-class Bench:
+class BenchMessage:
     """A modified law with torque = 3 N m + 10 N m/rad times the wanted position."""
 
     def __init__(self, **modifications: Mapping[str, Any] | str) -> None:
@@ -128,7 +128,7 @@ class Bench:
         self.tick = 0
 
     def switch(self, name: str, is_on: bool) -> str:
-        return self.law.switch(name, is_on)
+        return self.law.switch_modification(name, is_on)
 
     def run(self, samples: int, wanted: Callable[[int], float] = lambda tick: 0.0) -> Array:
         """Return the torque of the third joint in each sample, N m."""
@@ -137,7 +137,9 @@ class Bench:
             motion = Motion(np.zeros((3, JOINTS)))
             motion.position[:] = wanted(self.tick)
             found.append(
-                self.law.torque(self._law, LawInputs(motion, STATE, INERTIA, LOAD, self.tick))[2]
+                self.law.compute_torque(
+                    self._law, LawInputs(motion, STATE, INERTIA, LOAD, self.tick)
+                )[2]
             )
             self.tick += 1
         return np.array(found)
@@ -155,7 +157,7 @@ class Bench:
 def test_after_a_switch_the_torque_changes_over_smoothly_in_the_transfer_time(
     name: str, after: float
 ) -> None:
-    bench = Bench(it=name)
+    bench = BenchMessage(it=name)
     bench.run(5)
     assert bench.switch("it", True) == ""
     torque = bench.run(TRANSFER_TICKS + 3)
@@ -174,11 +176,11 @@ def test_modifications_act_at_their_hooks_in_the_order_of_the_config() -> None:
         name: {"class": HERE + kind, "on": True}
         for name, kind in (("half", "Half"), ("counts", "Counts"), ("further", "Further"))
     }
-    assert Bench(**tables).run(2).tolist() == [0.5 * 13.0 + 1.0, 0.5 * 13.0 + 2.0]
+    assert BenchMessage(**tables).run(2).tolist() == [0.5 * 13.0 + 1.0, 0.5 * 13.0 + 2.0]
 
 
 def test_a_modification_in_place_of_the_law_replaces_another() -> None:
-    bench = Bench(nine="Nine", pd={"class": COMMON + "JointPd"}, huge="Huge")
+    bench = BenchMessage(nine="Nine", pd={"class": COMMON + "JointPd"}, huge="Huge")
     bench.switch("nine", True)
     bench.run(60)
     bench.switch("pd", True)
@@ -194,7 +196,7 @@ def test_a_modification_in_place_of_the_law_replaces_another() -> None:
 
 
 def test_a_modification_that_raises_is_undone_and_switched_off_in_the_same_sample() -> None:
-    bench = Bench(raises="Raises", half={"class": HERE + "Half", "on": True})
+    bench = BenchMessage(raises="Raises", half={"class": HERE + "Half", "on": True})
     bench.run(1)
     bench.switch("raises", True)
     torque = bench.run(TRANSFER_TICKS + 5)
@@ -212,7 +214,7 @@ def test_a_modification_that_raises_is_undone_and_switched_off_in_the_same_sampl
 
 @pytest.mark.parametrize("name", ["GivesNan", "SetsNothing"])
 def test_a_modification_with_a_result_that_is_not_finite_is_switched_off(name: str) -> None:
-    bench = Bench(it=name)
+    bench = BenchMessage(it=name)
     bench.run(1)
     bench.switch("it", True)
     assert bench.run(3).tolist() == [3.0] * 3

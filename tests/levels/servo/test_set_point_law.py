@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rack.backplane.watch.alarms import NO_TORQUE, Alarm
+from rack.backplane.watch.alarms import BRAKED_WITHOUT_TORQUE, Alarm
 from rack.boards.config import load
 from rack.boards.config.resolved import resolve
 from rack.boards.errors import ConfigError
@@ -88,7 +88,7 @@ def test_after_missed_cycles_the_first_set_point_is_where_the_arm_is(
     servo.miss(12)
     servo.run(20, course.at)
     assert servo.alarms() == [Alarm.BRAKES_CLOSED, Alarm.BRAKES_OPENED]
-    assert servo.found[0].finding.subject == NO_TORQUE
+    assert servo.found[0].finding.subject == BRAKED_WITHOUT_TORQUE
     for _ in range(20):
         servo.run(int(random.integers(5, 20)), course.at)
         # Some of these outlast the patience of the drives.
@@ -140,13 +140,13 @@ def test_a_drive_that_does_not_follow_is_a_motor_fault(
 def test_set_points_are_for_the_end_of_the_cycle(tmp_path: Path, interface: Interface) -> None:
     cell: Cell = build_cell(pendulum(tmp_path, interface=interface), SceneConfig(), CLOCK_NS)
     law = SetPointLaw(cell, LoopGains(), TICK_S)
-    law.tune(LoopGains(bandwidth=60.0, damping=1.5))
+    law.set_gains(LoopGains(bandwidth=60.0, damping=1.5))
     now, later = (np.array([[0.1, 0.2], [1.0, -1.0], [4.0, 8.0]]) for _ in range(2))
     later[1] += TICK_S * now[2]
     later[0] += TICK_S * 0.5 * (now[1] + later[1])
     off = np.array([0.01, 0.0])
     torque = np.array([3.0, 4.0])
-    target = law.target(Motion(now), now[0] - off, torque)
+    target = law.compute_target(Motion(now), now[0] - off, torque)
     correction = 20.0 * off if interface == "velocity" else 0.0
     assert target.position == pytest.approx(later[0], abs=1e-12)
     assert target.velocity == pytest.approx(later[1] + correction, abs=1e-12)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.message import State
-from rack.backplane.watch.alarms import NO_TORQUE, Alarm
+from rack.backplane.watch.alarms import BRAKED_WITHOUT_TORQUE, Alarm
 from rack.levels.algebra import Array
 from rack.levels.level import Demand, Finding
 from rack.levels.messages import Error
@@ -172,8 +172,8 @@ def test_brakes_that_engage_and_release_between_two_cycles_are_reported_with_the
     rig.run(missed + 5, move.at)
     # The last torque was given a tick before, and the motors kept it for two.
     closed, opened = (
-        Finding(Alarm.BRAKES_CLOSED, NO_TORQUE, missed, begun + 1),
-        Finding(Alarm.BRAKES_OPENED, NO_TORQUE, missed - 1),
+        Finding(Alarm.BRAKES_CLOSED, BRAKED_WITHOUT_TORQUE, missed, begun + 1),
+        Finding(Alarm.BRAKES_OPENED, BRAKED_WITHOUT_TORQUE, missed - 1),
     )
     found = [(begun + missed, closed), (begun + missed, opened)]
     assert rig.found == (found if missed > 1 else [])

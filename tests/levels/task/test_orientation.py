@@ -16,7 +16,7 @@ from rack.levels.planning.motion_planner import MotionPlanner
 from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import GripperConfig, RobotConfig, SceneConfig
-from rack.levels.task.actions import goto, rehearse
+from rack.levels.task.actions import rehearse, rehearse_goto
 from rack.levels.task.program import Goto, TaskConfig
 from rack.levels.task.rehearsal import Rehearsal
 from tests.levels.arms import CLOCK_NS, config
@@ -89,7 +89,7 @@ def write_five_joint_arm(folder: Path, x: float = 0.25, bend: float = 2.0) -> Ro
 
 def rehearsal(robot: RobotConfig, scene: SceneConfig = SCENE) -> Rehearsal:
     made = build_cell(robot, scene, CLOCK_NS)
-    poses = made.start().qpos[made.object_qpos[:, None] + np.arange(7)]
+    poses = made.build_start_data().qpos[made.object_qpos[:, None] + np.arange(7)]
     situation = Situation(poses[:, :3].copy(), poses[:, 3:].copy())
     return Rehearsal(MotionPlanner(made, scene, 1), made.home, situation)
 
@@ -102,19 +102,19 @@ def transfer(to: list[float]) -> dict[str, Any]:
 def test_a_refusal_says_when_another_orientation_would_reach(tmp_path: Path) -> None:
     start = rehearsal(write_five_joint_arm(tmp_path))
     with pytest.raises(Refused, match="in reach in another orientation"):
-        goto(start, 0, Goto(position=(0.45, 0.0, 0.25)))
+        rehearse_goto(start, 0, Goto(position=(0.45, 0.0, 0.25)))
     with pytest.raises(Refused) as refused:
-        goto(start, 0, Goto(position=(0.9, 0.0, 0.25)))
+        rehearse_goto(start, 0, Goto(position=(0.9, 0.0, 0.25)))
     assert "orientation" not in str(refused.value)
 
 
 def test_a_goto_in_any_direction_reaches_the_place_with_five_joints(tmp_path: Path) -> None:
     start = rehearsal(write_five_joint_arm(tmp_path))
     place = (0.40, 0.1, 0.25)
-    end = goto(start, 0, Goto(position=place, direction="any"))
-    assert end.motion.ik.tool_at(end.q).position == pytest.approx(place, abs=1e-4)
+    end = rehearse_goto(start, 0, Goto(position=place, direction="any"))
+    assert end.motion.ik.compute_tool_pose(end.q).position == pytest.approx(place, abs=1e-4)
     with pytest.raises(Refused, match="out of reach"):
-        goto(start, 0, Goto(position=(0.9, 0.0, 0.2), direction="any"))
+        rehearse_goto(start, 0, Goto(position=(0.9, 0.0, 0.2), direction="any"))
 
 
 def compute_lean(end: Rehearsal) -> float:

@@ -18,7 +18,7 @@ from rack.levels.planning.pose import Pose
 from rack.levels.task import TaskPlanner, read_program
 from rack.levels.task.actions import rehearse
 from rack.levels.task.program import TaskParams
-from rack.levels.task.rehearsal import Rehearsal, Rehearsed, finish_times
+from rack.levels.task.rehearsal import Rehearsal, Rehearsed, compute_finish_times
 from tests.levels.arms import cell, config
 from tests.levels.whole_rack import WholeRack
 
@@ -44,7 +44,7 @@ HOME = {"do": "home"}
 @pytest.fixture(scope="module")
 def start() -> Rehearsal:
     puma = cell("puma560")
-    data = puma.start()
+    data = puma.build_start_data()
     situation = Situation(data.xpos[puma.bodies].copy(), data.xquat[puma.bodies].copy())
     return Rehearsal(MotionPlanner(puma, SCENE, 1990), puma.home, situation)
 
@@ -124,7 +124,7 @@ def test_an_impossible_action_is_refused_with_a_possible_alternative(
 def test_a_move_with_a_deadline_ends_no_sooner_and_delays_later_moves(start: Rehearsal) -> None:
     first, second = rehearse_actions(start, REACH, HOME).moves
     late = Rehearsed(first.move._replace(by_s=50.0), first.duration_s)
-    times = finish_times([late, second], 4.0, CONTEXT, TaskParams())
+    times = compute_finish_times([late, second], 4.0, CONTEXT, TaskParams())
     assert times[0] == pytest.approx(51.0)
     assert times[1] > 50.0 + second.duration_s
 
@@ -158,4 +158,4 @@ def test_a_deadline_on_another_racks_clock_is_not_refused_because_of_rounding() 
     )
     for offset in np.random.default_rng(1).uniform(-20.0, 0.0, 200):
         planner._ahead_s = float(offset)  # the move is slowed down to end just in time
-        planner._promise(planner._with_times([Rehearsed(home, 1.0)]), 0.0)
+        planner._check_times(planner._add_times([Rehearsed(home, 1.0)]), 0.0)

@@ -12,7 +12,7 @@ import pytest
 from rack.backplane.message import Message, State
 from rack.levels.level import Executor, Input, Output
 from rack.levels.messages import (
-    WINDOW,
+    WINDOW_MOVES,
     Error,
     MoveStatus,
     ServoStatus,
@@ -28,7 +28,7 @@ ROBOT, SCENE = config("puma560")
 HOME = {"do": "home"}
 
 
-class Bench(Lockstep):
+class BenchMessage(Lockstep):
     """The task executor alone; the test plays its planner and the level below."""
 
     def __init__(self, *actions: Mapping[str, Any], **params: Any) -> None:
@@ -65,33 +65,33 @@ class Bench(Lockstep):
 
 
 def test_the_window_moves_with_completed_moves_and_ends_with_the_plan() -> None:
-    bench, moves = Bench(HOME, HOME), 2 * WINDOW
-    bench.plan([0] * WINDOW + [1] * WINDOW)
-    assert bench.window() == list(range(1, WINDOW + 1))
+    bench, moves = BenchMessage(HOME, HOME), 2 * WINDOW_MOVES
+    bench.plan([0] * WINDOW_MOVES + [1] * WINDOW_MOVES)
+    assert bench.window() == list(range(1, WINDOW_MOVES + 1))
     bench.cycle(done=2)
-    assert bench.window() == list(range(3, WINDOW + 3))
+    assert bench.window() == list(range(3, WINDOW_MOVES + 3))
     assert bench.status.action == 0
-    bench.cycle(done=WINDOW)
+    bench.cycle(done=WINDOW_MOVES)
     assert bench.status.action == 1
     bench.cycle(done=moves)
-    assert bench.window() == list(range(WINDOW + 1, moves + 1))
+    assert bench.window() == list(range(WINDOW_MOVES + 1, moves + 1))
     assert bench.status.state == State.DONE
     assert bench.status.action == bench.status.actions == 2
 
 
 def test_no_moves_of_a_refused_plan_are_handed_down() -> None:
-    bench = Bench(HOME)
+    bench = BenchMessage(HOME)
     bench.plan([], error=Error.UNREACHABLE)
     assert bench.window() == []
     assert (bench.status.state, bench.status.reason) == (State.ERROR, "no")
     # Without a program the level is idle.
-    bench = Bench()
+    bench = BenchMessage()
     bench.cycle()
     assert bench.status.state == State.IDLE
 
 
 def test_a_late_action_is_an_error() -> None:
-    bench = Bench({**HOME, "by": 5.0})
+    bench = BenchMessage({**HOME, "by": 5.0})
     bench.plan([0])
     bench.cycle()
     bench.cycle()
@@ -121,7 +121,7 @@ HELD = {"state": State.HOLDING, "reason": "waiting for servo: brakes engaged"}
 def test_a_stalled_task_ends_with_the_reason(
     plan: list[int], below: dict[str, Any], why: str
 ) -> None:
-    bench = Bench(HOME, stalled_s=5.0)
+    bench = BenchMessage(HOME, stalled_s=5.0)
     if plan:
         bench.plan(plan)
     for k in range(4):  # the arm moves slowly
@@ -165,7 +165,7 @@ class PlannedBench(Lockstep):
 
     def _show(self) -> None:
         puma, world = cell("puma560"), self.message("world.model")
-        start = puma.start()
+        start = puma.build_start_data()
         world.position, world.quaternion = start.xpos[puma.bodies], start.xquat[puma.bodies]
         world.revision = 1
         self.write("world.model", world)

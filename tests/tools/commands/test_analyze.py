@@ -103,10 +103,10 @@ def test_differences_between_prediction_and_measurement_are_marked(
         Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1), flags=int(k == 7))
         for k in range(40)
     ]
-    analysis = Analysis.of(recorded(tmp_path / "run", config, {"lower": trace}))
-    differing = {pair.equation for pair in analysis.pairs if pair.disagrees}
+    analysis = Analysis.from_recording(recorded(tmp_path / "run", config, {"lower": trace}))
+    differing = {pair.equation for pair in analysis.pairs if pair.is_contradicted}
     assert differing >= {"3.1", "3.6", "response time"}
-    assert not analysis.holds
+    assert not analysis.is_fulfilled
     found = text(analysis)
     assert "not as predicted: lower 3.1" in found
     assert f"to do: rack check CONFIG --from {tmp_path / 'run'} lists changes" in found
@@ -120,12 +120,12 @@ def test_a_rare_stall_fails_only_the_worst_cycle(small: Path, tmp_path: Path) ->
     config = load(small, ["clock.mode=realtime", *BUDGET])
     trace = [Cycle(SETTLED + k, (0.0, 0.1, 2.6 if k == 7 else 1.0, 0.1)) for k in range(400)]
     recording = recorded(tmp_path / "run", config, {"lower": trace})
-    analysis = Analysis.of(recording)
-    assert not analysis.holds
+    analysis = Analysis.from_recording(recording)
+    assert not analysis.is_fulfilled
     assert "failed in more than 1 of 100 cycles: none" in text(analysis)
     assert "to do: nothing about the config: it failed in single cycles" in brief(analysis)
-    assert "to do: nothing\n" in brief(Analysis.of(recording, 99.0))
-    assert Analysis.of(recording, 99.0).holds
+    assert "to do: nothing\n" in brief(Analysis.from_recording(recording, 99.0))
+    assert Analysis.from_recording(recording, 99.0).is_fulfilled
 
 
 @pytest.mark.parametrize(
@@ -159,11 +159,11 @@ def test_the_equations_are_applied_to_the_worst_cycle(
 ) -> None:
     config = load(small, [f"clock.mode={mode}", "timing.context_switch_ms=0.1"])
     trace = [*(Cycle(SETTLED + k, PLAIN) for k in range(8)), last, Cycle(SETTLED + 15, PLAIN)]
-    analysis = Analysis.of(recorded(tmp_path / "run", config, {"lower": trace}))
+    analysis = Analysis.from_recording(recorded(tmp_path / "run", config, {"lower": trace}))
     found = {
         pair.equation: (pair.measured.left / MS, pair.measured.right / MS)
         for pair in analysis.pairs
-        if pair.measured is not None and pair.fails and pair.subject == "lower"
+        if pair.measured is not None and pair.is_failed and pair.subject == "lower"
     }
     assert found == {name: pytest.approx(sides, abs=1e-6) for name, sides in broken.items()}
 
@@ -173,6 +173,6 @@ def test_a_late_level_whose_times_fit_is_not_referred_to_the_check(
 ) -> None:
     config = load(small, ["clock.mode=realtime", *BUDGET])
     late = [Cycle(SETTLED + k, PLAIN, late=3.0) for k in range(40)]
-    analysis = Analysis.of(recorded(tmp_path / "run", config, {"lower": late}))
-    assert not analysis.holds
+    analysis = Analysis.from_recording(recorded(tmp_path / "run", config, {"lower": late}))
+    assert not analysis.is_fulfilled
     assert "to do: nothing about the config: its levels' own times fit" in brief(analysis)

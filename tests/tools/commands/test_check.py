@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import budgets, load
-from rack.boards.config.files import names
+from rack.boards.config import load, read_budgets
+from rack.boards.config.files import list_names
 from rack.tools.timing.judged_config import JudgedConfig
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
@@ -46,7 +46,7 @@ def failures(done: subprocess.CompletedProcess[str]) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in names() if name not in FAILING])
+@pytest.mark.parametrize("name", [name for name in list_names() if name not in FAILING])
 def test_a_shipped_rack_passes_its_own_check(name: str) -> None:
     done = check(name)
     assert (done.returncode, failures(done), done.stderr) == (0, [], "")
@@ -81,13 +81,13 @@ def test_a_fixed_config_loads_and_holds(small: Path, tmp_path: Path) -> None:
     fixed.write_text(done.stdout)
     config = load(fixed)
     assert config.board["lower"].within_cycles == 7
-    assert JudgedConfig.of(config).failing == ()
+    assert JudgedConfig.judge(config).failures == ()
     document = json.loads(check(small, *FAILS, *ALONE, "--fix", "--json").stdout)
     assert (document["fits"], "within_cycles = 7" in document["config"]) == (True, True)
     # One that fits stays as it is.
     again = check(fixed, "--fix")
     assert (again.returncode, again.stderr) == (0, "nothing to change\n")
-    assert again.stdout == config.text()
+    assert again.stdout == config.to_toml_text()
 
 
 def test_no_config_is_printed_if_no_change_helps(small: Path) -> None:
@@ -113,7 +113,7 @@ def test_budgets_come_from_an_earlier_run_and_are_in_a_fixed_config(
     assert done.returncode == 0, done.stderr
     fixed = tmp_path / "fixed.toml"
     fixed.write_text(done.stdout)
-    assert set(budgets(load(fixed))) == {"upper", "lower"}
+    assert set(read_budgets(load(fixed))) == {"upper", "lower"}
     assert check(fixed).returncode == 0
 
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from rack.boards.config import CONFIGS, load, names
+from rack.boards.config import CONFIGS, list_names, load
 from rack.boards.config.toml import to_toml
 from rack.tools.cli import run_commands
 from rack.tools.console.answer import MAX_LINE
@@ -57,7 +57,9 @@ def texts() -> dict[str, dict[str, Any]]:
             tables["robot"]["model"] = f"robots/{tables['robot']['model']}"
         if "/" in place:
             tables["extends"] = ["nasrem"]
-    return found | {f"{name}, resolved": tomllib.loads(load(name).text()) for name in names()}
+    return found | {
+        f"{name}, resolved": tomllib.loads(load(name).to_toml_text()) for name in list_names()
+    }
 
 
 def places(node: Any) -> Iterator[tuple[Any, Any]]:

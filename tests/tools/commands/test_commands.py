@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.segment import racks
+from rack.backplane.segment import list_racks
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.console.interrupt import descendants
+from rack.tools.console.interrupt import list_descendants
 from tests.processes import RACK, runs, wait_until
 from tests.shared_runs import small_run
 from tests.tools.command_line import BOUND_S, ROOT, rack
@@ -52,9 +52,9 @@ def running(small: Path, rack_name: str) -> Iterator[subprocess.Popen[str]]:
 
 def wait_until_gone(name: str) -> bool:
     deadline = time.monotonic() + BOUND_S
-    while name in racks() and time.monotonic() < deadline:
+    while name in list_racks() and time.monotonic() < deadline:
         time.sleep(0.02)
-    return name not in racks()
+    return name not in list_racks()
 
 
 HEAVY = ("mujoco", "numba", "numpy", "pyarrow", "pydantic", "rerun", "typer")
@@ -134,7 +134,7 @@ def test_a_config_with_mistakes_is_refused_before_anything_starts(
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 2
     assert not (tmp_path / "run").exists()
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
 
 
 def upper_of(small: Path, source: str) -> Path:
@@ -175,7 +175,7 @@ def test_a_module_that_loops_is_named_and_ended_by_a_signal(small: Path, rack_na
     assert process.stderr is not None
     try:
         assert process.stderr.readline() == "still importing 'own_upper'; it may take 60 s\n"
-        family = list(descendants(process.pid))
+        family = list(list_descendants(process.pid))
         # The crate, and the child that imports.
         assert len(family) == 2
         process.send_signal(signal.SIGINT)
@@ -229,7 +229,7 @@ def test_leftovers_of_a_killed_launcher_are_cleaned(
     assert "; its launcher is gone: 'rack clean' removes it" in seen.stdout.splitlines()[0]
     cleaned = json.loads(rack("clean", "--json").stdout)
     assert rack_name not in cleaned["in_use"]
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
 
 
 def test_a_folder_that_holds_files_is_not_written_over(small: Path, tmp_path: Path) -> None:

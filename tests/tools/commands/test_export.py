@@ -50,7 +50,7 @@ def test_every_message_is_exported_as_it_was_written(run: Path, exported: Path) 
     assert sorted(events, key=str) == sorted(wanted, key=str)
     assert {*ticks} == {*recording.mailboxes}
     for name, found in ticks.items():
-        assert found == recording.signal(name, "tick").tolist()
+        assert found == recording.read_signal(name, "tick").tolist()
     assert {*states["lower.status"]} <= {"idle", "executing", "done", "error", "holding"}
 
 

@@ -96,7 +96,7 @@ def test_without_budgets_a_run_is_shown_alone_and_a_config_has_no_schedule(tmp_p
     found = json.loads(rack("gantt", tmp_path / "run", "--json").stdout)
     assert [panel["kind"] for panel in found["panels"]] == ["measured"]
     assert "no board has a budget" in found["notes"][0]
-    (tmp_path / "bare.toml").write_text(bare.text())
+    (tmp_path / "bare.toml").write_text(bare.to_toml_text())
     shown = rack("gantt", tmp_path / "bare.toml")
     assert (shown.returncode, shown.stdout) == (2, "")
     assert "no board has a budget: give [board.<name>.budget]" in shown.stderr

@@ -57,7 +57,7 @@ def test_a_fault_begins_at_the_next_tick_and_says_which(running: str) -> None:
     assert (answer["kind"], answer["board"]) == ("kill", "wave")
     # It comes back, for the next test.
     entry = FaultTable(segment).entries[answer["fault"]]
-    wait_until(lambda: entry.count and UtilityLines(segment).bad_inputs == [])
+    wait_until(lambda: entry.count and UtilityLines(segment).reset_obstacles == [])
 
 
 @pytest.mark.slow
@@ -150,7 +150,7 @@ def test_a_fault_that_does_not_fit_the_rack_is_not_added(
 ) -> None:
     injected = Segment.attach(running).words[System.INJECTED]
     with pytest.raises(ConfigError) as error:
-        LiveRack(Segment.attach(running)).inject(
+        LiveRack(Segment.attach(running)).inject_fault(
             {"board": "wave", "kind": kind, **keys}, wait=False
         )
     assert str(error.value).startswith(line)

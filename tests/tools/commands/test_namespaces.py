@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.segment import racks
+from rack.backplane.segment import list_racks
 from tests.processes import RACK
 from tests.tools.command_line import BOUND_S, ROOT
 from tests.tools.held_racks import held_rack
@@ -70,7 +70,7 @@ def test_a_running_rack_is_listed_as_running_never_cleaned_and_can_be_stopped(
     assert held.poll() is None
     stopped = inside("stop", rack_name)
     assert (stopped.returncode, stopped.stdout) == (0, f"rack '{rack_name}' has ended\n")
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
     assert held.wait(BOUND_S) == 1
 
 
@@ -83,4 +83,4 @@ def test_a_rack_whose_launcher_was_killed_is_listed_as_dead_and_cleaned(
     held.wait(BOUND_S)
     assert seen(rack_name)["state"] == "dead"
     assert rack_name in json.loads(inside("clean", "--json").stdout)["removed"]
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()

@@ -24,9 +24,9 @@ from rack.tools.commands.replay import replay
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.time_line import on_one_time_line
+from rack.tools.recording.time_line import place_on_time_line
 from rack.tools.report.report import write_report
-from rack.tools.viewer.reading import read
+from rack.tools.viewer.reading import read_component
 from rack.tools.viewer.window import ViewerWindow
 from tests.boards.lan.racks import configs, ring_texts
 from tests.processes import RACK, wait_until
@@ -64,9 +64,9 @@ def test_a_rack_that_runs_can_be_recorded_until_its_end(
     report, _ = write_report(tmp_path / "run")
     assert report["rack"] == rack_name
     assert report["tasks"]["lower"]["traced"] > 0
-    ticks = Recording(tmp_path / "run").signal("lower.status", "tick")
+    ticks = Recording(tmp_path / "run").read_signal("lower.status", "tick")
     assert ticks[-1] == rack.outcome.ticks - 1
-    shown = read(folder / "run.rrd", "/signals/lower.status/count")
+    shown = read_component(folder / "run.rrd", "/signals/lower.status/count")
     assert shown.ticks.tolist() == ticks.tolist()
 
 
@@ -97,16 +97,16 @@ def test_the_recording_so_far_is_saved_while_the_run_continues(
     files = [path for path in saved.rglob("*") if path.is_file() and path.name != CHECKSUMS]
     assert answer["bytes"] == sum(path.stat().st_size for path in files)
     part, whole = Recording(saved), Recording(run)
-    assert not any(whole.lost.values())
-    ticks = part.signal("lower.status", "tick")
+    assert not any(whole.lost_rows.values())
+    ticks = part.read_signal("lower.status", "tick")
     traced = np.concatenate([rows["tick"] for rows in part.cycles.values()]) * 0.0025
     assert answer["since_s"] == pytest.approx(traced.min())
     assert answer["until_s"] == pytest.approx(traced.max())
-    assert 0 < answer["until_s"] < 0.0025 * whole.ended["outcome"]["ticks"]
+    assert 0 < answer["until_s"] < 0.0025 * whole.end_counts["outcome"]["ticks"]
     for name in ("lower", *part.mailboxes):
-        rows = part.rows(name)
-        assert np.array_equal(whole.rows(name)[: len(rows)], rows)
-    shown = read(saved / "run.rrd", "/signals/lower.status/count")
+        rows = part.read_rows(name)
+        assert np.array_equal(whole.read_rows(name)[: len(rows)], rows)
+    shown = read_component(saved / "run.rrd", "/signals/lower.status/count")
     assert shown.ticks.tolist() == ticks.tolist()
     report, _ = write_report(saved)
     assert report["recording"] == "without the end of the run"
@@ -154,12 +154,14 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
         report, _ = write_report(folder / name)
         assert report["tasks"]["pulse"]["traced"] > 0
     recordings = [Recording(folder / name) for name in names[::-1]]
-    place = on_one_time_line(recordings)[1]
+    place = place_on_time_line(recordings)[1]
     assert place.note == note
     # The two were on one clock: what that showed is the truth.
-    true_ns = place.line.time_ns(np.array([place.own.epoch_ns]))[0]
-    assert abs(place.times_ns(np.zeros(1, dtype=int), 0)[0] - true_ns) <= place.uncertainty_ns
-    assert len(read(folder / "run.rrd", f"/{names[0]}/signals/pulse.status/count").ticks) > 0
+    true_ns = place.line.convert_stamps(np.array([place.own.epoch_ns]))[0]
+    assert abs(place.convert_ticks(np.zeros(1, dtype=int), 0)[0] - true_ns) <= place.uncertainty_ns
+    assert (
+        len(read_component(folder / "run.rrd", f"/{names[0]}/signals/pulse.status/count").ticks) > 0
+    )
 
 
 def kill_thread(pid: int, number: int) -> None:
@@ -234,7 +236,9 @@ def test_replay_writes_only_new_files_and_only_from_runs(tmp_path: Path) -> None
     replay([tmp_path], tmp_path / "again.rrd", against=None)
     for name in "ab":
         lane = f"/{name}/boards/2-pulse/executor"
-        again, first = (read(f, lane, "StateChange:state") for f in (tmp_path / "again.rrd", out))
+        again, first = (
+            read_component(f, lane, "StateChange:state") for f in (tmp_path / "again.rrd", out)
+        )
         assert again.ticks.tolist() == first.ticks.tolist()
     empty = tmp_path / "empty"
     empty.mkdir()

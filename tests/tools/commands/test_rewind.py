@@ -14,8 +14,8 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.boards.events import CONTINUES, Event
-from rack.tools.launch.continued import RunAgain
+from rack.boards.events import CONTINUATION_CODE, Event
+from rack.tools.launch.continued import RepeatedRun
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
@@ -68,7 +68,7 @@ def test_any_tick_is_reached_and_its_messages_shown(run: Path, asked: Asked) -> 
         *("show wave.status", "goto 0", "back", "show wave.status", "quit", "goto 1"),
     )
     value = dict(
-        zip(*(Recording(run).signal("wave.status", n) for n in ("tick", "value")), strict=True)
+        zip(*(Recording(run).read_signal("wave.status", n) for n in ("tick", "value")), strict=True)
     )
     assert found[0] == {"tick": 480, "time_s": 1.2}
     first = found[1]["value"]
@@ -84,7 +84,7 @@ def test_any_tick_is_reached_and_its_messages_shown(run: Path, asked: Asked) -> 
 
 
 def test_a_condition_is_found_forwards_and_backwards(run: Path, asked: Asked) -> None:
-    ticks, value = (Recording(run).signal("wave.status", name) for name in ("tick", "value"))
+    ticks, value = (Recording(run).read_signal("wave.status", name) for name in ("tick", "value"))
     limit = float(value[300]) + 1.0
     held = value > limit
     begins = ticks[held & ~held.astype(bool).take(range(-1, len(held) - 1))] + 1
@@ -110,32 +110,32 @@ def test_later_ticks_continue_from_the_nearest_reached_tick(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun: list[int] = []
-    rack_at = RunAgain.rack_at
+    rack_at = RepeatedRun.run_rack_to
 
     @contextmanager
-    def noted(self: RunAgain, *asked: Any) -> Iterator[Rack]:
+    def noted(self: RepeatedRun, *asked: Any) -> Iterator[Rack]:
         with rack_at(self, *asked) as ran:
             begun.append(continued_from(ran.events))
             yield ran
 
-    monkeypatch.setattr(RunAgain, "rack_at", noted)
+    monkeypatch.setattr(RepeatedRun, "run_rack_to", noted)
     recording = Recording(run)
     before = descriptors()
-    with RunAgain(recording) as again:
-        levels = [again.levels(tick) for tick in (450, 470, 450, 460)]
+    with RepeatedRun(recording) as again:
+        levels = [again.read_levels(tick) for tick in (450, 470, 450, 460)]
     assert (begun[0], begun[2]) == (-1, 450)
     # None at which there is a snapshot runs again.
     assert len(begun) == 3
     assert begun[1] >= 450
     assert levels[0] == levels[2]
     assert descriptors() == before
-    with RunAgain(Recording(run)) as alone:
-        assert alone.levels(470) == levels[1]
+    with RepeatedRun(Recording(run)) as alone:
+        assert alone.read_levels(470) == levels[1]
 
 
 def continued_from(events: Sequence[Event]) -> int:
     """Return the tick of the snapshot from which a rack continued, or -1 without one."""
-    return next((event.tick for event in events if event.code == CONTINUES), -1)
+    return next((event.tick for event in events if event.code == CONTINUATION_CODE), -1)
 
 
 def test_a_branch_differs_only_after_its_tick_and_only_if_changed(
@@ -150,10 +150,10 @@ def test_a_branch_differs_only_after_its_tick_and_only_if_changed(
         f"branch --out {other}",
         "branch --set board.wave.parms.factor=2",
     )
-    expected = Recording(run).ended["outcome"]["digest"]
+    expected = Recording(run).end_counts["outcome"]["digest"]
     assert (found[1]["first_difference"], found[1]["outcome"]["digest"]) == (None, expected)
     assert found[2]["first_difference"] == {"tick": 480, "mailbox": "wave.status"}
-    assert Recording(other).signal("wave.status", "tick")[0] == 480
+    assert Recording(other).read_signal("wave.status", "tick")[0] == 480
     assert "exists already" in found[3]["error"]
     assert "board.wave.parms = " in found[4]["error"]
     assert {path: path.read_bytes() for path in run.rglob("*") if path.is_file()} == before

@@ -136,19 +136,19 @@ def test_a_trigger_that_fails_or_does_not_fit_is_reported(
 def go_on(name: str, until: str, ticks: int = 8000) -> None:
     """Step a rack by 8 ticks until a text is printed, up to a number of ticks, then end its run."""
     stepper = Stepper(Segment.attach(name))
-    tick = stepper.hold()
+    tick = stepper.hold_rack()
     for step in range(0, ticks, 8):
         # Before the command begins, stdout is pytest's.
         printed = sys.stdout.getvalue() if isinstance(sys.stdout, StringIO) else ""
         if until and until in printed:
             break
-        stepper.go(tick + step + 8)
+        stepper.run_to(tick + step + 8)
         time.sleep(0.002)
     Segment.attach(name).words[System.STOP_REQUEST] = 1
 
 
 def test_times_are_accepted_in_all_units() -> None:
-    assert [watch._seconds("--every", text) for text in ("20ms", "0.5s", "2 min")] == [
+    assert [watch._parse_seconds("--every", text) for text in ("20ms", "0.5s", "2 min")] == [
         0.02,
         0.5,
         120.0,

@@ -7,14 +7,20 @@ import io
 import pytest
 from rich.console import Console
 
-from rack.tools.console.tables import TextTable, render_markdown, render_text, show_blocks, table
+from rack.tools.console.tables import (
+    TextTable,
+    format_table,
+    render_markdown,
+    render_text,
+    show_blocks,
+)
 
 HEAD = ("task", "count", "what it says of itself")
 ROWS = (("servo", "12", "torque of j3 is NaN, and rejected"), ("elemental_move", "7", "idle"))
 
 
 def test_numbers_stand_to_the_right_and_texts_to_the_left() -> None:
-    assert list(table(HEAD, ROWS)) == [
+    assert list(format_table(HEAD, ROWS)) == [
         "task            count  what it says of itself",
         "servo              12  torque of j3 is NaN, and rejected",
         "elemental_move      7  idle",
@@ -23,20 +29,20 @@ def test_numbers_stand_to_the_right_and_texts_to_the_left() -> None:
 
 @pytest.mark.parametrize("width", [30, 40, 55, 56, 80])
 def test_a_table_fits_its_width_with_long_cells_wrapped(width: int) -> None:
-    lines = list(table(HEAD, ROWS, width))
+    lines = list(format_table(HEAD, ROWS, width))
     assert max(map(len, lines)) <= width
     assert (len(lines) == 3) == (width >= 56)
     assert " ".join(" ".join(lines).split()).count("12") == 1
 
 
 def test_optional_columns_are_dropped_before_cells_are_wrapped() -> None:
-    assert list(table(HEAD, ROWS, 40, ("what it says of itself", "count"))) == [
+    assert list(format_table(HEAD, ROWS, 40, ("what it says of itself", "count"))) == [
         "task            count",
         "servo              12",
         "elemental_move      7",
     ]
-    assert list(table(HEAD, ROWS, 56, ("count",))) == list(table(HEAD, ROWS))
-    assert next(table(HEAD, ROWS, 55, ("count",))).split() == [
+    assert list(format_table(HEAD, ROWS, 56, ("count",))) == list(format_table(HEAD, ROWS))
+    assert next(format_table(HEAD, ROWS, 55, ("count",))).split() == [
         "task",
         "what",
         "it",
@@ -48,11 +54,11 @@ def test_optional_columns_are_dropped_before_cells_are_wrapped() -> None:
 
 def test_in_a_pipe_a_table_is_neither_cut_nor_coloured_nor_read_as_markup() -> None:
     rows = [["[red]a[/red]", "x" * 5000, ":smile:"]]
-    assert list(table(("a", "b", "c"), rows))[1].split() == rows[0]
+    assert list(format_table(("a", "b", "c"), rows))[1].split() == rows[0]
 
 
 def test_no_word_is_lost_where_a_column_is_narrower_than_it() -> None:
-    lines = list(table(("name", "what"), [["a" * 30, "b" * 30]], 20))
+    lines = list(format_table(("name", "what"), [["a" * 30, "b" * 30]], 20))
     assert max(map(len, lines)) <= 20
     assert ["".join(lines).count(letter) for letter in "ab"] == [30 + 2, 30]
 

@@ -10,11 +10,11 @@ from rack.backplane.layout import MailboxSpec
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import Message, State
 from rack.backplane.segment import Segment
-from rack.boards.config.layout import field_specs
+from rack.boards.config.layout import build_field_specs
 from rack.boards.faults.kind import KINDS
 from rack.levels.messages import ArmState, Error, ServoStatus, TaskStatus
-from rack.tools.faults.campaigns.trial import is_late, kill_from_outside, levels_of
-from rack.tools.faults.ending import AT_REST, EXTERNAL, arm_of, strikes
+from rack.tools.faults.campaigns.trial import build_outside_kill, format_levels, is_late
+from rack.tools.faults.ending import EXTERNAL, REST_VELOCITY, list_strikes, read_arm
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
 
@@ -30,8 +30,8 @@ def box(kind: type[Message], name: str) -> MailboxSpec:
         readers=(),
         message=kind.message_type.name,
         version=kind.message_type.version,
-        size=kind.message_type.dtype(SIZES).itemsize,
-        fields=field_specs(kind.message_type, SIZES),
+        size=kind.message_type.build_dtype(SIZES).itemsize,
+        fields=build_field_specs(kind.message_type, SIZES),
     )
 
 
@@ -55,12 +55,12 @@ def test_the_last_states_of_levels_are_reported_with_their_reasons(
     make_bus: MakeBus,  # noqa: F811
 ) -> None:
     segment = make_bus(*BOXES, *TASKS)
-    assert levels_of(segment) == ""
+    assert format_levels(segment) == ""
     write(segment, "arm.state", tick=1)
     write(segment, "task.status", state=State.ERROR, reason="no path")
-    assert levels_of(segment) == "task error (no path)"
+    assert format_levels(segment) == "task error (no path)"
     write(segment, "servo.status", state=State.EXECUTING)
-    assert levels_of(segment) == "task error (no path), servo executing"
+    assert format_levels(segment) == "task error (no path), servo executing"
 
 
 def test_only_a_level_that_gave_up_because_of_a_time_is_late(
@@ -82,12 +82,12 @@ def test_the_arm_is_as_its_board_last_reported_it(
     make_bus: MakeBus,  # noqa: F811
 ) -> None:
     segment = make_bus(*BOXES, *TASKS)
-    still = arm_of(segment)
+    still = read_arm(segment)
     assert (still.violations, still.touches, still.is_at_rest) == (0, 0, True)
     for speed, rests in ((0.5, True), (-0.5, True), (-2.0, False)):
-        velocity = (0.0, speed * AT_REST)
+        velocity = (0.0, speed * REST_VELOCITY)
         write(segment, "servo.status", violations=3, touches=2, velocity=velocity)
-        end = arm_of(segment)
+        end = read_arm(segment)
         assert (end.violations, end.touches, end.is_at_rest) == (3, 2, rests)
 
 
@@ -99,10 +99,13 @@ def test_strikes_come_from_the_fault_table_and_from_outside_kills(
     bias, mute = KINDS["sensor-bias"], KINDS["mute"]
     joint = tuple(1.0 if p.name == "joint" else 0.25 for p in bias.parameters)
     injected = Injection(bias.number, 1, tick=40, ticks=400, seed=7, parameters=joint)
-    begun, waits = table.add(injected), table.add(Injection(mute.number, 0, mailbox=0, tick=90))
+    begun, waits = (
+        table.add_fault(injected),
+        table.add_fault(Injection(mute.number, 0, mailbox=0, tick=90)),
+    )
     begun.stage = Stage.ACTIVE
-    begun.acted(43)
-    first, second = strikes(segment, JOINTS)
+    begun.record_action(43)
+    first, second = list_strikes(segment, JOINTS)
     assert (first.kind, first.board) == ("sensor-bias", "servo")
     assert (first.began, first.tick, first.count) == (40, 43, 1)
     assert (first.joint, first.mailboxes) == ("elbow", ("servo.status",))
@@ -111,7 +114,7 @@ def test_strikes_come_from_the_fault_table_and_from_outside_kills(
     # It waits, so it has not begun.
     assert (second.kind, second.began, second.tick, second.count) == ("mute", -1, -1, 0)
     assert (second.fault, second.joint) == (waits.index, "")
-    kill = kill_from_outside(segment.layout, "task", 60, 5_000)
+    kill = build_outside_kill(segment.layout, "task", 60, 5_000)
     assert (kill.fault, kill.kind, kill.board) == (-1, EXTERNAL, "task")
     assert (kill.began, kill.ends, kill.tick) == (60, 60, 60)
     assert (kill.time_ns, kill.mailboxes) == (5_000, ("task.status",))

@@ -10,7 +10,7 @@ import pytest
 from rack.tools.faults.evidence import (
     Aftermath,
     SkippedTicks,
-    aftermath,
+    find_aftermath,
 )
 from tests.tools.fault_events import event, strike
 
@@ -44,7 +44,7 @@ SKIPS = SkippedTicks(
 def test_skipped_ticks_are_counted_by_one_task_and_bounded(
     first: int, last: int, skipped: int
 ) -> None:
-    assert SKIPS.between(first, last) == skipped
+    assert SKIPS.count_between(first, last) == skipped
 
 
 RESTART = event(105, "reaction", "restart", "lower")
@@ -52,14 +52,14 @@ REJOINED = event(130, "recovery", "rejoined", "lower")
 
 
 def test_each_reaction_is_undone_by_its_recovery() -> None:
-    assert aftermath(KILL, [RESTART], 500, ()) == Aftermath(("restart",), False, None, ())
+    assert find_aftermath(KILL, [RESTART], 500, ()) == Aftermath(("restart",), False, None, ())
     other = replace(REJOINED, board="upper")
     early = replace(REJOINED, tick=104)
-    assert not aftermath(KILL, [RESTART, other, early], 500, ()).is_undone
-    done = aftermath(KILL, [RESTART, REJOINED, replace(REJOINED, tick=140)], 500, ())
+    assert not find_aftermath(KILL, [RESTART, other, early], 500, ()).is_undone
+    done = find_aftermath(KILL, [RESTART, REJOINED, replace(REJOINED, tick=140)], 500, ())
     assert done == Aftermath(("restart",), True, 30, ())
     # Not to it: before it, or from the horizon on. A board that is killed must be restarted.
     nothing = Aftermath((), True, None, ("restart",))
-    assert aftermath(KILL, [replace(RESTART, tick=99)], 500, ()) == nothing
-    assert aftermath(KILL, [RESTART], 105, ()) == nothing
-    assert aftermath(replace(KILL, tick=-1), [RESTART], 500, ()) == Aftermath()
+    assert find_aftermath(KILL, [replace(RESTART, tick=99)], 500, ()) == nothing
+    assert find_aftermath(KILL, [RESTART], 105, ()) == nothing
+    assert find_aftermath(replace(KILL, tick=-1), [RESTART], 500, ()) == Aftermath()

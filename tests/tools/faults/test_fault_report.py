@@ -12,8 +12,8 @@ from rack.boards.config import load
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.report.report import write_report
-from rack.tools.report.report_markdown import markdown
-from rack.tools.viewer.reading import read
+from rack.tools.report.report_markdown import format_markdown
+from rack.tools.viewer.reading import read_component
 from tests.conftest import SMALL
 
 HANG = '{ kind = "hang", board = "upper", tick = 80 }'
@@ -58,7 +58,7 @@ def test_a_fault_is_reported_with_its_detection_reaction_and_recovery(
 
 @pytest.mark.slow
 def test_the_text_has_a_row_for_each_fault(report: Report) -> None:
-    lines = markdown(report).splitlines()
+    lines = format_markdown(report).splitlines()
     head = lines.index("## Faults: 2")
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[head + 2 :]]
     assert cells[0][:4] == ["fault", "target", "at tick", "found as"]
@@ -68,10 +68,10 @@ def test_the_text_has_a_row_for_each_fault(report: Report) -> None:
     assert cells[3][:4] == ["hang", "lower", "-", "not struck"]
     assert "Restarts: upper 1." in lines
     found = {"tick": 7, "board": "upper", "code": "gap", "text": "a message is missing"}
-    lines = markdown({**report, "unexplained": [found]}).splitlines()
+    lines = format_markdown({**report, "unexplained": [found]}).splitlines()
     assert "## Unexplained detections: 1" in lines
     assert "| 7    | upper    | gap | a message is missing |" in lines
-    plain = markdown({**report, "faults": [], "restarts": {}})
+    plain = format_markdown({**report, "faults": [], "restarts": {}})
     assert not {"Faults", "Restarts"} & set(plain.replace(":", " ").split())
 
 
@@ -86,19 +86,25 @@ def test_a_silent_board_is_recovered_from_only_when_it_is_heard_again(
     (fault,) = report["faults"]
     assert (fault["seen"], fault["found_as"]) == ("detected", "mute")
     assert fault["is_recovered"] is bool(lasts)
-    row = next(line for line in markdown(report).splitlines() if line.startswith("| mute"))
+    row = next(line for line in format_markdown(report).splitlines() if line.startswith("| mute"))
     assert row.strip("| ").endswith(recovered)
 
 
 @pytest.mark.slow
 def test_the_viewer_shows_the_course_of_a_fault_in_the_lane_of_its_board(folder: Path) -> None:
-    lane = read(folder / "run.rrd", "/events/upper", "StateChange:state").values.ravel().tolist()
+    lane = (
+        read_component(folder / "run.rrd", "/events/upper", "StateChange:state")
+        .values.ravel()
+        .tolist()
+    )
     # The fault ends with its board's process; who hears of which first is open, and the reaction
     # stays in sight.
     assert [state for state in lane if state] == ["fault", "died", "reaction", "recovery"]
     assert "" not in lane[lane.index("died") :]
-    text = read(folder / "run.rrd", "/log/events", "TextLog:text").values.ravel().tolist()
-    levels = read(folder / "run.rrd", "/log/events", "TextLog:level").values.ravel().tolist()
+    text = read_component(folder / "run.rrd", "/log/events", "TextLog:text").values.ravel().tolist()
+    levels = (
+        read_component(folder / "run.rrd", "/log/events", "TextLog:level").values.ravel().tolist()
+    )
     level_of = {line.partition(":")[0]: level for line, level in zip(text, levels, strict=True)}
     assert (level_of["fault"], level_of["detection"], level_of["recovery"]) == (
         "WARN",

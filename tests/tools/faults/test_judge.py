@@ -10,7 +10,13 @@ import pytest
 from rack.backplane.fault_table import NEVER
 from rack.boards.events import Event
 from rack.tools.faults.ending import EXTERNAL, Strike
-from rack.tools.faults.judge import Circumstances, FaultVerdict, Judgement, faults, judge
+from rack.tools.faults.judge import (
+    Circumstances,
+    FaultVerdict,
+    Judgement,
+    judge_faults,
+    report_faults,
+)
 from tests.tools.fault_events import LAYOUT, TICK_NS, box, event, flows, found, strike
 
 END = event(10_000, "end", "")
@@ -36,7 +42,7 @@ INVALID, LIMIT = (
 
 
 def verdict(strikes: list[Strike], *events: Event, run: Circumstances = REAL_TIME) -> FaultVerdict:
-    return judge(strikes, [*events, END], run)
+    return judge_faults(strikes, [*events, END], run)
 
 
 def judged(one: Strike, *events: Event, run: Circumstances = REAL_TIME) -> Judgement:
@@ -324,16 +330,21 @@ def test_reactions_after_the_next_fault_belong_to_that_fault() -> None:
 
 
 def test_a_run_that_ends_before_the_bound_of_a_recovery_says_nothing_about_it() -> None:
-    ends = [judge([NAN], [INVALID, CLOSED, event(end, "end", "")], REAL_TIME) for end in (209, 210)]
+    ends = [
+        judge_faults([NAN], [INVALID, CLOSED, event(end, "end", "")], REAL_TIME)
+        for end in (209, 210)
+    ]
     assert [found.faults[0].is_recovered for found in ends] == [True, False]
 
 
 def test_nothing_recovers_from_a_fault_of_messages_without_an_end() -> None:
     silent = replace(MUTE, ends=NEVER)
-    fault = judge([silent], [flows(99), SEEN, event(200, "end", "")], REAL_TIME).faults[0]
+    fault = judge_faults([silent], [flows(99), SEEN, event(200, "end", "")], REAL_TIME).faults[0]
     assert (fault.seen, fault.struck, fault.is_recovered) == ("detected", 100, False)
     # One that was to end says nothing yet.
-    (fault,) = judge([replace(MUTE, ends=900)], [SEEN, event(200, "end", "")], REAL_TIME).faults
+    (fault,) = judge_faults(
+        [replace(MUTE, ends=900)], [SEEN, event(200, "end", "")], REAL_TIME
+    ).faults
     assert fault.seen == "not struck"
 
 
@@ -378,7 +389,7 @@ def test_faults_are_listed_as_they_struck_and_those_that_never_did_last() -> Non
     late, first = strike("hang", "upper", 100, 200), strike("hang", "lower", 0, 50)
     never = strike("mute", "lower", NEVER, NEVER)
     struck = [asdict(one) for one in (late, never, first)]
-    found = faults([{"kind": "outcome", "outcome": {}, "faults": struck}], LAYOUT)["faults"]
+    found = report_faults([{"kind": "outcome", "outcome": {}, "faults": struck}], LAYOUT)["faults"]
     assert [(one["kind"], one["board"], one["struck"]) for one in found] == [
         ("hang", "lower", 0),
         ("hang", "upper", 100),

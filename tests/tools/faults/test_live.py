@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.fault_table import NEVER, FaultTable, Stage
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import Run, System
 from rack.boards.config import load, resolve
 from rack.tools.console.answer import Failure
@@ -52,10 +52,10 @@ class Running:
 @pytest.fixture
 def rack(small: Path, rack_name: str) -> Iterator[Running]:
     config = load(small, [f"name={rack_name}"])
-    segment = Segment.create(resolve(config).layout, config.text())
+    segment = Segment.create(resolve(config).layout, config.to_toml_text())
     yield Running(segment)
     segment.close()
-    unlink(rack_name)
+    unlink_segment(rack_name)
 
 
 def test_a_fault_that_begins_at_the_next_tick_is_waited_for(rack: Running) -> None:
@@ -64,11 +64,13 @@ def test_a_fault_that_begins_at_the_next_tick_is_waited_for(rack: Running) -> No
         rack.begin(0)
 
     with in_thread(serve):
-        found = rack.live.inject({"board": "lower", "kind": "drop", "probability": "0.5"}, False)
+        found = rack.live.inject_fault(
+            {"board": "lower", "kind": "drop", "probability": "0.5"}, False
+        )
     assert (found["fault"], found["stage"], found["waits_for"]) == (0, "active", "")
     assert found["message"].endswith(f": from tick {TICK + 1} to tick {TICK + 8}")
     rack.begin(0, NEVER)
-    assert rack.live._state(rack.table.entries[0]).endswith("to the end of the run")
+    assert rack.live._describe_state(rack.table.entries[0]).endswith("to the end of the run")
 
 
 @pytest.mark.parametrize(("acted", "text"), [(1, "acted once"), (3, "acted 3 times")])
@@ -79,13 +81,15 @@ def test_a_fault_that_is_over_says_when_it_acted(rack: Running, acted: int, text
         rack.end(0, acted)
 
     with in_thread(serve):
-        found = rack.live.inject({"board": "lower", "kind": "mute", "cycles": "4"}, True, 20.0)
+        found = rack.live.inject_fault(
+            {"board": "lower", "kind": "mute", "cycles": "4"}, True, 20.0
+        )
     assert found["stage"] == "over"
     assert found["message"].endswith(f": ticks {TICK + 1} to {TICK + 8}, {text}")
 
 
 def test_a_fault_with_a_future_tick_is_armed_and_can_be_withdrawn(rack: Running) -> None:
-    found = rack.live.inject({"board": "lower", "kind": "kill", "tick": TICK + 1}, False)
+    found = rack.live.inject_fault({"board": "lower", "kind": "kill", "tick": TICK + 1}, False)
     assert (found["stage"], found["waits_for"]) == (
         "waiting",
         f"tick {TICK + 1}; the rack is at tick {TICK}",
@@ -93,7 +97,7 @@ def test_a_fault_with_a_future_tick_is_armed_and_can_be_withdrawn(rack: Running)
     hint = f"to withdraw it: rack inject {rack.segment.rack} --withdraw 0"
     assert found["message"].endswith(f"armed, waits for {found['waits_for']}; {hint}")
     with pytest.raises(Failure, match="fault 1 is not waiting; waiting: 0"):
-        rack.live.withdraw(1)
+        rack.live.withdraw_fault(1)
     ticks = iter((TICK + 1, TICK + 2))
 
     def tick() -> None:
@@ -102,15 +106,15 @@ def test_a_fault_with_a_future_tick_is_armed_and_can_be_withdrawn(rack: Running)
             rack.segment.words[System.TICK] = now
 
     with in_thread(tick):
-        withdrawn = rack.live.withdraw(0)
+        withdrawn = rack.live.withdraw_fault(0)
     assert (withdrawn["stage"], withdrawn["message"]) == ("free", f"{found['text']}: withdrawn")
-    assert rack.live.faults() == []
+    assert rack.live.list_faults() == []
     with pytest.raises(Failure, match="fault 0 is not waiting; waiting: none"):
-        rack.live.withdraw(0)
+        rack.live.withdraw_fault(0)
 
 
 def test_a_fault_that_begins_while_it_is_withdrawn_stays(rack: Running) -> None:
-    rack.live.inject({"board": "lower", "kind": "kill", "tick": TICK + 1}, False)
+    rack.live.inject_fault({"board": "lower", "kind": "kill", "tick": TICK + 1}, False)
 
     def begin() -> None:
         wait_until(lambda: rack.table.entries[0].tick == NEVER)
@@ -121,7 +125,7 @@ def test_a_fault_that_begins_while_it_is_withdrawn_stays(rack: Running) -> None:
         in_thread(begin),
         pytest.raises(Failure, match="it had begun before it could be withdrawn"),
     ):
-        rack.live.withdraw(0)
+        rack.live.withdraw_fault(0)
 
 
 @pytest.mark.timeout(20)
@@ -129,24 +133,24 @@ def test_a_fault_is_withdrawn_at_once_from_a_held_rack(
     rack: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(live, "BEGIN_S", 1000.0)
-    rack.live.inject({"board": "lower", "kind": "kill", "tick": TICK + 50}, False)
+    rack.live.inject_fault({"board": "lower", "kind": "kill", "tick": TICK + 50}, False)
     rack.segment.words[System.HELD] = TICK
-    assert rack.live.withdraw(0)["stage"] == "free"
+    assert rack.live.withdraw_fault(0)["stage"] == "free"
 
 
 def test_every_wait_ends(rack: Running, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live, "BEGIN_S", 0.02)
     with pytest.raises(Failure, match=r"the clock has not begun it within 0\.02 s"):
-        rack.live.inject({"board": "lower", "kind": "kill"}, False)
+        rack.live.inject_fault({"board": "lower", "kind": "kill"}, False)
     later = {"board": "lower", "kind": "kill", "tick": TICK + 50}
     with pytest.raises(Failure, match=r"timed out after 0\.02 s: .* armed"):
-        rack.live.inject(later, True, 0.02)
+        rack.live.inject_fault(later, True, 0.02)
 
     def stop() -> None:
-        wait_until(lambda: len(rack.table.staged((Stage.WAITING,))) == 3)
+        wait_until(lambda: len(rack.table.list_entries((Stage.WAITING,))) == 3)
         rack.segment.words[System.STATE] = Run.STOPPED
 
     with in_thread(stop), pytest.raises(Failure, match="the run ended before it began"):
-        rack.live.inject(later, True)
+        rack.live.inject_fault(later, True)
     with pytest.raises(Failure, match=f"rack '{rack.segment.rack}': its run is over"):
-        rack.live.inject(later, False)
+        rack.live.inject_fault(later, False)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.segment import racks
-from rack.boards.config import loads
+from rack.backplane.segment import list_racks
+from rack.boards.config import load_text
 from tests.tools.command_line import rack
 
 pytestmark = pytest.mark.slow
@@ -35,7 +35,7 @@ def test_a_run_with_a_script_repeats_with_its_faults(
     report, repeated = json.loads(done.stdout), json.loads(again.stdout)
     assert report["digest"] == repeated["digest"]
     assert [fault["struck"] for fault in report["faults"]] == [200]
-    found = loads((tmp_path / "run" / "config.toml").read_text())
+    found = load_text((tmp_path / "run" / "config.toml").read_text())
     assert [(fault.kind, fault.at) for fault in found.fault] == [("hang", 0.5)]
 
 
@@ -64,4 +64,4 @@ def test_a_script_that_does_not_fit_is_refused_before_anything_starts(
     assert done.stderr.startswith(line)
     assert len(done.stderr.splitlines()) == 1
     assert not (tmp_path / "run").exists()
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()

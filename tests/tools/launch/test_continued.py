@@ -61,10 +61,10 @@ def test_a_continued_run_is_recorded_with_its_origin(run: Path, tmp_path: Path) 
     assert {path.suffix for path in two.rglob("*") if path.is_file()} <= kinds
     one, other = Recording(run), Recording(two)
     for name in other.mailboxes:
-        serials = other.signal(name, "serial")
-        assert other.signal(name, "tick")[0] >= 480
-        assert serials.tolist() == one.signal(name, "serial")[-len(serials) :].tolist()
-    assert other.trace("lower")["tick"][[0, -1]].tolist() == [480, 799]
+        serials = other.read_signal(name, "serial")
+        assert other.read_signal(name, "tick")[0] >= 480
+        assert serials.tolist() == one.read_signal(name, "serial")[-len(serials) :].tolist()
+    assert other.read_trace("lower")["tick"][[0, -1]].tolist() == [480, 799]
     assert report["continues"] == {
         "folder": str(run),
         "tick": 480,

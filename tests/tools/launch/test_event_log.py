@@ -25,12 +25,12 @@ def codes(path: Path) -> list[str]:
 def test_a_log_is_sorted_by_tick_at_the_end(tmp_path: Path, is_ended: bool) -> None:
     path = tmp_path / "events.jsonl"
     log = EventLog(Display())
-    log.open(path)
+    log.open_file(path)
     for code, tick in KNOWN:
-        log.add(Event(0, tick, "detection", "", "", code))
+        log.add_event(Event(0, tick, "detection", "", "", code))
     assert codes(path) == [code for code, _ in KNOWN]
     if is_ended:
-        log.end({"rack": "nasrem"})
+        log.write_outcome({"rack": "nasrem"})
         assert codes(path) == ["launch", "died", "brakes", "rejoined", "opened", "outcome"]
         assert [*tmp_path.iterdir()] == [path]
     else:

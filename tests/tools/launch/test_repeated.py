@@ -15,13 +15,13 @@ from rack.backplane.operator_table import Client, OperatorTable, Request
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, load, resolve
-from rack.boards.config.commands import asked, request
+from rack.boards.config.commands import build_request, parse_command
 from rack.tools.launch.launch import Beginning, run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.monitor.snapshot import Snapshot
-from rack.tools.recording.divergence import first_difference
-from rack.tools.recording.entries import commands_from, recorded_commands
-from rack.tools.recording.history import misses
+from rack.tools.recording.divergence import find_first_difference
+from rack.tools.recording.entries import load_commands_from, load_operator_commands
+from rack.tools.recording.history import list_misses
 from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.tools.command_line import rack
@@ -43,7 +43,7 @@ class Commanding(Display):
         """Give what is due, at once."""
         while self._given and snapshot.tick >= self._given[0].tick:
             with closing(Segment.attach(self._rack)) as segment:
-                OperatorTable(segment).add(replace(self._given.pop(0), tick=-1))
+                OperatorTable(segment).add_request(replace(self._given.pop(0), tick=-1))
 
 
 class ByHand(Display):
@@ -67,7 +67,7 @@ class ByHand(Display):
             return
         if self._given and words[System.HELD] - 1 == self._given[0].tick:
             now = replace(self._given.pop(0), tick=-1)
-            claim = OperatorTable(self._segment).claim(now, self._client)
+            claim = OperatorTable(self._segment).claim_request(now, self._client)
             self._claims.enter_context(claim)
         words[System.HOLD_AT] = self._given[0].tick + 1 if self._given else 0
 
@@ -82,8 +82,8 @@ def requests(config: RackConfig, **ticks: int) -> tuple[Request, ...]:
     """Return commands to the upper level, each at a tick."""
     plan = resolve(config)
     return tuple(
-        request(
-            asked({"level": "upper", "what": what, "tick": tick}),
+        build_request(
+            parse_command({"level": "upper", "what": what, "tick": tick}),
             config,
             plan.published.levels,
             plan.layout,
@@ -104,7 +104,7 @@ def commanded(folder: Path, name: str, mode: str) -> Recording:
     given = requests(config, resume=80, hold=200)
     run = folder / "one"
     if mode == "lockstep":
-        run_rack(config, SECONDS, run, Display(), begins=Beginning(requests=given))
+        run_rack(config, SECONDS, run, Display(), beginning=Beginning(requests=given))
     else:
         run_rack(config, SECONDS, run, Commanding(name, given))
     return Recording(run)
@@ -127,8 +127,8 @@ def test_an_operators_command_is_not_mistaken_for_one_of_the_config(
     file.write_text(COMMANDED)
     config = load(file, (f"name={rack_name}", "clock.mode=lockstep", commands(HOLD)))
     given = requests(config, hold=20, resume=30)
-    run_rack(config, 0.5, tmp_path / "one", Display(), begins=Beginning(requests=given))
-    assert recorded_commands(Recording(tmp_path / "one")) == given
+    run_rack(config, 0.5, tmp_path / "one", Display(), beginning=Beginning(requests=given))
+    assert load_operator_commands(Recording(tmp_path / "one")) == given
 
 
 @pytest.fixture(scope="module")
@@ -145,9 +145,9 @@ def test_a_lockstep_run_continues_from_any_tick_with_its_operators_commands(
     in_lockstep: Recording, tmp_path: Path, at: float, ticks: list[int]
 ) -> None:
     two = repeated(in_lockstep, tmp_path / "two", at)
-    assert first_difference(in_lockstep, two) is None
-    assert two.signal("upper.operator", "tick").tolist() == ticks
-    assert in_lockstep.ended["outcome"]["digest"] == two.ended["outcome"]["digest"]
+    assert find_first_difference(in_lockstep, two) is None
+    assert two.read_signal("upper.operator", "tick").tolist() == ticks
+    assert in_lockstep.end_counts["outcome"]["digest"] == two.end_counts["outcome"]["digest"]
 
 
 @pytest.mark.slow
@@ -158,7 +158,7 @@ def test_a_repeated_run_without_the_commands_differs(
     again = load(in_lockstep.folder / "config.toml", [])
     assert [command.tick for command in again.command] == [40]
     run_rack(again, SECONDS, tmp_path / "two", Display())
-    difference = first_difference(in_lockstep, Recording(tmp_path / "two"))
+    difference = find_first_difference(in_lockstep, Recording(tmp_path / "two"))
     assert difference is not None
     assert 80 <= difference.tick < 120
 
@@ -171,8 +171,8 @@ def test_a_run_in_real_time_is_repeated_equal_up_to_its_first_miss(
     one = commanded(tmp_path, rack_name, "realtime")
     two = repeated(one, tmp_path / "two")
     assert two.rack_config.clock.mode == "lockstep"
-    missed = [miss["tick"] for miss in misses(one)]
-    difference = first_difference(one, two)
+    missed = [miss["tick"] for miss in list_misses(one)]
+    difference = find_first_difference(one, two)
     if missed:
         # Each message until then is the same; what comes later may be.
         assert difference is None or difference.tick >= missed[0]
@@ -192,7 +192,7 @@ def by_hand(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     with closing(ByHand(name, given, request.param)) as operator:
         run_rack(config, SECONDS, folder / "one", operator, step=True)
     one = Recording(folder / "one")
-    assert one.signal("upper.operator", "tick").tolist() == [40, 140, 260]
+    assert one.read_signal("upper.operator", "tick").tolist() == [40, 140, 260]
     return one
 
 
@@ -213,9 +213,9 @@ def test_later_commands_of_operators_are_repeated(
     by_hand: Recording, tmp_path: Path, at: float, ticks: list[int]
 ) -> None:
     two = continued(by_hand, at, tmp_path / "two")
-    assert first_difference(by_hand, two) is None
-    assert two.signal("upper.operator", "tick").tolist() == ticks
-    assert by_hand.ended["outcome"]["digest"] == two.ended["outcome"]["digest"]
+    assert find_first_difference(by_hand, two) is None
+    assert two.read_signal("upper.operator", "tick").tolist() == ticks
+    assert by_hand.end_counts["outcome"]["digest"] == two.end_counts["outcome"]["digest"]
 
 
 @pytest.mark.slow
@@ -225,9 +225,9 @@ def test_a_command_that_waits_in_a_snapshot_is_issued_once(
     two = continued(by_hand, 0.3, tmp_path / "two")
     # Those that two repeats wait in the snapshot at tick 240.
     three = continued(two, 0.6, tmp_path / "three")
-    assert three.signal("upper.operator", "tick").tolist() == [260]
-    assert first_difference(two, three) is None
-    assert by_hand.ended["outcome"]["digest"] == three.ended["outcome"]["digest"]
+    assert three.read_signal("upper.operator", "tick").tolist() == [260]
+    assert find_first_difference(two, three) is None
+    assert by_hand.end_counts["outcome"]["digest"] == three.end_counts["outcome"]["digest"]
 
 
 @pytest.mark.slow
@@ -236,7 +236,7 @@ def test_a_branch_adds_its_commands_to_the_repeated_ones(
 ) -> None:
     earlier = "level = 'upper', what = 'hold', tick = 200"
     two = continued(by_hand, 0.25, tmp_path / "two", commands(HOLD, earlier))
-    assert two.signal("upper.operator", "tick").tolist() == [140, 200, 260]
+    assert two.read_signal("upper.operator", "tick").tolist() == [140, 200, 260]
 
 
 @pytest.mark.slow
@@ -245,7 +245,7 @@ def test_commands_in_a_flight_recorder_are_repeated_to_the_end_of_a_stretch(
 ) -> None:
     flight = Recording(by_hand.folder)
     flight.kept = [(0, 200), (240, 800)]
-    found = [[one.tick for one in commands_from(flight, tick)] for tick in (0, 100, 250)]
+    found = [[one.tick for one in load_commands_from(flight, tick)] for tick in (0, 100, 250)]
     assert found == [[40, 140], [140], [260]]
 
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from rack.backplane.operator_table import OperatorTable
-from rack.backplane.segment import Segment, racks
+from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import System
-from rack.tools.monitor.desk import LiveDesk
+from rack.tools.monitor.desk import LevelCommander
 from rack.tools.scripting.attached import AttachedRack
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.processes import RACK, wait_until
@@ -141,7 +141,7 @@ def test_a_level_holds_when_the_operator_of_a_lease_has_gone(
                 # A tick of lockstep has no length: silence means nothing there.
                 until = segment.words[System.TICK] + 1000
                 wait_until(lambda: segment.words[System.TICK] > until)
-                assert OperatorTable(segment).leased()
+                assert OperatorTable(segment).list_leased()
                 process.kill()
             event = live.wait_for("operator_gone", BOUND_S)
             process.kill()
@@ -165,8 +165,8 @@ def test_a_lease_ends_when_another_command_supersedes_it(running: str) -> None:
         assert process.poll() is None
         assert rack("command", running, "upper", "resume").returncode == 0
         assert process.wait(BOUND_S) == 0
-    assert not OperatorTable(segment).leased()
-    assert LiveDesk(Segment.attach(running)).highest("hold") == []
+    assert not OperatorTable(segment).list_leased()
+    assert LevelCommander(Segment.attach(running)).list_highest_levels("hold") == []
 
 
 @pytest.mark.slow
@@ -181,7 +181,7 @@ def test_a_paused_rack_continues_from_its_tick(running: str) -> None:
         assert again.startswith(f"rack '{running}': held before tick {paused['tick']}; ")
     else:
         assert paused["levels"] == ["upper"]
-        assert LiveDesk(Segment.attach(running)).highest("hold") == ["upper"]
+        assert LevelCommander(Segment.attach(running)).list_highest_levels("hold") == ["upper"]
         tick = words[System.TICK]
         wait_until(lambda: words[System.TICK] > tick)
     done = rack("resume", running)
@@ -224,7 +224,7 @@ def test_a_parameter_set_on_a_held_rack_repeats_with_a_command_of_its_config(
     held = subprocess.Popen(
         [*RACK, *map(str, run), "--step"], cwd=ROOT, stdout=subprocess.PIPE, text=True
     )
-    wait_until(lambda: rack_name in racks() and Segment.attach(rack_name).words[System.HELD])
+    wait_until(lambda: rack_name in list_racks() and Segment.attach(rack_name).words[System.HELD])
     given = rack("set", rack_name, "board.lower.params.by=3", "--tick", "101")
     assert given.returncode == 0
     assert " set by=3: waits: the rack is held before" in given.stdout
@@ -269,8 +269,8 @@ def test_a_client_that_ends_while_it_waits_leaves_no_command_behind(
     table = OperatorTable(Segment.attach(running))
     command = [*RACK, "command", running, "upper", "hold", "--tick", str(10**9)]
     process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
-    wait_until(table.waiting)
+    wait_until(table.list_waiting)
     process.send_signal(end)
     process.communicate(timeout=BOUND_S)
     assert process.returncode == (-end if end == signal.SIGKILL else 128 + end)
-    assert table.waiting() == []
+    assert table.list_waiting() == []

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from rack.boards.events import Event
-from rack.tools.monitor.display import COLUMNS, PlainDisplay, RackView, line_of
+from rack.tools.monitor.display import COLUMNS, PlainDisplay, RackView, format_line
 from rack.tools.monitor.holds import Hold
 from rack.tools.monitor.snapshot import Snapshot, TaskProgress, TaskRow
 
@@ -100,9 +100,9 @@ def test_table_and_line_show_holds_and_problems_of_the_rack(
     assert sum("by the operator" in line for line in found) == len(
         snapshot.holds or [row for row in snapshot.tasks if row.reason.startswith("held")]
     )
-    assert line_of(snapshot).endswith(end)
+    assert format_line(snapshot).endswith(end)
     # It is short whatever holds the rack.
-    assert not snapshot.holds or len(line_of(snapshot)) <= 90
+    assert not snapshot.holds or len(format_line(snapshot)) <= 90
 
 
 def test_a_display_shows_the_events_of_a_fault_but_no_misses(

@@ -12,7 +12,7 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input
 
-from rack.backplane.segment import Segment, racks
+from rack.backplane.segment import Segment, list_racks
 from rack.tools.monitor.full_screen import RackScreen
 from tests.processes import wait_until
 from tests.tools.command_line import BOUND_S, rack
@@ -119,4 +119,4 @@ def test_the_screen_ends_with_the_run(running: str) -> None:
                 await pilot.pause(0.05)
 
     on_screen(running, act)
-    wait_until(lambda: running not in racks(), BOUND_S)
+    wait_until(lambda: running not in list_racks(), BOUND_S)

@@ -10,12 +10,12 @@ import pytest
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import State
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import Block, Run, System
-from rack.boards.config import load, wire
+from rack.boards.config import load, resolve_layout
 from rack.levels.operator import Answer, Goal, Operation
-from rack.tools.monitor.holds import STILL_S, Standstill, find_holds
-from rack.tools.monitor.newest_messages import Newest
+from rack.tools.monitor.holds import STANDSTILL_S, StandstillDetector, find_holds
+from rack.tools.monitor.newest_messages import NewestMessages
 from tests.boards.commanded_racks import COMMANDED
 
 TICK_S = 0.0025
@@ -25,10 +25,10 @@ TICK_S = 0.0025
 def segment(tmp_path: Path, rack_name: str) -> Iterator[Segment]:
     (tmp_path / "told.toml").write_text(COMMANDED)
     config = load(tmp_path / "told.toml", [f"name={rack_name}"])
-    made = Segment.create(wire(config), config.text())
+    made = Segment.create(resolve_layout(config), config.to_toml_text())
     yield made
     made.close()
-    unlink(rack_name)
+    unlink_segment(rack_name)
 
 
 def give(segment: Segment, *whats: Operation) -> None:
@@ -53,7 +53,7 @@ def answer(
 
 
 def lines(segment: Segment) -> list[str]:
-    return [hold.line for hold in find_holds(Newest(segment))]
+    return [hold.line for hold in find_holds(NewestMessages(segment))]
 
 
 def test_a_hold_or_a_diversion_of_an_operator_says_since_when_and_how_to_release_it(
@@ -71,12 +71,12 @@ def test_a_hold_or_a_diversion_of_an_operator_says_since_when_and_how_to_release
     # A command that was refused leaves the one before it standing.
     give(segment, Operation.GOTO, Operation.GOTO)
     answer(segment, Operation.GOTO, 2, Answer.REFUSED)
-    assert [hold.since_tick for hold in find_holds(Newest(segment))] == [100]
+    assert [hold.since_tick for hold in find_holds(NewestMessages(segment))] == [100]
 
 
 def test_a_level_that_holds_by_itself_gives_its_reason(segment: Segment) -> None:
     answer(segment, Operation.NONE, 0, Answer.NONE, State.HOLDING)
-    segment.block("upper")[Block.LEVEL_SINCE] = 40
+    segment.get_block("upper")[Block.LEVEL_SINCE] = 40
     assert lines(segment) == ["upper holding: something is in the way, since 0.10 s"]
 
 
@@ -97,15 +97,15 @@ def test_nothing_holds_a_level_at_its_work_or_a_rack_whose_run_is_over(segment: 
 def test_a_standstill_is_one_event_for_each_hold(segment: Segment) -> None:
     give(segment, Operation.HOLD)
     answer(segment, Operation.HOLD, 1, Answer.DONE)
-    standstill, events = Standstill(segment), []
+    standstill, events = StandstillDetector(segment), []
     for second in range(20):
         segment.words[System.TICK] = round(second / TICK_S)
-        events += list(standstill.look())
+        events += list(standstill.list_events())
     (event,) = events
     assert (event.kind, event.code) == ("held", "standstill")
     assert (event.subject, event.since) == ("upper", 100)
     # Held since 0.25 s, looked at every second.
-    assert event.tick == round((STILL_S + 1) / TICK_S)
+    assert event.tick == round((STANDSTILL_S + 1) / TICK_S)
     assert event.text.startswith(
         "nothing has moved for 6 s: upper held by the operator (hold), since 0.25 s; "
     )

@@ -58,7 +58,7 @@ def test_a_run_with_a_host_board_is_continued_with_its_messages(
 ) -> None:
     run, first = recorded
     one = Recording(run)
-    tick = int(one.signal("bridge.numbers", "tick")[20])
+    tick = int(one.read_signal("bridge.numbers", "tick")[20])
     middle_s = tick * one.layout.clock_ns * 1e-9
     asked = f"--from {run}@{middle_s}"
     done = rack("run", *asked.split(), "--out", tmp_path / "two", "--json")
@@ -67,7 +67,7 @@ def test_a_run_with_a_host_board_is_continued_with_its_messages(
         f"{asked}: not started: 'program'; their recorded messages are replayed",
     ]
     two = Recording(tmp_path / "two")
-    assert two.signal("bridge.numbers", "tick").min() >= tick
+    assert two.read_signal("bridge.numbers", "tick").min() >= tick
     refused = rack("run", *asked.split(), "--entries", run)
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
     assert "--from replays the entries anyway" in refused.stderr

@@ -12,7 +12,7 @@ from rack.boards.config import load
 from rack.tools.monitor.interrupts import replay_inbox
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
-from tests.boards.messages import Written
+from tests.boards.messages import WrittenMessages
 from tests.boards.run.test_interrupts import BOARDS, OVERLOADED, RACK, SECONDS, SMALL, TICKS
 from tests.tools.recordings import recorded as write_recording
 
@@ -24,7 +24,7 @@ def recorded(folder: Path, name: str, *settings: str) -> Recording:
     config = load(path, [f"name={name}", *settings])
     with Rack(config) as rack:
         rack.run(SECONDS)
-        found = Written.on(rack.segment)
+        found = WrittenMessages.on(rack.segment)
     traces = {task: rows.tolist() for task, rows in found.cycles.items()}
     return write_recording(folder / "run", config, traces, messages=found.messages)
 
@@ -35,10 +35,10 @@ def test_recording_and_report_agree_with_the_inbox_of_the_board(
     tmp_path: Path, rack_name: str, settings: tuple[str, ...]
 ) -> None:
     recording = recorded(tmp_path, rack_name, *settings)
-    slot = recording.layout.task("hub").slot
+    slot = recording.layout.find_task("hub").slot
     arrivals = replay_inbox(recording, slot)
-    names = [box.name for box in recording.layout.interrupting(slot)]
-    had = recording.signal("hub.status", "cycle")
+    names = [box.name for box in recording.layout.list_interrupting_mailboxes(slot)]
+    had = recording.read_signal("hub.status", "cycle")
     for at in range(BOARDS):
         ends = arrivals.end_ns[arrivals.mailbox == names.index(f"figure{at}.status")]
         shown = [np.flatnonzero(ends <= tick * recording.layout.clock_ns) for tick in range(TICKS)]

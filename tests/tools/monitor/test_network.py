@@ -12,24 +12,24 @@ import pytest
 from rich.console import Console
 
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.segment import Segment, unlink
-from rack.boards.config.loader import loads
-from rack.boards.config.resolved import wire
+from rack.backplane.segment import Segment, unlink_segment
+from rack.boards.config.loader import load_text
+from rack.boards.config.resolved import resolve_layout
 from rack.levels.peer import Presence
 from rack.tools.monitor.display import RackView
 from rack.tools.monitor.network import (
     ExportRow,
     ImportRow,
     PeerRow,
-    exchanged,
-    export_rows,
-    import_rows,
-    peer_rows,
+    list_exports,
+    list_imports,
+    list_peers,
+    read_entries,
 )
-from rack.tools.monitor.newest_messages import Newest
+from rack.tools.monitor.newest_messages import NewestMessages
 from rack.tools.monitor.snapshot import RackMonitor
-from rack.tools.report.report import network
-from rack.tools.report.report_markdown import _network
+from rack.tools.report.report import summarize_network
+from rack.tools.report.report_markdown import _format_network
 from tests.boards.lan.racks import rack_text
 
 TEXT = rack_text(
@@ -50,8 +50,8 @@ COUNTS = {
 @pytest.fixture
 def segment(rack_name: str) -> Iterator[Segment]:
     """Segment of a rack whose adapter has exchanged messages for a while."""
-    config = loads(TEXT.replace('name = "one"', f'name = "{rack_name}"'))
-    made = Segment.create(wire(config), config.text())
+    config = load_text(TEXT.replace('name = "one"', f'name = "{rack_name}"'))
+    made = Segment.create(resolve_layout(config), config.to_toml_text())
     status, peer = open_writer(made, "lan.status"), open_writer(made, "lan.peer_other_one")
     status.message.import_other[...] = (*COUNTS.values(), 99, 40, 80, 16, 0.04)
     status.message.export_pulse[...] = (12, 24)
@@ -62,25 +62,27 @@ def segment(rack_name: str) -> Iterator[Segment]:
     peer.write(8)
     yield made
     made.close()
-    unlink(rack_name)
+    unlink_segment(rack_name)
 
 
 def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> None:
-    assert peer_rows(Newest(segment)) == (PeerRow("other-one", "lost", 400, 2, 1, -500.0, 0.2),)
+    assert list_peers(NewestMessages(segment)) == (
+        PeerRow("other-one", "lost", 400, 2, 1, -500.0, 0.2),
+    )
     taken = ImportRow(
         "lan.other", "other-one/pulse.status", *COUNTS.values(), age_ticks=16, age_s=0.04
     )
-    assert import_rows(Newest(segment)) == (taken,)
-    assert export_rows(Newest(segment)) == (ExportRow("lan.pulse", "pulse.status", 12),)
+    assert list_imports(NewestMessages(segment)) == (taken,)
+    assert list_exports(NewestMessages(segment)) == (ExportRow("lan.pulse", "pulse.status", 12),)
     terminal = Console(width=200, record=True, file=StringIO())
-    terminal.print(RackView(RackMonitor(segment).look()))
+    terminal.print(RackView(RackMonitor(segment).take_snapshot()))
     text = terminal.export_text()
     shown = ("other-one  lost", "lan.other  other-one/pulse.status", "lan.pulse  pulse.status")
     assert [part for part in (*shown, "16  0.040") if part not in text] == []
-    assert exchanged('name = "alone"') is None
+    assert read_entries('name = "alone"') is None
 
 
-class Recorded:
+class RecordedRun:
     """Stands in for a recording with three cycles of the adapter."""
 
     mailboxes = ("lan.status",)
@@ -103,8 +105,8 @@ class Recorded:
 
 
 def test_a_report_has_counts_ages_and_losses(segment: Segment) -> None:
-    recording: Any = Recorded(segment)
-    found = network(recording)
+    recording: Any = RecordedRun(segment)
+    found = summarize_network(recording)
     assert found is not None
     (entry,) = found["imports"]
     assert {name: entry[name] for name in COUNTS} == COUNTS
@@ -113,7 +115,7 @@ def test_a_report_has_counts_ages_and_losses(segment: Segment) -> None:
         {"peer": "other-one", "state": "lost", "losses": 1, "restarts": 1, "lost_s": 0.04},
         {"peer": "third", "state": "awaited", "losses": 0, "restarts": 0, "lost_s": 0.0},
     ]
-    lines = list(_network(found))
+    lines = list(_format_network(found))
     assert "- rack other-one: lost; lost 1 times, 0.04 s; restarted 1 times" in lines
-    assert list(_network(None)) == []
-    assert network(SimpleNamespace(config='name = "alone"', mailboxes=())) is None  # type: ignore[arg-type]
+    assert list(_format_network(None)) == []
+    assert summarize_network(SimpleNamespace(config='name = "alone"', mailboxes=())) is None  # type: ignore[arg-type]

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from rack.boards import Rack
-from rack.boards.config import load, wire
+from rack.boards.config import load, resolve_layout
 from rack.tools.console.tables import render_text
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
-from rack.tools.monitor.newest_messages import Newest
-from rack.tools.monitor.queues import queue_fills
+from rack.tools.monitor.newest_messages import NewestMessages
+from rack.tools.monitor.queues import list_queue_fills
 from rack.tools.report.report import write_report
-from rack.tools.timing.inventory import inventory, inventory_blocks
+from rack.tools.timing.inventory import build_inventory, format_inventory
 from tests.boards.test_queues import QUEUES
 
 FULL = ("protocol.depth={ 'upper.requests' = 7 }", "board.lower.params.most=2")
@@ -29,15 +29,17 @@ def test_status_check_and_report_show_fill_and_refusals_of_a_queue(
     config = load(path, [f"name={rack_name}", *FULL])
     (line,) = (
         line
-        for line in render_text(inventory_blocks(inventory(config, wire(config), [])))
+        for line in render_text(
+            format_inventory(build_inventory(config, resolve_layout(config), []))
+        )
         if "upper.requests " in line
     )
     assert "queue of 7" in line
     with Rack(config) as rack:
-        (empty,) = queue_fills(Newest(rack.segment))
+        (empty,) = list_queue_fills(NewestMessages(rack.segment))
         assert empty.line == "queue upper.requests: 0 of 7 unread"
         rack.run(1.0)
-        (full,) = queue_fills(Newest(rack.segment))
+        (full,) = list_queue_fills(NewestMessages(rack.segment))
     assert full.line == "queue upper.requests: 5 of 7 unread, 19 refused"
     result = run_rack(config, 2.0, tmp_path / "run", Display())
     report, text = write_report(tmp_path / "run")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import Block
 from rack.boards.config import load, resolve
-from rack.tools.monitor.replies import REPLY_CYCLES, LastCycle
+from rack.tools.monitor.replies import REPLY_CYCLES, ReplyDeadline
 from tests.boards.commanded_racks import COMMANDED
 
 
@@ -16,17 +16,18 @@ def test_the_wait_for_a_level_is_bounded_by_its_cycles(tmp_path: Path, rack_name
     layout = resolve(load(tmp_path / "told.toml", [f"name={rack_name}"])).layout
     segment = Segment.create(layout, "")
     try:
-        block = segment.block("lower")
-        last = LastCycle(segment, layout.mailbox("lower.status"))
+        block = segment.get_block("lower")
+        last = ReplyDeadline(segment, layout.find_mailbox("lower.status"))
         # It skipped ticks, but did few cycles.
         block[Block.CYCLES] = REPLY_CYCLES
-        assert last.passed(100) == ""
+        assert last.explain_silence(100) == ""
         block[Block.CYCLES] += 1
-        assert last.passed(101) == f"has not answered within {REPLY_CYCLES} cycles"
-        stopped = LastCycle(segment, layout.mailbox("lower.status"))
-        assert stopped.passed(101) == stopped.passed(501) == ""
+        assert last.explain_silence(101) == f"has not answered within {REPLY_CYCLES} cycles"
+        stopped = ReplyDeadline(segment, layout.find_mailbox("lower.status"))
+        assert stopped.explain_silence(101) == stopped.explain_silence(501) == ""
         assert (
-            stopped.passed(502) == "has not answered, and has not completed a cycle since tick 101"
+            stopped.explain_silence(502)
+            == "has not answered, and has not completed a cycle since tick 101"
         )
     finally:
-        unlink(rack_name)
+        unlink_segment(rack_name)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.tools.monitor.signals import SignalTap, Strip
+from rack.tools.monitor.signals import SignalHistory, SignalReader
 from rack.tools.recording.signal import Signal
 from tests.backplane.bus import NAME
 from tests.link import Link, links
@@ -23,23 +23,23 @@ def link(rack_name: str) -> Iterator[Link]:
 def signals(link: Link) -> list[Signal]:
     """Two signals of its mailbox."""
     boxes = link.segment.layout.mailboxes
-    return [Signal.of(f"{NAME}.{name}", boxes) for name in ("row[3]", "id")]
+    return [Signal.parse(f"{NAME}.{name}", boxes) for name in ("row[3]", "id")]
 
 
 def test_every_message_is_read_once_and_overwritten_ones_are_counted(
     link: Link, signals: list[Signal]
 ) -> None:
-    tap = SignalTap(link.segment, signals)
+    tap = SignalReader(link.segment, signals)
     taken = []
     for first in range(0, 60, 20):
         link.run(first, first + 20)
-        for written in tap.take():
+        for written in tap.read_new():
             assert (written.mailbox, written.lost) == (NAME, 0)
             taken += zip(written.ticks.tolist(), written.messages["id"].tolist(), strict=True)
     assert taken == [(tick, tick) for tick in range(0, 60, 2)]
-    assert [*tap.take()] == []
+    assert [*tap.read_new()] == []
     link.run(60, 460)
-    (written,) = tap.take()
+    (written,) = tap.read_new()
     assert written.lost + len(written.ticks) == 200
     assert written.lost > 0
 
@@ -47,23 +47,23 @@ def test_every_message_is_read_once_and_overwritten_ones_are_counted(
 def test_a_strip_has_a_row_for_each_tick_and_keeps_its_span(
     link: Link, signals: list[Signal]
 ) -> None:
-    strip = Strip(link.segment, signals, span=20)
+    strip = SignalHistory(link.segment, signals, span=20)
     link.run(0, 40)
-    strip.take()
-    assert strip.table(10, 15) == [(10, [10, 10]), (12, [12, 12]), (14, [14, 14])]
+    strip.read_new()
+    assert strip.list_rows(10, 15) == [(10, [10, 10]), (12, [12, 12]), (14, [14, 14])]
     for first in range(40, 400, 40):
         link.run(first, first + 40)
-        strip.take()
-    kept = strip.table(0, 400)
+        strip.read_new()
+    kept = strip.list_rows(0, 400)
     assert kept[-1] == (398, [398, 398])
     # The span, and as much as one look may bring: the ring, and what is being written.
     assert kept[0][0] == 398 - 20 - 2 * 64 - 4 - 2
 
 
 def test_a_signal_keeps_its_value_between_messages(link: Link, signals: list[Signal]) -> None:
-    strip = Strip(link.segment, signals, span=20)
-    assert strip.table(0, 10) == []
+    strip = SignalHistory(link.segment, signals, span=20)
+    assert strip.list_rows(0, 10) == []
     link.run(0, 8)
-    strip.take()
-    assert strip.table(5, 6) == [(6, [6, 6])]
-    assert strip.time_s(6) == 0.015
+    strip.read_new()
+    assert strip.list_rows(5, 6) == [(6, [6, 6])]
+    assert strip.to_time_s(6) == 0.015

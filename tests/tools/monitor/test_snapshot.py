@@ -10,10 +10,10 @@ import pytest
 from rack.backplane.fault_table import FaultTable, Stage
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import State
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import Block, Demand, System, TaskState
-from rack.boards.config import load, wire
-from rack.boards.config.injections import injections
+from rack.boards.config import load, resolve_layout
+from rack.boards.config.injections import build_injections
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.monitor.snapshot import RackMonitor, Snapshot, TaskRow
@@ -25,12 +25,12 @@ FAULT = 'fault=[{ kind = "mute", board = "lower" }]'
 @pytest.fixture
 def segment(small: Path, rack_name: str) -> Iterator[Segment]:
     config = load(small, [f"name={rack_name}", FAULT])
-    layout = wire(config)
-    made = Segment.create(layout, config.text())
-    FaultTable(made).add(injections(config, layout)[0])
+    layout = resolve_layout(config)
+    made = Segment.create(layout, config.to_toml_text())
+    FaultTable(made).add_fault(build_injections(config, layout)[0])
     yield made
     made.close()
-    unlink(rack_name)
+    unlink_segment(rack_name)
 
 
 class Seen(Display):
@@ -47,11 +47,11 @@ class Seen(Display):
 
 
 def row(segment: Segment, task: str) -> TaskRow:
-    return next(row for row in RackMonitor(segment).look().tasks if row.task == task)
+    return next(row for row in RackMonitor(segment).take_snapshot().tasks if row.task == task)
 
 
 def test_a_lost_task_is_shown_as_lost_whatever_its_status(segment: Segment) -> None:
-    segment.block("lower")[Block.LOST] = 41
+    segment.get_block("lower")[Block.LOST] = 41
     assert [row(segment, name).state for name in ("lower", "upper")] == ["lost", "absent"]
 
 
@@ -93,8 +93,8 @@ def test_active_faults_and_the_demand_on_the_arm_are_shown(segment: Segment) -> 
     seen = []
     for stage in (Stage.WAITING, Stage.ACTIVE, Stage.OVER):
         entry.stage = stage
-        seen.append(RackMonitor(segment).look().faults)
+        seen.append(RackMonitor(segment).take_snapshot().faults)
     assert seen == [(), ("mute of lower",), ()]
     for demand in Demand:
         segment.words[System.DEMAND] = demand
-        assert RackMonitor(segment).look().demand == demand.name.lower()
+        assert RackMonitor(segment).take_snapshot().demand == demand.name.lower()

@@ -24,8 +24,8 @@ def test_a_set_is_made_for_every_name_and_only_its_owner_may_read_it(tmp_path: P
     assert (done.returncode, done.stderr) == (0, "")
     names = [*SHARED, "cell.pem", "cell-key.pem", "operator.pem", "operator-key.pem"]
     assert sorted(path.name for path in folder.iterdir()) == sorted(names)
-    assert list(Credentials(folder, "cell").flaws(["10.0.0.1", "cell.local"])) == []
-    assert list(Credentials(folder, "operator").flaws()) == []
+    assert list(Credentials(folder, "cell").find_flaws(["10.0.0.1", "cell.local"])) == []
+    assert list(Credentials(folder, "operator").find_flaws()) == []
     assert "This set is for tests" in done.stdout
     assert "Each machine needs only authority.pem and one pair" in done.stdout
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
@@ -50,7 +50,7 @@ def test_names_are_added_by_the_same_authority(tmp_path: Path) -> None:
     assert answer["names"] == {"puma": ["10.0.0.2"]}
     # Not longer than its authority.
     assert datetime.fromisoformat(answer["expires"]) < datetime.now(UTC) + timedelta(days=2)
-    assert list(Credentials(tmp_path, "puma").flaws(["10.0.0.2"])) == []
+    assert list(Credentials(tmp_path, "puma").find_flaws(["10.0.0.2"])) == []
     assert {path: path.read_bytes() for path in before} == before
 
 

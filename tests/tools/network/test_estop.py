@@ -24,7 +24,7 @@ from rack.tools.console.address import Operator, RackAddress
 from rack.tools.console.answer import Failure
 from rack.tools.network.certificates import make_credentials
 from rack.tools.network.estop import check_reach
-from rack.tools.viewer.window import free_port
+from rack.tools.viewer.window import find_free_port
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import BOUND_S, RACK, wait_until
 from tests.tools.command_line import ROOT, rack
@@ -83,7 +83,7 @@ def afar(*commands: str) -> list[Ended]:
 def far(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Far]:
     """A rack on this machine that runs until it is stopped, to be reached by its address."""
     folder = tmp_path_factory.mktemp("far")
-    name, port = f"test-afar-{os.getpid()}", free_port()
+    name, port = f"test-afar-{os.getpid()}", find_free_port()
     peer = f"{name}-peer"
     config, log = folder / "far.toml", folder / "log"
     config.write_text(COMMANDED + OF_LAN.format(port=port, peer=peer))
@@ -236,7 +236,7 @@ def test_a_ready_operator_is_told_when_the_run_ends(far: Far) -> None:
 
 @pytest.mark.slow
 def test_an_unreachable_host_is_reported_in_one_line(tmp_path: Path) -> None:
-    port = free_port()
+    port = find_free_port()
     make_credentials(tmp_path / "certs", {"cell": []}, 1)
     why = "must be RACK or HOST[:PORT]/RACK, as in 10.0.0.5/cell"
     with socket.create_server(("127.0.0.1", 0)) as server:

@@ -118,7 +118,7 @@ def notes_of(recording: Recording) -> list[str]:
 def counts(recording: Recording) -> dict[str, int]:
     """Return the rows of every task and every mailbox."""
     rows = {task: len(cycles) for task, cycles in recording.cycles.items()}
-    return rows | {name: len(recording.signal(name, "serial")) for name in recording.mailboxes}
+    return rows | {name: len(recording.read_signal(name, "serial")) for name in recording.mailboxes}
 
 
 def realtime(config: RackConfig) -> RackConfig:

@@ -21,9 +21,9 @@ from rack.boards import Rack
 from rack.boards.config import RackConfig, load
 from rack.boards.events import Event
 from rack.tools.console.answer import Failure
-from rack.tools.recording.checksums import CHECKSUMS, checked_line, read_line
+from rack.tools.recording.checksums import CHECKSUMS, format_checked_line, parse_checked_line
 from rack.tools.recording.file_names import CONFIG, SPOOL
-from rack.tools.recording.parquet import HEAD
+from rack.tools.recording.parquet import HEAD_COLUMNS
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
@@ -75,12 +75,14 @@ def read_values(folder: Path) -> object:
     """Return everything that a recording says."""
     found = Recording(folder)
     signals = {
-        (box.name, field): found.signal(box.name, field).tolist()
+        (box.name, field): found.read_signal(box.name, field).tolist()
         for box in found.layout.timed
-        for field in (*HEAD, *sorted(found.fields(box.name)))
+        for field in (*HEAD_COLUMNS, *sorted(found.list_fields(box.name)))
     }
     cycles = {task: rows.tobytes() for task, rows in found.cycles.items()}
-    return repr((found.config, cycles, signals, found.events, found.lost, found.kept, found.layout))
+    return repr(
+        (found.config, cycles, signals, found.events, found.lost_rows, found.kept, found.layout)
+    )
 
 
 def find_failure(folder: Path) -> str:
@@ -140,10 +142,10 @@ def test_a_flipped_bit_in_the_files_of_a_killed_recorder_is_named(
     config = load(small, [f"name={rack_name}", *([record] if record else [])])
     folder, copy = tmp_path / "run", tmp_path / "copy"
     folder.mkdir()
-    (folder / CONFIG).write_text(config.text())
+    (folder / CONFIG).write_text(config.to_toml_text())
     with Rack(config) as running, Recorder(running.segment, folder) as recorder:
         running.run(0.5)
-        recorder.drain()
+        recorder.drain_rings()
         recorder._spool.flush(now=True)
         # Leave the spool as a killed recorder would.
         shutil.copytree(folder, copy)
@@ -158,11 +160,11 @@ def test_a_flipped_bit_in_the_files_of_a_killed_recorder_is_named(
 
 
 def test_nan_is_null_in_json_and_is_restored() -> None:
-    line = checked_line({"kind": "detection", "value": float("nan")})
+    line = format_checked_line({"kind": "detection", "value": float("nan")})
     assert json.loads(line, parse_constant=pytest.fail)["value"] is None
-    assert np.isnan(read_line(line)["value"])
+    assert np.isnan(parse_checked_line(line)["value"])
     with pytest.raises(ValueError, match="checksum"):
-        read_line(line.replace("detection", "Detection"))
+        parse_checked_line(line.replace("detection", "Detection"))
 
 
 @pytest.mark.slow

@@ -14,8 +14,8 @@ from rack.tools.monitor.display import Display
 from rack.tools.recording import cores
 from rack.tools.recording.cores import UNMEASURED, CoreMeter, CoreRecord, Stolen
 from rack.tools.recording.recording import Recording
-from rack.tools.report.report import report_of
-from rack.tools.report.report_markdown import markdown
+from rack.tools.report.report import build_report
+from rack.tools.report.report_markdown import format_markdown
 from tests.tools.recordings import MS, Cycle, recorded
 
 HEAD = "cpu  9 9 9 9 9 9 9 99 0 0\n"
@@ -44,17 +44,17 @@ def steal(machine: Path, first: int, second: int) -> None:
 
 def test_a_rise_of_steal_is_recorded_with_its_core_and_time_span(machine: Path) -> None:
     found = CoreMeter()
-    found.look()
-    assert found.record().stolen == ()
+    found.read_counters()
+    assert found.build_record().stolen == ()
     steal(machine, 3, 9)
-    found.look()
-    record = found.record()
+    found.read_counters()
+    record = found.build_record()
     assert record.stolen is not None
     (stolen,) = record.stolen
     assert (stolen.core, stolen.ms) == (1, 20)
     assert stolen.from_ns < stolen.to_ns
     assert record.lasted_ns > 0
-    assert CoreRecord.of(record.text()) == record
+    assert CoreRecord.from_json(record.to_json()) == record
 
 
 def test_frequencies_come_from_cpuinfo_without_cpufreq(machine: Path) -> None:
@@ -63,15 +63,15 @@ def test_frequencies_come_from_cpuinfo_without_cpufreq(machine: Path) -> None:
         (machine / "cpuinfo").write_text(
             f"processor\t: 0\ncpu MHz\t\t: {mhz}\n\nprocessor\t: 1\ncpu MHz\t\t: 900\n"
         )
-        found.look()
-    assert found.record().mhz == ((0, 1200.5, 2600.0), (1, 900.0, 900.0))
+        found.read_counters()
+    assert found.build_record().mhz == ((0, 1200.5, 2600.0), (1, 900.0, 900.0))
     # One core has a frequency file, another core is offline.
     for core, text in ((0, "3100000\n"), (1, "")):
         path = machine / f"cpu{core}" / "cpufreq" / "scaling_cur_freq"
         path.parent.mkdir(parents=True)
         path.write_text(text)
-    found.look()
-    assert found.record().mhz == ((0, 1200.5, 3100.0), (1, 900.0, 900.0))
+    found.read_counters()
+    assert found.build_record().mhz == ((0, 1200.5, 3100.0), (1, 900.0, 900.0))
 
 
 def run(folder: Path, config: Path, record: CoreRecord) -> Recording:
@@ -86,11 +86,11 @@ def run(folder: Path, config: Path, record: CoreRecord) -> Recording:
 
 def test_misses_during_steal_are_counted_by_core_and_time(small: Path, tmp_path: Path) -> None:
     empty = run(tmp_path / "run", small, UNMEASURED)
-    period_ns, core = empty.layout.clock_ns, empty.layout.task("lower").core
+    period_ns, core = empty.layout.clock_ns, empty.layout.find_task("lower").core
     during = Stolen(20 * period_ns - MS, 20 * period_ns + MS, core, 10)
     elsewhere = Stolen(30 * period_ns - MS, 30 * period_ns + MS, core + 1, 30)
     record = CoreRecord(5 * S, (during, elsewhere))
-    report = report_of(run(tmp_path / "run", small, record))
+    report = build_report(run(tmp_path / "run", small, record))
     first, second = str(core), str(core + 1)
     assert report["steal"] == {
         "measured": True,
@@ -100,20 +100,22 @@ def test_misses_during_steal_are_counted_by_core_and_time(small: Path, tmp_path:
     assert (report["stalls"]["lost"], report["stalls"]["during_steal"]) == (3, 1)
     taken = f"core {core} for 0.20 %, core {core + 1} for 0.60 % of the run"
     line = f"- the hypervisor took {taken} (steal); 1 of 3 lost cycles were due at these times"
-    assert line in markdown(report)
+    assert line in format_markdown(report)
 
 
 def test_a_report_mentions_only_what_happened(small: Path, tmp_path: Path) -> None:
     def report(*mhz: tuple[int, float, float]) -> dict[str, Any]:
-        return report_of(run(tmp_path / "run", small, CoreRecord(S, (), mhz)))
+        return build_report(run(tmp_path / "run", small, CoreRecord(S, (), mhz)))
 
     quiet = report((0, 2600.0, 2600.0), (1, 2600.0, 2650.0))
     assert quiet["steal"]["measured"]
     assert quiet["frequency_mhz"]["1"] == {"min": 2600.0, "max": 2650.0}
-    assert not {"hypervisor", "frequency"} & set(markdown(quiet).split())
+    assert not {"hypervisor", "frequency"} & set(format_markdown(quiet).split())
     slow = report((0, 800.0, 2600.0), (1, 2600.0, 2600.0))
-    assert "- the processor changed its frequency: core 0 800 to 2600 MHz\n" in markdown(slow)
-    unknown = report_of(run(tmp_path / "run", small, UNMEASURED))
+    assert "- the processor changed its frequency: core 0 800 to 2600 MHz\n" in format_markdown(
+        slow
+    )
+    unknown = build_report(run(tmp_path / "run", small, UNMEASURED))
     assert not unknown["steal"]["measured"]
     assert unknown["frequency_mhz"] is None
 
@@ -127,4 +129,4 @@ def test_a_recording_keeps_what_the_machine_did(
     record = Recording(tmp_path / "run").cores
     assert record.lasted_ns >= 0.3 * S
     assert record.stolen is not None
-    assert report_of(Recording(tmp_path / "run"))["steal"]["measured"]
+    assert build_report(Recording(tmp_path / "run"))["steal"]["measured"]

@@ -15,7 +15,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.checksums import Checksums
-from rack.tools.recording.cycles import measured_budgets
+from rack.tools.recording.cycles import measure_budgets
 from rack.tools.recording.recording import Recording
 from tests.tools.recordings import MS, Cycle, recorded
 
@@ -39,7 +39,7 @@ def test_undisturbed_cycles_have_the_times_of_their_stamps(
         Cycle(SETTLED + k, (0.05, 0.1, 1.0 + 0.1 * k, 0.2), processor=1.5 + 0.1 * k)
         for k in range(4)
     ]
-    found = measured_budgets(recorded(tmp_path / "run", config, {"lower": trace}))
+    found = measure_budgets(recorded(tmp_path / "run", config, {"lower": trace}))
     assert found == {
         "lower": Budget(
             read_ns=MS // 10, process_ns=1_300_000, write_ns=MS // 5, exchange_ns=MS // 20
@@ -53,7 +53,7 @@ def test_preemption_by_the_executor_is_not_planner_time(config: RackConfig, tmp_
     # U.
     plan = Cycle(SETTLED, (0.0, 0.1, 3.1, 2.6), late=1.4, processor=3.2, flags=PLANNED)
     recording = recorded(tmp_path / "run", config, {"lower": executor, "lower.planner": [plan]})
-    found = measured_budgets(recording)["lower"]
+    found = measure_budgets(recording)["lower"]
     # Reading is part of P. U began at 6 ms and was preempted from 7.5 ms on.
     assert found.plan_ns == round((0.1 + 1.8) * MS)
     assert found.update_ns == round(1.3 * MS)
@@ -64,7 +64,7 @@ def test_untraced_time_is_subtracted_from_unusually_long_parts(
 ) -> None:
     usual = [Cycle(SETTLED + k, PLAIN) for k in range(10)]
     stolen = Cycle(SETTLED + 10, (0.0, 0.1, 1.0, 1.2), processor=1.3)
-    found = measured_budgets(recorded(tmp_path / "run", config, {"lower": [*usual, stolen]}))[
+    found = measure_budgets(recorded(tmp_path / "run", config, {"lower": [*usual, stolen]}))[
         "lower"
     ]
     assert (found.process_ns, found.write_ns) == (MS, MS // 5)
@@ -76,12 +76,12 @@ def test_the_start_up_of_a_process_is_not_counted(config: RackConfig, tmp_path: 
     trace = [Cycle(tick, cold if tick in (0, 39, 80, 119) else PLAIN) for tick in ticks]
     event = {"kind": "recovery", "code": "rejoined", "time_ns": 0, "text": ""}
     rejoined, other = event | {"board": "lower", "tick": 80}, event | {"board": "upper", "tick": 45}
-    found = measured_budgets(
+    found = measure_budgets(
         recorded(tmp_path / "run", config, {"lower": trace}, [rejoined, other])
     )["lower"]
     assert found.process_ns == MS
     late = [Cycle(tick, cold if tick == 45 else PLAIN) for tick in ticks]
-    found = measured_budgets(
+    found = measure_budgets(
         recorded(tmp_path / "late", config, {"lower": late}, [rejoined, other])
     )["lower"]
     assert found.process_ns == 2_200_000
@@ -121,7 +121,7 @@ def test_measured_times_match_known_computing_times(
     measured_run: Recording,
 ) -> None:
     # Use the median, so that a host that takes the machine away does not fail this test.
-    found = measured_budgets(measured_run, 50.0)["level"]
+    found = measure_budgets(measured_run, 50.0)["level"]
     expected = {
         "read_ns": 1.0,
         "process_ns": 1.0,

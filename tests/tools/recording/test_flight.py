@@ -23,16 +23,16 @@ from rack.tools.console.answer import Failure
 from rack.tools.launch.launch import RunResult, run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.monitor.snapshot import Snapshot
-from rack.tools.recording.divergence import first_difference
+from rack.tools.recording.divergence import find_first_difference
 from rack.tools.recording.file_names import CONFIG, SPOOL
 from rack.tools.recording.occasions import Retention
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import find_missing, tally
+from rack.tools.recording.run_files import count_spool, find_missing
 from rack.tools.recording.spool import STRETCHES
 from rack.tools.report.report import write_report
 from rack.tools.viewer.parts import FILE
-from rack.tools.viewer.reading import read
+from rack.tools.viewer.reading import read_component
 from tests.conftest import SMALL
 from tests.tools.recording.struck_recorders import Held
 
@@ -93,7 +93,7 @@ def test_a_long_run_does_not_grow_and_keeps_the_time_around_a_fault(
     recording = Recording(folder)
     assert not (folder / STRETCHES).exists()
     around, last = recording.kept
-    ticks = recording.trace("lower")["tick"]
+    ticks = recording.read_trace("lower")["tick"]
     for first, end in (
         ((FAULT_S - AROUND_S) * SECOND, (FAULT_S + AROUND_S) * SECOND),
         (result.outcome.ticks - KEEP_S * SECOND, result.outcome.ticks),
@@ -101,8 +101,8 @@ def test_a_long_run_does_not_grow_and_keeps_the_time_around_a_fault(
         assert np.isin(np.arange(first, end), ticks).all()
         assert any(begin <= first and end <= until for begin, until in (around, last))
     assert len(ticks) < (KEEP_S + 2 * AROUND_S + LEEWAY) * SECOND
-    assert not any(recording.lost.values())
-    assert recording.gaps() == []
+    assert not any(recording.lost_rows.values())
+    assert recording.find_gaps() == []
 
 
 def test_removed_stretches_count_neither_as_lost_nor_as_gaps(
@@ -119,13 +119,13 @@ def test_removed_stretches_count_neither_as_lost_nor_as_gaps(
     # Ages must not span the removed stretch.
     assert report["tasks"]["lower"]["plan_age_ms"]["max"] < 100
     with pytest.raises(Failure, match=r"the rest was not kept.*cannot be compared"):
-        first_difference(recording, recording)
+        find_first_difference(recording, recording)
     assert not (folder / FILE).exists()
     replay([folder], made, against=None)
-    shown = read(made, "/signals/lower.status/count")
-    assert shown.ticks.tolist() == recording.signal("lower.status", "tick").tolist()
+    shown = read_component(made, "/signals/lower.status/count")
+    assert shown.ticks.tolist() == recording.read_signal("lower.status", "tick").tolist()
     # The viewer must not show an age where nothing was kept.
-    ages = read(made, "/ages/lower.status").ticks
+    ages = read_component(made, "/ages/lower.status").ticks
     assert len(ages)
     (_, gone), (back, _) = recording.kept
     assert not ((ages > gone + SECOND) & (ages < back - SECOND)).any()
@@ -141,30 +141,30 @@ def test_a_restarted_flight_recorder_continues_with_the_next_stretch(
     assert display.struck
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
-    ticks = recording.trace("lower")["tick"]
+    ticks = recording.read_trace("lower")["tick"]
     # Stretches that the first recorder had not removed are kept.
     assert np.isin(np.arange((FAULT_S - AROUND_S) * SECOND, 25 * SECOND), ticks).all()
-    assert not any(recording.lost.values())
+    assert not any(recording.lost_rows.values())
 
 
 def record_flight(rack: Rack, folder: Path, seconds: float) -> Recorder:
     """Run a rack and record it in this process. Returns the recorder, which is still open."""
     folder.mkdir()
-    (folder / CONFIG).write_text(rack.config.text())
+    (folder / CONFIG).write_text(rack.config.to_toml_text())
     recorder = Recorder(rack.segment, folder)
     rack.start(seconds)
     while rack.watch(0.002):
-        recorder.drain()
-    recorder.drain()
+        recorder.drain_rings()
+    recorder.drain_rings()
     return recorder
 
 
 def find_missing_rows(segment: Segment, folder: Path) -> tuple[set[str], list[tuple[int, int]]]:
     """Return the rings with missing rows, and the required ticks that were not kept."""
-    left, keeping = tally(folder), Retention.of(segment)
+    left, keeping = count_spool(folder), Retention.from_config(segment)
     assert left is not None
     assert keeping is not None
-    absent = keeping.absent(segment, left.kept, segment.words[System.STOP_TICK])
+    absent = keeping.find_missing_windows(segment, left.kept, segment.words[System.STOP_TICK])
     return {*find_missing(segment, left.taken, left.lost)}, [tuple(ends) for ends in absent]
 
 
@@ -214,6 +214,6 @@ def test_kept_stretches_can_be_saved_during_the_run(config: RackConfig, tmp_path
     part, whole = Recording(saved), Recording(run)
     assert not (saved / SPOOL).exists()
     assert not (saved / STRETCHES).exists()
-    ticks = part.trace("lower")["tick"]
+    ticks = part.read_trace("lower")["tick"]
     assert len(ticks) > SECOND
-    assert np.isin(ticks, whole.trace("lower")["tick"]).all()
+    assert np.isin(ticks, whole.read_trace("lower")["tick"]).all()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.backplane.segment import racks
+from rack.backplane.segment import list_racks
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.launch.launch import run_rack
@@ -61,8 +61,8 @@ def test_a_full_disk_under_the_events_ends_no_run(config: RackConfig, tmp_path: 
     folder.mkdir()
     (folder / "events.jsonl").symlink_to("/dev/full")
     result = run_rack(config, 0.5, folder, display)
-    assert (result.outcome.worked, result.worked) == (True, False)
-    assert result.failure().endswith(
+    assert (result.outcome.is_success, result.worked) == (True, False)
+    assert result.describe_failure().endswith(
         "the recording is incomplete: events.jsonl ends before the run"
     )
     assert display.texts.count("events.jsonl ends here: No space left on device") == 1
@@ -85,7 +85,7 @@ def test_a_full_disk_ends_the_run_within_seconds_and_names_the_folder(
     assert re.fullmatch(
         f"{tmp_path}/run: File too large: the recording ends at tick [0-9]+", str(caught.value)
     )
-    assert config.name not in racks()
+    assert config.name not in list_racks()
     assert set(children_of(os.getpid())) <= before
 
 
@@ -104,7 +104,7 @@ def test_a_disk_that_is_full_from_the_start_ends_the_run(
     (tmp_path / "run" / name).symlink_to("/dev/full")
     with pytest.raises(Failure, match=why):
         run_rack(config, 5 * LONG_S, tmp_path / "run", Display())
-    assert config.name not in racks()
+    assert config.name not in list_racks()
 
 
 @pytest.mark.slow
@@ -129,7 +129,7 @@ def test_a_small_disk_ends_the_run_with_one_line_and_leaves_no_process(
     assert done.returncode == 1, done
     *_, last = done.stderr.splitlines()
     assert last.startswith(f"{disk}/run: No space left on device")
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
 
 
 @pytest.mark.slow

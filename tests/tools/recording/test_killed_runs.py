@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 from rerun.chunk import RrdReader
 
-from rack.backplane.segment import Segment, racks
+from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import Run, System
 from rack.tools.recording.recording import Recording
-from rack.tools.viewer.parts import FILE, parts_of
+from rack.tools.viewer.parts import FILE, list_parts
 from tests.conftest import SMALL
 from tests.processes import RACK, children_of, wait_until
 
@@ -64,7 +64,7 @@ def count_ticks_lost_by_a_kill(
     run = folder / "run"
     process = subprocess.Popen([*command, "--out", run, "--json"], stdout=subprocess.DEVNULL)
     try:
-        wait_until(lambda: name in racks(), BOUND_S)
+        wait_until(lambda: name in list_racks(), BOUND_S)
         segment = Segment.attach(name)
         wait_until(lambda: segment.words[System.STATE] == Run.RUNNING, BOUND_S)
         wait_until(lambda: segment.words[System.FOLLOWER_TICK], BOUND_S)
@@ -96,16 +96,16 @@ def count_ticks_lost_by_a_kill(
     recording = Recording(run)
     assert recording.events
     for mailbox in recording.mailboxes:
-        recording.rows(mailbox)
-    for part in parts_of(run / FILE):
+        recording.read_rows(mailbox)
+    for part in list_parts(run / FILE):
         try:
             RrdReader(str(part)).stream().to_chunks()
         except ValueError as error:
             # The recorder was killed before it wrote its first block.
             if "No recording store found" not in str(error):
                 raise
-    newest = int(recording.trace("lower")["tick"][-1])
-    return recording.lost.get("lower", 0) + max(0, tick - 1 - newest)
+    newest = int(recording.read_trace("lower")["tick"][-1])
+    return recording.lost_rows.get("lower", 0) + max(0, tick - 1 - newest)
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,13 @@ import pytest
 from rack.backplane.words import Head, System
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.commands.status import recorded_by
+from rack.tools.commands.status import find_run_folder
 from rack.tools.console.answer import Failure
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recording import Recording
-from rack.tools.report.report import report_of
+from rack.tools.report.report import build_report
 from tests.shared_runs import SMALL_S, small_run
 
 TICKS = 1600
@@ -29,15 +29,15 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 def test_every_message_and_every_cycle_is_recorded(recording: Recording) -> None:
-    report = report_of(recording)
+    report = build_report(recording)
     assert report["recording"] == "complete"
-    assert not any(recording.lost.values())
+    assert not any(recording.lost_rows.values())
     boxes = {"upper.command", "upper.status", "lower.status", "lower.plan"}
     assert set(recording.mailboxes) == boxes
     for mailbox in recording.mailboxes:
-        serials = recording.signal(mailbox, "serial")
+        serials = recording.read_signal(mailbox, "serial")
         assert np.array_equal(serials, np.arange(1, len(serials) + 1))
-    assert len(recording.signal("lower.status", "serial")) == TICKS
+    assert len(recording.read_signal("lower.status", "serial")) == TICKS
     assert {task: len(rows) for task, rows in recording.cycles.items()} == {
         "upper": report["tasks"]["upper"]["cycles"],
         "lower": report["tasks"]["lower"]["cycles"],
@@ -50,7 +50,7 @@ def test_recording_changes_nothing_in_a_run(
     small: Path, rack_name: str, recording: Recording
 ) -> None:
     unrecorded = run_rack(load(small, [f"name={rack_name}"]), SMALL_S, None, Display())
-    assert unrecorded.outcome.digest == report_of(recording)["digest"]
+    assert unrecorded.outcome.digest == build_report(recording)["digest"]
 
 
 @pytest.mark.slow
@@ -65,7 +65,7 @@ def test_lockstep_does_not_wait_for_a_recorder_in_another_pid_namespace(
         try:
             with Recorder(rack.segment, tmp_path):
                 assert words[System.FOLLOWER_PID] == (os.getpid() if is_same_namespace else 0)
-                found = recorded_by(rack.segment)
+                found = find_run_folder(rack.segment)
                 assert found == (tmp_path if is_same_namespace else None)
         finally:
             words[Head.LAUNCHER_NAMESPACE] = namespace

@@ -16,7 +16,7 @@ import pytest
 from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD
 from rack.boards import Rack
-from rack.boards.config import RackConfig, load, wire
+from rack.boards.config import RackConfig, load, resolve_layout
 from rack.tools.console.answer import Failure
 from rack.tools.launch.launch import NO_RECORDER, run_rack
 from rack.tools.monitor.display import Display
@@ -25,8 +25,8 @@ from rack.tools.recording.file_names import CONFIG, SPOOL
 from rack.tools.recording.recorder import process as recorder_process
 from rack.tools.recording.recorder.recorder import Recorder
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import mend
-from rack.tools.recording.spool import Spool, locked
+from rack.tools.recording.run_files import rebuild_files
+from rack.tools.recording.spool import Spool, try_lock
 from rack.tools.report.analysis import Analysis
 from rack.tools.report.report import write_report
 from tests.tools.analysis_text import text as analysis_text
@@ -62,9 +62,9 @@ def test_a_killed_recorder_is_restarted_and_continues_where_it_stopped(
     restarted = "the recorder ended with status -9; restarted, 1 of at most 3 times"
     assert notes_of(recording)[0] == restarted
     # In lockstep the clock waits for the next recorder as for the first, so no row is missing.
-    serials = recording.signal("lower.status", "serial")
+    serials = recording.read_signal("lower.status", "serial")
     assert np.array_equal(serials, np.arange(1, result.outcome.ticks + 1))
-    assert not any(recording.lost.values())
+    assert not any(recording.lost_rows.values())
     whole = run_rack(config, LONG_S, tmp_path / "whole", Display())
     assert result.outcome.digest == whole.outcome.digest
     assert counts(recording) == counts(Recording(tmp_path / "whole"))
@@ -87,7 +87,7 @@ def test_a_stopped_recorder_is_replaced_without_losing_rows(
     assert (result.worked, result.recording) == (True, "complete")
     recording = Recording(tmp_path / "run")
     assert notes_of(recording)[0] == "the recorder did not respond and was killed"
-    rows = len(recording.signal("lower.status", "serial"))
+    rows = len(recording.read_signal("lower.status", "serial"))
     assert rows == result.outcome.ticks or mode == "realtime"
 
 
@@ -126,7 +126,7 @@ def test_no_message_is_missing_or_repeated_despite_damage_and_a_killed_recorder(
     assert display.struck
     assert result.faults[0].count >= 1
     assert result.recording == "complete"
-    serials = Recording(folder).signal("lower.status", "serial")
+    serials = Recording(folder).read_signal("lower.status", "serial")
     assert np.all(np.diff(serials) > 0)
 
 
@@ -134,31 +134,31 @@ def test_no_message_is_missing_or_repeated_despite_damage_and_a_killed_recorder(
 def test_a_run_whose_recorder_dies_too_often_fails_and_reports_missing_rows(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    display = Held(config.name, signal.SIGKILL, times=recorder_process.RESTARTS + 1)
+    display = Held(config.name, signal.SIGKILL, times=recorder_process.MAX_RESTARTS + 1)
     result = run_rack(config, LONG_S, tmp_path / "run", display, step=True)
-    assert len(display.struck) == recorder_process.RESTARTS + 1
-    assert (result.outcome.worked, result.worked) == (True, False)
+    assert len(display.struck) == recorder_process.MAX_RESTARTS + 1
+    assert (result.outcome.is_success, result.worked) == (True, False)
     recording, ticks = Recording(tmp_path / "run"), result.outcome.ticks
     taken = counts(recording)
     missing = {name: ticks - taken[name] for name in ("lower", "lower.status")}
     assert missing["lower"] > ticks / 4
     assert missing.items() <= result.rows_lost.items()
-    assert missing.items() <= recording.lost.items()
+    assert missing.items() <= recording.lost_rows.items()
     worst = max(result.rows_lost, key=lambda name: (result.rows_lost[name], name))
-    (gap,) = recording.gaps()
+    (gap,) = recording.find_gaps()
     # Slow rings lack the rows after their last message.
     assert (gap.first <= taken["lower"], gap.last) == (True, ticks - 1)
     assert set(gap.rings) == set(result.rows_lost)
     others = f"and rows of {len(result.rows_lost) - 1} more tasks and mailboxes"
     lacking = f"{missing['lower']:,} of {ticks:,} rows of {worst} are missing ({others})"
     assert result.recording == f"{lacking}; {gap}; the recorder ended with status -9"
-    assert result.failure().endswith(result.recording)
+    assert result.describe_failure().endswith(result.recording)
     report, text = write_report(tmp_path / "run")
     assert f"Times of lower are from {taken['lower']:,} of {ticks:,} cycles." in text
     assert f"- {gap}" in text
     assert report["gaps"] == [{"first": gap.first, "last": gap.last, "rings": gap.rings}]
     assert f"lower: judged by {taken['lower']:,} of {ticks:,} cycles" in analysis_text(
-        Analysis.of(recording)
+        Analysis.from_recording(recording)
     )
 
 
@@ -167,7 +167,7 @@ def test_a_recorder_that_dies_while_writing_the_viewers_file_is_reported(
     config: RackConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        recorder_process, "VIEW", "tests.tools.recording.struck_recorders:EndingView"
+        recorder_process, "VIEW_CLASS", "tests.tools.recording.struck_recorders:EndingView"
     )
     result = run_rack(config, 1.0, tmp_path / "run", Display())
     # Its tables were complete before.
@@ -183,37 +183,37 @@ def test_two_recorders_do_not_write_into_one_folder(config: RackConfig, tmp_path
         with pytest.raises(Failure, match="another recorder is still writing it"):
             Recorder(rack.segment, tmp_path)
         with pytest.raises(Failure, match="another recorder is still writing it"):
-            mend(tmp_path)
+            rebuild_files(tmp_path)
 
 
 @pytest.mark.slow
 def test_opening_a_run_waits_for_the_recorder_of_a_killed_launcher(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    (tmp_path / CONFIG).write_text(config.text())
+    (tmp_path / CONFIG).write_text(config.to_toml_text())
     with Rack(config) as rack, ThreadPoolExecutor(1) as pool:
         recorder = Recorder(rack.segment, tmp_path)
         rack.run(0.5)
         opened = pool.submit(Recording, tmp_path)
         with pytest.raises(TimeoutError):
-            opened.result(3 * recorder_process.LOOK_S)
-        recorder.drain()
+            opened.result(3 * recorder_process.CHECK_PERIOD_S)
+        recorder.drain_rings()
         recorder.close()
-        assert len(opened.result(WATCHDOG_S).trace("lower")) == 200
+        assert len(opened.result(WATCHDOG_S).read_trace("lower")) == 200
     assert not (tmp_path / SPOOL).exists()
 
 
 def test_a_truncated_spool_yields_all_complete_lines(config: RackConfig, tmp_path: Path) -> None:
     with Rack(config) as rack, Recorder(rack.segment, tmp_path) as recorder:
         rack.run(0.5)
-        recorder.drain()
+        recorder.drain_rings()
         whole = (tmp_path / SPOOL).read_bytes()
     found = []
     for size in (len(whole), len(whole) - 1, len(whole) * 2 // 3, len(whole) // 2):
         folder = tmp_path / str(size)
         folder.mkdir()
         (folder / SPOOL).write_bytes(whole[:size])
-        assert mend(folder)
+        assert rebuild_files(folder)
         tables = (folder / "signals").iterdir()
         found.append(sum(pq.read_table(table).num_rows for table in tables))
     assert found == sorted(found, reverse=True)
@@ -230,27 +230,27 @@ def test_a_spool_is_locked_until_the_files_built_from_it_are_in_place(
 
     def store(checksums: Checksums, *patterns: str) -> None:
         with (tmp_path / SPOOL).open("rb") as spool:
-            refused.append(not locked(spool))
+            refused.append(not try_lock(spool))
 
     monkeypatch.setattr(Checksums, "store", store)
-    assert mend(tmp_path)
+    assert rebuild_files(tmp_path)
     assert refused == [True]
 
 
 def test_a_gap_keeps_its_position_when_files_are_rebuilt(
     config: RackConfig, tmp_path: Path
 ) -> None:
-    (tmp_path / CONFIG).write_text(config.text())
+    (tmp_path / CONFIG).write_text(config.to_toml_text())
     rows = np.zeros(300, dtype=RECORD)
     rows["tick"] = np.arange(300)
-    spool = Spool(tmp_path, wire(config), Launch(*range(1, 1 + len(Launch._fields))))
-    spool.add("lower", rows[:100], 0)
+    spool = Spool(tmp_path, resolve_layout(config), Launch(*range(1, 1 + len(Launch._fields))))
+    spool.add_rows("lower", rows[:100], 0)
     spool.flush(now=True)
     # One flush writes two drains, with rows lost between them.
-    spool.add("lower", rows[100:120], 0)
-    spool.add("lower", rows[220:], 100)
+    spool.add_rows("lower", rows[100:120], 0)
+    spool.add_rows("lower", rows[220:], 100)
     spool.flush(now=True)
     spool.close()
-    assert [str(gap) for gap in Recording(tmp_path).gaps()] == [
+    assert [str(gap) for gap in Recording(tmp_path).find_gaps()] == [
         "ticks 120 to 219 of lower are not recorded"
     ]

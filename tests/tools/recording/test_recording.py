@@ -15,21 +15,21 @@ import pyarrow.parquet as pq
 import pytest
 
 from rack.backplane.message import State
-from rack.boards.config import loads
+from rack.boards.config import load_text
 from rack.tools.console.answer import Failure
-from rack.tools.recording.checksums import Checksums, checked_line, read_line
-from rack.tools.recording.parquet import HEAD, signal_tables
+from rack.tools.recording.checksums import Checksums, format_checked_line, parse_checked_line
+from rack.tools.recording.parquet import HEAD_COLUMNS, create_signal_tables
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.run_files import TABLES
+from rack.tools.recording.run_files import TABLE_PATTERNS
 from rack.tools.report.analysis import Analysis
 from rack.tools.report.report import write_report
-from rack.tools.timing.charts.gantt import subject_of
+from rack.tools.timing.charts.gantt import find_subject
 from tests.shared_runs import nasrem_run, small_run
 
 READERS: tuple[Callable[[Path], object], ...] = (
     write_report,
-    lambda folder: Analysis.of(Recording(folder), 100.0, lambda done: None),
-    lambda folder: subject_of(str(folder), [], None),
+    lambda folder: Analysis.from_recording(Recording(folder), 100.0, lambda done: None),
+    lambda folder: find_subject(str(folder), [], None),
 )
 TABLE = "signals/lower.status.parquet"
 PARQUET = ("cycles.parquet", f"{TABLE}/0001.parquet")
@@ -72,7 +72,7 @@ def test_a_config_cut_off_at_the_end_of_a_table_is_named(damaged: Path) -> None:
     whole = path.read_text()
     path.write_text(whole[: whole.rindex("\n[") + 1])
     # The truncated text is still a valid config.
-    loads(path.read_text())
+    load_text(path.read_text())
     assert_refused(damaged, path.name)
 
 
@@ -89,16 +89,16 @@ def test_a_missing_part_is_reported_by_its_number(damaged: Path) -> None:
 
 
 def messages(recording: Recording) -> dict[str, list[bytes]]:
-    return {box.name: recording.rows(box.name).tolist() for box in recording.layout.timed}
+    return {box.name: recording.read_rows(box.name).tolist() for box in recording.layout.timed}
 
 
 def test_a_table_holds_the_columns_of_its_mailbox_and_their_units(run: Path) -> None:
     recording = Recording(run)
     table = pq.read_table(run / TABLE)
-    fields = recording.fields("lower.status")
-    assert table.column_names[:7] == ["time_s", *HEAD]
+    fields = recording.list_fields("lower.status")
+    assert table.column_names[:7] == ["time_s", *HEAD_COLUMNS]
     assert set(table.column_names[7:]) == fields
-    assert table["tick"].to_pylist() == recording.signal("lower.status", "tick").tolist()
+    assert table["tick"].to_pylist() == recording.read_signal("lower.status", "tick").tolist()
     assert table["time_s"].to_pylist() == pytest.approx(0.0025 * table["tick"].to_numpy())
     assert table.schema.field("time_s").metadata == {b"unit": b"s"}
 
@@ -108,18 +108,18 @@ def test_a_field_named_like_a_column_of_every_mailbox_keeps_its_own_values(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     recording = Recording(nasrem_run(tmp_path_factory))
-    box = recording.layout.mailbox("servo.state")
-    rows = recording.rows(box.name)
+    box = recording.layout.find_mailbox("servo.state")
+    rows = recording.read_rows(box.name)
     rows["message"]["tick"] += 7
-    tables = signal_tables(recording.folder / "signals", recording.layout)
-    tables[box.name].add(rows)
+    tables = create_signal_tables(recording.folder / "signals", recording.layout)
+    tables[box.name].add_rows(rows)
     for table in tables.values():
         table.close()
-    Checksums(recording.folder).store(*TABLES)
+    Checksums(recording.folder).store(*TABLE_PATTERNS)
     again = Recording(recording.folder)
-    assert np.array_equal(again.rows(box.name)["message"], rows["message"])
+    assert np.array_equal(again.read_rows(box.name)["message"], rows["message"])
     assert np.array_equal(
-        again.signal(box.name, "tick") + 7, again.signal(box.name, "message.tick")
+        again.read_signal(box.name, "tick") + 7, again.read_signal(box.name, "message.tick")
     )
 
 
@@ -136,14 +136,14 @@ def test_a_long_run_has_many_parts_which_are_one_table(
         shutil.copy(damaged / name, folder / name)
     # Files of a killed recorder are replaced.
     for _ in range(2):
-        signals = signal_tables(folder / "signals", recording.layout)
+        signals = create_signal_tables(folder / "signals", recording.layout)
         for box in recording.layout.timed:
-            rows = recording.rows(box.name)
+            rows = recording.read_rows(box.name)
             for begin in range(0, len(rows), 16):
-                signals[box.name].add(rows[begin : begin + 16])
+                signals[box.name].add_rows(rows[begin : begin + 16])
         for table in signals.values():
             table.close()
-    Checksums(folder).store("config.toml", *TABLES)
+    Checksums(folder).store("config.toml", *TABLE_PATTERNS)
     assert len([*(folder / TABLE).iterdir()]) > 10
     again = Recording(folder)
     assert messages(again) == messages(recording)
@@ -165,13 +165,13 @@ def test_lines_that_are_no_events_are_reported_with_their_number(
 def test_an_event_that_was_reported_late_is_sorted_by_tick(damaged: Path) -> None:
     path = damaged / "events.jsonl"
     *lines, outcome = path.read_text().splitlines(keepends=True)
-    late = read_line(lines[-1]) | {"tick": 7, "code": "late"}
-    path.write_text("".join([*lines, checked_line(late), outcome]))
+    late = parse_checked_line(lines[-1]) | {"tick": 7, "code": "late"}
+    path.write_text("".join([*lines, format_checked_line(late), outcome]))
     events = Recording(damaged).events
     ticks = [event["tick"] for event in events[:-1]]
     assert late in events
     assert ticks == sorted(ticks)
-    assert events[-1] == read_line(outcome)
+    assert events[-1] == parse_checked_line(outcome)
 
 
 def test_an_incomplete_last_line_is_left_out_with_a_note(
@@ -180,7 +180,7 @@ def test_an_incomplete_last_line_is_left_out_with_a_note(
     path = damaged / "events.jsonl"
     lines = path.read_text().splitlines()
     path.write_text("\n".join([*lines, lines[0][:20]]))
-    assert Recording(damaged).events == [read_line(line) for line in lines]
+    assert Recording(damaged).events == [parse_checked_line(line) for line in lines]
     assert f"{path}: line {len(lines) + 1} is cut off, and left out" in capsys.readouterr().err
 
 
@@ -192,7 +192,7 @@ def test_a_reason_cannot_command_the_terminal_that_shows_a_report(damaged: Path)
         values = pa.array([value] * len(table), column.type)
         table = table.set_column(table.schema.get_field_index(name), column, values)
     pq.write_table(table, file)
-    Checksums(damaged).store(*TABLES)
+    Checksums(damaged).store(*TABLE_PATTERNS)
     _, text = write_report(damaged)
     assert "\x1b" not in text
     assert r"\x1b[2J" in text

@@ -135,7 +135,7 @@ def test_neither_mode_waits_for_the_library_of_the_viewer(
     for mode in ("lockstep", "realtime"):
         config = load(small, [f"name={rack_name}", f"clock.mode={mode}"])
         with Rack(config) as running:
-            safe = SafeSink.of(running.segment, None, opening, pytest.fail)
+            safe = SafeSink.open_for(running.segment, None, opening, pytest.fail)
             assert safe is not None
             assert safe._opening.is_alive()
     opening.may.set()

@@ -9,7 +9,7 @@ import pytest
 
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import Message, field
-from rack.boards.config.layout import field_specs
+from rack.boards.config.layout import build_field_specs
 from rack.tools.console.answer import Failure
 from rack.tools.recording.signal import Signal, Trigger
 
@@ -32,7 +32,7 @@ class Walker(Message, version=1):
     legs: np.ndarray = field(Leg, doc="left and right", shape=2)
 
 
-DTYPE = Walker.message_type.dtype({})
+DTYPE = Walker.message_type.build_dtype({})
 BOX = MailboxSpec(
     name="walker.status",
     writer="walker",
@@ -44,7 +44,7 @@ BOX = MailboxSpec(
     message=Walker.message_type.name,
     version=1,
     size=DTYPE.itemsize,
-    fields=field_specs(Walker.message_type, {}),
+    fields=build_field_specs(Walker.message_type, {}),
 )
 
 
@@ -73,17 +73,17 @@ def messages() -> np.ndarray:
 def test_a_signal_is_a_field_or_a_part_of_it(
     messages: np.ndarray, name: str, values: list[object]
 ) -> None:
-    signal = Signal.of(f"walker.status.{name}", [BOX])
-    assert signal.plain(messages) == values
-    assert signal.plain(messages[:0]) == []
+    signal = Signal.parse(f"walker.status.{name}", [BOX])
+    assert signal.extract_plain(messages) == values
+    assert signal.extract_plain(messages[:0]) == []
 
 
 def test_a_text_is_shown_with_escapes_in_place_of_control_characters(messages: np.ndarray) -> None:
-    signal = Signal.of("walker.status.name", [BOX])
+    signal = Signal.parse("walker.status.name", [BOX])
     messages["name"] = b"\x1b[2J\xe9"
     shown = "\\x1b[2J\N{REPLACEMENT CHARACTER}"
-    assert signal.plain(messages) == [shown] * 3
-    assert signal.in_message(messages[0]) == shown
+    assert signal.extract_plain(messages) == [shown] * 3
+    assert signal.read_message(messages[0]) == shown
 
 
 UNKNOWN = {
@@ -100,7 +100,7 @@ UNKNOWN = {
 @pytest.mark.parametrize(("name", "why"), UNKNOWN.items())
 def test_an_unknown_name_is_reported_in_one_line(name: str, why: str) -> None:
     with pytest.raises(Failure) as failure:
-        Signal.of(name, [BOX])
+        Signal.parse(name, [BOX])
     assert str(failure.value).startswith(f"{name}: {why}")
     assert failure.value.status == 2
 
@@ -118,7 +118,7 @@ def test_an_unknown_name_is_reported_in_one_line(name: str, why: str) -> None:
     ],
 )
 def test_a_condition_compares_a_number(messages: np.ndarray, text: str, holds: list[bool]) -> None:
-    assert Trigger.of(text, [BOX]).holds(messages).tolist() == holds
+    assert Trigger.parse(text, [BOX]).evaluate_messages(messages).tolist() == holds
 
 
 UNFIT = {
@@ -137,5 +137,5 @@ UNFIT = {
 @pytest.mark.parametrize(("text", "why"), UNFIT.items())
 def test_an_invalid_condition_is_reported_in_one_line(text: str, why: str) -> None:
     with pytest.raises(Failure) as failure:
-        Trigger.of(text, [BOX])
+        Trigger.parse(text, [BOX])
     assert (str(failure.value), failure.value.status) == (why.format(text), 2)

@@ -10,20 +10,20 @@ import pytest
 
 from rack.backplane.trace import SKIPPED_SHIFT, Flag
 from rack.boards.config import RackConfig, load
-from rack.boards.config.layout import obtained_core
+from rack.boards.config.layout import find_core
 from rack.tools.recording.cores import CoreRecord, Stolen
-from rack.tools.recording.cycles import cycles_of, measured_budgets
+from rack.tools.recording.cycles import measure_budgets, read_cycles
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import (
     Absence,
     Quota,
     Stalls,
-    stalls_of,
+    analyze_stalls,
 )
 from rack.tools.report.analysis import Analysis
-from rack.tools.report.report import report_of
-from rack.tools.report.report_markdown import markdown
-from rack.tools.report.tables import document
+from rack.tools.report.report import build_report
+from rack.tools.report.report_markdown import format_markdown
+from rack.tools.report.tables import build_document
 from tests.tools.analysis_text import text
 from tests.tools.recordings import MS, Cycle, recorded
 
@@ -31,7 +31,7 @@ MISSED, PLANNED = int(Flag.MISSED), int(Flag.PLANNED)
 TICK_MS = 2.5
 PLAIN = (0.0, 0.1, 1.0, 0.1)
 SETTLED = 40
-FIRST = obtained_core(0)
+FIRST = find_core(0)
 """The clock's core."""
 OTHER = FIRST + 1
 """The core of the lower level and of its planner, whatever cores this machine has."""
@@ -81,7 +81,7 @@ def run(
 
 
 def find_stalls(recording: Recording) -> Stalls:
-    return stalls_of(recording)[0]
+    return analyze_stalls(recording)[0]
 
 
 def test_skipped_cycles_are_attributed_to_steal_of_their_core(
@@ -101,7 +101,7 @@ def test_skipped_cycles_are_attributed_to_steal_of_their_core(
         assert (found.lost, found.during_steal) == (7, during)
     recording.cores = CoreRecord(100 * MS, (Stolen(0, 50 * MS, OTHER, 10),))
     line = f"took core {OTHER} for 10.00 % of the run (steal); 5 of 7 lost cycles were due at these"
-    assert line in markdown(report_of(recording))
+    assert line in format_markdown(build_report(recording))
 
 
 def test_stalls_that_end_at_the_same_phase_suggest_a_quota(
@@ -111,13 +111,13 @@ def test_stalls_that_end_at_the_same_phase_suggest_a_quota(
     ends = [*(100.0 * k + 31.2 + jitter[k] for k in range(11)), 1260.0, 1388.0]
     recording = run(tmp_path / "run", config, {"lower": [resumed_at(end) for end in ends]})
     assert find_stalls(recording).quota == Quota(together=11, stalls=13, levels=[])
-    report = report_of(recording)
+    report = build_report(recording)
     assert report["stalls"]["quota"] == {"together": 11, "stalls": 13, "levels": []}
     line = (
         "- 11 of 13 stalls end at the same phase of a 100 ms period, which suggests a quota of the"
         " host\n"
     )
-    assert line in markdown(report)
+    assert line in format_markdown(report)
 
 
 def test_overlapping_losses_count_as_one_stall(config: RackConfig, tmp_path: Path) -> None:
@@ -142,7 +142,7 @@ def test_a_level_with_the_period_of_the_stalls_is_a_possible_cause(
         "- 6 of 6 stalls end at the same phase of a 100 ms period, which suggests the cycle of"
         " upper or a quota of the host\n"
     )
-    assert line in markdown(report_of(recording))
+    assert line in format_markdown(build_report(recording))
     # With another phase of the quota, the ends lie at two phases of the level.
     either = [resumed_at(100.0 * k + 31.2) for k in range(6)]
     assert find_stalls(run(tmp_path / "run", config, {"lower": either})).quota == Quota(6, 6, [])
@@ -162,14 +162,14 @@ def absence_trace() -> dict[str, list[Cycle]]:
 def test_an_absence_of_a_core_without_steal_is_reported(config: RackConfig, tmp_path: Path) -> None:
     recording = run(tmp_path / "run", config, absence_trace())
     assert find_stalls(recording).absences == [Absence(OTHER, times=1, longest_ms=6.0, lost=2)]
-    report = report_of(recording)
+    report = build_report(recording)
     assert report["stalls"]["absences"] == [
         {"core": OTHER, "times": 1, "longest_ms": 6.0, "lost": 2}
     ]
     line = (
         f"- core {OTHER} was away although no steal was counted (stalls: 1, longest 6 ms); 2 of 2 "
     )
-    assert line in markdown(report)
+    assert line in format_markdown(report)
 
 
 def test_a_core_that_ran_another_task_was_not_absent(config: RackConfig, tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ def test_a_task_without_real_time_priority_shows_no_absence(
     late = late_clock(52, since=50, late_ms=5.9)
     refused = run(tmp_path / "refused", config, absence_trace() | long, late, priority=0)
     assert not find_stalls(refused).absences
-    assert [cycles.stalled for cycles in cycles_of(refused).values()] == [0, 0]
+    assert [cycles.stalled for cycles in read_cycles(refused).values()] == [0, 0]
 
 
 def test_counted_steal_is_not_reported_as_an_absence_again(
@@ -212,7 +212,7 @@ def test_lockstep_has_no_stalls(small: Path, tmp_path: Path) -> None:
     long = {"lower.planner": [Cycle(SETTLED, (0.0, 0.1, 60.0, 0.1), flags=PLANNED)]}
     recording = run(tmp_path / "run", load(small), absence_trace() | long)
     assert find_stalls(recording) == Stalls(2, 0, [], None)
-    assert [cycles.stalled for cycles in cycles_of(recording).values()] == [0, 0]
+    assert [cycles.stalled for cycles in read_cycles(recording).values()] == [0, 0]
 
 
 def test_stalled_cycles_do_not_count_towards_a_budget(config: RackConfig, tmp_path: Path) -> None:
@@ -226,18 +226,18 @@ def test_stalled_cycles_do_not_count_towards_a_budget(config: RackConfig, tmp_pa
         ]
     }
     computed = run(tmp_path / "computed", config, trace)
-    assert measured_budgets(computed)["lower"].process_ns == round(6.3 * MS)
-    assert cycles_of(computed)["lower"].stalled == 0
+    assert measure_budgets(computed)["lower"].process_ns == round(6.3 * MS)
+    assert read_cycles(computed)["lower"].stalled == 0
     stolen = run(tmp_path / "stolen", config, trace)
     stolen.cores = CoreRecord(200 * MS, (Stolen(126 * MS, 130 * MS, OTHER, 10),))
     # The clock board was away at that time, so the whole machine may have been.
     away = run(tmp_path / "away", config, trace, late_clock(52, since=51, late_ms=3.0))
     for recording in (stolen, away):
-        assert measured_budgets(recording)["lower"].process_ns == MS
-        analysis = Analysis.of(recording)
+        assert measure_budgets(recording)["lower"].process_ns == MS
+        analysis = Analysis.from_recording(recording)
         assert "stalled cycles are not judged: lower 1\n" in text(analysis)
-        task = document(analysis)["tasks"]["lower"]
+        task = build_document(analysis)["tasks"]["lower"]
         left = len(trace["lower"]) - 1
         assert (task["cycles"], task["start_up"], task["stalled"]) == (left, 0, 1)
         # The report gives the times of all cycles.
-        assert report_of(recording)["tasks"]["lower"]["execution_ms"]["max"] == 6.3
+        assert build_report(recording)["tasks"]["lower"]["execution_ms"]["max"] == 6.3

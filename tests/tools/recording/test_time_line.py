@@ -10,19 +10,30 @@ import pytest
 
 from rack.levels.peer import DRIFT_PPM
 from rack.tools.console.answer import Failure
-from rack.tools.recording.time_line import RackPlace, on_one_time_line
-from tests.tools.machines import CLOCK_NS, ERROR_NS, MS, TICKS, A, B, C, Machine, S, recorded
+from rack.tools.recording.time_line import RackPlace, place_on_time_line
+from tests.tools.machines import (
+    CLOCK_NS,
+    ERROR_NS,
+    MS,
+    TICKS,
+    A,
+    B,
+    C,
+    MachineComparison,
+    S,
+    recorded,
+)
 
 
-def check_place(place: RackPlace, own: Machine, line: Machine) -> None:
+def check_place(place: RackPlace, own: MachineComparison, line: MachineComparison) -> None:
     """Check that the time of each tick is right within the uncertainty."""
     ticks = np.arange(0, TICKS, 7)
-    found = place.times_ns(ticks, 0)
+    found = place.convert_ticks(ticks, 0)
     true = [line.shows(own.true_ns(int(tick))) - line.epoch_ns for tick in ticks]
     apart_ns = np.abs(found - np.array(true) * line.speed)
     assert apart_ns.max() <= place.uncertainty_ns * line.speed + MS // 1000
     # The uncertainty covers only the error of a comparison and the drift between comparisons.
-    assert place.uncertainty_ns <= (ERROR_NS + 7 * S * DRIFT_PPM // 1_000_000) * len(place.shifts)
+    assert place.uncertainty_ns <= (ERROR_NS + 7 * S * DRIFT_PPM // 1_000_000) * len(place.offsets)
 
 
 @pytest.mark.parametrize("seen_by", ["first", "second", "both"])
@@ -31,14 +42,15 @@ def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(
 ) -> None:
     one = recorded(A, [B] if seen_by != "second" else [], tmp_path / "a")
     other = recorded(B, [A] if seen_by != "first" else [], tmp_path / "b", seed=2)
-    first, second = on_one_time_line([one, other])
+    first, second = place_on_time_line([one, other])
     check_place(second, B, A)
-    assert (first.times_ns(np.arange(TICKS), 5) == np.arange(TICKS) * CLOCK_NS + 5).all()
+    assert (first.convert_ticks(np.arange(TICKS), 5) == np.arange(TICKS) * CLOCK_NS + 5).all()
     assert first.uncertainty_ns == 0
     # The other rack's wall clock does not count, because it may be wrong.
     stamps = np.array([B.shows(3 * S)])
     assert (
-        second.wall_ns(stamps)[0] - first.wall_ns(np.array([A.shows(3 * S)]))[0]
+        second.convert_to_wall_clock(stamps)[0]
+        - first.convert_to_wall_clock(np.array([A.shows(3 * S)]))[0]
         <= second.uncertainty_ns
     )
 
@@ -46,12 +58,12 @@ def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(
 def test_racks_that_never_met_are_placed_through_a_common_peer(tmp_path: Path) -> None:
     a, b = recorded(A, [], tmp_path / "a"), recorded(B, [A, C], tmp_path / "b")
     c = recorded(C, [], tmp_path / "c")
-    places = on_one_time_line([c, a, b])
+    places = place_on_time_line([c, a, b])
     check_place(places[1], A, C)
     check_place(places[2], B, C)
-    assert len(places[1].shifts) == 2
+    assert len(places[1].offsets) == 2
     with pytest.raises(Failure, match=r"rack 'c' and 'a' never met: no recording holds"):
-        on_one_time_line([a, c])
+        place_on_time_line([a, c])
 
 
 def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
@@ -60,7 +72,7 @@ def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         Failure, match=r"not of the same run: 'a' met a launch of 'b' that began 60\.00\d s earlier"
     ) as refused:
-        on_one_time_line([one, later])
+        place_on_time_line([one, later])
     assert refused.value.status == 2
     assert "\n" not in str(refused.value)
 
@@ -68,10 +80,10 @@ def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
 def test_one_rack_twice_and_two_modes_are_refused(tmp_path: Path) -> None:
     one = recorded(A, [B], tmp_path / "a")
     with pytest.raises(Failure, match="both are of rack 'a'"):
-        on_one_time_line([one, one])
+        place_on_time_line([one, one])
     stepped = recorded(replace(B, mode="lockstep"), [A], tmp_path / "b")
     with pytest.raises(Failure, match=r"b ran in lockstep, .*a in real time"):
-        on_one_time_line([one, stepped])
+        place_on_time_line([one, stepped])
 
 
 def test_in_lockstep_imported_messages_must_equal_the_senders_messages(tmp_path: Path) -> None:
@@ -81,4 +93,4 @@ def test_in_lockstep_imported_messages_must_equal_the_senders_messages(tmp_path:
         Failure,
         match=r"message that 'a' imported into lan\.other at 0\.0000 s is not one that 'b' wrote",
     ):
-        on_one_time_line([one, other])
+        place_on_time_line([one, other])

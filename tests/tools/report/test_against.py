@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 
 from rack.boards.config import load
-from rack.tools.launch.continued import RunAgain, branched
+from rack.tools.launch.continued import RepeatedRun, load_branch_config
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
-from rack.tools.recording.checksums import checked_line, read_line
+from rack.tools.recording.checksums import format_checked_line, parse_checked_line
 from rack.tools.recording.recording import Recording
-from rack.tools.report.against import compared
+from rack.tools.report.against import compare_runs
 from rack.tools.report.report import OtherRun
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.boards.remembering_racks import REMEMBERING
@@ -108,18 +108,18 @@ def explain_difference(
     one: Recording, other: Recording, *, of: str = "", repeats: bool = True
 ) -> dict[str, Any]:
     """Return the explanation in the report of two runs."""
-    return compared(one, OtherRun(other.folder, of, repeats))
+    return compare_runs(one, OtherRun(other.folder, of, repeats))
 
 
 def _losing(run: Recording) -> Path:
     """Return a copy of a recorded run whose recorder lost rows."""
     folder = Path(shutil.copytree(run.folder, run.folder.with_name("losing")))
     events = folder / "events.jsonl"
-    lines = [read_line(line) for line in events.read_text().splitlines()]
+    lines = [parse_checked_line(line) for line in events.read_text().splitlines()]
     ends = [
         line | {"rows_lost": {"wave": 3}} if line["kind"] == "outcome" else line for line in lines
     ]
-    events.write_text("".join(map(checked_line, ends)))
+    events.write_text("".join(map(format_checked_line, ends)))
     return folder
 
 
@@ -151,9 +151,9 @@ def test_a_branch_shows_the_state_of_the_level_at_its_first_tick(
     runs: tuple[Run, Recording, Recording], tmp_path: Path
 ) -> None:
     _, one, _ = runs
-    config = branched(one, ["board.wave.params.factor=2"], None)
-    with RunAgain(one) as again:
-        run_rack(config, SECONDS, tmp_path / "two", Display(), begins=again.beginning(150))
+    config = load_branch_config(one, ["board.wave.params.factor=2"], None)
+    with RepeatedRun(one) as again:
+        run_rack(config, SECONDS, tmp_path / "two", Display(), beginning=again.continue_at(150))
     found = explain_difference(Recording(tmp_path / "two"), one)
     (cycle,) = found["chain"]
     assert (cycle["tick"], cycle["mailbox"]) == (150, "wave.status")

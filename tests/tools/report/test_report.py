@@ -23,10 +23,10 @@ from rack.tools.launch.verdict import ACROSS_RACKS, judge_run
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from rack.tools.report import arm_outcome
-from rack.tools.report.report import report_of, write_report
-from rack.tools.report.report_markdown import markdown, terminal_blocks
-from rack.tools.report.task_times import task_times
-from rack.tools.timing.measured_response import system_response
+from rack.tools.report.report import build_report, write_report
+from rack.tools.report.report_markdown import format_for_terminal, format_markdown
+from rack.tools.report.task_times import compute_task_times
+from rack.tools.timing.measured_response import measure_system_response
 from tests.boards.commanded_racks import COMMANDED, commands
 from tests.shared_runs import slow_run
 
@@ -59,7 +59,7 @@ def test_times_of_a_task_follow_equation_3_5() -> None:
     cycles = np.array(
         [cycle(0, 1, 0.5, 3, 0.5), cycle(1, 2, 1, 4, 1), cycle(2, 0, 0.5, 2, 0.5)], RECORD
     )
-    times = task_times(TASK, cycles, 10 * MS, False, stretches=np.zeros(3))
+    times = compute_task_times(TASK, cycles, 10 * MS, False, stretches=np.zeros(3))
     assert (times["lateness_ms"]["max"], times["lateness_ms"]["p50"]) == (2.0, 1.0)
     assert (times["execution_ms"]["min"], times["execution_ms"]["max"]) == (2.0, 4.0)
     assert times["communication_ms"]["max"] == 2.0
@@ -94,22 +94,22 @@ def test_measured_response_of_a_run_meets_its_prediction(folder: Path) -> None:
 class CutRecording(Recording):
     """A recording without ten of the commands. `lost` says whether their loss is known."""
 
-    lost: ClassVar[dict[str, int]] = {"upper.command": 10}
+    lost_rows: ClassVar[dict[str, int]] = {"upper.command": 10}
 
-    def signal(self, mailbox: str, field: str) -> np.ndarray:
-        values = super().signal(mailbox, field)
+    def read_signal(self, mailbox: str, field: str) -> np.ndarray:
+        values = super().read_signal(mailbox, field)
         return np.delete(values, slice(20, 30), axis=0) if mailbox == "upper.command" else values
 
 
 class SilentRecording(CutRecording):
     """A recording of a run in which these commands were never written."""
 
-    lost: ClassVar[dict[str, int]] = {}
+    lost_rows: ClassVar[dict[str, int]] = {}
 
 
 @pytest.mark.slow
 def test_a_response_is_not_measured_across_messages_that_the_recording_lacks(folder: Path) -> None:
-    way = report_of(CutRecording(folder))["system_response"]["command"]
+    way = build_report(CutRecording(folder))["system_response"]["command"]
     assert (way["holds"], way["beyond"], way["unseen"]) == (True, [], 1)
     assert way["measured_ms"]["max"] == way["bound_ms"]
 
@@ -117,16 +117,16 @@ def test_a_response_is_not_measured_across_messages_that_the_recording_lacks(fol
 @pytest.mark.slow
 def test_a_response_beyond_its_bound_fails_with_the_cause_of_the_delay(folder: Path) -> None:
     recording = SilentRecording(folder)
-    recording.ended["faults"] = [
+    recording.end_counts["faults"] = [
         {"kind": "mute", "board": "upper", "began": 19 * 40, "ends": 30 * 40}
     ]
-    response = system_response(recording)
+    response = measure_system_response(recording)
     assert response is not None
     (beyond,) = response["command"]["beyond"]
     assert response["command"]["holds"] is False
     assert (beyond["tick"], beyond["ms"]) == (19 * 40, (45 + 10 * 40) * 2.5)
     assert beyond["delayed_by"] == ["fault: mute of upper"]
-    lines = markdown(write_report(folder)[0] | {"system_response": response}).splitlines()
+    lines = format_markdown(write_report(folder)[0] | {"system_response": response}).splitlines()
     assert any(line.startswith("| command, down") and "beyond" in line for line in lines)
     assert "- 1112.5 ms from tick 760: fault: mute of upper" in lines
 
@@ -135,28 +135,28 @@ def test_a_response_beyond_its_bound_fails_with_the_cause_of_the_delay(folder: P
 def test_a_response_beyond_its_bound_fails_the_run_unless_something_explains_it(
     folder: Path,
 ) -> None:
-    sound = report_of(Recording(folder))
+    sound = build_report(Recording(folder))
     assert (sound["worked"], sound["failures"], sound["unjudged"]) == (True, [], [])
-    report = report_of(SilentRecording(folder))
+    report = build_report(SilentRecording(folder))
     (failure,) = report["failures"]
     assert report["worked"] is False
     assert failure == (
         "the response of a command along upper > lower took up to 1112.5 ms; bound: 112.5 ms, 1"
         " times exceeded without a lost cycle"
     )
-    assert markdown(report).splitlines()[0] == f"# {report['rack']} failed: {failure}"
+    assert format_markdown(report).splitlines()[0] == f"# {report['rack']} failed: {failure}"
     explained = SilentRecording(folder)
     mute = {"kind": "mute", "board": "upper", "began": 760, "ends": 1200, "tick": 760}
-    explained.ended["faults"] = [mute | {"fault": 0}]
-    assert report_of(explained)["worked"]
+    explained.end_counts["faults"] = [mute | {"fault": 0}]
+    assert build_report(explained)["worked"]
 
 
 @pytest.mark.slow
 def test_the_response_of_a_rack_that_imports_messages_is_not_judged(folder: Path) -> None:
-    response = system_response(SilentRecording(folder))
+    response = measure_system_response(SilentRecording(folder))
     assert response is not None
     assert response["crosses_racks"] is False
-    ended = Recording(folder).ended
+    ended = Recording(folder).end_counts
     judged = judge_run(ended, response | {"crosses_racks": True})
     assert judged == {"worked": True, "failures": [], "unjudged": [ACROSS_RACKS]}
 
@@ -170,7 +170,7 @@ def test_lockstep_reports_no_time_relative_to_the_clock(folder: Path) -> None:
         assert task["execution_ms"]["max"] > 0
     assert "there are no deadlines" in text
     assert not {"late", "alpha", "residual min"} & set(text.replace("|", " ").split())
-    realtime = markdown({**report, "mode": "realtime"})
+    realtime = format_markdown({**report, "mode": "realtime"})
     assert "| residual min |" in realtime
 
 
@@ -182,12 +182,12 @@ def test_the_section_of_misses_explains_why_it_lists_fewer_than_the_headline(fol
     }
     skipped = {"task": "lower", "tick": 10, "what": "skipped", "count": 3}
     report = write_report(folder)[0] | {"misses": [late, skipped], "missed": 1, "skipped": 3}
-    lines = markdown(report).splitlines()
+    lines = format_markdown(report).splitlines()
     assert "## Missed and skipped cycles: 1 and 3" in lines
-    assert "The tasks counted" not in markdown(report)
-    fewer = markdown({**report, "missed": 2, "skipped": 7})
+    assert "The tasks counted" not in format_markdown(report)
+    fewer = format_markdown({**report, "missed": 2, "skipped": 7})
     assert "The tasks counted 2 and 7; the recording does not contain all of them." in fewer
-    lossy = markdown({**report, "missed": 2, "skipped": 7, "rows_lost": {"lower": 4}})
+    lossy = format_markdown({**report, "missed": 2, "skipped": 7, "rows_lost": {"lower": 4}})
     assert "The tasks counted 2 and 7; the recorder lost rows." in lossy
     assert "- the recorder lost rows: lower 4" in lossy.splitlines()
 
@@ -202,7 +202,7 @@ def test_a_report_fits_the_width_of_the_terminal(folder: Path, width: int) -> No
     }
     report["tasks"] = dict.fromkeys(("elemental_move.planner", "lower"), task)
     terminal = Console(width=width, record=True, file=io.StringIO())
-    show_blocks(terminal_blocks(report), terminal)
+    show_blocks(format_for_terminal(report), terminal)
     lines = terminal.export_text().splitlines()
     assert max(map(len, lines)) <= width
     rows = [line.split() for line in lines if line.startswith("elemental_move.planner")]
@@ -210,7 +210,7 @@ def test_a_report_fits_the_width_of_the_terminal(folder: Path, width: int) -> No
     assert len(rows) == 1
     assert "residual min" in head
     assert lines[-1] == f"all columns: {folder}/report.md; all data: report.json" or width == 80
-    assert max(map(len, markdown(report).splitlines())) > 120
+    assert max(map(len, format_markdown(report).splitlines())) > 120
 
 
 @pytest.mark.slow
@@ -258,7 +258,7 @@ def test_the_headline_names_the_end_of_the_run_and_latched_faults(
     folder: Path, outcome: dict[str, object], headline: str
 ) -> None:
     recording = Recording(folder)
-    recording.ended["outcome"] |= outcome
-    report = report_of(recording)
+    recording.end_counts["outcome"] |= outcome
+    report = build_report(recording)
     assert report["worked"] is (not outcome["faults"] and outcome["cause"] == "task done")
-    assert markdown(report).splitlines()[0] == f"# {report['rack']}{headline}"
+    assert format_markdown(report).splitlines()[0] == f"# {report['rack']}{headline}"

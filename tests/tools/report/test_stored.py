@@ -13,7 +13,7 @@ import pytest
 from rack.tools.recording.checksums import Checksums
 from rack.tools.report import stored
 from rack.tools.report.report import OtherRun, write_report
-from rack.tools.report.stored import RECORDED, stored_report
+from rack.tools.report.stored import RECORDED_FILES, read_stored_report
 from tests.shared_runs import small_run
 from tests.tools.command_line import rack
 
@@ -42,8 +42,8 @@ def cut_off(path: Path) -> None:
 
 
 CHANGES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
-    "newer": (make_newer, tuple(RECORDED)),
-    "missing": (rename, ("report.json", "report.md", *RECORDED)),
+    "newer": (make_newer, tuple(RECORDED_FILES)),
+    "missing": (rename, ("report.json", "report.md", *RECORDED_FILES)),
     "there": (Path.touch, (stored.SPOOL,)),
     "damaged": (cut_off, ("report.json",)),
 }
@@ -60,31 +60,31 @@ CHANGES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
 def test_a_stored_report_is_shown_until_a_file_changes(
     folder: Path, change: Callable[[Path], object], name: str
 ) -> None:
-    assert stored_report(folder) == write_report(folder)
+    assert read_stored_report(folder) == write_report(folder)
     change(folder / name)
-    assert stored_report(folder) is None
+    assert read_stored_report(folder) is None
 
 
 def test_a_report_is_rebuilt_when_the_program_changes(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stored, "PROGRAM", tmp_path)
+    monkeypatch.setattr(stored, "PROGRAM_FOLDER", tmp_path)
     (tmp_path / "levels").mkdir()
     changed = tmp_path / "levels" / "level.py"
     changed.touch()
     os.utime(changed, ns=(0, 0))
-    assert stored_report(folder) is not None
+    assert read_stored_report(folder) is not None
     make_newer(changed)
-    assert stored_report(folder) is None
+    assert read_stored_report(folder) is None
 
 
 def test_a_report_is_rebuilt_in_another_folder_and_after_a_comparison(folder: Path) -> None:
     write_report(folder, OtherRun(folder, "", True))
-    assert stored_report(folder) is None
+    assert read_stored_report(folder) is None
     write_report(folder)
     moved = folder.with_name(f"{folder.name}-moved")
     folder.rename(moved)
-    assert stored_report(moved) is None
+    assert read_stored_report(moved) is None
 
 
 def test_the_command_rebuilds_a_report_only_when_necessary(folder: Path) -> None:

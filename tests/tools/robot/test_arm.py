@@ -8,7 +8,7 @@ import pytest
 
 from rack.levels.errors import RobotError
 from rack.tools.robot.arm import ArmParts, find_arm
-from rack.tools.robot.draft import Wishes, draft
+from rack.tools.robot.draft import ArmOptions, draft_arm
 from rack.tools.robot.source import read_source
 from tests.tools.command_line import ROOT
 from tests.tools.robot.models import joint, link, urdf, written
@@ -42,7 +42,7 @@ def without_motor(name: str, text: str = DESK_ARM) -> str:
 
 def found(folder: Path, text: str, tip: str = "", joints: tuple[str, ...] = ()) -> ArmParts:
     name = "arm.urdf" if "<robot" in text else "arm.xml"
-    return find_arm(read_source(written(folder, text, name)).compiled(), tip, joints)
+    return find_arm(read_source(written(folder, text, name)).compile_model(), tip, joints)
 
 
 HOSE = rod("h1", rod("h2", rod("h3", rod("h4", rod("h5", rod("h6", rod("h7", rod("h8"))))))))
@@ -119,7 +119,9 @@ def test_an_arm_with_too_many_joints_is_refused_with_advice(tmp_path: Path) -> N
 @pytest.mark.slow
 def test_springs_stay_springs_and_other_passive_joints_are_held(tmp_path: Path) -> None:
     text = with_tool("flange", rod("flex1") + rod("loose", spring=""))
-    made = draft(read_source(written(tmp_path, text, "arm.xml")), Wishes(), tmp_path, "drafted")
+    made = draft_arm(
+        read_source(written(tmp_path, text, "arm.xml")), ArmOptions(), tmp_path, "drafted"
+    )
     model = made.cell().model
     names = [model.joint(k).name for k in range(model.njnt)]
     assert set(names) == {*JOINTS, "flex1"}
@@ -147,7 +149,7 @@ def test_the_inertia_of_a_base_that_never_moves_does_not_matter(tmp_path: Path, 
     assert text not in (urdf(), DESK_ARM)
     name = "arm.xml" if case == "MJCF" else "arm.urdf"
     source = read_source(written(tmp_path, text, name))
-    assert source.compiled().nbody > len(JOINTS)
+    assert source.compile_model().nbody > len(JOINTS)
     assert "physically impossible inertias were balanced" not in source.notes
 
 
@@ -168,7 +170,7 @@ def test_an_invalid_range_is_reported_and_mujoco_prints_nothing(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     source = read_source(written(tmp_path, urdf(gripper=False).replace(LIMITS, limits, 3)))
-    made = draft(source, Wishes(), tmp_path, "drafted")
+    made = draft_arm(source, ArmOptions(), tmp_path, "drafted")
     assert "joints without limits: j1, j2, j3; [robot] position can state them" in made.notes
     assert capfd.readouterr() == ("", "")
     assert not (tmp_path / "MUJOCO_LOG.TXT").exists()
@@ -180,7 +182,7 @@ def test_an_infinite_effort_counts_as_unstated_and_torques_are_guessed(
     tmp_path: Path, effort: str
 ) -> None:
     text = urdf(gripper=False).replace('effort="60.0"', f'effort="{effort}"')
-    made = draft(read_source(written(tmp_path, text)), Wishes(), tmp_path, "drafted")
+    made = draft_arm(read_source(written(tmp_path, text)), ArmOptions(), tmp_path, "drafted")
     assert "torque" in made.guessed
     assert made.robot.torque is not None
     assert max(made.robot.torque) < 1e3

@@ -8,7 +8,7 @@ import pytest
 
 from rack.levels.errors import Refused
 from rack.tools.robot import assignment
-from rack.tools.robot.draft import NOTHING, Wishes, draft
+from rack.tools.robot.draft import EMPTY_SCENE, ArmOptions, draft_arm
 from rack.tools.robot.source import read_source
 from tests.tools.robot.models import urdf, written
 
@@ -17,9 +17,9 @@ from tests.tools.robot.models import urdf, written
 def test_a_rehearsal_finds_no_more_paths_when_its_time_is_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = draft(read_source(written(tmp_path, urdf())), Wishes(), tmp_path, "drafted")
+    made = draft_arm(read_source(written(tmp_path, urdf())), ArmOptions(), tmp_path, "drafted")
     home = [{"do": "home"}]
-    assignment._rehearse(made, NOTHING, home)
+    assignment._rehearse_program(made, EMPTY_SCENE, home)
     monkeypatch.setattr(assignment, "REHEARSAL_S", 0.0)
     with pytest.raises(Refused, match="no way found in 0 s of processor time"):
-        assignment._rehearse(made, NOTHING, home)
+        assignment._rehearse_program(made, EMPTY_SCENE, home)

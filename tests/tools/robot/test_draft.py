@@ -11,8 +11,8 @@ import pytest
 
 from rack.levels.robot.dynamics import Dynamics
 from rack.tools.robot.assignment import Assignment
-from rack.tools.robot.draft import NOTHING, Wishes, draft
-from rack.tools.robot.folder import config_text
+from rack.tools.robot.draft import EMPTY_SCENE, ArmOptions, draft_arm
+from rack.tools.robot.folder import format_config
 from rack.tools.robot.source import read_source
 from tests.tools.robot.models import urdf, written
 
@@ -29,14 +29,14 @@ def with_friction(text: str) -> str:
 @pytest.mark.slow
 def test_dry_friction_of_light_links_follows_the_equation_of_motion(tmp_path: Path) -> None:
     source = read_source(written(tmp_path, with_friction(urdf(gripper=False))))
-    made = draft(source, Wishes(), tmp_path, "drafted")
+    made = draft_arm(source, ArmOptions(), tmp_path, "drafted")
     assert "dry friction acts within 1 ms" in made.notes
     cell = made.cell()
     dynamics = Dynamics(cell)
     velocity = np.full(6, SPEED)
     friction = dynamics.friction(velocity)
     assert friction == pytest.approx(np.full(6, DRY_N_M), rel=1e-3)
-    data = cell.start()
+    data = cell.build_start_data()
     data.qvel[cell.dof] = velocity
     data.qfrc_applied[cell.dof] = dynamics.terms(cell.home, velocity).bias + friction
     mujoco.mj_forward(cell.model, data)
@@ -50,9 +50,9 @@ def test_a_loop_is_stiff_enough_for_joints_to_rest_at_their_goals(
     friction: float, bandwidth: float | None, tmp_path: Path
 ) -> None:
     model = with_friction(urdf(gripper=False)).replace(str(DRY_N_M), str(friction))
-    made = draft(read_source(written(tmp_path, model)), Wishes(), tmp_path, "drafted")
+    made = draft_arm(read_source(written(tmp_path, model)), ArmOptions(), tmp_path, "drafted")
     assert made.limits.bandwidth == bandwidth
-    text = config_text(made, Assignment(NOTHING, [], "nothing"), "drafted", made.model)
+    text = format_config(made, Assignment(EMPTY_SCENE, [], "nothing"), "drafted", made.model)
     assert tomllib.loads(text).get("board", {}) == (
         {"servo": {"params": {"bandwidth": bandwidth}}} if bandwidth else {}
     )

@@ -8,7 +8,7 @@ import pytest
 
 from rack.levels.robot.cell import build_cell
 from rack.levels.tables import FollowConfig, GripperConfig
-from rack.tools.robot.draft import CLOCK_NS, NOTHING, Draft, Wishes, draft
+from rack.tools.robot.draft import CLOCK_NS, EMPTY_SCENE, ArmOptions, Draft, draft_arm
 from rack.tools.robot.source import read_source
 from tests.levels.robot import grippers
 from tests.tools.robot.models import urdf, written
@@ -18,7 +18,7 @@ MOTOR = '<position name="grip_right" joint="finger_right" forcerange="-15 15"/>'
 
 
 def drafted(folder: Path, model: Path) -> Draft:
-    return draft(read_source(model), Wishes(), folder, "drafted")
+    return draft_arm(read_source(model), ArmOptions(), folder, "drafted")
 
 
 def gripper_of(made: Draft) -> GripperConfig:
@@ -48,10 +48,12 @@ def test_a_single_finger_closes_on_its_jaw_with_the_tool_next_to_that(tmp_path: 
     assert (gripper.joint, gripper.open, gripper.closed) == ("finger_left", 0.04, -0.035)
     assert made.gripper is not None
     fingertips = made.gripper.fingertips
-    assert fingertips.is_one
+    assert fingertips.has_one_finger
     # The jaw is at y = -35 mm of the hand, the finger opens 75 mm from it.
-    assert fingertips.block == pytest.approx(0.35 * 0.075)
-    assert fingertips.tool.position[1] == pytest.approx(-0.035 + 0.5 * fingertips.block, abs=1e-4)
+    assert fingertips.block_width == pytest.approx(0.35 * 0.075)
+    assert fingertips.tool.position[1] == pytest.approx(
+        -0.035 + 0.5 * fingertips.block_width, abs=1e-4
+    )
     assert "finger and fixed jaw" in made.guessed["tool"]
 
 
@@ -74,4 +76,4 @@ def test_a_gripper_that_its_arm_blocks_is_fixed(tmp_path: Path) -> None:
     made = drafted(tmp_path, robot.model)
     assert made.robot.gripper is None
     assert made.notes[-1].startswith("no gripper: robot.gripper.force: 2.918 does not move")
-    build_cell(made.robot, NOTHING, CLOCK_NS)
+    build_cell(made.robot, EMPTY_SCENE, CLOCK_NS)

@@ -8,7 +8,7 @@ import mujoco
 import pytest
 
 from rack.levels.robot.model import load_spec
-from rack.tools.robot.arm import hold
+from rack.tools.robot.arm import fix_joints
 from tests.tools.robot.models import written
 
 MODEL = """<mujoco><worldbody><body name="arm"><joint name="j"/><geom name="g" size="1"/>
@@ -70,7 +70,7 @@ def held(folder: Path, inside: str = "", outside: str = "") -> mujoco.MjModel:
     spec = load_spec(written(folder, text, "given.xml"))
     spec.compile()
     path = written(folder, spec.to_xml(), "held.xml")
-    assert sorted(hold(path, ["j"])) == ["cube", "hand"]
+    assert sorted(fix_joints(path, ["j"])) == ["cube", "hand"]
     return load_spec(path).compile()
 
 

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.levels.robot.cell import build_cell, unchecked_cell
+from rack.levels.robot.cell import build_cell, build_unchecked_cell
 from rack.tools.robot.pieces import cut_meshes
 from tests.levels.arms import CLOCK_NS
 from tests.levels.robot import grippers
@@ -60,7 +60,7 @@ def test_pieces_leave_the_bend_free_that_a_hull_fills(tmp_path: Path) -> None:
     assert distance(whole.model, IN_BEND, "whole") < 0.0
     spec = mujoco.MjSpec.from_file(str(robot.model))
     spec.compile()
-    cut_meshes(spec, unchecked_cell(robot, scene, CLOCK_NS), np.array([0.0, 0.0, -1.0]))
+    cut_meshes(spec, build_unchecked_cell(robot, scene, CLOCK_NS), np.array([0.0, 0.0, -1.0]))
     cut = spec.compile()
     assert distance(cut, IN_BEND, "cut") > 0.003
     assert distance(cut, IN_PLATE, "cut") < 0.0

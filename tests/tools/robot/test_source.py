@@ -107,7 +107,7 @@ def with_visuals(links: range) -> str:
 def test_visible_shapes_are_used_in_planning_with_a_note(tmp_path: Path) -> None:
     source = read(tmp_path, with_visuals(range(3, 6)))
     assert source.notes == ["no <collision>, so planning uses the visible shapes: l3, l4, l5"]
-    model = source.compiled()
+    model = source.compile_model()
     shown = [int(model.body(f"l{k}").geomnum[0]) for k in range(1, 7)]
     assert shown == [1] * 6
     assert model.geom_contype.all()
@@ -154,7 +154,7 @@ def test_collada_is_refused_unless_a_readable_mesh_is_beside_it(tmp_path: Path) 
     why = f"convert '{tmp_path / 'b.dae'}', in its folder, as Collada and the like are not read"
     assert why in refusal(tmp_path, text)
     (tmp_path / "b.obj").write_text(CUBE)
-    assert read(tmp_path, text).compiled().nmesh == 1
+    assert read(tmp_path, text).compile_model().nmesh == 1
 
 
 def test_a_fifo_in_place_of_a_mesh_is_refused(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import rack
-from rack.backplane.segment import racks
+from rack.backplane.segment import list_racks
 from rack.backplane.words import Demand, System
 from rack.boards import Rack
 from rack.boards.events import Event
@@ -46,7 +46,7 @@ def own(request: pytest.FixtureRequest, path: Path, rack_name: str) -> Iterator[
     with Rack.from_file(path, [f"name={rack_name}", f"clock.mode={request.param}"]) as own:
         own.run_in_background()
         yield own
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
     wait_until(lambda: not named(f"{rack_name}:"))
 
 
@@ -123,7 +123,7 @@ def test_an_error_of_its_supervision_ends_a_rack_and_is_shown(path: Path, rack_n
         own.run_in_background()
         own.command("upper", "hold")
         wait_until(lambda: own.segment.run_is_over)
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
 
 
 @pytest.mark.slow
@@ -147,7 +147,7 @@ def test_a_program_that_is_interrupted_or_ends_leaves_nothing(
         os.kill(process.pid, signal.SIGINT)
     process.communicate(timeout=BOUND_S)
     assert process.returncode == (-signal.SIGINT if status else 0)
-    assert rack_name not in racks()
+    assert rack_name not in list_racks()
     wait_until(lambda: not named(f"{rack_name}:"))
 
 

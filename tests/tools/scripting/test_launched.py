@@ -18,12 +18,12 @@ import pytest
 import rack
 from rack.backplane.segment import Segment
 from rack.boards.config import load
-from rack.boards.config.toml import override
+from rack.boards.config.toml import apply_settings
 from rack.boards.events import Event
 from rack.tools.recording.recorder import process as recorder_process
 from rack.tools.recording.recorder.process import RecorderProcess
 from rack.tools.recording.recording import Recording
-from rack.tools.scripting.settings import settings_of
+from rack.tools.scripting.settings import list_settings
 from tests.boards.commanded_racks import COMMANDED
 from tests.processes import BOUND_S
 
@@ -75,11 +75,13 @@ VALUES = [
 
 @pytest.mark.parametrize("value", VALUES, ids=repr)
 def test_a_value_of_python_is_read_as_it_is(value: object) -> None:
-    assert override({}, [*settings_of({"table": {"key": value}})], []) == {"table": {"key": value}}
+    assert apply_settings({}, [*list_settings({"table": {"key": value}})], []) == {
+        "table": {"key": value}
+    }
 
 
 def test_arrays_are_lists() -> None:
-    (setting,) = settings_of({"key": np.arange(4.0).reshape(2, 2)})
+    (setting,) = list_settings({"key": np.arange(4.0).reshape(2, 2)})
     assert setting == "key=[[0.0, 1.0], [2.0, 3.0]]"
 
 
@@ -125,9 +127,9 @@ def test_a_recorded_rack_leaves_the_run_of_the_command(
         outcome = own.run(1.0)
     assert repr(own) == f"<rack '{rack_name}': time over, recorded into {out}>"
     recording = Recording(out)
-    assert recording.ended["outcome"]["digest"] == outcome.digest
-    assert recording.ended["recording"] == "complete"
-    assert recording.ended["tasks"]["lower"]["cycles"] == 400
+    assert recording.end_counts["outcome"]["digest"] == outcome.digest
+    assert recording.end_counts["recording"] == "complete"
+    assert recording.end_counts["tasks"]["lower"]["cycles"] == 400
     run = rack.open_run(out)
     assert run.signals["lower.status.count"].ticks.tolist() == list(range(400))
     assert [event.kind for event in run.events] == [event.kind for event in heard]
@@ -144,7 +146,7 @@ def test_a_rack_stays_until_its_recorder_has_begun(
     path: Path, tmp_path: Path, rack_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waits: list[float] = []
-    wait: Callable[[RecorderProcess, float], bool] = RecorderProcess.await_begun
+    wait: Callable[[RecorderProcess, float], bool] = RecorderProcess.wait_until_attached
 
     def note(recorder: RecorderProcess, bound_s: float = math.inf) -> bool:
         # Raises when the rack is gone.
@@ -152,12 +154,12 @@ def test_a_rack_stays_until_its_recorder_has_begun(
             waits.append(bound_s)
             return wait(recorder, bound_s)
 
-    monkeypatch.setattr(RecorderProcess, "await_begun", note)
+    monkeypatch.setattr(RecorderProcess, "wait_until_attached", note)
     settings = {**LOCKSTEP, "name": rack_name}
     with rack.Rack(path, settings=settings, out=tmp_path / "run") as own:
         own.run(0.1)
     assert waits == [recorder_process.ATTACH_S, math.inf]
-    assert Recording(tmp_path / "run").ended["recording"] == "complete"
+    assert Recording(tmp_path / "run").end_counts["recording"] == "complete"
 
 
 @pytest.mark.slow

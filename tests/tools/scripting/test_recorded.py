@@ -16,7 +16,7 @@ from rack.boards.config import load
 from rack.boards.events import Event
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
-from rack.tools.recording.checksums import checked_line
+from rack.tools.recording.checksums import format_checked_line
 from rack.tools.recording.recording import Recording
 from tests.boards.commanded_racks import COMMANDED
 from tests.conftest import SMALL
@@ -70,7 +70,7 @@ def test_a_run_is_resumed_from_a_time_in_the_background(tmp_path: Path, rack_nam
     config = load(path, [f"name={rack_name}"])
     run = tmp_path / "run"
     run_rack(config, 2.0, run, Display())
-    expected = Recording(run).ended["outcome"]
+    expected = Recording(run).end_counts["outcome"]
     with rack.open_run(run).at(1.2025).resume(seconds=2.0) as resumed:
         outcome = resumed.wait(20)
     assert outcome is not None
@@ -115,7 +115,7 @@ def test_a_plot_has_units_names_and_marks(small: Path, tmp_path: Path) -> None:
             (900, "fault", "ends", "wave ends"),
         ):
             event = Event(0, tick, kind, "lower", text, code)  # type: ignore[arg-type]
-            events.write(checked_line(asdict(event)))
+            events.write(format_checked_line(asdict(event)))
     signals = rack.open_run(folder).signals
     axes = signals["lower.status.count"].plot()
     count, *marks = axes.get_lines()
@@ -175,5 +175,5 @@ def test_a_rack_of_a_program_is_recorded(tmp_path: Path, rack_name: str) -> None
     assert outcome is not None
     run = rack.open_run(tmp_path / "run")
     assert run.signals["lower.status.count"].ticks.tolist() == list(range(400))
-    assert Recording(tmp_path / "run").gaps() == []
+    assert Recording(tmp_path / "run").find_gaps() == []
     assert run.events == []

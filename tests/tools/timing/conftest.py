@@ -76,6 +76,6 @@ def judge(budgeted: Path) -> Judge:
     """Return a function that judges the rack with settings."""
 
     def judged(*settings: str) -> JudgedConfig:
-        return JudgedConfig.of(load(budgeted, settings))
+        return JudgedConfig.judge(load(budgeted, settings))
 
     return judged

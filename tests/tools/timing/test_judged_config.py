@@ -25,7 +25,7 @@ def sides(
 
 
 def failing(judged: JudgedConfig) -> set[tuple[str, str]]:
-    return {(verdict.equation, verdict.subject) for verdict in judged.failing}
+    return {(verdict.equation, verdict.subject) for verdict in judged.failures}
 
 
 SECOND = (
@@ -139,7 +139,7 @@ def test_equations_of_a_tight_planner_do_not_apply_to_a_loose_or_unknown_one(
     judged = judge(*settings)
     found = {v.equation for v in judged.verdicts if v.subject == "lower"}
     assert not found & {"3.8", "3.9", "3.10"}
-    assert (judged.timing.level("lower").within_cycles is None) == (settings != LOOSE)
+    assert (judged.timing.build_level("lower").within_cycles is None) == (settings != LOOSE)
 
 
 def test_a_response_without_bound_is_none_as_plain_data(judge: Judge) -> None:
@@ -148,7 +148,7 @@ def test_a_response_without_bound_is_none_as_plain_data(judge: Judge) -> None:
         v for v in judged.verdicts if (v.equation, v.subject) == ("response time", "lower.planner")
     )
     assert (verdict.left, verdict.margin) == (inf, -inf)
-    assert (verdict.document()["left"], verdict.document()["margin"]) == (None, None)
+    assert (verdict.to_document()["left"], verdict.to_document()["margin"]) == (None, None)
 
 
 @pytest.mark.parametrize(
@@ -163,4 +163,4 @@ def test_a_response_without_bound_is_none_as_plain_data(judge: Judge) -> None:
 def test_the_papers_figures_are_predicted_as_the_paper_has_them(
     rack: str, expected: set[str]
 ) -> None:
-    assert {v.equation for v in JudgedConfig.of(load(rack)).failing} == expected
+    assert {v.equation for v in JudgedConfig.judge(load(rack)).failures} == expected

@@ -12,8 +12,8 @@ import pytest
 from rack.boards.config import load
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.tools.console.tables import render_text
-from rack.tools.lab.benches.observed import record, with_commands
-from rack.tools.timing.operator_response import OperatorResponse, plot, response_of
+from rack.tools.lab.benches.observed import add_commands, record_rack
+from rack.tools.timing.operator_response import OperatorResponse, measure_response, plot_response
 from tests.boards.commanded_racks import COMMANDED
 
 MakeConfig = Callable[..., RackConfig]
@@ -27,7 +27,7 @@ def config(rack_name: str, tmp_path: Path) -> MakeConfig:
 
 
 def run_and_measure(config: RackConfig, folder: Path, *given: CommandConfig) -> OperatorResponse:
-    response = response_of(record(with_commands(config, given), 1.0, folder).recording)
+    response = measure_response(record_rack(add_commands(config, given), 1.0, folder).recording)
     assert response is not None
     return response
 
@@ -53,9 +53,9 @@ def test_every_command_of_a_run_comes_at_its_predicted_tick(
         (176, 184, 192, 192),
         (250, 251, 251, 251),
     ]
-    assert response.held
-    assert "0 " in "\n".join(render_text(response.blocks())).splitlines()[-1]
-    pictures = plot(response, tmp_path)
+    assert response.is_within_bounds
+    assert "0 " in "\n".join(render_text(response.format_blocks())).splitlines()[-1]
+    pictures = plot_response(response, tmp_path)
     assert [picture.suffix for picture in pictures] == [".png", ".svg"]
     assert all(picture.stat().st_size > 1000 for picture in pictures)
 
@@ -76,10 +76,10 @@ def test_commands_without_effect_have_distinct_fates(config: MakeConfig, tmp_pat
         "acted on",
         "run over",
     ]
-    assert len(response.measured) == 1
+    assert len(response.measured_commands) == 1
     assert (
         "not measured: 1 to upper (refused), 2 to upper (superseded), 4 to upper (run over)"
-        in "\n".join(render_text(response.blocks()))
+        in "\n".join(render_text(response.format_blocks()))
     )
 
 
@@ -88,8 +88,8 @@ def test_a_response_at_another_tick_or_beyond_a_bound_is_detected(
     response: OperatorResponse,
 ) -> None:
     late = replace(response.commands[0], acts=113)
-    assert not replace(response, commands=(late,)).held
-    assert replace(response, commands=(late,)).off == [late]
-    assert replace(response, commands=(late,)).beyond == []
+    assert not replace(response, commands=(late,)).is_within_bounds
+    assert replace(response, commands=(late,)).mispredicted_commands == [late]
+    assert replace(response, commands=(late,)).commands_beyond_bound == []
     lost = replace(response.commands[0], acts=101 + 40)
-    assert replace(response, commands=(lost,), lockstep=False).beyond == [lost]
+    assert replace(response, commands=(lost,), lockstep=False).commands_beyond_bound == [lost]

@@ -6,19 +6,19 @@ from collections.abc import Sequence
 
 import pytest
 
-from rack.boards.config import load, loads
+from rack.boards.config import load, load_text
 from rack.tools.timing.judged_config import Change, JudgedConfig
-from rack.tools.timing.repair import changes_for, first_that, repair
+from rack.tools.timing.repair import find_changes, find_repair, search_first
 from tests.tools.timing.conftest import Judge
 
 
 def list_settings(judged: JudgedConfig, board: str = "lower") -> list[dict[str, object]]:
-    return [change.settings for change in changes_for(judged, board)]
+    return [change.settings for change in find_changes(judged, board)]
 
 
 def find_change(judged: JudgedConfig, key: str) -> Change:
     """Return the first change for the lower board that sets `key`."""
-    return next(change for change in changes_for(judged, "lower") if key in change.settings)
+    return next(change for change in find_changes(judged, "lower") if key in change.settings)
 
 
 def test_the_first_item_that_works_is_found_in_few_attempts() -> None:
@@ -28,9 +28,9 @@ def test_the_first_item_that_works_is_found_in_few_attempts() -> None:
         attempts.append(number)
         return number if number >= 700 else None
 
-    assert first_that(range(10_000), attempt) == 700
+    assert search_first(range(10_000), attempt) == 700
     assert len(attempts) < 25
-    found = [first_that(range(n), lambda k: k if k >= 5 else None) for n in (0, 5, 6, 100)]
+    found = [search_first(range(n), lambda k: k if k >= 5 else None) for n in (0, 5, 6, 100)]
     assert found == [None, None, 5, 5]
 
 
@@ -99,37 +99,39 @@ def test_another_priority_costs_nothing_and_comes_first(judge: Judge) -> None:
         *(f"board.upper.{setting}" for setting in settings), "board.lower.budget.plan_ms=0.1"
     )
     assert ("response time", "lower") in {
-        (verdict.equation, verdict.subject) for verdict in judged.failing
+        (verdict.equation, verdict.subject) for verdict in judged.failures
     }
-    first = changes_for(judged, "lower")[0]
+    first = find_changes(judged, "lower")[0]
     assert (first.settings, first.text) == ({"priority": 86}, "board 'lower': priority 80 -> 86")
-    assert first.after.failing == ()
+    assert first.after.failures == ()
 
 
 def test_every_change_is_a_config_that_holds_by_itself(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1")
-    for change in changes_for(judged, "lower"):
-        assert not JudgedConfig.of(loads(change.after.config.text()), judged.budgets).failing
+    for change in find_changes(judged, "lower"):
+        assert not JudgedConfig.judge(
+            load_text(change.after.config.to_toml_text()), judged.budgets
+        ).failures
 
 
 def test_the_next_smaller_change_does_not_help(judge: Judge) -> None:
     judged = judge("board.lower.budget.plan_ms=60")
     assert {"within_cycles": 11} in list_settings(judged)
-    assert judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=10").failing
-    assert not judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=11").failing
+    assert judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=10").failures
+    assert not judge("board.lower.budget.plan_ms=60", "board.lower.within_cycles=11").failures
 
 
 def test_a_critical_section_turns_into_a_time_slice_between_two_processors(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "protocol.mailbox={ 'lower.plan' = 'lock' }")
     loosened = find_change(judged, "coupling")
-    assert loosened.after.layout.mailbox("lower.plan").protocol == "time-slice"
-    assert loosened.document()["protocols"] == {"lower.plan": "time-slice"}
+    assert loosened.after.layout.find_mailbox("lower.plan").protocol == "time-slice"
+    assert loosened.to_document()["protocols"] == {"lower.plan": "time-slice"}
     assert "lower.plan by time-slice" in loosened.text
 
 
 def test_a_longer_cycle_gives_a_plan_fewer_cycles_if_its_age_is_bounded() -> None:
     config = load("fig3")
-    changes = changes_for(JudgedConfig.of(config), "level")
+    changes = find_changes(JudgedConfig.judge(config), "level")
     # The paper's remedies: its figure 4 first, then its figure 2.
     assert [change.settings for change in changes] == [
         {"coupling": "loose", "planner_slot": 3, "planner_core": 0},
@@ -139,30 +141,30 @@ def test_a_longer_cycle_gives_a_plan_fewer_cycles_if_its_age_is_bounded() -> Non
 
 def test_boards_are_repaired_one_after_another(judge: Judge) -> None:
     judged = judge("board.lower.within_cycles=1", "board.upper.budget.process_ms=19")
-    repaired = repair(judged)
+    repaired = find_repair(judged)
     assert [changes[0].board for changes in repaired.steps] == ["lower", "upper"]
-    assert repaired.left == ()
-    assert repaired.end.failing == ()
+    assert repaired.remaining_failures == ()
+    assert repaired.end.failures == ()
     # The second step builds on the first.
     assert repaired.end.config.board["lower"].within_cycles == 2
-    assert [line.split(":")[0] for line in repaired.lines() if not line.startswith(" ")] == [
+    assert [line.split(":")[0] for line in repaired.format_lines() if not line.startswith(" ")] == [
         "to make it fit, one of these, cheapest first",
         "then, with the first of these",
     ]
 
 
 def test_a_failure_that_no_change_removes_is_named(judge: Judge) -> None:
-    hopeless = repair(judge("board.lower.budget.process_ms=200"))
+    hopeless = find_repair(judge("board.lower.budget.process_ms=200"))
     assert hopeless.steps == ()
-    assert {verdict.equation for verdict in hopeless.left} >= {"3.1", "3.4"}
-    assert hopeless.lines()[-1].startswith("no change helps with 3.1 of lower, ")
-    assert hopeless.document() == {"steps": [], "fits": False}
+    assert {verdict.equation for verdict in hopeless.remaining_failures} >= {"3.1", "3.4"}
+    assert hopeless.format_lines()[-1].startswith("no change helps with 3.1 of lower, ")
+    assert hopeless.to_document() == {"steps": [], "fits": False}
 
 
 def test_a_rack_that_fits_needs_no_changes(judge: Judge) -> None:
     judged = judge()
-    assert repair(judged).end is judged
-    assert repair(judged).lines() == []
+    assert find_repair(judged).end is judged
+    assert find_repair(judged).format_lines() == []
 
 
 @pytest.fixture(autouse=True)
@@ -177,4 +179,4 @@ def test_a_loose_planner_moves_to_another_core(judge: Judge) -> None:
     judged = judge(*(f"board.lower.{setting}" for setting in loose))
     assert {"planner_core": 2} in list_settings(judged)
     # The upper level could go instead, at no cost.
-    assert changes_for(judged, "lower")[0].board == "upper"
+    assert find_changes(judged, "lower")[0].board == "upper"

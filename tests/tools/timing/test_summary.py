@@ -14,9 +14,9 @@ from rack.backplane.mailbox.inbox import InterruptSource
 from rack.boards.config import load
 from rack.boards.timing.forecast import Forecast
 from rack.boards.timing.interrupts import InboxTiming
-from rack.boards.timing.verdicts import INBOX, verdicts
+from rack.boards.timing.verdicts import INBOX, judge_rack
 from rack.tools.timing.judged_config import JudgedConfig
-from rack.tools.timing.summary import tightest
+from rack.tools.timing.summary import find_tightest
 from tests.tools.command_line import rack
 
 BUDGET = "board.lower.budget={ read_ms = 0.1, process_ms = 0.5, plan_ms = 2.0, update_ms = 0.1 }"
@@ -81,8 +81,8 @@ def test_the_document_names_everything_that_was_not_counted(small: Path) -> None
 
 
 def test_host_boards_are_named_as_not_counted() -> None:
-    judged = JudgedConfig.of(load("ibm"))
-    found = Forecast.of(judged.timing, hosts=judged.config.host).uncounted
+    judged = JudgedConfig.judge(load("ibm"))
+    found = Forecast.from_rack(judged.timing, hosts=judged.config.host).uncounted
     assert judged.config.host
     assert judged.config.host.keys() <= found.keys()
 
@@ -108,8 +108,8 @@ def test_a_planner_that_never_finishes_is_described_in_a_sentence(small: Path) -
 
 def test_interrupts_that_never_end_are_described_in_a_sentence() -> None:
     inbox = InboxTiming("low", ("up.status",), (InterruptSource(1_000, 2_000),), 4)
-    timing = replace(JudgedConfig.of(load("fig2")).timing, inboxes={"low": inbox})
-    (found,) = [verdict for verdict in verdicts(timing) if verdict.equation == INBOX]
-    assert list(tightest([found])) == [
+    timing = replace(JudgedConfig.judge(load("fig2")).timing, inboxes={"low": inbox})
+    (found,) = [verdict for verdict in judge_rack(timing) if verdict.equation == INBOX]
+    assert list(find_tightest([found])) == [
         "tightest: interrupts of 'low' come faster than it serves them (load 2)"
     ]

@@ -10,14 +10,14 @@ import pytest
 import rerun.blueprint as rrb
 
 from rack.backplane.segment import Launch
-from rack.boards.config import load, wire
+from rack.boards.config import load, resolve_layout
 from rack.boards.events import Event
 from rack.levels.messages import ServoStatus
-from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.robot.cell import build_cell, compute_sizes
 from rack.tools.viewer.blueprint import RackViews
-from rack.tools.viewer.cell import Marks
-from rack.tools.viewer.reading import read
-from rack.tools.viewer.stream import Moment, RowBlock, Stream, Timelines, new_recording
+from rack.tools.viewer.cell import MarkWriter
+from rack.tools.viewer.reading import read_component
+from rack.tools.viewer.stream import Moment, RowBlock, Stream, Timelines, open_recording
 from rack.tools.viewer.style import LOST
 
 Part = rrb.Container | rrb.View
@@ -46,7 +46,7 @@ def plots(name: str, first: bool) -> list[rrb.TimeSeriesView]:
     config = load(name)
     robot = config.robot
     cell = None if robot is None else build_cell(robot, config.scene, config.clock_ns)
-    found = views(RackViews(wire(config), config, cell).everything(), first)
+    found = views(RackViews(resolve_layout(config), config, cell).build_all_views(), first)
     return [view for view in found if isinstance(view, rrb.TimeSeriesView)]
 
 
@@ -83,13 +83,13 @@ def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Pat
     assert config.robot is not None
     cell = build_cell(config.robot, config.scene, config.clock_ns)
     times = Timelines(config.clock_ns, Launch(0, 0))
-    recording = new_recording("run", "run", tmp_path / "run.rrd", rrb.Blueprint(rrb.TextLogView()))
+    recording = open_recording("run", "run", tmp_path / "run.rrd", rrb.Blueprint(rrb.TextLogView()))
     stream = Stream(recording, times)
-    marks = Marks(stream, cell, config.robot.joints)
+    marks = MarkWriter(stream, cell, config.robot.joints)
     dtype = [
         ("tick", "i8"),
         ("stamp_ns", "i8"),
-        ("message", ServoStatus.message_type.dtype(sizes(cell))),
+        ("message", ServoStatus.message_type.build_dtype(compute_sizes(cell))),
     ]
     rows = np.zeros(9, dtype=dtype)
     rows["tick"] = np.arange(9)
@@ -98,15 +98,15 @@ def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Pat
     for tick, code in ((2, "begins"), (7, "ends")):
         text = f"sensor-nan (j3) {code}, and more"
         event = Event(0, tick, "fault", "servo", text, code, fault=0, subject="j3")
-        marks.fault(Moment(tick, 0), event)
+        marks.mark_fault(Moment(tick, 0), event)
     stream.close()
     for joint in config.robot.joints:
-        brakes = read(tmp_path / "run.rrd", f"/cell/brakes/{joint}", "Points3D:positions")
+        brakes = read_component(tmp_path / "run.rrd", f"/cell/brakes/{joint}", "Points3D:positions")
         assert [len(row) for row in brakes.values] == [0, 1, 0]
         assert brakes.ticks.tolist() == [0, 3, 6]
-    colour = read(tmp_path / "run.rrd", "/cell/brakes/j6", "Points3D:colors").values
+    colour = read_component(tmp_path / "run.rrd", "/cell/brakes/j6", "Points3D:colors").values
     assert set(colour.ravel().tolist()) == {LOST}
-    faults = read(tmp_path / "run.rrd", "/cell/faults/j3", "Points3D:labels")
+    faults = read_component(tmp_path / "run.rrd", "/cell/faults/j3", "Points3D:labels")
     assert list(faults.values[0]) == ["fault of servo: sensor-nan (j3)"]
-    places = read(tmp_path / "run.rrd", "/cell/faults/j3", "Points3D:positions")
+    places = read_component(tmp_path / "run.rrd", "/cell/faults/j3", "Points3D:positions")
     assert [len(row) for row in places.values] == [1, 0]

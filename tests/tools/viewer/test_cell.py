@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from rack.tools.viewer.cell import STEP_RAD, in_pieces, moving_bodies
-from rack.tools.viewer.shapes import placed, shape_of
+from rack.tools.viewer.cell import STEP_RAD, find_moving_bodies, subdivide_path
+from rack.tools.viewer.shapes import build_shape, transform_to_body
 
 MODEL = """
 <mujoco>
@@ -46,7 +46,7 @@ def model() -> mujoco.MjModel:
 
 def column(model: mujoco.MjModel, geom: str, name: str) -> np.ndarray:
     """Return one component of a geom's shape, one row per instance."""
-    shape = shape_of(model, model.geom(geom).id)
+    shape = build_shape(model, model.geom(geom).id)
     assert shape is not None
     batches = {
         b.component_descriptor().component.partition(":")[2]: b
@@ -56,7 +56,7 @@ def column(model: mujoco.MjModel, geom: str, name: str) -> np.ndarray:
 
 
 def test_every_kind_of_geom_has_a_shape(model: mujoco.MjModel) -> None:
-    without = [model.geom(g).name for g in range(model.ngeom) if shape_of(model, g) is None]
+    without = [model.geom(g).name for g in range(model.ngeom) if build_shape(model, g) is None]
     assert without == ["hidden"]
 
 
@@ -88,16 +88,16 @@ def test_points_of_a_geom_are_placed_as_mujoco_places_them(model: mujoco.MjModel
     geom, point = model.geom("box").id, np.array([[0.1, 0.2, 0.3]])
     expected = data.geom_xpos[geom] + data.geom_xmat[geom].reshape(3, 3) @ point[0]
     body = model.geom_bodyid[geom]
-    in_body = placed(model, geom, point)[0]
+    in_body = transform_to_body(model, geom, point)[0]
     assert data.xpos[body] + data.xmat[body].reshape(3, 3) @ in_body == pytest.approx(expected)
 
 
 def test_bodies_on_joints_and_mocap_bodies_are_moving_bodies(model: mujoco.MjModel) -> None:
-    assert [model.body(body).name for body in moving_bodies(model)] == ["arm", "hand", "post"]
+    assert [model.body(body).name for body in find_moving_bodies(model)] == ["arm", "hand", "post"]
 
 
 def test_a_path_is_drawn_in_small_pieces_through_its_corners() -> None:
     corners = np.array([[0.0, 0.0], [0.1, -0.2], [0.1, -0.2], [0.3, 0.0]])
-    points = in_pieces(corners)
+    points = subdivide_path(corners)
     assert np.abs(np.diff(points, axis=0)).max() <= STEP_RAD + 1e-12
     assert all((points == corner).all(axis=1).any() for corner in corners)

@@ -10,14 +10,14 @@ import pytest
 from rerun.chunk import RrdReader
 
 from rack.boards.config import load
-from rack.tools.launch.continued import RunAgain, branched
+from rack.tools.launch.continued import RepeatedRun, load_branch_config
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.time_line import on_one_time_line
+from rack.tools.recording.time_line import place_on_time_line
 from rack.tools.viewer.merged import write_merged
-from rack.tools.viewer.pictures import NoViewerError, opened
-from rack.tools.viewer.reading import read
+from rack.tools.viewer.pictures import NoViewerError, open_screen
+from rack.tools.viewer.reading import read_component
 from tests.boards.remembering_racks import REMEMBERING
 from tests.shared_runs import nasrem_run
 from tests.tools.command_line import rack
@@ -50,7 +50,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 @pytest.mark.slow
 def test_a_view_built_from_files_equals_the_recorders_view(run: Recording, tmp_path: Path) -> None:
-    write_merged(on_one_time_line([run]), tmp_path / "again.rrd", lambda part: None)
+    write_merged(place_on_time_line([run]), tmp_path / "again.rrd", lambda part: None)
     again, live = read_contents(tmp_path / "again.rrd"), read_contents(run.folder / "run.rrd")
     # Losses and limits are written once per block, and the blocks differ.
     loose = ("/recorder/rows_lost", "limits")
@@ -63,7 +63,7 @@ def test_a_view_built_from_files_equals_the_recorders_view(run: Recording, tmp_p
 @pytest.fixture(scope="module")
 def merged_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("both")
-    places = on_one_time_line([recorded(A, [B], folder / "a"), recorded(B, [A], folder / "b")])
+    places = place_on_time_line([recorded(A, [B], folder / "a"), recorded(B, [A], folder / "b")])
     shown: list[float] = []
     write_merged(places, folder / "both.rrd", shown.append)
     assert shown == sorted(shown)
@@ -93,7 +93,9 @@ def test_each_rack_is_below_its_name_and_simultaneous_events_coincide(
 
 
 def test_the_uncertainty_of_times_is_in_the_log(merged_file: Path) -> None:
-    (line,) = read(merged_file, "/log/time\\ line", "TextLog:text").values.ravel().tolist()
+    (line,) = (
+        read_component(merged_file, "/log/time\\ line", "TextLog:text").values.ravel().tolist()
+    )
     begin = (A.shows(B.begins_ns) - A.epoch_ns) / S
     assert line.startswith(f"rack 'b' is on the time line of 'a': it begins at +{begin:.3f}")
     assert line.endswith(" ms")
@@ -107,9 +109,9 @@ def branched_runs(rack_name: str, tmp_path: Path) -> Path:
     config = load(file, [f"name={rack_name}"])
     run_rack(config, 1.0, tmp_path / "whole", Display())
     whole = Recording(tmp_path / "whole")
-    config = branched(whole, ["board.wave.params.factor=2"], None)
-    with RunAgain(whole) as again:
-        run_rack(config, 1.0, tmp_path / "other", Display(), begins=again.beginning(150))
+    config = load_branch_config(whole, ["board.wave.params.factor=2"], None)
+    with RepeatedRun(whole) as again:
+        run_rack(config, 1.0, tmp_path / "other", Display(), beginning=again.continue_at(150))
     return tmp_path
 
 
@@ -121,20 +123,23 @@ def test_a_branch_is_shown_on_the_ticks_of_its_run_with_the_fork_marked(
     done = rack("replay", *names, folder=branched_runs)
     assert done.returncode == 0, done.stderr
     merged_file = branched_runs / "both.rrd"
-    curves = [read(merged_file, f"/{run}/signals/wave.status/value") for run in ("whole", "other")]
+    curves = [
+        read_component(merged_file, f"/{run}/signals/wave.status/value")
+        for run in ("whole", "other")
+    ]
     for rows, run in zip(curves, ("whole", "other"), strict=True):
         own = Recording(branched_runs / run)
-        assert rows.ticks.tolist() == own.signal("wave.status", "tick").tolist()
-        assert rows.values.ravel().tolist() == own.signal("wave.status", "value").tolist()
+        assert rows.ticks.tolist() == own.read_signal("wave.status", "tick").tolist()
+        assert rows.values.ravel().tolist() == own.read_signal("wave.status", "value").tolist()
     assert (curves[0].ticks[0], curves[1].ticks[0]) == (0, 150)
-    marks = read(merged_file, "/log/time\\ line", "TextLog:text")
+    marks = read_component(merged_file, "/log/time\\ line", "TextLog:text")
     assert list(zip(marks.ticks.tolist(), marks.values.ravel().tolist(), strict=True)) == [
         (150, "other branches off"),
         (150, "other differs from whole: wave.status"),
     ]
     try:
-        with opened(merged_file) as screen:
-            look = screen.look(at_s=0.5)
+        with open_screen(merged_file) as screen:
+            look = screen.take_picture(at_s=0.5)
             views = set(screen.views)
     except NoViewerError as error:
         pytest.skip(str(error))

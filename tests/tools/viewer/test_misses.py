@@ -12,9 +12,9 @@ import rerun.blueprint as rrb
 from rack.backplane.layout import TaskSpec
 from rack.backplane.segment import Launch
 from rack.backplane.trace import RECORD, Flag
-from rack.tools.viewer.reading import read
-from rack.tools.viewer.stream import RowBlock, Stream, Timelines, new_recording
-from rack.tools.viewer.timing import missed_cycles
+from rack.tools.viewer.reading import read_component
+from rack.tools.viewer.stream import RowBlock, Stream, Timelines, open_recording
+from rack.tools.viewer.timing import build_miss_lane
 
 TICK_NS = 2_500_000
 SPAN = 100
@@ -24,8 +24,8 @@ TASK = TaskSpec("servo", "servo", "executor", 2, 0, 0, 1, 1, 4)
 def recorded(folder: Path, missed: list[list[int]]) -> Path:
     """Write blocks of 400 cycles with misses at these ticks."""
     times = Timelines(TICK_NS, Launch(time.time_ns(), 0))
-    stream = Stream(new_recording("misses", "run", folder / "run.rrd", rrb.Blueprint()), times)
-    write = missed_cycles(stream, TASK)
+    stream = Stream(open_recording("misses", "run", folder / "run.rrd", rrb.Blueprint()), times)
+    write = build_miss_lane(stream, TASK)
     for number, ticks in enumerate(missed):
         rows = np.zeros(400, dtype=RECORD)
         rows["tick"] = np.arange(400) + 400 * number
@@ -39,13 +39,15 @@ def recorded(folder: Path, missed: list[list[int]]) -> Path:
 
 def test_a_missed_cycle_marks_its_quarter_of_a_second_and_is_in_the_log(tmp_path: Path) -> None:
     file = recorded(tmp_path, [[5, 120, 130], [], [1199]])
-    lane = read(file, "/levels/servo/executor_missed", "StateChange:state")
+    lane = read_component(file, "/levels/servo/executor_missed", "StateChange:state")
     assert lane.ticks.tolist() == [0, SPAN, 2 * SPAN, 11 * SPAN, 12 * SPAN]
     assert lane.values.ravel().tolist() == ["missed", "missed", "", "missed", ""]
-    log = read(file, "/log/misses", "TextLog:text").values.ravel().tolist()
+    log = read_component(file, "/log/misses", "TextLog:text").values.ravel().tolist()
     assert log == ["missed: servo: 3 cycles, ticks 5 to 130", "missed: servo: tick 1199"]
 
 
 def test_a_task_that_never_misses_has_no_lane(tmp_path: Path) -> None:
     with pytest.raises(KeyError, match="executor_missed"):
-        read(recorded(tmp_path, [[], []]), "/levels/servo/executor_missed", "StateChange:state")
+        read_component(
+            recorded(tmp_path, [[], []]), "/levels/servo/executor_missed", "StateChange:state"
+        )

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.tools.viewer.pictures import NoViewerError, _connected
-from rack.tools.viewer.window import ViewerWindow, free_port
+from rack.tools.viewer.pictures import NoViewerError, _connect_client
+from rack.tools.viewer.window import ViewerWindow, find_free_port
 
 ROOT = Path(__file__).resolve().parents[3]
 BOUND_S = 60
@@ -43,10 +43,10 @@ def test_without_a_driver_the_cause_and_what_to_install_are_one_line(
 
 
 def test_the_viewer_listens_to_this_machine_alone() -> None:
-    port = free_port()
+    port = find_free_port()
     window = ViewerWindow(headless=True, port=port)
     try:
-        _connected(window, port)
+        _connect_client(window, port)
         sockets = [
             line.split()[1:4]
             for name in ("tcp", "tcp6")

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from rack.boards.config import load, loads
+from rack.boards.config import load, load_text
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.robot.engine import view_state
 from rack.tools.recording.recording import Recording
-from rack.tools.viewer.pictures import NoViewerError, opened
-from rack.tools.viewer.reading import read
+from rack.tools.viewer.pictures import NoViewerError, open_screen
+from rack.tools.viewer.reading import read_component
 from tests.shared_runs import NASREM_S, nasrem_run
 
 
@@ -23,20 +23,20 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 @pytest.fixture(scope="module")
 def cell(run: Recording) -> Cell:
-    config = loads(run.config)
+    config = load_text(run.config)
     assert config.robot is not None
     return build_cell(config.robot, config.scene, config.clock_ns)
 
 
 @pytest.mark.slow
 def test_joint_curves_are_the_signals_bit_for_bit(run: Recording) -> None:
-    ticks = run.signal("servo.status", "tick")
+    ticks = run.read_signal("servo.status", "tick")
     for at, joint in enumerate(load("nasrem").robot.joints):
         for quantity, fields in {"position": ["target", "position"], "torque": ["torque"]}.items():
-            rows = read(run.folder / "run.rrd", f"/joints/{joint}/{quantity}")
+            rows = read_component(run.folder / "run.rrd", f"/joints/{joint}/{quantity}")
             assert np.array_equal(rows.ticks, ticks)
             expected = np.column_stack(
-                [run.signal("servo.status", field)[:, at] for field in fields]
+                [run.read_signal("servo.status", field)[:, at] for field in fields]
             )
             assert np.array_equal(rows.values, expected)
 
@@ -45,15 +45,15 @@ def test_joint_curves_are_the_signals_bit_for_bit(run: Recording) -> None:
 def test_poses_are_mujocos_own(run: Recording, cell: Cell) -> None:
     states = dict(
         zip(
-            run.signal("servo.state", "tick").tolist(),
-            run.signal("servo.state", "state"),
+            run.read_signal("servo.state", "tick").tolist(),
+            run.read_signal("servo.state", "state"),
             strict=True,
         )
     )
     file, data = run.folder / "run.rrd", mujoco.MjData(cell.model)
-    frames = read(file, "/frames", "Transform3D:child_frame")
-    places = read(file, "/frames", "Transform3D:translation").values[:, 0]
-    turns = read(file, "/frames", "Transform3D:quaternion").values[:, 0]
+    frames = read_component(file, "/frames", "Transform3D:child_frame")
+    places = read_component(file, "/frames", "Transform3D:translation").values[:, 0]
+    turns = read_component(file, "/frames", "Transform3D:quaternion").values[:, 0]
     for tick in np.unique(frames.ticks)[::37]:
         view_state(cell.model, data, states[tick])
         mujoco.mj_kinematics(cell.model, data)
@@ -67,7 +67,7 @@ def test_poses_are_mujocos_own(run: Recording, cell: Cell) -> None:
 @pytest.mark.slow
 def test_each_cycle_of_each_task_has_its_spans(run: Recording) -> None:
     for task in run.layout.tasks:
-        rows = read(
+        rows = read_component(
             run.folder / "run.rrd",
             f"/boards/{task.slot}-{task.board}/{task.role}",
             "StateChange:state",
@@ -81,10 +81,10 @@ def test_each_cycle_of_each_task_has_its_spans(run: Recording) -> None:
 @pytest.mark.slow
 def test_an_age_belongs_to_the_newest_visible_message(run: Recording) -> None:
     made, visible = (
-        run.signal("elemental_move.status", "tick"),
-        run.signal("elemental_move.status", "visible_at"),
+        run.read_signal("elemental_move.status", "tick"),
+        run.read_signal("elemental_move.status", "visible_at"),
     )
-    rows = read(run.folder / "run.rrd", "/ages/elemental_move.status")
+    rows = read_component(run.folder / "run.rrd", "/ages/elemental_move.status")
     expected = [
         (tick - made[visible <= tick].max()) * run.layout.clock_ns * 1e-6 for tick in rows.ticks
     ]
@@ -101,7 +101,7 @@ def test_the_recording_contains_config_and_events(run: Recording) -> None:
         RrdReader(str(file)).stream().filter(content="/config").to_chunks()[0].to_record_batch()
     )
     assert run.config in document.column("TextDocument:text")[0].as_py()[0]
-    lines = read(file, "/log/events", "TextLog:text").values.ravel().tolist()
+    lines = read_component(file, "/log/events", "TextLog:text").values.ravel().tolist()
     shown = [e for e in run.events if "tick" in e and (e["kind"], e["tick"]) != ("waiting", -1)]
     assert len(lines) == len(shown)
     assert [line.partition(":")[0] for line in lines] == [e["kind"] for e in shown]
@@ -133,8 +133,8 @@ def test_the_blueprint_shows_only_existing_entities(run: Recording) -> None:
 @pytest.mark.slow
 def test_no_view_fails_in_the_viewer(run: Recording) -> None:
     try:
-        with opened(run.folder / "run.rrd") as screen:
-            look = screen.look(at_s=NASREM_S - 0.5)
+        with open_screen(run.folder / "run.rrd") as screen:
+            look = screen.take_picture(at_s=NASREM_S - 0.5)
     except NoViewerError as error:
         pytest.skip(str(error))
     assert look.complaints == ()

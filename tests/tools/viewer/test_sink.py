@@ -10,11 +10,11 @@ import pytest
 
 from rack.boards import Rack
 from rack.boards.config import load
-from rack.tools.recording.spool import rings
+from rack.tools.recording.spool import open_rings
 from rack.tools.viewer import sink
-from rack.tools.viewer.reading import read
+from rack.tools.viewer.reading import read_component
 from rack.tools.viewer.sink import ViewSink
-from rack.tools.viewer.window import executable
+from rack.tools.viewer.window import find_executable
 
 TICKS = 600
 """1.5 s: the rings hold two."""
@@ -30,7 +30,7 @@ def test_a_long_run_is_in_parts_that_are_finished_one_by_one(
     with Rack(load(small, [f"name={rack_name}"])) as rack:
         view = ViewSink(rack.segment, tmp_path, None)
         rack.run(TICKS * 2.5e-3)
-        taken = {name: ring.drain().rows for name, ring in rings(rack.segment).items()}
+        taken = {name: ring.read_new_rows().rows for name, ring in open_rings(rack.segment).items()}
         for end in range(BLOCK, TICKS + 1, BLOCK):
             for name, rows in taken.items():
                 view.add(name, rows[(rows["tick"] >= end - BLOCK) & (rows["tick"] < end)])
@@ -40,13 +40,15 @@ def test_a_long_run_is_in_parts_that_are_finished_one_by_one(
             # All parts except the newest are complete.
             for part in parts[: end // PART]:
                 subprocess.run(
-                    [executable(), "rrd", "verify", part],
+                    [find_executable(), "rrd", "verify", part],
                     check=True,
                     capture_output=True,
                     timeout=60,
                 )
         view.close(TICKS, {})
-    whole, *later = [read(part, "/signals/lower.status/count").ticks for part in parts[:3]]
+    whole, *later = [
+        read_component(part, "/signals/lower.status/count").ticks for part in parts[:3]
+    ]
     assert [len(ticks) for ticks in later] == [PART] * 2
     # A reader of the first part continues in the others.
     assert np.array_equal(whole, np.arange(TICKS))

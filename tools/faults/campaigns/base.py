@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
-from rack.boards.errors import UNKEPT
+from rack.boards.errors import NO_SNAPSHOTS_PREFIX
 from rack.boards.events import Event
 from rack.boards.wiring import Continuation, SnapshotPolicy
 from rack.tools.faults.campaigns.plan import Plan
@@ -40,7 +40,7 @@ class Start:
     continues: Continuation | None = None
     events: tuple[Event, ...] = ()
 
-    def at(self, tick: int) -> Start:
+    def resolve_snapshot(self, tick: int) -> Start:
         """Return the start at the snapshot that was used, with the events before its tick."""
         if self.continues is None:
             return self
@@ -61,9 +61,9 @@ class BaseRack:
         self._config = config
         self._crate: WarmCrate | None = None
         self._events: Sequence[Event] = ()
-        self._why_none = config.outside
+        self._why_none = config.outside_state
 
-    def start_of(self, plan: Plan, crate: WarmCrate | None, seconds: float | None) -> Start:
+    def find_start(self, plan: Plan, crate: WarmCrate | None, seconds: float | None) -> Start:
         """Return where the trial of a plan starts. Run the faultless rack first if necessary.
 
         Args:
@@ -75,26 +75,28 @@ class BaseRack:
             return Start()
         if not plan.lockstep or crate is None:
             return Start(whole="real time")
-        if not plan.first:
+        if not plan.first_tick:
             return Start(whole="a fault prevents the launch")
         if not self._why_none and self._crate is not crate:
-            self._run(crate, seconds)
+            self._run_faultless(crate, seconds)
         if self._why_none:
-            return Start(whole=f"{UNKEPT}{self._why_none}")
-        continuation = Continuation(plan.first, len(self._config.fault), len(self._config.command))
+            return Start(whole=f"{NO_SNAPSHOTS_PREFIX}{self._why_none}")
+        continuation = Continuation(
+            plan.first_tick, len(self._config.fault), len(self._config.command)
+        )
         return Start(continues=continuation, events=tuple(self._events))
 
-    def _run(self, crate: WarmCrate, seconds: float | None) -> None:
+    def _run_faultless(self, crate: WarmCrate, seconds: float | None) -> None:
         """Run the faultless rack in a crate, which keeps its snapshots."""
-        config = Plan(0, "nominal", lockstep=True).config(self._config, self.name)
+        config = Plan(0, "nominal", lockstep=True).to_config(self._config, self.name)
         every = max(1, round(EVERY_S * 1e9 / config.clock_ns))
         with Rack(config, crate=crate, snapshots=SnapshotPolicy(part=0, every=every)) as rack:
             rack.run(seconds)
         self._crate = crate
         self._events = rack.events
         reasons = (
-            event.text.removeprefix(UNKEPT)
+            event.text.removeprefix(NO_SNAPSHOTS_PREFIX)
             for event in rack.events
-            if event.text.startswith(UNKEPT)
+            if event.text.startswith(NO_SNAPSHOTS_PREFIX)
         )
         self._why_none = next(reasons, "")

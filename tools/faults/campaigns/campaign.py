@@ -15,17 +15,17 @@ from pathlib import Path
 
 from rack.backplane.json_text import encode_json
 from rack.backplane.layout import Layout
-from rack.boards.config import wire
+from rack.boards.config import resolve_layout
 from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Document, Failure, write_json
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.progress import Progress
 from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans, kill_plans, size_plans
-from rack.tools.faults.campaigns.environment import examine, load
-from rack.tools.faults.campaigns.plan import Plan, Targets, kinds_for, needs_real_time
-from rack.tools.faults.campaigns.results import Faultless, Results, TrialResult, kept
+from rack.tools.faults.campaigns.environment import check_violation_counter, run_load
+from rack.tools.faults.campaigns.plan import Plan, Targets, needs_real_time, select_kinds
+from rack.tools.faults.campaigns.results import FaultlessTime, Results, TrialResult, load_result
 from rack.tools.faults.campaigns.workers import TrialJob, Workers
-from rack.tools.faults.ending import EXTERNAL, record_of
+from rack.tools.faults.ending import EXTERNAL, find_record
 
 LAUNCH_S = 2.0
 """Approximate duration of a launch and an end, for the progress bar."""
@@ -33,7 +33,7 @@ SHORTEST_S = 1.0
 """Shortest run of faultless time."""
 ROUNDS = 8
 """Number of rounds in which faults that did not act are drawn again before they are given up."""
-MOST_AGAIN = 4
+MAX_DRAWS = 4
 """Maximum number of draws for one missing fault in a round.
 
 The number grows from round to round: the fewer faults are missing, the less an extra draw costs.
@@ -74,9 +74,9 @@ class Order:
     loads: tuple[bool, ...] = (False, True)
     seconds: float | None = None
 
-    def document(self) -> Document:
+    def to_document(self) -> Document:
         """Return the order as plain data. Equal campaigns have equal documents."""
-        return {**vars(self), "config": self.config.text()}
+        return {**vars(self), "config": self.config.to_toml_text()}
 
 
 class Campaign:
@@ -100,10 +100,10 @@ class Campaign:
         # Drop the config's faults, which would act in every trial. Misses are counted, not judged.
         unjudged = order.config.supervision.model_copy(update={"max_missed_fraction": 1.0})
         self._config = order.config.model_copy(update={"fault": (), "supervision": unjudged})
-        self.layout: Layout = wire(self._config)
+        self.layout: Layout = resolve_layout(self._config)
         self._second = 1e9 / self._config.clock_ns
         self._targets = Targets(self._config, self.layout)
-        self.kinds = kinds_for(order.kinds, self._targets, False in order.modes)
+        self.kinds = select_kinds(order.kinds, self._targets, False in order.modes)
         self._ticks = 0
         self._number = 0
         self._whole = whole
@@ -115,11 +115,11 @@ class Campaign:
             Failure: The task is not done even without faults, or another campaign uses the folder.
         """
         order = self.order
-        self._open()
-        examine(self._config)
+        self._open_folder()
+        check_violation_counter(self._config)
         with Workers(self._config, self._whole) as self._workers:
-            self._progress.begin("without faults, in lockstep")
-            nominal_runs = self._made([NOMINAL])
+            self._progress.begin_run("without faults, in lockstep")
+            nominal_runs = self._run_plans([NOMINAL])
             if not nominal_runs:
                 raise Failure(f"{order.name}: interrupted before the first run was done")
             nominal = nominal_runs[0]
@@ -129,22 +129,22 @@ class Campaign:
             self._ticks = nominal.ticks
             results = Results(nominal)
             for lockstep in order.modes:
-                self._inject(results, lockstep)
+                self._run_fault_trials(results, lockstep)
             # Runs of kills alternate between the modes.
-            rack = self._under_test(False not in order.modes)
+            rack = self._describe_rack(False not in order.modes)
             kills = kill_plans(rack, order.kills, order.seed, order.modes, self._number + 1)
-            results.trials += self._made(kills)
-            rack = self._under_test(True)
+            results.trials += self._run_plans(kills)
+            rack = self._describe_rack(True)
             sizes = size_plans(rack, self.kinds, order.sizes, order.seed, self._number + 1)
-            results.sizes += self._made(sizes)
+            results.sizes += self._run_plans(sizes)
             self._run_faultless(results)
         results.is_interrupted = INTERRUPT.number != 0
         return results
 
-    def _open(self) -> None:
+    def _open_folder(self) -> None:
         """Create the folder or continue in it. Raises `Failure` if another campaign uses it."""
         path = self.folder / ORDER
-        wanted = json.loads(encode_json(self.order.document()))
+        wanted = json.loads(encode_json(self.order.to_document()))
         if path.exists():
             stored = json.loads(path.read_text())
             if differing_keys := [key for key in wanted if wanted[key] != stored.get(key)]:
@@ -157,12 +157,12 @@ class Campaign:
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(path, wanted)
 
-    def _under_test(self, lockstep: bool) -> RackUnderTest:
+    def _describe_rack(self, lockstep: bool) -> RackUnderTest:
         """Describe the rack for the draws of plans."""
-        restart = self._config.supervision.restart_s(lockstep)
+        restart = self._config.supervision.find_restart_time(lockstep)
         return RackUnderTest(self._targets, self._ticks, self._second, restart)
 
-    def _inject(self, results: Results, lockstep: bool) -> None:
+    def _run_fault_trials(self, results: Results, lockstep: bool) -> None:
         """Run trials until every kind has acted as often as ordered."""
         order = self.order
         kinds = self.kinds
@@ -171,15 +171,15 @@ class Campaign:
             kinds = [kind for kind in kinds if needs_real_time(kind) != lockstep]
         # Unary plus leaves out the kinds that lack nothing.
         lacking = +Counter(dict.fromkeys(kinds, order.injections))
-        rack = self._under_test(lockstep)
+        rack = self._describe_rack(lockstep)
         tried = set[str]()
         # Faults that need a whole trial each come in later rounds, which leave cores free.
-        round_kinds = [kind for kind in lacking if record_of(kind).recoverable] or list(lacking)
+        round_kinds = [kind for kind in lacking if find_record(kind).recoverable] or list(lacking)
         for turn in range(ROUNDS):
             seed = f"{order.seed} {turn}"
-            draws = min(turn + 1, MOST_AGAIN)
+            draws = min(turn + 1, MAX_DRAWS)
             counts = {kind: lacking[kind] * (draws if kind in tried else 1) for kind in round_kinds}
-            results_of_round = self._made(
+            results_of_round = self._run_plans(
                 fault_plans(rack, counts, seed, lockstep, self._number + 1)
             )
             results.trials += results_of_round
@@ -197,37 +197,41 @@ class Campaign:
             for kind, count in lacking.items()
         ]
 
-    def _made(self, plans: Sequence[Plan]) -> list[TrialResult]:
+    def _run_plans(self, plans: Sequence[Plan]) -> list[TrialResult]:
         """Return the results of these plans in their order, from new runs or from files."""
         self._number = max([self._number, *(plan.number for plan in plans)])
         if plans:
-            self._progress.total(self._guess_s(plans))
-        jobs = [self._job(plan) for plan in plans]
+            self._progress.set_total(self._estimate_s(plans))
+        jobs = [self._build_job(plan) for plan in plans]
         for lockstep in (True, False):
-            waiting = [job for job in jobs if job.plan.lockstep is lockstep and not _kept(job)]
+            waiting = [
+                job
+                for job in jobs
+                if job.plan.lockstep is lockstep and not _load_matching_result(job)
+            ]
             if waiting:
                 mode = "lockstep" if lockstep else "real time"
-                self._progress.begin(f"{len(waiting)} in {mode}")
+                self._progress.begin_run(f"{len(waiting)} in {mode}")
             for job in self._workers.run(waiting, alone=not lockstep):
-                self._show(job)
-        return [result for job in jobs if (result := _kept(job))]
+                self._show_result(job)
+        return [result for job in jobs if (result := _load_matching_result(job))]
 
-    def _job(self, plan: Plan) -> TrialJob:
+    def _build_job(self, plan: Plan) -> TrialJob:
         """Return the job that carries out a plan."""
         name = f"{plan.number:04}" if plan.number else plan.purpose
         path = self.folder / TRIALS / f"{name}.json"
         return TrialJob(plan, path, self._ticks, self.order.seconds)
 
-    def _show(self, job: TrialJob) -> None:
+    def _show_result(self, job: TrialJob) -> None:
         """Show how a trial ended. If it has shortfalls, write a plan that repeats it."""
         plan = job.plan
-        if (result := _kept(job)) is None:
+        if (result := _load_matching_result(job)) is None:
             return
         if result.shortfalls and plan.number:
             path = self.folder / f"trial-{plan.number:04}.toml"
-            path.write_text(plan.toml(self.order.name))
-        text = f"{_text(plan)}: {result.ended}"
-        self._progress.end(self._guess_s([plan]), text, result.shortfalls)
+            path.write_text(plan.format_faults(self.order.name))
+        text = f"{_describe_plan(plan)}: {result.ended}"
+        self._progress.end_run(self._estimate_s([plan]), text, result.shortfalls)
 
     def _run_faultless(self, results: Results) -> None:
         """Run without faults for as long as ordered, without load and under load."""
@@ -236,40 +240,40 @@ class Campaign:
         for stretch, is_loaded in enumerate(self.order.loads):
             if INTERRUPT.number:
                 return
-            burden = load() if is_loaded else nullcontext("")
+            burden = run_load() if is_loaded else nullcontext("")
             with burden as load_text:
-                runs = tuple(self._calm(stretch, load_text))
+                runs = tuple(self._run_faultless_stretch(stretch, load_text))
             seconds = sum(run.ticks for run in runs) / self._second
-            results.faultless.append(Faultless(load_text, seconds, runs))
+            results.faultless.append(FaultlessTime(load_text, seconds, runs))
 
-    def _calm(self, stretch: int, load_text: str) -> Iterator[TrialResult]:
+    def _run_faultless_stretch(self, stretch: int, load_text: str) -> Iterator[TrialResult]:
         """Yield the results of faultless runs in real time.
 
         Args:
             stretch: Index of the stretch of faultless time.
             load_text: Description of the load. Empty without load.
         """
-        faultless = self._job(Plan(0, "faultless", lockstep=False))
+        faultless = self._build_job(Plan(0, "faultless", lockstep=False))
         name = f"faultless under {load_text}" if load_text else "faultless"
         left_s = self.order.faultless_s
         run_number = 0
         while left_s >= SHORTEST_S and not INTERRUPT.number:
-            self._progress.begin(f"{name}, {left_s:.0f} s left")
+            self._progress.begin_run(f"{name}, {left_s:.0f} s left")
             seconds = left_s if left_s < self._ticks / self._second else self.order.seconds
             path = faultless.path.with_stem(f"faultless-{stretch}-{run_number:03}")
             job = replace(faultless, path=path, seconds=seconds)
-            if _kept(job) is None:
+            if _load_matching_result(job) is None:
                 list(self._workers.run([job], alone=True))
-            if (result := _kept(job)) is None:
+            if (result := _load_matching_result(job)) is None:
                 return
             yield result
             # A run without ticks has not ended, and would not end if it were repeated.
             ran_s = result.ticks / self._second or left_s
             left_s -= ran_s
             run_number += 1
-            self._progress.end(ran_s, result.ended, result.shortfalls)
+            self._progress.end_run(ran_s, result.ended, result.shortfalls)
 
-    def _guess_s(self, plans: Sequence[Plan]) -> float:
+    def _estimate_s(self, plans: Sequence[Plan]) -> float:
         """Estimate the duration of runs, s.
 
         In lockstep a core simulates the default rack in about a third of real time.
@@ -280,16 +284,16 @@ class Campaign:
         return sum(LAUNCH_S + run_s[plan.lockstep] for plan in plans)
 
 
-def _kept(job: TrialJob) -> TrialResult | None:
+def _load_matching_result(job: TrialJob) -> TrialResult | None:
     """Return the saved result of a trial. None if it is missing or belongs to another plan.
 
     Another version may draw another plan for the same trial number.
     """
-    result = kept(job.path)
+    result = load_result(job.path)
     return result if result is not None and result.plan == job.plan else None
 
 
-def _text(plan: Plan) -> str:
+def _describe_plan(plan: Plan) -> str:
     """Describe a plan in a few words."""
     if not plan.number:
         return plan.purpose

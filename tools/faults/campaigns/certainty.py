@@ -8,11 +8,11 @@ from rack.backplane.fault_table import NEVER
 from rack.backplane.words import System
 from rack.boards import Rack
 from rack.boards.events import Event
-from rack.tools.faults.ending import Strike, strikes
-from rack.tools.faults.judge import Circumstances, Judge, Judgement, end_of
+from rack.tools.faults.ending import Strike, list_strikes
+from rack.tools.faults.judge import Circumstances, Judge, Judgement, find_end
 
 
-class Certainty:
+class EarlyEnd:
     """Ends a lockstep trial as soon as no later event can change the verdict on any fault.
 
     It holds the rack before the ticks at which that may be the case.
@@ -27,31 +27,31 @@ class Certainty:
         self._joints = joints
         self._run = run
         self._words = rack.segment.words
-        self._hold(max(0, rack.begins_at))
+        self._hold_before(max(0, rack.begins_at))
 
-    def look(self) -> None:
+    def judge_if_held(self) -> None:
         """If the rack is held, judge its faults, then let it continue or end it."""
         tick = self._words[System.HELD] - 1
         if tick < 0 or self.is_reached:
             return
-        struck = strikes(self._rack.segment, self._joints)
-        certain_at = certain_from(struck, self._rack.events, self._run, tick)
+        struck = list_strikes(self._rack.segment, self._joints)
+        certain_at = find_certain_tick(struck, self._rack.events, self._run, tick)
         if certain_at is None:
             # The verdict needs the whole run, so hold it no more.
             self._words[System.HOLD_AT] = 0
         elif certain_at > tick:
-            self._hold(certain_at)
+            self._hold_before(certain_at)
         else:
             self.is_reached = True
             self._words[System.STOP_TICK] = max(tick, 1)
             self._words[System.HOLD_AT] = 0
 
-    def _hold(self, tick: int) -> None:
+    def _hold_before(self, tick: int) -> None:
         """Let the rack hold before a tick."""
         self._words[System.HOLD_AT] = tick + 1
 
 
-def certain_from(
+def find_certain_tick(
     strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances, tick: int
 ) -> int | None:
     """Return the tick from which no later event can change the judgement of a run's faults.
@@ -67,35 +67,37 @@ def certain_from(
         if the judgement needs the whole run.
     """
     end_event = Event(0, tick, "end", "", "")
-    return _ForesightedJudge(strikes, [*events, end_event], run).certain_from(tick)
+    return _ForesightedJudge(strikes, [*events, end_event], run).find_certain_tick(tick)
 
 
 class _ForesightedJudge(Judge):
     """Judge that also computes when its judgements become final."""
 
-    def certain_from(self, tick: int) -> int | None:
+    def find_certain_tick(self, tick: int) -> int | None:
         """Return the tick from which all judgements are final: see the function of this name."""
         latest = tick
-        for strike, judgement in zip(self._strikes, self.verdict().faults, strict=True):
-            certain_tick = self._closes(strike, judgement, tick)
+        for strike, judgement in zip(self._strikes, self.judge_all().faults, strict=True):
+            certain_tick = self._find_fault_certain_tick(strike, judgement, tick)
             if certain_tick is None:
                 return None
             latest = max(latest, certain_tick)
         return latest
 
-    def _closes(self, strike: Strike, judgement: Judgement, tick: int) -> int | None:
+    def _find_fault_certain_tick(
+        self, strike: Strike, judgement: Judgement, tick: int
+    ) -> int | None:
         """Return the tick from which one judgement is final: see `find_certain_tick`."""
         retry_tick = tick + self._settle
         if strike.began < 0:
             return retry_tick
         if strike.ends >= NEVER:
             return None
-        ends = end_of(strike)
+        ends = find_end(strike)
         if strike.tick < 0 and ends >= tick:
             return retry_tick
-        certain_tick = self._last_trace(strike, ends) + 1
+        certain_tick = self._find_last_effect(strike, ends) + 1
         if certain_tick > tick:
             return certain_tick
         # A planner may notice a fault of its plans, or write its next message, at any later time.
-        is_open = self._window(strike)[1] >= tick and judgement.seen != "detected"
+        is_open = self._compute_window(strike)[1] >= tick and judgement.seen != "detected"
         return retry_tick if is_open or not judgement.is_recovered else tick

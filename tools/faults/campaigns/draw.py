@@ -9,12 +9,12 @@ from random import Random
 
 from rack.backplane.fault_table import Injection
 from rack.boards.faults.clock_board import PHASES
-from rack.boards.faults.drawing import Drawing, swept
+from rack.boards.faults.drawing import Drawing, list_sweep_sizes
 from rack.tools.console.answer import Document
 from rack.tools.faults.campaigns.plan import Kill, Plan, Purpose, Target, Targets
-from rack.tools.faults.ending import EXTERNAL, record_of
+from rack.tools.faults.ending import EXTERNAL, find_record
 
-MOST_FAULTS = 40
+MAX_FAULTS = 40
 """Maximum number of faults in a trial. The fault table has room for a few more."""
 LEAD_S = 0.1
 """Minimum simulated time before the first fault."""
@@ -25,25 +25,25 @@ A fault must act while the task is being executed.
 """
 SETTLE_S = 0.1
 """Simulated time between the last possible effect of a fault and the next fault."""
-EPISODE = 25
+EPISODE_READS = 25
 """Number of reads after which a reader reports another fault of the same mailbox, with a margin.
 
 See `Episodes` for the number itself.
 """
-MORE_S = 0.25
+MAX_EXTENSION_S = 0.25
 """Maximum simulated time by which a window is extended so that its mailbox may be used again."""
-HOLDS_UP_S = 0.5
+ARM_STOP_S = 0.5
 """Simulated time by which each fault that stops the arm prolongs the task, s.
 
 For NASREM it is 0.5 to 1.6 s. Faults after the end of the task do not act and are drawn again.
 """
 SHUFFLES = 20
 """Number of random orders that are tried for the faults of a trial."""
-BATCH = 1000
+BATCH_FAULTS = 1000
 """Number of faults that are distributed over trials at a time."""
 KILL_GAP_S = 3.5
 """Minimum simulated time between two kills from outside. A restart takes up to 2 s of real time."""
-LEAST_TICKS = 20
+MIN_TICKS = 20
 """Minimum time in ticks that a fault without a mailbox needs to be detected and to end."""
 SEEDS = 2**31
 
@@ -65,16 +65,16 @@ class RackUnderTest:
     restart_s: float
 
     @property
-    def first(self) -> int:
+    def first_tick(self) -> int:
         """First tick at which a fault may begin."""
         return round(LEAD_S * self.second)
 
     @property
-    def room(self) -> int:
+    def room_ticks(self) -> int:
         """Number of ticks in which faults may begin and have their consequences."""
-        return max(1, self.ticks - round(TAIL_S * self.second) - self.first)
+        return max(1, self.ticks - round(TAIL_S * self.second) - self.first_tick)
 
-    def window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
+    def compute_window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
         """Return the time from the beginning of a fault to the next fault.
 
         In this time the fault is detected, ends and is recovered from.
@@ -95,16 +95,16 @@ class RackUnderTest:
         box = boxes.index(target.mailbox) if target.mailbox else -1
         values = tuple(parameters.get(p.name, p.default or 0.0) for p in kind.parameters)
         entry = Injection(kind.number, task, box, parameters=values)
-        duration = kind.bound_ticks(entry, layout) or 0
+        duration = kind.compute_bound_ticks(entry, layout) or 0
         if not kind.is_over_when_found:
-            min_duration = 2 * target.cycle + target.reader if target.mailbox else LEAST_TICKS
+            min_duration = 2 * target.cycle + target.reader if target.mailbox else MIN_TICKS
             duration = max(duration, ticks, min_duration)
-        recovery = kind.recovery_ticks(target.board, layout, self.restart_s)
+        recovery = kind.compute_recovery_ticks(target.board, layout, self.restart_s)
         return duration + recovery + round(SETTLE_S * self.second)
 
 
 @dataclass(frozen=True)
-class Card:
+class FaultCard:
     """One fault that is to be assigned to a trial.
 
     Attributes:
@@ -129,7 +129,9 @@ class Card:
     phase: float
 
     @classmethod
-    def draw(cls, rack: RackUnderTest, kind: str, rng: Random, size: float | None = None) -> Card:
+    def draw_card(
+        cls, rack: RackUnderTest, kind: str, rng: Random, size: float | None = None
+    ) -> FaultCard:
         """Draw a fault as the record of its kind describes.
 
         Args:
@@ -148,16 +150,18 @@ class Card:
             if "joint" in parameters:
                 parameters["joint"] = rng.randrange(joints)
             parameters["size"] = size
-        window = rack.window(target, ticks, parameters)
+        window = rack.compute_window(target, ticks, parameters)
         reported_ticks = 0
         if target.mailbox is not None:
             delay_ticks = parameters.get("by", 0) * target.cycle if record.where == "writer" else 0
-            reported_ticks = ticks + round(delay_ticks) + EPISODE * max(target.reader, target.cycle)
-        if window < reported_ticks <= window + MORE_S * rack.second:
+            reported_ticks = (
+                ticks + round(delay_ticks) + EPISODE_READS * max(target.reader, target.cycle)
+            )
+        if window < reported_ticks <= window + MAX_EXTENSION_S * rack.second:
             window = reported_ticks
         is_stop = parameters.get("size", 0.0) >= (record.visible_from or 0.0)
         prolonged_ticks = (
-            round(HOLDS_UP_S * rack.second) if record.where == "arm" and is_stop else 0
+            round(ARM_STOP_S * rack.second) if record.where == "arm" and is_stop else 0
         )
         return cls(
             target=target,
@@ -167,10 +171,10 @@ class Card:
             room=window - prolonged_ticks,
             may_repeat=window >= reported_ticks,
             seed=rng.randrange(SEEDS),
-            phase=_phase(rng),
+            phase=_draw_phase(rng),
         )
 
-    def table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> Document:
+    def to_table(self, rack: RackUnderTest, tick: int, lockstep: bool) -> Document:
         """Return the fault as a `[[fault]]` table.
 
         Args:
@@ -210,8 +214,8 @@ def fault_plans(
     rng = Random(f"{seed} {mode}")
     kinds = [kind for kind, count in counts.items() for _ in range(count)]
     rng.shuffle(kinds)
-    cards = [Card.draw(rack, kind, rng) for kind in kinds]
-    return _packed(rack, first, lockstep, "faults", cards, rng)
+    cards = [FaultCard.draw_card(rack, kind, rng) for kind in kinds]
+    return _pack_plans(rack, first, lockstep, "faults", cards, rng)
 
 
 def kill_plans(
@@ -229,12 +233,12 @@ def kill_plans(
     rng = Random(f"{seed} kills")
     targets = rack.targets.by_kind[EXTERNAL]
     gap_ticks = KILL_GAP_S * rack.second
-    kills_per_run = max(1, int(rack.room / gap_ticks))
+    kills_per_run = max(1, int(rack.room_ticks / gap_ticks))
     plans = list[Plan]()
     for done in range(0, count, kills_per_run):
         boards = [rng.choice(targets).board for _ in range(min(kills_per_run, count - done))]
-        starts = _starts(rack, [round(gap_ticks)] * len(boards), rng)
-        kills = [Kill(b, tick, _phase(rng)) for b, tick in zip(boards, starts, strict=True)]
+        starts = _draw_starts(rack, [round(gap_ticks)] * len(boards), rng)
+        kills = [Kill(b, tick, _draw_phase(rng)) for b, tick in zip(boards, starts, strict=True)]
         lockstep = modes[len(plans) % len(modes)]
         plans.append(Plan(first + len(plans), "kills", lockstep, kills=tuple(kills)))
     return plans
@@ -253,21 +257,21 @@ def size_plans(
         first: Number of the first trial.
     """
     rng = Random(f"{seed} sizes")
-    sizes = [(kind, size) for kind in kinds for size in swept_sizes(kind, count)]
+    sizes = [(kind, size) for kind in kinds for size in list_swept_sizes(kind, count)]
     rng.shuffle(sizes)
-    cards = [Card.draw(rack, kind, rng, size) for kind, size in sizes]
-    return _packed(rack, first, True, "sizes", cards, rng)
+    cards = [FaultCard.draw_card(rack, kind, rng, size) for kind, size in sizes]
+    return _pack_plans(rack, first, True, "sizes", cards, rng)
 
 
-def swept_sizes(kind: str, count: int) -> list[float]:
+def list_swept_sizes(kind: str, count: int) -> list[float]:
     """Return the sizes for a kind's curve. Empty for a kind that is always detectable."""
-    record = record_of(kind)
+    record = find_record(kind)
     if record.visible_from is None or record.size is None:
         return []
-    return swept(record.size.least, record.visible_from, count)
+    return list_sweep_sizes(record.size.least, record.visible_from, count)
 
 
-class Share:
+class TrialShare:
     """The faults that are assigned to one trial.
 
     Attributes:
@@ -275,21 +279,21 @@ class Share:
         room: Ticks that are left for more faults.
     """
 
-    def __init__(self, room: int) -> None:
-        self.cards: list[Card] = []
-        self.room = room
+    def __init__(self, room_ticks: int) -> None:
+        self.cards: list[FaultCard] = []
+        self.room = room_ticks
         # By affected mailbox, whether another fault of it may follow.
         self._struck: dict[str, bool] = {}
 
-    def takes(self, card: Card) -> bool:
+    def has_room_for(self, card: FaultCard) -> bool:
         """Return True if a fault fits into the trial. The first one always does."""
         box = card.target.mailbox
         if box in self._struck and not (self._struck[box] and card.may_repeat):
             return False
-        fits = card.room <= self.room and len(self.cards) < MOST_FAULTS
+        fits = card.room <= self.room and len(self.cards) < MAX_FAULTS
         return fits or not self.cards
 
-    def add(self, card: Card) -> None:
+    def add_card(self, card: FaultCard) -> None:
         """Assign a fault to the trial."""
         self.cards.append(card)
         self.room -= card.room
@@ -297,50 +301,52 @@ class Share:
             self._struck[card.target.mailbox] = card.may_repeat
 
 
-def _packed(
+def _pack_plans(
     rack: RackUnderTest,
     first: int,
     lockstep: bool,
     purpose: Purpose,
-    cards: Sequence[Card],
+    cards: Sequence[FaultCard],
     rng: Random,
 ) -> list[Plan]:
     """Return plans with all of these faults, in as few trials as possible."""
     shared = [card for card in cards if card.target.record.recoverable]
     trials = [
         share.cards
-        for first_card in range(0, len(shared), BATCH)
-        for share in _shared_out(rack.room, shared[first_card : first_card + BATCH])
+        for first_card in range(0, len(shared), BATCH_FAULTS)
+        for share in _distribute_cards(
+            rack.room_ticks, shared[first_card : first_card + BATCH_FAULTS]
+        )
     ]
     trials += [[card] for card in cards if not card.target.record.recoverable]
     plans = list[Plan]()
     for trial_cards in trials:
-        trial_cards = _ordered(rack.room, trial_cards, rng)
-        starts = _starts(rack, [card.window for card in trial_cards], rng)
+        trial_cards = _choose_order(rack.room_ticks, trial_cards, rng)
+        starts = _draw_starts(rack, [card.window for card in trial_cards], rng)
         faults = list[Document]()
         kills = list[Kill]()
         for card, start in zip(trial_cards, starts, strict=True):
             if card.target.kind == EXTERNAL:
                 kills.append(Kill(card.target.board, start, card.phase))
             else:
-                faults.append(card.table(rack, start, lockstep))
+                faults.append(card.to_table(rack, start, lockstep))
         plans.append(Plan(first + len(plans), purpose, lockstep, tuple(faults), tuple(kills)))
     return plans
 
 
-def _shared_out(room_ticks: int, cards: Sequence[Card]) -> list[Share]:
+def _distribute_cards(room_ticks: int, cards: Sequence[FaultCard]) -> list[TrialShare]:
     """Distribute faults over trials: the longest first, each where least room is left."""
-    shares: list[Share] = []
+    shares: list[TrialShare] = []
     for card in sorted(cards, key=lambda card: -card.window):
-        fitting = [share for share in shares if share.takes(card)]
+        fitting = [share for share in shares if share.has_room_for(card)]
         if not fitting:
-            fitting = [Share(room_ticks)]
+            fitting = [TrialShare(room_ticks)]
             shares += fitting
-        min(fitting, key=lambda share: share.room).add(card)
+        min(fitting, key=lambda share: share.room).add_card(card)
     return shares
 
 
-def _ordered(room_ticks: int, cards: Sequence[Card], rng: Random) -> list[Card]:
+def _choose_order(room_ticks: int, cards: Sequence[FaultCard], rng: Random) -> list[FaultCard]:
     """Return faults in the best of some random orders.
 
     If possible, each begins before the end of a task that earlier faults have prolonged. Faults of
@@ -348,7 +354,7 @@ def _ordered(room_ticks: int, cards: Sequence[Card], rng: Random) -> list[Card]:
     """
     orders = [rng.sample(cards, len(cards)) for _ in range(SHUFFLES)]
 
-    def rate_order(order: list[Card]) -> tuple[bool, int]:
+    def rate_order(order: list[FaultCard]) -> tuple[bool, int]:
         """Rate an order: whether all faults fit, and how late the first fault of the arm comes."""
         needed = max(accumulate(card.room for card in order))
         cards_before = takewhile(lambda card: card.target.record.where != "arm", order)
@@ -357,17 +363,17 @@ def _ordered(room_ticks: int, cards: Sequence[Card], rng: Random) -> list[Card]:
     return max(orders, key=rate_order)
 
 
-def _starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
+def _draw_starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
     """Return a start tick for each window, one after the other from a random tick on.
 
     The first tick is late if there is room, because a trial continues from the last snapshot before
     its first fault.
     """
-    spare_ticks = max(rack.first, rack.room - sum(windows))
-    earliest = accumulate(windows, initial=rack.first + rng.randint(0, spare_ticks))
+    spare_ticks = max(rack.first_tick, rack.room_ticks - sum(windows))
+    earliest = accumulate(windows, initial=rack.first_tick + rng.randint(0, spare_ticks))
     return list(earliest)[:-1]
 
 
-def _phase(rng: Random) -> float:
+def _draw_phase(rng: Random) -> float:
     """Draw the fraction of a tick that passes before a fault acts."""
     return rng.randrange(PHASES) / PHASES

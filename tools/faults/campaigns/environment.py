@@ -10,60 +10,60 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
-from rack.backplane.process import COPY, die_with_parent, is_alive
+from rack.backplane.process import COPY_PREFIX, die_with_parent, is_alive
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards.config.schema import RackConfig
 from rack.tools.console.answer import Failure
-from rack.tools.console.interrupt import await_ends, descendants
+from rack.tools.console.interrupt import await_ends, list_descendants
 
 BOUND_S = 2.0
 """Time that killed processes get to end."""
 COMM_LENGTH = 15
 """Number of characters of a process's name that the kernel keeps."""
-FACTOR = 2.0
+SPEED_FACTOR = 2.0
 """Velocity that the violation counter must count, as a multiple of the limit."""
 BUSY = ("sh", "-c", "while :; do :; done")
 WRITING = ("sh", "-c", "while :; do sync; done")
 
 
-def children() -> set[int]:
+def list_living_descendants() -> set[int]:
     """Return the living descendants of this process."""
-    living = {pid for pid in descendants(os.getpid()) if is_alive(pid)}
+    living = {pid for pid in list_descendants(os.getpid()) if is_alive(pid)}
     # Snapshots end with their crate, which may serve several racks.
-    return {pid for pid in living if not _name(pid).startswith(COPY)}
+    return {pid for pid in living if not _read_name(pid).startswith(COPY_PREFIX)}
 
 
-def left_behind(rack: str, before: set[int]) -> list[str]:
+def find_leftovers(rack: str, pids_before: set[int]) -> list[str]:
     """Return everything that is left of a rack, as readable texts.
 
     Args:
         rack: Name of the rack.
-        before: Descendants of this process that existed before the rack.
+        pids_before: Descendants of this process that existed before the rack.
 
     Returns:
         The paths of segments and semaphores, and the processes.
     """
-    await_ends({*_named(rack), *(children() - before)}, BOUND_S)
-    processes = _named(rack) | (children() - before)
+    await_ends({*_find_board_processes(rack), *(list_living_descendants() - pids_before)}, BOUND_S)
+    processes = _find_board_processes(rack) | (list_living_descendants() - pids_before)
     files = [str(path) for path in sorted(SHM_FOLDER.iterdir()) if rack in path.name]
-    return files + [f"process {pid} ({_name(pid)})" for pid in sorted(processes)]
+    return files + [f"process {pid} ({_read_name(pid)})" for pid in sorted(processes)]
 
 
-def _named(rack: str) -> set[int]:
+def _find_board_processes(rack: str) -> set[int]:
     """Return the processes that are named like a rack's boards, whatever their parent."""
     start = f"{rack}:"[:COMM_LENGTH]
     pids = (int(path.name) for path in Path("/proc").glob("[0-9]*"))
-    return {pid for pid in pids if _name(pid).startswith(start) and is_alive(pid)}
+    return {pid for pid in pids if _read_name(pid).startswith(start) and is_alive(pid)}
 
 
-def _name(pid: int) -> str:
+def _read_name(pid: int) -> str:
     """Return the name of a process. Empty if it does not exist."""
     with suppress(FileNotFoundError, ProcessLookupError):
         return Path(f"/proc/{pid}/comm").read_text().rstrip("\n")
     return ""
 
 
-def examine(config: RackConfig) -> None:
+def check_violation_counter(config: RackConfig) -> None:
     """Check the violation counter by moving every joint at twice its limit for one tick.
 
     A campaign that reports "no limit violated" must be able to see a violation.
@@ -77,7 +77,7 @@ def examine(config: RackConfig) -> None:
     from rack.levels.arm import SimulatedArm
     from rack.levels.arm.substeps import copy_state
     from rack.levels.messages import ArmState
-    from rack.levels.robot.cell import build_cell, sizes
+    from rack.levels.robot.cell import build_cell, compute_sizes
 
     if config.robot is None:
         return
@@ -86,23 +86,23 @@ def examine(config: RackConfig) -> None:
         if not isfinite(limit):
             continue
         arm = SimulatedArm(cell, config.scene, config.clock_ns)
-        data = cell.start()
-        state = ArmState.zeros(sizes(cell))
+        data = cell.build_start_data()
+        state = ArmState.zeros(compute_sizes(cell))
         arm.save(state)
-        data.qvel[dof] = FACTOR * limit
+        data.qvel[dof] = SPEED_FACTOR * limit
         copy_state(cell.model._address, data._address, data.tree_asleep, state.state)
         arm.restore(state)
         arm.step(1)
         if not arm.violations:
             name = config.robot.joints[joint]
-            speed = f"{FACTOR * limit:g} rad/s"
+            speed = f"{SPEED_FACTOR * limit:g} rad/s"
             raise Failure(
                 f"the violation counter does not count joint '{name}' at {speed}, twice its limit"
             )
 
 
 @contextmanager
-def load() -> Iterator[str]:
+def run_load() -> Iterator[str]:
     """Keep all cores that this process may use, and the disks, busy. Yields a description.
 
     Uses `stress-ng` if it is installed.
@@ -120,7 +120,7 @@ def load() -> Iterator[str]:
                 command,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                preexec_fn=partial(_begin, os.getpid(), its_cores),
+                preexec_fn=partial(_prepare_load_process, os.getpid(), its_cores),
             )
             stack.callback(process.wait)
             # Terminate it instead of killing it, so that stress-ng can end its processes.
@@ -128,7 +128,7 @@ def load() -> Iterator[str]:
         yield description
 
 
-def _begin(parent: int, cores: set[int]) -> None:
+def _prepare_load_process(parent: int, cores: set[int]) -> None:
     """Prepare a process of the load, which runs on these cores and ends with its parent."""
     die_with_parent(parent)
     os.sched_setaffinity(0, cores)

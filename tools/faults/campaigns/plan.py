@@ -9,15 +9,15 @@ from typing import Any, Literal
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.mailbox.queue import is_position
-from rack.boards.config.connections import executors
+from rack.backplane.mailbox.queue import is_position_mailbox
+from rack.boards.config.connections import find_executors
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.toml import to_toml
-from rack.boards.faults.bounds import between_reads, cycle_ticks
+from rack.boards.faults.bounds import compute_read_interval, cycle_ticks
 from rack.boards.faults.config import FaultConfig
 from rack.boards.faults.kind import KINDS, Kind
 from rack.tools.console.answer import Failure
-from rack.tools.faults.ending import EXTERNAL, record_of
+from rack.tools.faults.ending import EXTERNAL, find_record
 
 Purpose = Literal["faults", "kills", "sizes", "nominal", "faultless"]
 
@@ -63,12 +63,12 @@ class Plan:
         return f"trial {self.number}" if self.number else f"{self.purpose} run"
 
     @property
-    def first(self) -> int:
+    def first_tick(self) -> int:
         """Tick at which the first fault begins. 0 for a fault that prevents the launch."""
         ticks = [table.get("tick", 0) for table in self.faults] + [kill.tick for kill in self.kills]
         return min(ticks, default=0)
 
-    def config(self, config: RackConfig, rack: str) -> RackConfig:
+    def to_config(self, config: RackConfig, rack: str) -> RackConfig:
         """Return the config that carries out this plan, with another name for the rack."""
         clock: dict[str, Any] = {"mode": "realtime"}
         if self.lockstep:
@@ -83,7 +83,7 @@ class Plan:
             }
         )
 
-    def toml(self, config: str) -> str:
+    def format_faults(self, config: str) -> str:
         """Return the faults as a file for `--faults`.
 
         Kills from outside cannot be expressed in such a file, so they are written as comments.
@@ -128,7 +128,7 @@ class Target:
     @property
     def record(self) -> Kind:
         """Record of the kind."""
-        return record_of(self.kind)
+        return find_record(self.kind)
 
 
 class Targets:
@@ -144,28 +144,28 @@ class Targets:
         self.layout = layout
         self.joints = len(config.robot.joints) if config.robot is not None else 0
         self._roles = {task.name: task.role for task in layout.tasks}
-        self._driving = {name: kind.faults for name, kind in executors(config).items()}
-        self.by_kind = {kind.name: self._of(kind) for kind in KINDS}
+        self._driving = {name: kind.faults for name, kind in find_executors(config).items()}
+        self.by_kind = {kind.name: self._find_targets(kind) for kind in KINDS}
         # The clock's process can be killed from outside as well.
-        self.by_kind[EXTERNAL] = self._at(EXTERNAL, [*self._roles, CLOCK])
+        self.by_kind[EXTERNAL] = self._build_targets(EXTERNAL, [*self._roles, CLOCK])
 
-    def _of(self, kind: Kind) -> list[Target]:
+    def _find_targets(self, kind: Kind) -> list[Target]:
         """Return the targets of a kind."""
         if not kind.takes_mailbox:
-            return self._at(kind.name, self._tasks(kind))
+            return self._build_targets(kind.name, self._list_tasks(kind))
         targets = []
-        for box in filter(partial(self._is_seen, kind), self.layout.mailboxes):
+        for box in filter(partial(self._is_detectable, kind), self.layout.mailboxes):
             # The servo level writes a scene only in every n-th cycle.
             cycle = max(cycle_ticks(self.layout, box.writer), box.every)
-            reader = min(between_reads(self.layout, box, reader) for reader in box.readers)
+            reader = min(compute_read_interval(self.layout, box, reader) for reader in box.readers)
             targets.append(Target(kind.name, box.writer, cycle, box.name, reader))
         return targets
 
-    def _at(self, kind: str, tasks: Iterable[str]) -> list[Target]:
+    def _build_targets(self, kind: str, tasks: Iterable[str]) -> list[Target]:
         """Return a target for each of these tasks."""
         return [Target(kind, task, cycle_ticks(self.layout, task)) for task in tasks]
 
-    def _tasks(self, kind: Kind) -> list[str]:
+    def _list_tasks(self, kind: Kind) -> list[str]:
         """Return the tasks that a kind may affect as a whole."""
         if kind.where == "clock":
             return [CLOCK]
@@ -173,7 +173,7 @@ class Targets:
             return [task for task, steps in self._driving.items() if isinstance(kind.step, steps)]
         return [task for task, role in self._roles.items() if role in kind.tasks]
 
-    def _is_seen(self, kind: Kind, box: MailboxSpec) -> bool:
+    def _is_detectable(self, kind: Kind, box: MailboxSpec) -> bool:
         """Return True if a fault of a mailbox can be detected.
 
         The mailbox needs readers, and messages often enough: plans, for example, are not periodic.
@@ -185,12 +185,12 @@ class Targets:
         if kind.where == "lock" and box.protocol != "lock":
             return False
         # A queue is written on demand, and its reader's position is not written through a port.
-        if kind.where == "writer" and (box.protocol == "queue" or is_position(box)):
+        if kind.where == "writer" and (box.protocol == "queue" or is_position_mailbox(box)):
             return False
         return role in kind.tasks and (kind.where != "writer" or role == "executor")
 
 
-def kinds_for(wanted: str | None, targets: Targets, realtime: bool) -> list[str]:
+def select_kinds(wanted: str | None, targets: Targets, realtime: bool) -> list[str]:
     """Return the kinds of a campaign.
 
     Args:

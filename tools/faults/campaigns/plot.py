@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.ticker import NullFormatter
 
-from rack.tools.console.pictures import picture
+from rack.tools.console.pictures import open_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,21 +24,23 @@ DOT = "#4477aa"
 MIDDLE = "#222222"
 BOUND = "#cc3311"
 """Colours that are distinguishable with any kind of colour vision (Paul Tol)."""
-WIDEST = 1.5
+MAX_FRACTION = 1.5
 """Fraction of a bound up to which delays are drawn. Later ones are arrows at the edge."""
 
 
-def plot(report: CampaignReport, path: Path) -> None:
+def plot_campaign(report: CampaignReport, path: Path) -> None:
     """Draw a campaign into a PNG file: delays against bounds, curves of size, recovery times."""
     order = report.order
-    with picture([path], *SIZE_IN) as figure:
-        for position, draw in zip(_places(figure), (_delays, _sizes, _recoveries), strict=True):
+    with open_figure([path], *SIZE_IN) as figure:
+        for position, draw in zip(
+            _list_places(figure), (_draw_delays, _draw_sizes, _draw_recoveries), strict=True
+        ):
             draw(figure.add_subplot(position), report)
-        title = f"Faults injected into {order.name}: {report.trials}, seed {order.seed}"
+        title = f"Faults injected into {order.name}: {report.trials_text}, seed {order.seed}"
         figure.suptitle(title, fontsize=11)
 
 
-def _places(figure: Figure) -> Iterator[SubplotSpec]:
+def _list_places(figure: Figure) -> Iterator[SubplotSpec]:
     """Yield the places of the three charts: one on the left, two on the right."""
     # Fixed margins: the numbers beside the left chart and the names of kinds always need room.
     grid = figure.add_gridspec(
@@ -55,22 +57,31 @@ def _places(figure: Figure) -> Iterator[SubplotSpec]:
     yield from (grid[:, 0], grid[0, 1], grid[1, 1])
 
 
-def _delays(axes: Axes, report: CampaignReport) -> None:
+def _draw_delays(axes: Axes, report: CampaignReport) -> None:
     """Draw the detection delay of each fault as a fraction of its bound.
 
     The median and the maximum of each kind are written beside it, in cycles.
     """
     kinds = list(report.by_kind)[::-1]
     for row, kind in enumerate(kinds):
-        detected = [fault for fault in report.faults_of(kind) if fault.seen == "detected"]
-        fractions = [fraction for fraction in map(_part, detected) if fraction is not None]
-        _row(axes, row, [fraction for fraction in fractions if fraction <= WIDEST])
-        late_count = sum(fraction > WIDEST for fraction in fractions)
+        detected = [fault for fault in report.list_faults(kind) if fault.seen == "detected"]
+        fractions = [
+            fraction for fraction in map(_compute_fraction, detected) if fraction is not None
+        ]
+        _draw_row(axes, row, [fraction for fraction in fractions if fraction <= MAX_FRACTION])
+        late_count = sum(fraction > MAX_FRACTION for fraction in fractions)
         axes.scatter(
-            [WIDEST] * late_count, [row] * late_count, marker=">", s=40, color=BOUND, clip_on=False
+            [MAX_FRACTION] * late_count,
+            [row] * late_count,
+            marker=">",
+            s=40,
+            color=BOUND,
+            clip_on=False,
         )
         if fractions:
-            axes.scatter([min(WIDEST, median(fractions))], [row], marker="|", s=180, color=MIDDLE)
+            axes.scatter(
+                [min(MAX_FRACTION, median(fractions))], [row], marker="|", s=180, color=MIDDLE
+            )
         figures = report.by_kind[kind]
         numbers = f"{figures.detected} of {figures.injected}"
         if figures.cycles is not None:
@@ -78,13 +89,13 @@ def _delays(axes: Axes, report: CampaignReport) -> None:
         frame = ("axes fraction", "data")
         axes.annotate(numbers, (1.02, row), xycoords=frame, fontsize=8, va="center")
     axes.axvline(1.0, color=BOUND, linewidth=1.2)
-    axes.set_xlim(-0.03, WIDEST)
+    axes.set_xlim(-0.03, MAX_FRACTION)
     _name_rows(axes, kinds)
     axes.set_xlabel("time to detection as a part of its bound (red); the mark is the median")
     axes.set_title("found of injected; median, longest, cycles", fontsize=9, loc="right")
 
 
-def _row(axes: Axes, row: int, values: list[float]) -> None:
+def _draw_row(axes: Axes, row: int, values: list[float]) -> None:
     """Draw values as dots in a row."""
     axes.scatter(
         values, [row] * len(values), s=26, color=DOT, alpha=0.4, linewidths=0, clip_on=False
@@ -97,17 +108,17 @@ def _name_rows(axes: Axes, names: list[str]) -> None:
     axes.set_ylim(-0.7, max(0, len(names) - 1) + 0.7)
 
 
-def _part(fault: Judgement) -> float | None:
+def _compute_fraction(fault: Judgement) -> float | None:
     """Return the delay of a fault as a fraction of its bound.
 
     A bound of 0, the same cycle, is either met exactly or exceeded.
     """
     if fault.bound == 0 and fault.bound_ms is None:
-        return 0.0 if fault.delay == 0 else 2 * WIDEST
-    return fault.part_of_bound
+        return 0.0 if fault.delay == 0 else 2 * MAX_FRACTION
+    return fault.fraction_of_bound
 
 
-def _sizes(axes: Axes, report: CampaignReport) -> None:
+def _draw_sizes(axes: Axes, report: CampaignReport) -> None:
     """Draw the size of sensor errors against the delay of their detection."""
     edge = axes.get_xaxis_transform()
     longest = 10 * report.clock_ms
@@ -135,13 +146,13 @@ def _sizes(axes: Axes, report: CampaignReport) -> None:
     axes.set_ylabel("time to detection, ms")
 
 
-def _recoveries(axes: Axes, report: CampaignReport) -> None:
+def _draw_recoveries(axes: Axes, report: CampaignReport) -> None:
     """Draw the time from each fault until every reaction was undone."""
     kinds: list[str] = []
     for kind in reversed(report.by_kind):
-        ticks = [fault.recovery for fault in report.faults_of(kind) if fault.recovery is not None]
+        ticks = [fault.recovery for fault in report.list_faults(kind) if fault.recovery is not None]
         if ticks:
-            _row(axes, len(kinds), [tick * report.clock_ms * 1e-3 for tick in ticks])
+            _draw_row(axes, len(kinds), [tick * report.clock_ms * 1e-3 for tick in ticks])
             kinds.append(kind)
     _name_rows(axes, kinds)
     axes.set_xlim(left=0.0)

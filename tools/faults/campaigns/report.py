@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 from rack.boards.faults.kind import KINDS
 from rack.tools.console.answer import Document
-from rack.tools.console.tables import markdown_table
+from rack.tools.console.tables import format_markdown_table
 from rack.tools.faults.campaigns.campaign import Campaign
 from rack.tools.faults.campaigns.results import Ended, Results, TrialResult
 from rack.tools.faults.campaigns.statistics import (
@@ -19,14 +19,14 @@ from rack.tools.faults.campaigns.statistics import (
     KindFigures,
     SizeCurve,
     Spread,
-    by_kind,
-    curve,
-    rate,
-    totals,
+    compute_by_kind,
+    compute_rate,
+    count_faults,
+    list_size_points,
 )
 from rack.tools.faults.judge import Judgement
 
-SHOWN = 30
+MAX_SHOWN = 30
 """Maximum number of shortfalls in campaign.md. campaign.json contains all of them."""
 KINDS_HEAD = [
     "kind",
@@ -105,31 +105,31 @@ class CampaignReport:
         clock_ns = campaign.layout.clock_ns
         swept = [fault for run in results.sizes for fault in run.faults] + results.faults
         curves = {
-            kind.name: SizeCurve(kind.visible_from, curve(swept, kind.name, clock_ns))
+            kind.name: SizeCurve(kind.visible_from, list_size_points(swept, kind.name, clock_ns))
             for kind in KINDS
             if kind.visible_from is not None
         }
         self.order = campaign.order
         self.results = results
         self.clock_ms = clock_ns * 1e-6
-        self.summary = _summary(results, 1e9 / clock_ns)
-        self.by_kind = by_kind(results.faults, clock_ns)
+        self.summary = _build_summary(results, 1e9 / clock_ns)
+        self.by_kind = compute_by_kind(results.faults, clock_ns)
         self.curves = {kind: curve for kind, curve in curves.items() if curve.curve}
-        self.shortfalls = _shortfalls(results)
+        self.shortfalls = _list_shortfalls(results)
         self.modes = ["lockstep" if mode else "realtime" for mode in campaign.order.modes]
         self._kinds = campaign.kinds
         self._wall_s = round(wall_s, 1)
 
     @property
-    def trials(self) -> str:
+    def trials_text(self) -> str:
         """Number of trials and their modes, as text."""
         return f"{self.summary.trials} trials, {' and '.join(self.modes)}"
 
-    def faults_of(self, kind: str) -> list[Judgement]:
+    def list_faults(self, kind: str) -> list[Judgement]:
         """Return the judgements of a kind in all trials."""
         return [fault for fault in self.results.faults if fault.kind == kind]
 
-    def document(self) -> Document:
+    def to_document(self) -> Document:
         """Return the content of campaign.json."""
         run = self.results.nominal
         return {
@@ -143,7 +143,7 @@ class CampaignReport:
                 "cores": len(os.sched_getaffinity(0)),
                 "kernel": platform.release(),
                 "python": platform.python_version(),
-                "notes": self._notes(),
+                "notes": self._list_notes(),
             },
             "clock_ms": self.clock_ms,
             "nominal": {
@@ -153,27 +153,27 @@ class CampaignReport:
             },
             "summary": asdict(self.summary),
             "by_kind": {
-                kind: {**asdict(figures), **self._trials_with(kind)}
+                kind: {**asdict(figures), **self._count_trials(kind)}
                 for kind, figures in self.by_kind.items()
             },
             "sizes": {kind: asdict(size_curve) for kind, size_curve in self.curves.items()},
-            "faultless": [stretch.document() for stretch in self.results.faultless],
+            "faultless": [stretch.to_document() for stretch in self.results.faultless],
             "faults": [
                 {"trial": run.plan.number, "lockstep": run.plan.lockstep, **asdict(fault)}
                 for run in self.results.trials
                 for fault in run.faults
             ],
-            "trials": [_trial(run) for run in self.results.trials],
+            "trials": [_to_trial_entry(run) for run in self.results.trials],
             "shortfalls": self.shortfalls,
         }
 
-    def _notes(self) -> list[str]:
+    def _list_notes(self) -> list[str]:
         # Leave out lockstep, where every launch notes that all boards share one core.
         """Return the notes of launches in real time, each once."""
         runs = [run for run in self.results.runs if not run.plan.lockstep]
         return list(dict.fromkeys(note for run in runs for note in run.notes))
 
-    def _trials_with(self, kind: str) -> dict[str, int]:
+    def _count_trials(self, kind: str) -> dict[str, int]:
         """Count the trials in which a kind acted, and how many of them completed their task."""
         ends = [
             run.ended
@@ -182,11 +182,11 @@ class CampaignReport:
         ]
         return {"trials": len(ends), "tasks_done": ends.count("task done")}
 
-    def markdown(self) -> str:
+    def to_markdown(self) -> str:
         """Return the content of campaign.md."""
-        return "\n".join(self._lines()) + "\n"
+        return "\n".join(self._format_lines()) + "\n"
 
-    def _lines(self) -> Iterator[str]:
+    def _format_lines(self) -> Iterator[str]:
         """Yield the lines of campaign.md."""
         verdict = "fell short" if self.shortfalls else "passed"
         cores = len(os.sched_getaffinity(0))
@@ -194,29 +194,31 @@ class CampaignReport:
         yield f"# Campaign on {self.order.name}, seed {self.order.seed}: {verdict}"
         yield ""
         yield (
-            f"{self.trials}, in {self._wall_s:.0f} s on {cores} cores, Linux"
+            f"{self.trials_text}, in {self._wall_s:.0f} s on {cores} cores, Linux"
             f" {platform.release()}.{interrupted}"
         )
-        yield from (f"- {note}" for note in self._notes())
+        yield from (f"- {note}" for note in self._list_notes())
         yield ""
-        yield from markdown_table(["", ""], [[name, str(value)] for name, value in self._rows()])
+        yield from format_markdown_table(
+            ["", ""], [[name, str(value)] for name, value in self._format_summary()]
+        )
         if self.by_kind:
             yield from ("", "## Faults by kind", "")
-            rows = [_kind_row(kind, figures) for kind, figures in self.by_kind.items()]
-            yield from markdown_table(KINDS_HEAD, rows)
+            rows = [_format_kind(kind, figures) for kind, figures in self.by_kind.items()]
+            yield from format_markdown_table(KINDS_HEAD, rows)
             yield ""
             yield (
                 "'At least' is the smallest lower bound of Wilson's 95 % intervals for the shares"
                 " detected, in bound and recovered."
             )
-        yield from self._faultless()
+        yield from self._format_faultless()
         for kind, size_curve in self.curves.items():
-            yield from _sizes(kind, size_curve)
+            yield from _format_sizes(kind, size_curve)
         if self.shortfalls:
             yield from ("", f"## Shortfalls: {len(self.shortfalls)}", "")
-            yield from (f"- {line}" for line in self.shortfalls[:SHOWN])
+            yield from (f"- {line}" for line in self.shortfalls[:MAX_SHOWN])
 
-    def _rows(self) -> Iterator[tuple[str, Any]]:
+    def _format_summary(self) -> Iterator[tuple[str, Any]]:
         """Yield the rows of the summary."""
         summary = self.summary
         redrawn = f"{summary.not_struck} more did not strike and were drawn again"
@@ -239,28 +241,28 @@ class CampaignReport:
         yield "touches", summary.touches
         yield "left behind", f"{summary.left_behind} (processes, segments)"
         unexplained = f"{summary.unexplained} in {summary.simulated_s / 3600.0:.2f} simulated hours"
-        yield "false detections", f"{unexplained}: {_rate(summary.unexplained_per_hour)}"
+        yield "false detections", f"{unexplained}: {_format_rate(summary.unexplained_per_hour)}"
         if summary.faultless_s:
             trips = f"{summary.false_trips} in {summary.faultless_s:g} s"
-            trips_per_hour = _rate(summary.false_trips_per_hour)
+            trips_per_hour = _format_rate(summary.false_trips_per_hour)
             yield "of these without faults, in real time", f"{trips}: {trips_per_hour}"
         yield "unexplained misses in real time", summary.stray_misses
 
-    def _faultless(self) -> Iterator[str]:
+    def _format_faultless(self) -> Iterator[str]:
         """Yield the lines about faultless time."""
         rows = []
         for stretch in self.results.faultless:
             load = f"under {stretch.load}" if stretch.load else "alone"
             misses = [f"{count} {name.replace('_', ' ')}" for name, count in stretch.misses.items()]
-            row = [load, f"{stretch.seconds:.0f}", str(stretch.trips), _rate(stretch.rate)]
+            row = [load, f"{stretch.seconds:.0f}", str(stretch.trips), _format_rate(stretch.rate)]
             rows.append([*row, ", ".join(misses) or "none"])
         if rows:
             yield from ("", "## Faultless, in real time", "")
             head = ["", "s", "false trips", "an hour", "misses (no trips)"]
-            yield from markdown_table(head, rows)
+            yield from format_markdown_table(head, rows)
 
 
-def _summary(results: Results, second: float) -> CampaignSummary:
+def _build_summary(results: Results, second: float) -> CampaignSummary:
     """Compute the figures of all kinds together. `second` is the number of ticks in a second."""
     trials = results.trials
     runs = results.runs
@@ -270,7 +272,7 @@ def _summary(results: Results, second: float) -> CampaignSummary:
     simulated_s = sum(run.ticks for run in runs) / second
     unexplained = sum(len(run.unexplained) for run in runs)
     return CampaignSummary(
-        **vars(totals(results.faults)),
+        **vars(count_faults(results.faults)),
         trials=len(trials),
         tasks_done=end_counts["task done"],
         verdicts_certain=end_counts["verdicts certain"],
@@ -282,21 +284,21 @@ def _summary(results: Results, second: float) -> CampaignSummary:
         left_behind=sum(len(run.left) for run in runs),
         simulated_s=round(simulated_s, 1),
         unexplained=unexplained,
-        unexplained_per_hour=rate(unexplained, simulated_s),
+        unexplained_per_hour=compute_rate(unexplained, simulated_s),
         stray_misses=sum(run.stray_misses for run in trials if not run.plan.lockstep),
         false_trips=trips,
         faultless_s=round(faultless_s, 1),
-        false_trips_per_hour=rate(trips, faultless_s),
+        false_trips_per_hour=compute_rate(trips, faultless_s),
     )
 
 
-def _shortfalls(results: Results) -> list[str]:
+def _list_shortfalls(results: Results) -> list[str]:
     """Return the shortfalls of all runs."""
     lines = [f"{run.plan.name}: {line}" for run in results.runs for line in run.shortfalls]
     return lines + results.lacking
 
 
-def _trial(run: TrialResult) -> Document:
+def _to_trial_entry(run: TrialResult) -> Document:
     """Return the entry of a trial in campaign.json."""
     return {
         "number": run.plan.number,
@@ -311,14 +313,14 @@ def _trial(run: TrialResult) -> Document:
     }
 
 
-def _rate(event_rate: EventRate | None) -> str:
+def _format_rate(event_rate: EventRate | None) -> str:
     """Format a rate with its confidence bound."""
     if event_rate is None:
         return "-"
     return f"{event_rate.an_hour:.3g} an hour, below {event_rate.below:.3g} with 95 % confidence"
 
 
-def _kind_row(kind: str, figures: KindFigures) -> list[str]:
+def _format_kind(kind: str, figures: KindFigures) -> list[str]:
     """Return the row of a kind in the table of kinds."""
     counts = (figures.injected, figures.detected, figures.within_bound, figures.recovered)
     lowest = [share[0] for share in figures.wilson.values() if share is not None]
@@ -328,20 +330,20 @@ def _kind_row(kind: str, figures: KindFigures) -> list[str]:
         kind,
         *map(str, counts),
         worst,
-        *_median_max(figures.ticks),
+        *_format_spread(figures.ticks),
         "-".join(dict.fromkeys(map(str, bounds))) or "-",
-        *_median_max(figures.ms),
-        *_median_max(figures.recovery_ms),
+        *_format_spread(figures.ms),
+        *_format_spread(figures.recovery_ms),
         ", ".join(figures.reactions) or "-",
     ]
 
 
-def _median_max(values: Spread | None) -> tuple[str, str]:
+def _format_spread(values: Spread | None) -> tuple[str, str]:
     """Format median and maximum."""
     return ("-", "-") if values is None else (f"{values.median:.4g}", f"{values.max:.4g}")
 
 
-def _sizes(kind: str, curve_of_sizes: SizeCurve) -> Iterator[str]:
+def _format_sizes(kind: str, curve_of_sizes: SizeCurve) -> Iterator[str]:
     """Yield the lines about a curve of size against delay."""
     size = KINDS[kind].size
     unit = size.unit if size is not None else ""
@@ -354,4 +356,4 @@ def _sizes(kind: str, curve_of_sizes: SizeCurve) -> Iterator[str]:
     for point in curve_of_sizes.curve:
         after_ms = "-" if point.delay_ms is None else f"{point.delay_ms:g}"
         rows.append([f"{point.size:.4g}", point.joint or "all", after_ms])
-    yield from markdown_table([f"size, {unit}", "joint", "found after, ms"], rows)
+    yield from format_markdown_table([f"size, {unit}", "joint", "found after, ms"], rows)

@@ -15,9 +15,9 @@ from rack.boards.events import Event
 from rack.boards.faults.kind import KINDS
 from rack.tools.console.answer import Document, write_json
 from rack.tools.faults.campaigns.plan import Plan
-from rack.tools.faults.campaigns.statistics import EventRate, rate
+from rack.tools.faults.campaigns.statistics import EventRate, compute_rate
 from rack.tools.faults.campaigns.trial import Trial
-from rack.tools.faults.judge import FaultVerdict, Judgement, Seen, judge
+from rack.tools.faults.judge import FaultVerdict, Judgement, Seen, judge_faults
 
 Ended = Literal["task done", "verdicts certain", "safely stopped", "not armed", "neither"]
 
@@ -64,11 +64,11 @@ class TrialResult:
     whole: str = ""
 
 
-def result_of(trial: Trial) -> TrialResult:
+def judge_trial(trial: Trial) -> TrialResult:
     """Judge a trial."""
     outcome = trial.outcome
-    verdict = _verdict(trial)
-    ended = _ended(trial)
+    verdict = _judge_faults(trial)
+    ended = _classify_end(trial)
     ticks, digest = (outcome.ticks, outcome.digest) if outcome else (0, "")
     return TrialResult(
         plan=trial.plan,
@@ -84,17 +84,17 @@ def result_of(trial: Trial) -> TrialResult:
         stray_misses=len(verdict.misses),
         faults=verdict.faults,
         unexplained=verdict.unexplained,
-        shortfalls=_shortfalls(trial, verdict, ended),
+        shortfalls=_list_shortfalls(trial, verdict, ended),
         start=trial.start.tick,
         whole=trial.start.whole,
     )
 
 
-def keep(trial: Trial, path: Path) -> None:
+def save_result(trial: Trial, path: Path) -> None:
     """Judge a trial and save it with all its events. The file is written atomically."""
     outcome = asdict(trial.outcome) if trial.outcome else None
     document = {
-        "finding": asdict(result_of(trial)),
+        "finding": asdict(judge_trial(trial)),
         "outcome": outcome,
         "refused": trial.refused,
         "levels": trial.levels,
@@ -107,7 +107,7 @@ def keep(trial: Trial, path: Path) -> None:
 _KEPT = TypeAdapter(TrialResult)
 
 
-def kept(path: Path) -> TrialResult | None:
+def load_result(path: Path) -> TrialResult | None:
     """Load the result in a file, or return None if the file does not exist."""
     try:
         return _KEPT.validate_python(json.loads(path.read_text())["finding"])
@@ -116,7 +116,7 @@ def kept(path: Path) -> TrialResult | None:
 
 
 @dataclass(frozen=True)
-class Faultless:
+class FaultlessTime:
     """Runs without faults in real time.
 
     Attributes:
@@ -137,7 +137,7 @@ class Faultless:
     @property
     def rate(self) -> EventRate | None:
         """Rate of false trips. None if there were no runs."""
-        return rate(self.trips, self.seconds)
+        return compute_rate(self.trips, self.seconds)
 
     @property
     def misses(self) -> dict[str, int]:
@@ -147,7 +147,7 @@ class Faultless:
             total.update(run.misses)
         return dict(total)
 
-    def document(self) -> Document:
+    def to_document(self) -> Document:
         """Return the figures as plain data."""
         rate_document = asdict(self.rate) if self.rate else None
         return {
@@ -176,7 +176,7 @@ class Results:
     nominal: TrialResult
     trials: list[TrialResult] = field(default_factory=list)
     sizes: list[TrialResult] = field(default_factory=list)
-    faultless: list[Faultless] = field(default_factory=list)
+    faultless: list[FaultlessTime] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)
     is_interrupted: bool = False
 
@@ -197,17 +197,17 @@ class Results:
         return [fault for run in self.trials for fault in run.faults]
 
 
-def _verdict(trial: Trial) -> FaultVerdict:
+def _judge_faults(trial: Trial) -> FaultVerdict:
     """Judge the faults of a trial."""
     if trial.run is None:
         # A fault that prevents a launch is detected by the refusal of the launch.
         tables = trial.plan.faults
-        judged = tuple(_at_start(table["kind"], table["board"], trial) for table in tables)
+        judged = tuple(_judge_start_fault(table["kind"], table["board"], trial) for table in tables)
         return FaultVerdict(judged, ())
-    return judge(trial.strikes, trial.events, trial.run)
+    return judge_faults(trial.strikes, trial.events, trial.run)
 
 
-def _at_start(kind: str, board: str, trial: Trial) -> Judgement:
+def _judge_start_fault(kind: str, board: str, trial: Trial) -> Judgement:
     """Judge a fault of a rack whose launch was refused."""
     if KINDS[kind].where != "start":
         return Judgement(kind, board, -1, "not struck")
@@ -222,11 +222,11 @@ def _at_start(kind: str, board: str, trial: Trial) -> Judgement:
         found_as="not armed",
         is_within=is_found,
         reactions=("not armed",),
-        is_recovered=trial.again is not None and trial.again.worked,
+        is_recovered=trial.again is not None and trial.again.is_success,
     )
 
 
-def _ended(trial: Trial) -> Ended:
+def _classify_end(trial: Trial) -> Ended:
     """Return how a trial ended."""
     outcome = trial.outcome
     if trial.refused:
@@ -236,14 +236,19 @@ def _ended(trial: Trial) -> Ended:
         return "neither"
     if trial.is_cut:
         return "verdicts certain"
-    if outcome.worked:
+    if outcome.is_success:
         return "task done"
     return "safely stopped" if trial.arm.is_at_rest and not trial.arm.violations else "neither"
 
 
-def _shortfalls(trial: Trial, verdict: FaultVerdict, ended: Ended) -> tuple[str, ...]:
+def _list_shortfalls(trial: Trial, verdict: FaultVerdict, ended: Ended) -> tuple[str, ...]:
     """Return what was wrong in a trial, a line each."""
-    lines = [line for fault in verdict.faults if fault.is_judged for line in _of_fault(fault)]
+    lines = [
+        line
+        for fault in verdict.faults
+        if fault.is_judged
+        for line in _list_fault_shortfalls(fault)
+    ]
     lines += [
         f"no fault explains this event of {event.board} at tick {event.tick}: {event.text}"
         for event in verdict.unexplained
@@ -252,17 +257,19 @@ def _shortfalls(trial: Trial, verdict: FaultVerdict, ended: Ended) -> tuple[str,
         lines.append(f"limits violated at {trial.arm.violations} substeps")
     lines += [f"left behind: {leftover}" for leftover in trial.left]
     if ended == "neither":
-        lines.append(f"the task is neither done nor safely stopped: {_why_not_done(trial)}")
+        lines.append(f"the task is neither done nor safely stopped: {_explain_not_done(trial)}")
     # A fault had to end the task if it latched, or if the reactions to it made the task too late.
     had_to_end = any(
         fault.is_latched or (trial.is_late and fault.reactions) for fault in verdict.faults
     )
     if ended == "safely stopped" and not lines and not had_to_end:
-        lines.append(f"the task is not done, and no fault had to end it: {_why_not_done(trial)}")
+        lines.append(
+            f"the task is not done, and no fault had to end it: {_explain_not_done(trial)}"
+        )
     return tuple(lines)
 
 
-def _why_not_done(trial: Trial) -> str:
+def _explain_not_done(trial: Trial) -> str:
     """Return why the task of a trial was not done."""
     outcome = trial.outcome
     if trial.refused:
@@ -272,7 +279,7 @@ def _why_not_done(trial: Trial) -> str:
     return "; ".join(filter(None, [outcome.cause, *outcome.faults, trial.levels]))
 
 
-def _of_fault(fault: Judgement) -> Iterator[str]:
+def _list_fault_shortfalls(fault: Judgement) -> Iterator[str]:
     """Yield what was wrong with the detection of a fault, the reactions to it and its recovery."""
     target = f"{fault.mailbox or fault.board} {fault.joint}".rstrip()
     strike = f"{fault.kind} of {target} at tick {fault.struck}"

@@ -8,7 +8,7 @@ from math import exp, lgamma, log, sqrt
 from statistics import median
 
 from rack.boards.faults.kind import KINDS
-from rack.tools.faults.ending import EXTERNAL, record_of
+from rack.tools.faults.ending import EXTERNAL, find_record
 from rack.tools.faults.judge import Judgement
 
 
@@ -89,7 +89,7 @@ class SizeCurve:
     curve: list[SizePoint]
 
 
-def by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, KindFigures]:
+def compute_by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, KindFigures]:
     """Return the figures of each kind in the order of `KINDS`.
 
     Only faults that must be detected are counted.
@@ -97,7 +97,9 @@ def by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, KindFigures
     judged = [fault for fault in faults if fault.is_judged]
     kinds = dict.fromkeys([*KINDS.names, EXTERNAL])
     grouped = {kind: [fault for fault in judged if fault.kind == kind] for kind in kinds}
-    return {kind: _figures(kind, group, clock_ns) for kind, group in grouped.items() if group}
+    return {
+        kind: _compute_figures(kind, group, clock_ns) for kind, group in grouped.items() if group
+    }
 
 
 Z95 = 1.959964
@@ -105,21 +107,21 @@ Z95 = 1.959964
 RULE_95 = 0.05
 
 
-def wilson(count: int, of: int) -> tuple[float, float] | None:
-    """Return the bounds of Wilson's 95 % interval for the share `count` / `of`.
+def compute_wilson_interval(count: int, total: int) -> tuple[float, float] | None:
+    """Return the bounds of Wilson's 95 % interval for the share `count` / `total`.
 
-    None if `of` is 0.
+    None if `total` is 0.
     """
-    if not of:
+    if not total:
         return None
-    share = count / of
+    share = count / total
     z2 = Z95**2
-    middle = (share + z2 / (2 * of)) / (1 + z2 / of)
-    half = Z95 / (1 + z2 / of) * sqrt(share * (1 - share) / of + z2 / (4 * of * of))
+    middle = (share + z2 / (2 * total)) / (1 + z2 / total)
+    half = Z95 / (1 + z2 / total) * sqrt(share * (1 - share) / total + z2 / (4 * total * total))
     return max(0.0, round(middle - half, 6)), min(1.0, round(middle + half, 6))
 
 
-def rate(count: int, seconds: float) -> EventRate | None:
+def compute_rate(count: int, seconds: float) -> EventRate | None:
     """Return the rate of events. None if there was no time.
 
     The upper bound is the rate at which no more than `count` events have a probability of 5 %
@@ -140,7 +142,7 @@ def rate(count: int, seconds: float) -> EventRate | None:
     return EventRate(round(count / hours, 3), round(high / hours, 3))
 
 
-def totals(faults: Iterable[Judgement]) -> FaultCounts:
+def count_faults(faults: Iterable[Judgement]) -> FaultCounts:
     """Count how many faults acted, were detected, were detected in time and so on."""
     judged = [fault for fault in faults if fault.is_judged]
     struck = [fault for fault in judged if fault.seen != "not struck"]
@@ -157,7 +159,7 @@ def totals(faults: Iterable[Judgement]) -> FaultCounts:
     )
 
 
-def curve(faults: Iterable[Judgement], kind: str, clock_ns: int) -> list[SizePoint]:
+def list_size_points(faults: Iterable[Judgement], kind: str, clock_ns: int) -> list[SizePoint]:
     """Return the points of size against delay for one kind, the smallest size first.
 
     Args:
@@ -167,39 +169,43 @@ def curve(faults: Iterable[Judgement], kind: str, clock_ns: int) -> list[SizePoi
     """
     struck = [fault for fault in faults if fault.kind == kind and fault.struck >= 0]
     points = [
-        SizePoint(fault.size or 0.0, fault.joint, _ms(fault.delay, clock_ns), fault.delay)
+        SizePoint(fault.size or 0.0, fault.joint, _to_ms(fault.delay, clock_ns), fault.delay)
         for fault in struck
     ]
     return sorted(points, key=lambda point: point.size)
 
 
-def spread(values: Iterable[float | None]) -> Spread | None:
+def compute_spread(values: Iterable[float | None]) -> Spread | None:
     """Return median and maximum of the values that are not None, or None if all are."""
     numbers = [value for value in values if value is not None]
     return Spread(round(median(numbers), 3), round(max(numbers), 3)) if numbers else None
 
 
-def _figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> KindFigures:
+def _compute_figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> KindFigures:
     """Compute the figures of one kind."""
     detected = [fault for fault in faults if fault.seen == "detected"]
-    counts = vars(totals(faults))
+    counts = vars(count_faults(faults))
     shares = ("detected", "within_bound", "recovered")
     bounds = [fault.bound for fault in faults if fault.bound is not None]
     bound_ticks = {"least": min(bounds), "most": max(bounds)} if bounds else None
     return KindFigures(
         **counts,
-        wilson={share: wilson(counts[share], counts["injected"]) for share in shares},
-        bound=str(record_of(kind).bound),
-        cycles=spread(fault.delay / fault.cycle for fault in detected if fault.delay is not None),
-        ticks=spread(fault.delay for fault in detected),
+        wilson={
+            share: compute_wilson_interval(counts[share], counts["injected"]) for share in shares
+        },
+        bound=str(find_record(kind).bound),
+        cycles=compute_spread(
+            fault.delay / fault.cycle for fault in detected if fault.delay is not None
+        ),
+        ticks=compute_spread(fault.delay for fault in detected),
         bound_ticks=bound_ticks,
-        part_of_bound=spread(fault.part_of_bound for fault in detected),
-        ms=spread(fault.delay_ms for fault in detected),
+        part_of_bound=compute_spread(fault.fraction_of_bound for fault in detected),
+        ms=compute_spread(fault.delay_ms for fault in detected),
         reactions=sorted({name for fault in faults for name in fault.reactions}),
-        recovery_ms=spread(_ms(fault.recovery, clock_ns) for fault in detected),
+        recovery_ms=compute_spread(_to_ms(fault.recovery, clock_ns) for fault in detected),
     )
 
 
-def _ms(ticks: int | None, clock_ns: int) -> float | None:
+def _to_ms(ticks: int | None, clock_ns: int) -> float | None:
     """Convert ticks to ms."""
     return None if ticks is None else round(ticks * clock_ns * 1e-6, 3)

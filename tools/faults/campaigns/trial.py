@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from rack.backplane.address_map import CLOCK
 from rack.backplane.errors import BackplaneError
 from rack.backplane.layout import Layout
-from rack.backplane.message import State, reason_of, state_name
+from rack.backplane.message import State, format_state, get_reason
 from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
@@ -20,17 +20,17 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import BoardError, ConfigError
-from rack.boards.events import Event, Outcome, statuses
-from rack.boards.faults.bounds import struck_mailboxes
+from rack.boards.events import Event, Outcome, iterate_statuses
+from rack.boards.faults.bounds import list_struck_mailboxes
 from rack.levels.messages import Error
 from rack.tools.faults.campaigns.base import BaseRack, Start
-from rack.tools.faults.campaigns.certainty import Certainty
-from rack.tools.faults.campaigns.environment import children, left_behind
+from rack.tools.faults.campaigns.certainty import EarlyEnd
+from rack.tools.faults.campaigns.environment import find_leftovers, list_living_descendants
 from rack.tools.faults.campaigns.plan import Kill, Plan
-from rack.tools.faults.ending import EXTERNAL, ArmEnd, Strike, arm_of, strikes
+from rack.tools.faults.ending import EXTERNAL, ArmEnd, Strike, list_strikes, read_arm
 from rack.tools.faults.judge import Circumstances
 
-MAX_LENGTH = 4
+MAX_LENGTH_FACTOR = 4
 GRACE_S = 60.0
 """A run is stopped after `MAX_LENGTH_FACTOR` times a faultless run's length plus `GRACE_S`."""
 NOMINAL_S = 1800.0
@@ -43,7 +43,7 @@ LOOK_S = 0.001
 """Interval at which the tick is checked in lockstep, which has no grid on which to sleep."""
 HELD_S = 0.004
 """Interval at which a rack that may be held is checked."""
-AGAIN_S = 2.0
+RERUN_S = 2.0
 """Simulated time of the run after a refused launch, in which each task has some cycles."""
 RETRY_S = 0.02
 """Time after which a kill is tried again if its board is being restarted."""
@@ -63,16 +63,16 @@ class Killer:
         self._retry_at = 0.0
         self.done: list[Strike] = []
 
-    def due_in_s(self) -> float:
+    def compute_wait_s(self) -> float:
         """Return the time until the next kill, at most 0.5 s."""
         if not self._waiting:
             return 0.5
         if self._words[System.LOCKSTEP]:
             return LOOK_S
-        kill_s = max(self._instant_ns() * 1e-9, self._retry_at)
+        kill_s = max(self._compute_instant_ns() * 1e-9, self._retry_at)
         return min(0.5, max(0.0, kill_s - time.monotonic()))
 
-    def advance(self) -> None:
+    def kill_due_board(self) -> None:
         """Kill the board whose instant has come. If it is not running, try again later."""
         words = self._words
         if not self._waiting or time.monotonic() < self._retry_at:
@@ -80,45 +80,45 @@ class Killer:
         kill = self._waiting[0]
         if words[System.TICK] < kill.tick:
             return
-        wait_ns = self._instant_ns() - time.monotonic_ns()
+        wait_ns = self._compute_instant_ns() - time.monotonic_ns()
         if words[System.LOCKSTEP]:
             # In lockstep the phase only varies what the board is doing when it is killed.
             wait_ns = round(kill.phase * words[System.PERIOD_NS])
         time.sleep(max(0, wait_ns) * 1e-9)
-        if self._kill(kill.board):
+        if self._kill_board(kill.board):
             self._waiting.pop(0)
         else:
             self._retry_at = time.monotonic() + RETRY_S
 
-    def _instant_ns(self) -> int:
+    def _compute_instant_ns(self) -> int:
         """Return the CLOCK_MONOTONIC of the next kill, ns."""
         kill = self._waiting[0]
         words = self._words
         return words[System.EPOCH_NS] + round((kill.tick + kill.phase) * words[System.PERIOD_NS])
 
-    def _kill(self, board: str) -> bool:
+    def _kill_board(self, board: str) -> bool:
         """Kill a board and record it. Return False if it is not running."""
-        pid = self._pid(board)
+        pid = self._find_pid(board)
         if not is_alive(pid):
             return False
         tick = self._words[System.TICK]
-        kill = kill_from_outside(self._segment.layout, board, tick, time.monotonic_ns())
+        kill = build_outside_kill(self._segment.layout, board, tick, time.monotonic_ns())
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
             self.done.append(kill)
             return True
         return False
 
-    def _pid(self, board: str) -> int:
+    def _find_pid(self, board: str) -> int:
         """Return the process of a running board, or 0 if the board is not running."""
         if board == CLOCK:
             return self._words[System.CLOCK_PID]
-        block = self._segment.block(board)
+        block = self._segment.get_block(board)
         is_up = block[Block.STATE] == TaskState.RUNNING and not block[Block.LOST]
         return block[Block.PID] if is_up else 0
 
 
-def kill_from_outside(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
+def build_outside_kill(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
     """Return the record of a kill from outside.
 
     Args:
@@ -135,7 +135,7 @@ def kill_from_outside(layout: Layout, board: str, tick: int, time_ns: int) -> St
         ends=tick,
         tick=tick,
         time_ns=time_ns,
-        mailboxes=tuple(box.name for box in struck_mailboxes(layout, -1, board)),
+        mailboxes=tuple(box.name for box in list_struck_mailboxes(layout, -1, board)),
     )
 
 
@@ -203,10 +203,10 @@ def run_trial(
     Raises:
         ConfigError: The plan does not fit the config.
     """
-    start = Start(whole="as asked") if base is None else base.start_of(plan, crate, seconds)
-    pids_before = children()
+    start = Start(whole="as asked") if base is None else base.find_start(plan, crate, seconds)
+    pids_before = list_living_descendants()
     started = time.monotonic()
-    rack = Rack(plan.config(config, rack_name), crate=crate, continues=start.continues)
+    rack = Rack(plan.to_config(config, rack_name), crate=crate, continues=start.continues)
     refused = ""
     is_cut = False
     levels = ""
@@ -215,18 +215,18 @@ def run_trial(
     strikes_seen: tuple[Strike, ...] = ()
     try:
         with rack:
-            start = start.at(rack.begins_at)
-            rack.follow(start.events)
+            start = start.resolve_snapshot(rack.begins_at)
+            rack.take_over_events(start.events)
             killer = Killer(rack.segment, plan.kills)
             joints = config.robot.joints if config.robot is not None else ()
             certainty = None
             if start.continues is not None and not plan.kills:
-                certainty = Certainty(rack, joints, _circumstances(rack, plan))
-            _watch(rack, killer, ticks, seconds, certainty)
+                certainty = EarlyEnd(rack, joints, _collect_circumstances(rack, plan))
+            _watch_run(rack, killer, ticks, seconds, certainty)
             is_cut = certainty is not None and certainty.is_reached
-            strikes_seen = (*strikes(rack.segment, joints), *killer.done)
-            arm = arm_of(rack.segment)
-            levels = levels_of(rack.segment)
+            strikes_seen = (*list_strikes(rack.segment, joints), *killer.done)
+            arm = read_arm(rack.segment)
+            levels = format_levels(rack.segment)
             has_late_level = is_late(rack.segment)
     except ConfigError:
         raise
@@ -235,10 +235,10 @@ def run_trial(
     rerun_outcome = None
     run = None
     if not refused:
-        run = _circumstances(rack, plan)
+        run = _collect_circumstances(rack, plan)
     elif plan.faults:
         faultless = replace(plan, faults=())
-        rerun_outcome = run_trial(config, faultless, rack_name, ticks, AGAIN_S, crate=crate).outcome
+        rerun_outcome = run_trial(config, faultless, rack_name, ticks, RERUN_S, crate=crate).outcome
     return Trial(
         plan=plan,
         run=run,
@@ -247,7 +247,7 @@ def run_trial(
         events=tuple(sorted(rack.events, key=lambda event: event.tick)),
         strikes=strikes_seen,
         arm=arm,
-        left=tuple(left_behind(rack_name, pids_before)),
+        left=tuple(find_leftovers(rack_name, pids_before)),
         wall_s=time.monotonic() - started,
         levels=levels,
         is_late=has_late_level,
@@ -257,12 +257,12 @@ def run_trial(
     )
 
 
-def levels_of(segment: Segment) -> str:
+def format_levels(segment: Segment) -> str:
     """Return the last state of each level with its reason, as one text."""
     states = []
-    for writer, status in statuses(segment, "state"):
-        reason = f" ({why})" if (why := reason_of(status)) else ""
-        states.append(f"{writer} {state_name(status.state)}{reason}")
+    for writer, status in iterate_statuses(segment, "state"):
+        reason = f" ({why})" if (why := get_reason(status)) else ""
+        states.append(f"{writer} {format_state(status.state)}{reason}")
     return ", ".join(states)
 
 
@@ -270,38 +270,40 @@ def is_late(segment: Segment) -> bool:
     """Return True if a level gave up because it could not meet a time."""
     return any(
         status.state == State.ERROR and status.error == Error.TOO_LATE
-        for _, status in statuses(segment, "error")
+        for _, status in iterate_statuses(segment, "error")
     )
 
 
-def _circumstances(rack: Rack, plan: Plan) -> Circumstances:
+def _collect_circumstances(rack: Rack, plan: Plan) -> Circumstances:
     """Collect the facts that the judge needs about a run."""
     config = rack.config
     return Circumstances(
         layout=rack.segment.layout,
         offset_ns=time.time_ns() - time.monotonic_ns(),
         is_lockstep=plan.lockstep,
-        restart_s=config.supervision.restart_s(plan.lockstep),
-        has_failed=rack.outcome is not None and not rack.outcome.worked,
+        restart_s=config.supervision.find_restart_time(plan.lockstep),
+        has_failed=rack.outcome is not None and not rack.outcome.is_success,
         moving=tuple(motion.body for motion in config.scene.motion),
     )
 
 
-def _watch(
-    rack: Rack, killer: Killer, ticks: int, seconds: float | None, certainty: Certainty | None
+def _watch_run(
+    rack: Rack, killer: Killer, ticks: int, seconds: float | None, certainty: EarlyEnd | None
 ) -> None:
     """Watch a run to its end and kill boards as planned. Stop it if it takes too long."""
     rack.start(seconds)
     words = rack.segment.words
     extra_s = GRACE_S if ticks else NOMINAL_S
-    max_ticks = MAX_LENGTH * ticks + max(extra_s, seconds or 0.0) * 1e9 / rack.config.clock_ns
+    max_ticks = (
+        MAX_LENGTH_FACTOR * ticks + max(extra_s, seconds or 0.0) * 1e9 / rack.config.clock_ns
+    )
     last_tick = -1
     deadline = 0.0
     stopped = False
-    while rack.watch(killer.due_in_s() if certainty is None else HELD_S):
-        killer.advance()
+    while rack.watch(killer.compute_wait_s() if certainty is None else HELD_S):
+        killer.kill_due_board()
         if certainty is not None:
-            certainty.look()
+            certainty.judge_if_held()
         now_s = time.monotonic()
         if stopped and now_s > deadline:
             return

@@ -21,7 +21,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.campaigns.base import BaseRack
 from rack.tools.faults.campaigns.plan import Plan
-from rack.tools.faults.campaigns.results import keep
+from rack.tools.faults.campaigns.results import save_result
 from rack.tools.faults.campaigns.trial import run_trial
 
 LOOK_S = 0.2
@@ -62,7 +62,7 @@ class Workers:
         self._pool = ProcessPoolExecutor(
             self._most,
             mp_context=context,
-            initializer=_begin,
+            initializer=_prepare_worker,
             initargs=(config, whole, numbers, os.getpid()),
         )
 
@@ -94,7 +94,7 @@ class Workers:
         while (waiting or busy) and not INTERRUPT.number:
             while waiting and len(busy) < max_busy:
                 job = waiting.pop(0)
-                busy[self._pool.submit(_make, job)] = job
+                busy[self._pool.submit(_run_job, job)] = job
             done, _ = wait(busy, LOOK_S, FIRST_COMPLETED)
             for future in done:
                 job = busy.pop(future)
@@ -114,7 +114,7 @@ class Workers:
             process.terminate()
 
 
-class TrialMaker:
+class TrialRunner:
     """Runs the trials of one worker with its core, its crate and its faultless rack."""
 
     def __init__(self, config: RackConfig, whole: bool, core: int) -> None:
@@ -125,48 +125,48 @@ class TrialMaker:
         self._crate: WarmCrate | None = None
         self._base = BaseRack(config, f"camp-{os.getpid()}x")
 
-    def make(self, job: TrialJob) -> None:
+    def run_and_save(self, job: TrialJob) -> None:
         """Run a trial and save its result."""
         is_lockstep = job.plan.lockstep
         os.sched_setaffinity(0, {self._core} if is_lockstep else self._cores)
-        crate = self._ready(is_lockstep)
+        crate = self._prepare_crate(is_lockstep)
         base = None if self._whole else self._base
         name = self._base.name
         trial = run_trial(
             self._config, job.plan, name, job.ticks, job.seconds, base=base, crate=crate
         )
-        keep(trial, job.path)
+        save_result(trial, job.path)
 
-    def _ready(self, lockstep: bool) -> WarmCrate | None:
+    def _prepare_crate(self, lockstep: bool) -> WarmCrate | None:
         """Return the crate for the next trial, or None if the rack must start a new one.
 
         Use a fresh crate for each real-time trial: a warm one has different cache and page-fault
         behaviour.
         """
         if self._crate is not None and (self._crate.is_over or not lockstep):
-            self._crate.end()
+            self._crate.end_crate()
             self._crate = None
         if lockstep and self._crate is None:
             self._crate = WarmCrate()
         return self._crate
 
 
-_maker: TrialMaker
+_maker: TrialRunner
 
 
-def _begin(config: RackConfig, whole: bool, cores: SimpleQueue[int], parent: int) -> None:
+def _prepare_worker(config: RackConfig, whole: bool, cores: SimpleQueue[int], parent: int) -> None:
     """Prepare a worker process. It ends with its parent and ignores Ctrl-C on the terminal."""
     global _maker
     os.setpgid(0, 0)
-    INTERRUPT.catch()
+    INTERRUPT.install_handlers()
     die_with_parent(parent)
-    _maker = TrialMaker(config, whole, cores.get())
+    _maker = TrialRunner(config, whole, cores.get())
 
 
-def _make(job: TrialJob) -> str:
+def _run_job(job: TrialJob) -> str:
     """Run a trial in a worker. Return what went wrong, or an empty string."""
     try:
-        _maker.make(job)
+        _maker.run_and_save(job)
     except Exception as error:
         # Report any error, because the campaign would otherwise wait for the result.
         return f"{type(error).__name__}: {error}"

@@ -29,7 +29,7 @@ __path__ = [
     str(Path(__file__).resolve().parent),
 ]
 
-from rack.backplane.exports import on_first_use
+from rack.backplane.exports import build_lazy_getattr
 
 if TYPE_CHECKING:
     from rack.boards.errors import ConfigError, Failure
@@ -47,7 +47,7 @@ _PLACES = {
 
 # Hidden from type checkers, which would otherwise accept every misspelt name.
 if not TYPE_CHECKING:
-    __getattr__ = on_first_use(__name__, _PLACES)
+    __getattr__ = build_lazy_getattr(__name__, _PLACES)
 
 
 def __dir__() -> list[str]:

@@ -13,14 +13,14 @@ from multiprocessing.connection import Connection
 from typing import Any, ParamSpec, TypeVar
 
 from rack.backplane.process import die_with_parent
-from rack.boards.crate.line import environment
+from rack.boards.crate.line import build_environment
 from rack.tools.console.answer import Failure
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 
-def apart(work: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs) -> _R:
+def run_in_board_environment(work: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs) -> _R:
     """Call a function in a new process with the environment of boards.
 
     Args:
@@ -38,9 +38,9 @@ def apart(work: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs) -> _R:
     spawn = multiprocessing.get_context("spawn")
     own_end, other_end = spawn.Pipe()
     call = (other_end, os.getpid(), work, args, kwargs)
-    process = spawn.Process(target=_work, args=call, daemon=True)
+    process = spawn.Process(target=_answer_call, args=call, daemon=True)
     saved_environment = dict(os.environ)
-    os.environ.update(environment())
+    os.environ.update(build_environment())
     try:
         process.start()
     finally:
@@ -61,7 +61,7 @@ def apart(work: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs) -> _R:
     return result
 
 
-def _work(
+def _answer_call(
     pipe: Connection, parent: int, work: Callable[..., Any], args: Any, kwargs: dict[str, Any]
 ) -> None:
     """Call the function in the new process, and send the result or the exception."""

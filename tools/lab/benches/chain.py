@@ -15,7 +15,7 @@ from rack.tools.lab.benches import relay
 
 # SCHED_FIFO priorities, as in the bundled configs.
 CLOCK_PRIORITY = 90
-PRIORITY = 80
+BOARD_PRIORITY = 80
 
 
 class Chain(NamedTuple):
@@ -34,7 +34,7 @@ class Chain(NamedTuple):
         """Names of the boards, in the order in which they pass the message."""
         return [f"board{number}" for number in range(1, self.boards + 1)]
 
-    def text(self) -> str:
+    def format_config(self) -> str:
         """Format the config of the rack as TOML."""
         cores = sorted(os.sched_getaffinity(0))
         boards: dict[str, Any] = {}
@@ -43,7 +43,7 @@ class Chain(NamedTuple):
                 "slot": CLOCK_SLOT + 1 + number,
                 "core": cores[-1 - number % len(cores)],
                 "every": 1,
-                "priority": PRIORITY,
+                "priority": BOARD_PRIORITY,
                 "executor": f"{relay.__name__}:{'Relay' if number else 'FirstBoard'}",
             }
             if number:

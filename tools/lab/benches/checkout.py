@@ -13,17 +13,17 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import finished
+from rack.tools.lab.benches.harness import run_program
 
-THIS = "this tree"
-RUN = "import sys; from rack.tools.cli import main; sys.argv[0] = 'rack'; sys.exit(main())"
-WHERE = (
+THIS_TREE = "this tree"
+RUN_RACK = "import sys; from rack.tools.cli import main; sys.argv[0] = 'rack'; sys.exit(main())"
+PRINT_TREE = (
     "from pathlib import Path; import rack.tools.cli as cli;"
     " print(Path(cli.__file__).resolve().parents[1])"
 )
-WHERE_S = 30.0
-ENV = ".venv/installed"
-SOURCES = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
+PRINT_TREE_TIMEOUT_S = 30.0
+ENVIRONMENT_TARGET = ".venv/installed"
+MODULE_VARIABLES = ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")
 """Environment variables through which a process would find modules of this environment."""
 
 
@@ -53,7 +53,7 @@ class RackCommand:
         """
         label = f"{self.name}: rack {' '.join(map(str, arguments[:2]))}"
         argv = [*self.argv, *map(str, arguments)]
-        completed = finished(label, argv, bound_s, self.environment)
+        completed = run_program(label, argv, bound_s, self.environment)
         if completed.returncode:
             lines = filter(str.strip, completed.stderr.splitlines())
             messages = [f"exit status {completed.returncode}", *lines]
@@ -61,17 +61,17 @@ class RackCommand:
         return completed.stdout
 
 
-def rack_commands(against: Path | None) -> list[RackCommand]:
+def build_rack_commands(against: Path | None) -> list[RackCommand]:
     """Return the command of this tree, followed by the command of `against` if it is given.
 
     Raises:
         Failure: If `against` is not a usable checkout.
     """
-    this = RackCommand(THIS, (sys.executable, "-c", RUN))
-    return [this] if against is None else [this, checkout(against)]
+    this = RackCommand(THIS_TREE, (sys.executable, "-c", RUN_RACK))
+    return [this] if against is None else [this, build_checkout_command(against)]
 
 
-def checkout(tree: Path) -> RackCommand:
+def build_checkout_command(tree: Path) -> RackCommand:
     """Return the command of another checkout.
 
     Raises:
@@ -81,15 +81,19 @@ def checkout(tree: Path) -> RackCommand:
         raise Failure(f"{tree}: is not a checkout of rack: it has no tools/cli.py", 2)
     python = tree.resolve() / ".venv" / "bin" / "python"
     if not python.is_file():
-        raise Failure(f"{tree}: has no environment .venv; to create it: make -C {tree} {ENV}", 2)
-    # The working directory may be another tree. Safe path keeps it from being searched first.
-    inherited = {name: value for name, value in os.environ.items() if name not in SOURCES}
-    environment = {**inherited, "PYTHONSAFEPATH": "1"}
-    locate = RackCommand(tree.resolve().name, (str(python), "-c", WHERE), environment)
-    # A copied environment still runs the tree from which it was copied.
-    if (actual := Path(locate.run(bound_s=WHERE_S).strip())) != tree.resolve():
         raise Failure(
-            f"{tree}: its .venv belongs to {actual}; to renew it: make -C {tree} clean {ENV}",
+            f"{tree}: has no environment .venv; to create it: make -C {tree} {ENVIRONMENT_TARGET}",
             2,
         )
-    return replace(locate, argv=(str(python), "-c", RUN))
+    # The working directory may be another tree. Safe path keeps it from being searched first.
+    inherited = {name: value for name, value in os.environ.items() if name not in MODULE_VARIABLES}
+    environment = {**inherited, "PYTHONSAFEPATH": "1"}
+    locate = RackCommand(tree.resolve().name, (str(python), "-c", PRINT_TREE), environment)
+    # A copied environment still runs the tree from which it was copied.
+    if (actual := Path(locate.run(bound_s=PRINT_TREE_TIMEOUT_S).strip())) != tree.resolve():
+        raise Failure(
+            f"{tree}: its .venv belongs to {actual}; to renew it: make -C {tree} clean "
+            f"{ENVIRONMENT_TARGET}",
+            2,
+        )
+    return replace(locate, argv=(str(python), "-c", RUN_RACK))

@@ -21,28 +21,28 @@ import numpy as np
 
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import Blocks, TextTable
-from rack.tools.lab.benches.apart import apart
+from rack.tools.lab.benches.apart import run_in_board_environment
 from rack.tools.lab.benches.chain import Chain
-from rack.tools.lab.benches.checkout import THIS, RackCommand, rack_commands
-from rack.tools.lab.benches.harness import Comparison, Sample, interleaved, shown
-from rack.tools.lab.benches.physics import SERVO, replay
-from rack.tools.recording.cycles import Cycles, cycles_of
+from rack.tools.lab.benches.checkout import THIS_TREE, RackCommand, build_rack_commands
+from rack.tools.lab.benches.harness import Comparison, Sample, call_interleaved, format_value
+from rack.tools.lab.benches.physics import SERVO_BOARD, replay_physics
+from rack.tools.recording.cycles import Cycles, read_cycles
 from rack.tools.recording.recording import Recording
 
 PARTS = ("wake", "read", "process", "write", "bookkeeping")
 """Parts of a cycle in chronological order."""
-EMPTY = "empty"
+EMPTY_RACK = "empty"
 RATE_HZ = 400
 BOARDS = 6
 """Number of boards in the empty rack, enough for four levels, a world model and a planner."""
 LAUNCH_S = 5.0
 """Approximate time for launch and report, in addition to the time of a run, s."""
-BOUND_S = 120.0
+EXTRA_TIMEOUT_S = 120.0
 """Longest time for a run, in addition to ten times its simulated time, s."""
-REPLAYED_TICKS = 1000
+MAX_REPLAYED_TICKS = 1000
 """Maximum number of ticks in one replay of the physics."""
 PHYSICS = "mj_step alone"
-COMPARED = f"{SERVO}, lockstep"
+PHYSICS_CASE = f"{SERVO_BOARD}, lockstep"
 """Case in which the cycle is compared with its physics."""
 
 
@@ -66,7 +66,9 @@ class RackKind(NamedTuple):
 
 
 KINDS = tuple(
-    RackKind(config, mode) for mode in ("real time", "lockstep") for config in (EMPTY, "nasrem")
+    RackKind(config, mode)
+    for mode in ("real time", "lockstep")
+    for config in (EMPTY_RACK, "nasrem")
 )
 
 
@@ -80,25 +82,29 @@ class CycleCosts(Comparison):
 
     parts: Mapping[tuple[str, str], Mapping[str, float]] = field(default_factory=dict)
 
-    def document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, Any]:
         """Convert the comparison and the parts to plain data."""
         parts = [{"case": case, "who": who, **us} for (case, who), us in self.parts.items()]
-        return {**super().document(), "parts_unit": "us", "parts": parts}
+        return {**super().to_document(), "parts_unit": "us", "parts": parts}
 
-    def blocks(self) -> Blocks:
+    def format_blocks(self) -> Blocks:
         """Yield both tables for the terminal."""
         yield "Parts of a board's cycle, processor time, us, median"
         yield TextTable(
             [
-                {"board": board, "who": who, **{part: shown(medians[part]) for part in PARTS}}
+                {
+                    "board": board,
+                    "who": who,
+                    **{part: format_value(medians[part]) for part in PARTS},
+                }
                 for (board, who), medians in self.parts.items()
             ]
         )
         yield ""
-        yield from super().blocks()
+        yield from super().format_blocks()
 
 
-def measure(
+def measure_cycles(
     against: Path | None, seconds: float, rounds: int, progress: Progress, share: bool = False
 ) -> CycleCosts:
     """Run every rack of this tree and of another checkout alternately.
@@ -116,27 +122,27 @@ def measure(
     Raises:
         Failure: If a run fails.
     """
-    commands = rack_commands(against)
+    commands = build_rack_commands(against)
     with TemporaryDirectory() as folder:
-        progress.total(rounds * len(KINDS) * len(commands) * (seconds + LAUNCH_S))
+        progress.set_total(rounds * len(KINDS) * len(commands) * (seconds + LAUNCH_S))
         contestants = {
-            (kind, command.name): partial(_run, kind, command, seconds, folder, share)
+            (kind, command.name): partial(_run_kind, kind, command, seconds, folder, share)
             for kind in KINDS
             for command in commands
         }
-        runs_by_contestant = interleaved(contestants, rounds, progress, seconds + LAUNCH_S)
+        runs_by_contestant = call_interleaved(contestants, rounds, progress, seconds + LAUNCH_S)
     cycles: defaultdict[tuple[str, str], list[Cycles]] = defaultdict(list)
     physics_us: list[float] = []
     for (kind, who), runs in runs_by_contestant.items():
         for run in runs:
             physics_us += run.physics_us
             for board, board_cycles in run.cycles.items():
-                name = EMPTY if kind.config == EMPTY else board
+                name = EMPTY_RACK if kind.config == EMPTY_RACK else board
                 cycles[f"{name}, {kind.mode}", who].append(board_cycles)
-    return costs(cycles, physics_us, commands[-1].name if against else None)
+    return compute_costs(cycles, physics_us, commands[-1].name if against else None)
 
 
-def _run(
+def _run_kind(
     kind: RackKind, command: RackCommand, seconds: float, scratch: str, share: bool
 ) -> CycleRun:
     """Run one rack and return its cycles.
@@ -146,24 +152,26 @@ def _run(
     folder = Path(mkdtemp(dir=scratch))
     lockstep = kind.mode == "lockstep"
     config = kind.config
-    if config == EMPTY:
+    if config == EMPTY_RACK:
         path = folder / "empty.toml"
-        path.write_text(Chain(BOARDS, RATE_HZ).text())
+        path.write_text(Chain(BOARDS, RATE_HZ).format_config())
         config = str(path)
     # Missed cycles must not fail the run: the bench measures only what a cycle costs.
     settings = (f"name=bench-{os.getpid()}", "supervision.max_missed_fraction=1")
     options = [*(f"--set={setting}" for setting in settings), "--seconds", seconds]
     options += ["--lockstep"] * lockstep + ["--share"] * share
     options += ["--out", folder / "run"]
-    command.run("run", config, *options, bound_s=BOUND_S + 10.0 * seconds)
-    all_cycles = cycles_of(Recording(folder / "run"))
+    command.run("run", config, *options, bound_s=EXTRA_TIMEOUT_S + 10.0 * seconds)
+    all_cycles = read_cycles(Recording(folder / "run"))
     cycles = {name: each for name, each in all_cycles.items() if each.task.role == "executor"}
-    if not lockstep or kind.config == EMPTY or command.name != THIS:
+    if not lockstep or kind.config == EMPTY_RACK or command.name != THIS_TREE:
         return CycleRun(cycles, [])
-    return CycleRun(cycles, apart(replay, folder / "run", REPLAYED_TICKS))
+    return CycleRun(
+        cycles, run_in_board_environment(replay_physics, folder / "run", MAX_REPLAYED_TICKS)
+    )
 
 
-def costs(
+def compute_costs(
     cycles: Mapping[tuple[str, str], list[Cycles]], physics_us: list[float], baseline: str | None
 ) -> CycleCosts:
     """Compute the costs of all measured cycles.
@@ -181,20 +189,20 @@ def costs(
     for key in sorted(cycles, key=lambda key: cases.index(key[0])):
         judged_ns = [run.rows["processor_ns"][run.is_judged] for run in cycles[key]]
         samples.append(Sample(*key, tuple((np.concatenate(judged_ns) * 1e-3).tolist()), "us"))
-        run_parts = [parts_of(run) for run in cycles[key]]
+        run_parts = [compute_parts(run) for run in cycles[key]]
         medians = {part: np.concatenate([us[part] for us in run_parts]) for part in PARTS}
         # The bookkeeping of a cycle is in the next record, so a single cycle has no parts.
         if len(medians[PARTS[0]]):
             parts[key] = {part: float(np.median(times_us)) for part, times_us in medians.items()}
     if physics_us:
-        samples.append(Sample(COMPARED, PHYSICS, tuple(physics_us), "us"))
-    baselines = {COMPARED: PHYSICS} if baseline is None else dict.fromkeys(cases, baseline)
+        samples.append(Sample(PHYSICS_CASE, PHYSICS, tuple(physics_us), "us"))
+    baselines = {PHYSICS_CASE: PHYSICS} if baseline is None else dict.fromkeys(cases, baseline)
     return CycleCosts(
         "cycle", "Processor time of a board's cycle", tuple(samples), baselines, parts=parts
     )
 
 
-def parts_of(cycles: Cycles) -> dict[str, np.ndarray]:
+def compute_parts(cycles: Cycles) -> dict[str, np.ndarray]:
     """Return the processor time of each part of the judged cycles, us, shape (n,).
 
     The first cycle is left out.

@@ -18,15 +18,15 @@ import numpy as np
 
 from rack.backplane.process import set_priority
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import Absent, finished
+from rack.tools.lab.benches.harness import Absent, run_program
 
 CYCLICTEST = "cyclictest"
-LONGEST_US = 100_000
+MAX_BIN_US = 100_000
 """Largest lateness with a separate bin in the histogram, us.
 
 Larger ones are counted at the maximum.
 """
-PATIENCE_S = 30.0
+EXTRA_TIMEOUT_S = 30.0
 """Time that the program may take in addition to its wakes, s."""
 
 
@@ -46,21 +46,21 @@ class WakeGrid(NamedTuple):
     priority: int
 
 
-def absent_cyclictest() -> tuple[Absent, ...]:
+def find_missing_cyclictest() -> tuple[Absent, ...]:
     """Report why `cyclictest` cannot run. Empty if it can."""
     if shutil.which(CYCLICTEST) is None:
         return (Absent(CYCLICTEST, f"no program '{CYCLICTEST}'", "apt-get install rt-tests"),)
-    if not permits_fifo():
+    if not is_fifo_permitted():
         return (Absent(CYCLICTEST, "SCHED_FIFO is refused (see `ulimit -r`)"),)
     return ()
 
 
-def permits_fifo() -> bool:
+def is_fifo_permitted() -> bool:
     """Return True if this process may take a real-time priority."""
     return set_priority(1) and set_priority(0)
 
 
-def cyclictest(grid: WakeGrid) -> np.ndarray:
+def run_cyclictest(grid: WakeGrid) -> np.ndarray:
     """Run `cyclictest` and return the lateness of every wake, us, shape (n,), smallest first.
 
     Idle cores are left as they are (`--laptop`), as a rack leaves them by default.
@@ -76,11 +76,11 @@ def cyclictest(grid: WakeGrid) -> np.ndarray:
             f"--priority={grid.priority}",
             f"--interval={grid.period_ns // 1000}",
             f"--loops={grid.wakes}",
-            f"--histogram={LONGEST_US}",
+            f"--histogram={MAX_BIN_US}",
             f"--json={json_path}",
         ]
-        timeout_s = grid.wakes * grid.period_ns * 1e-9 + PATIENCE_S
-        completed = finished(CYCLICTEST, command, timeout_s)
+        timeout_s = grid.wakes * grid.period_ns * 1e-9 + EXTRA_TIMEOUT_S
+        completed = run_program(CYCLICTEST, command, timeout_s)
         if completed.returncode or not json_path.is_file():
             status = f"exit status {completed.returncode}, and no figures"
             raise Failure(f"{CYCLICTEST}: {' '.join(completed.stderr.split()) or status}")
@@ -90,7 +90,7 @@ def cyclictest(grid: WakeGrid) -> np.ndarray:
     return np.repeat([*map(float, counts), float(thread["max"])], [*counts.values(), beyond_count])
 
 
-def late_share(runs: Sequence[np.ndarray], period_ns: int) -> float | None:
+def compute_late_share(runs: Sequence[np.ndarray], period_ns: int) -> float | None:
     """Return the fraction of grid points at which a program was late by a cycle or more.
 
     Skipped points are included.

@@ -25,18 +25,18 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from rack.backplane.process import pin, set_priority
+from rack.backplane.process import pin_to_core, set_priority
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.tables import Blocks, Cell, TextTable, decimal, print_blocks
+from rack.tools.console.tables import Blocks, Cell, TextTable, format_decimal, print_blocks
 
 if TYPE_CHECKING:
     from rack.tools.console.progress import Progress
 
-EXTRA = "pip install 'nasrem-rack[lab]'"
+INSTALL_COMMAND = "pip install 'nasrem-rack[lab]'"
 """Command that installs the peers that are Python packages."""
-END_S = 1.2
+TERMINATION_TIMEOUT_S = 1.2
 """Longest wait for a program to end after SIGTERM, s."""
-FIGURES = ("median", "p99", "best", "worst")
+STATISTICS = ("median", "p99", "best", "worst")
 """Statistics of a sample, in the unit of the sample."""
 _Name = TypeVar("_Name")
 _Result = TypeVar("_Result")
@@ -99,22 +99,22 @@ class Absent:
     install: str = ""
 
     @property
-    def line(self) -> str:
+    def message(self) -> str:
         """Name, reason and command for installation in one line."""
         hint = f"; to install: {self.install}" if self.install else ""
         return f"absent: {self.who}: {self.reason}{hint}"
 
 
-def absent_package(who: str, module: str) -> tuple[Absent, ...]:
+def find_missing_package(who: str, module: str) -> tuple[Absent, ...]:
     """Report a contestant whose Python module cannot be imported. Empty if it can be."""
     try:
         import_module(module)
     except ImportError as error:
-        return (Absent(who, str(error), EXTRA),)
+        return (Absent(who, str(error), INSTALL_COMMAND),)
     return ()
 
 
-def finished(
+def run_program(
     label: str,
     argv: Sequence[str],
     timeout_s: float,
@@ -154,19 +154,19 @@ def finished(
         raise Failure(f"{label}: still running after {timeout_s:g} s") from None
     finally:
         if process.poll() is None:
-            _end(process)
+            _end_program(process)
     return subprocess.CompletedProcess(argv, process.returncode, stdout, stderr)
 
 
 @contextmanager
-def pinned(core: int, priority: int = 0) -> Iterator[None]:
+def stay_on_core(core: int, priority: int = 0) -> Iterator[None]:
     """Keep the calling process on a core while the context lasts.
 
     It also takes the real-time priority if this is permitted.
     """
     cores = os.sched_getaffinity(0)
     try:
-        pin(core)
+        pin_to_core(core)
         set_priority(priority)
         yield
     finally:
@@ -174,11 +174,11 @@ def pinned(core: int, priority: int = 0) -> Iterator[None]:
         os.sched_setaffinity(0, cores)
 
 
-def _end(process: subprocess.Popen[str]) -> None:
+def _end_program(process: subprocess.Popen[str]) -> None:
     """Terminate a program, and kill it if it does not react in time."""
     process.terminate()
     try:
-        process.communicate(timeout=END_S)
+        process.communicate(timeout=TERMINATION_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         process.kill()
         process.communicate()
@@ -205,11 +205,11 @@ class Comparison:
     absent: tuple[Absent, ...] = ()
     conclusion: str = ""
 
-    def sample(self, case: str, who: str) -> Sample | None:
+    def find_sample(self, case: str, who: str) -> Sample | None:
         """Return one sample. None if the contestant was not measured in this case."""
         return self._samples.get((case, who))
 
-    def ratio(self, sample: Sample, figure: str = "median") -> float | None:
+    def compute_ratio(self, sample: Sample, figure: str = "median") -> float | None:
         """Return a statistic of a sample divided by the same statistic of its baseline.
 
         Args:
@@ -228,24 +228,27 @@ class Comparison:
     def _samples(self) -> dict[tuple[str, str], Sample]:
         return {(sample.case, sample.who): sample for sample in self.samples}
 
-    def document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, Any]:
         """Convert the comparison to plain data, without the raw values."""
         return {
             "bench": self.name,
             "title": self.title,
             "baselines": dict(self.baselines),
-            "samples": [self._figures(sample) for sample in self.samples],
+            "samples": [self._format_figures(sample) for sample in self.samples],
             "absent": [asdict(absentee) for absentee in self.absent],
             "conclusion": self.conclusion,
         }
 
-    def _figures(self, sample: Sample) -> dict[str, Any]:
+    def _format_figures(self, sample: Sample) -> dict[str, Any]:
         """Return the statistics of a sample and its ratios to the baseline."""
-        names = ("case", "who", "unit", "count", *FIGURES)
-        ratios = {"ratio": self.ratio(sample), "p99_ratio": self.ratio(sample, "p99")}
+        names = ("case", "who", "unit", "count", *STATISTICS)
+        ratios = {
+            "ratio": self.compute_ratio(sample),
+            "p99_ratio": self.compute_ratio(sample, "p99"),
+        }
         return {name: getattr(sample, name) for name in names} | ratios
 
-    def blocks(self) -> Blocks:
+    def format_blocks(self) -> Blocks:
         """Yield the results for the terminal: a table, absent contestants and the conclusion."""
         yield self.title
         rows: list[dict[str, Cell]] = [
@@ -253,15 +256,15 @@ class Comparison:
                 "case": sample.case,
                 "who": sample.who,
                 "count": sample.count,
-                **{name: shown(getattr(sample, name)) for name in FIGURES},
+                **{name: format_value(getattr(sample, name)) for name in STATISTICS},
                 "unit": sample.unit,
-                "ratio": decimal(self.ratio(sample), 2),
-                "p99 ratio": decimal(self.ratio(sample, "p99"), 2),
+                "ratio": format_decimal(self.compute_ratio(sample), 2),
+                "p99 ratio": format_decimal(self.compute_ratio(sample, "p99"), 2),
             }
             for sample in self.samples
         ]
         yield TextTable(rows, ("count", "worst", "p99 ratio", "best"))
-        yield from (absentee.line for absentee in self.absent)
+        yield from (absentee.message for absentee in self.absent)
         if self.conclusion:
             yield self.conclusion
 
@@ -269,25 +272,25 @@ class Comparison:
 Found = TypeVar("Found", bound=Comparison)
 
 
-def show(measure: Callable[[Progress], Found], as_json: bool) -> Found:
+def measure_and_show(measure: Callable[[Progress], Found], as_json: bool) -> Found:
     """Run a bench with its progress on the terminal, print the result, and return it."""
-    from rack.tools.console.progress import progress_for
+    from rack.tools.console.progress import open_progress
 
-    with progress_for(as_json) as progress:
+    with open_progress(as_json) as progress:
         comparison = measure(progress)
     if as_json:
-        print_json(comparison.document())
+        print_json(comparison.to_document())
     else:
-        print_blocks(comparison.blocks())
+        print_blocks(comparison.format_blocks())
     return comparison
 
 
-def shown(value: float) -> str:
+def format_value(value: float) -> str:
     """Format a value with three significant digits, never with an exponent."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 
-def interleaved(
+def call_interleaved(
     contestants: Mapping[_Name, Callable[[], _Result]],
     rounds: int,
     progress: Progress | None = None,
@@ -312,8 +315,10 @@ def interleaved(
         for name in random.sample([*contestants], len(contestants)):
             if progress is not None:
                 words = name if isinstance(name, tuple) else (name,)
-                progress.begin(f"{', '.join(map(str, words))}: round {round_number} of {rounds}")
+                progress.begin_run(
+                    f"{', '.join(map(str, words))}: round {round_number} of {rounds}"
+                )
             results[name].append(contestants[name]())
             if progress is not None:
-                progress.end(each_s)
+                progress.end_run(each_s)
     return results

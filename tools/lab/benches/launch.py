@@ -23,13 +23,13 @@ from rack.tools.console.progress import Progress
 from rack.tools.faults.campaigns.plan import Kill
 from rack.tools.faults.campaigns.trial import Killer
 from rack.tools.faults.evidence import BRAKES
-from rack.tools.lab.benches.checkout import THIS, RackCommand, rack_commands
-from rack.tools.lab.benches.harness import Comparison, Sample, interleaved
-from rack.tools.lab.benches.observed import endless
+from rack.tools.lab.benches.checkout import THIS_TREE, RackCommand, build_rack_commands
+from rack.tools.lab.benches.harness import Comparison, Sample, call_interleaved
+from rack.tools.lab.benches.observed import remove_run_end
 
-BOUND_S = 60.0
+COMMAND_TIMEOUT_S = 60.0
 """Longest time that a command may take, s."""
-KILL_S = 2.5
+KILL_INTERVAL_S = 2.5
 """Time between kills, in which the board returns and the arm moves again, s."""
 RUN_S = 0.25
 """Simulated time of a run of which only the launch is measured, s."""
@@ -39,7 +39,7 @@ ROUND_S = 8.0
 """Expected time of a round of launches and commands, s."""
 
 
-def measure(
+def measure_launches(
     name: str, rounds: int, kills: int, against: Path | None, share: bool, progress: Progress
 ) -> Comparison:
     """Measure how long launches, commands and reactions to kills take.
@@ -55,15 +55,15 @@ def measure(
     Raises:
         Failure: If a command fails, or the rack has no arm.
     """
-    progress.total(rounds * ROUND_S + kills * KILL_S)
-    trees = rack_commands(against)
+    progress.set_total(rounds * ROUND_S + kills * KILL_INTERVAL_S)
+    trees = build_rack_commands(against)
     with tempfile.TemporaryDirectory() as folder:
-        progress.begin("launches and commands")
+        progress.begin_run("launches and commands")
         samples = _measure_commands(name, trees, Path(folder), rounds, share)
-        progress.end(rounds * ROUND_S)
-        progress.begin("kills")
+        progress.end_run(rounds * ROUND_S)
+        progress.begin_run("kills")
         samples += measure_kills(name, kills, share)
-        progress.end(kills * KILL_S)
+        progress.end_run(kills * KILL_INTERVAL_S)
     cases = [sample.case for sample in samples if sample.who == INTERPRETER]
     baselines = dict.fromkeys(cases, INTERPRETER)
     if against is not None:
@@ -78,7 +78,7 @@ def _measure_commands(
 ) -> list[Sample]:
     """Measure launches and commands alternately."""
     this_tree = trees[0]
-    run = run_briefly(this_tree, name, folder / "run", share)
+    run = make_brief_run(this_tree, name, folder / "run", share)
     idle = load(name, [f"name=bench-{os.getpid()}", "clock.mode=lockstep"])
     commands: dict[str, tuple[object, ...]] = {
         "rack --help": ("--help",),
@@ -87,23 +87,23 @@ def _measure_commands(
         "rack report": ("report", run),
     }
     contestants: dict[tuple[str, str], Callable[[], float]] = {
-        (LAUNCH, tree.name): partial(launch_s, tree, name, folder, share) for tree in trees
+        (LAUNCH, tree.name): partial(measure_launch_s, tree, name, folder, share) for tree in trees
     }
     python = RackCommand(INTERPRETER, (sys.executable, "-c", "import numpy"))
     for case, arguments in commands.items():
-        contestants[case, this_tree.name] = partial(_command_s, this_tree, arguments)
-        contestants[case, INTERPRETER] = partial(_command_s, python, ())
+        contestants[case, this_tree.name] = partial(_measure_command_s, this_tree, arguments)
+        contestants[case, INTERPRETER] = partial(_measure_command_s, python, ())
     # The boards of this rack wait for its clock. It gives `list` and `status` a rack to show, and
     # uses no core.
     with Rack(idle):
-        times = interleaved(contestants, rounds)
+        times = call_interleaved(contestants, rounds)
     return [
         Sample(case, who, tuple(1e3 * seconds for seconds in times_s), "ms")
         for (case, who), times_s in times.items()
     ]
 
 
-def launch_s(rack: RackCommand, config: str, folder: Path, share: bool) -> float:
+def measure_launch_s(rack: RackCommand, config: str, folder: Path, share: bool) -> float:
     """Return the time from the start of `rack run` to the first cycle of the fastest level, s.
 
     Args:
@@ -114,11 +114,11 @@ def launch_s(rack: RackCommand, config: str, folder: Path, share: bool) -> float
     """
     with tempfile.TemporaryDirectory(dir=folder) as run_folder:
         start_ns = time.monotonic_ns()
-        run = run_briefly(rack, config, Path(run_folder) / "run", share)
-        return (first_cycle_ns(run, fastest(load(config))) - start_ns) * 1e-9
+        run = make_brief_run(rack, config, Path(run_folder) / "run", share)
+        return (find_first_cycle_ns(run, find_fastest_board(load(config))) - start_ns) * 1e-9
 
 
-def run_briefly(rack: RackCommand, config: str, out: Path, share: bool) -> Path:
+def make_brief_run(rack: RackCommand, config: str, out: Path, share: bool) -> Path:
     """Make a run of which only the launch is used, and return its folder.
 
     Args:
@@ -129,18 +129,18 @@ def run_briefly(rack: RackCommand, config: str, out: Path, share: bool) -> Path:
     """
     options = ["--set", f"name=bench-run-{os.getpid()}", "--seconds", f"{RUN_S}", "--json"]
     # Missed cycles must not fail the run. Earlier checkouts do not have this key.
-    options += ["--set=supervision.max_missed_fraction=1"] * (rack.name == THIS)
+    options += ["--set=supervision.max_missed_fraction=1"] * (rack.name == THIS_TREE)
     options += ["--share"] * share
-    rack.run("run", config, *options, "--out", out, bound_s=BOUND_S)
+    rack.run("run", config, *options, "--out", out, bound_s=COMMAND_TIMEOUT_S)
     return out
 
 
-def fastest(config: RackConfig) -> str:
+def find_fastest_board(config: RackConfig) -> str:
     """Return the name of the executor with the shortest period."""
-    return min(config.board, key=config.every)
+    return min(config.board, key=config.find_period)
 
 
-def first_cycle_ns(run: Path, task: str) -> int:
+def find_first_cycle_ns(run: Path, task: str) -> int:
     """Return the CLOCK_MONOTONIC time at which the first recorded cycle of a task started, ns.
 
     The file is read directly, because another checkout may write other columns.
@@ -155,10 +155,10 @@ def first_cycle_ns(run: Path, task: str) -> int:
     return int(started)
 
 
-def _command_s(rack: RackCommand, arguments: tuple[object, ...]) -> float:
+def _measure_command_s(rack: RackCommand, arguments: tuple[object, ...]) -> float:
     """Return the time that a command takes, s."""
     start_s = time.monotonic()
-    rack.run(*arguments, bound_s=BOUND_S)
+    rack.run(*arguments, bound_s=COMMAND_TIMEOUT_S)
     return time.monotonic() - start_s
 
 
@@ -179,16 +179,16 @@ def measure_kills(name: str, count: int, share: bool = True) -> list[Sample]:
     config = load(name, [f"name=bench-kill-{os.getpid()}", "supervision.restarts=10000"])
     if config.robot is None:
         raise Failure(f"{name}: has no arm whose brakes could engage", 2)
-    servo = fastest(config)
+    servo = find_fastest_board(config)
     random = Random(count)
     # Add one tick to vary the phase of each kill within the slower cycles.
-    interval_ticks = round(KILL_S * 1e9 / config.clock_ns) + 1
+    interval_ticks = round(KILL_INTERVAL_S * 1e9 / config.clock_ns) + 1
     kills = [Kill(servo, n * interval_ticks, random.random()) for n in range(1, count + 1)]
-    with Rack(endless(config), share=share) as rack:
+    with Rack(remove_run_end(config), share=share) as rack:
         killer = Killer(rack.segment, kills)
-        rack.start(KILL_S * (count + 1))
-        while rack.watch(killer.due_in_s()):
-            killer.advance()
+        rack.start(KILL_INTERVAL_S * (count + 1))
+        while rack.watch(killer.compute_wait_s()):
+            killer.kill_due_board()
         # Offset from CLOCK_MONOTONIC to the time of events.
         offset_ns = time.time_ns() - time.monotonic_ns()
         epoch_ns = rack.segment.words[System.EPOCH_NS]

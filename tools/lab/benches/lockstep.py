@@ -23,17 +23,17 @@ from rack.boards import OneProcess
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.apart import apart
-from rack.tools.lab.benches.checkout import RackCommand, rack_commands
-from rack.tools.lab.benches.harness import Comparison, Sample, interleaved, shown
+from rack.tools.lab.benches.apart import run_in_board_environment
+from rack.tools.lab.benches.checkout import RackCommand, build_rack_commands
+from rack.tools.lab.benches.harness import Comparison, Sample, call_interleaved, format_value
 from rack.tools.recording.recording import Recording
 
 RACKS: Mapping[str, float | None] = {"nasrem": None, "k1607": None, "fig4": 10.0}
 """Simulated time of a run of each rack, s. None to run until its task ends."""
-BARE = "no rack"
+WITHOUT_RACK = "no rack"
 EXPECTED_S = 10.0
 """Approximate time of a run, s."""
-BOUND_S = 600.0
+RUN_TIMEOUT_S = 600.0
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class BareRun:
     last: Mapping[str, np.ndarray]
 
 
-def measure(
+def measure_lockstep(
     against: Path | None, racks: Mapping[str, float | None], rounds: int, progress: Progress
 ) -> Comparison:
     """Run every rack, its levels without a rack, and the rack of another checkout alternately.
@@ -71,26 +71,26 @@ def measure(
     Raises:
         Failure: If a run fails, or if the levels without a rack did different work.
     """
-    commands = rack_commands(against)
-    progress.total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
+    commands = build_rack_commands(against)
+    progress.set_total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
     samples = []
     for rack, seconds in racks.items():
-        progress.begin(f"{rack}: recorded, and compared with its levels without a rack")
+        progress.begin_run(f"{rack}: recorded, and compared with its levels without a rack")
         options = ["--set", f"name=bench-{os.getpid()}"]
         options += [] if seconds is None else ["--seconds", f"{seconds}"]
         with TemporaryDirectory() as folder:
-            ticks = _check(rack, options, Path(folder) / "run")
-        progress.end(EXPECTED_S, "equal")
-        runs = {each.name: partial(_run, each, rack, options) for each in commands}
-        runs[BARE] = partial(_run_bare, rack, ticks)
-        times = interleaved(runs, rounds, progress, EXPECTED_S)
+            ticks = _check_bare_run(rack, options, Path(folder) / "run")
+        progress.end_run(EXPECTED_S, "equal")
+        runs = {each.name: partial(_run_rack, each, rack, options) for each in commands}
+        runs[WITHOUT_RACK] = partial(_run_bare, rack, ticks)
+        times = call_interleaved(runs, rounds, progress, EXPECTED_S)
         samples += [Sample(rack, who, tuple(times_ms), "ms") for who, times_ms in times.items()]
-    return compare(samples, commands[-1].name if against else BARE)
+    return build_comparison(samples, commands[-1].name if against else WITHOUT_RACK)
 
 
-def compare(samples: Sequence[Sample], baseline: str) -> Comparison:
+def build_comparison(samples: Sequence[Sample], baseline: str) -> Comparison:
     """Compare samples with one contestant, and conclude with simulated seconds per second."""
-    speeds = [f"{one.case} {shown(1e3 / one.median)} ({one.who})" for one in samples]
+    speeds = [f"{one.case} {format_value(1e3 / one.median)} ({one.who})" for one in samples]
     return Comparison(
         name="lockstep",
         title="Time of a simulated second in lockstep",
@@ -100,27 +100,29 @@ def compare(samples: Sequence[Sample], baseline: str) -> Comparison:
     )
 
 
-def _run(command: RackCommand, rack: str, options: Sequence[object]) -> float:
+def _run_rack(command: RackCommand, rack: str, options: Sequence[object]) -> float:
     """Run a rack by a command, and return the time of a simulated second, ms."""
     result = json.loads(
-        command.run("run", rack, "--lockstep", "--no-record", "--json", *options, bound_s=BOUND_S)
+        command.run(
+            "run", rack, "--lockstep", "--no-record", "--json", *options, bound_s=RUN_TIMEOUT_S
+        )
     )
-    return _ms_a_second(rack, result["wall_s"], result["outcome"]["ticks"])
+    return _compute_ms_per_second(rack, result["wall_s"], result["outcome"]["ticks"])
 
 
 def _run_bare(rack: str, ticks: int) -> float:
     """Run the levels without a rack, and return the time of a simulated second, ms."""
-    return _ms_a_second(rack, _bare(rack, ticks).processor_s, ticks)
+    return _compute_ms_per_second(rack, _run_bare_apart(rack, ticks).processor_s, ticks)
 
 
-def _ms_a_second(rack: str, run_s: float, ticks: int) -> float:
+def _compute_ms_per_second(rack: str, run_s: float, ticks: int) -> float:
     """Convert the time of a run, s, to the time of a simulated second, ms."""
     return run_s / ticks * 1e12 / load(rack).clock_ns
 
 
-def _bare(rack: str, ticks: int) -> BareRun:
+def _run_bare_apart(rack: str, ticks: int) -> BareRun:
     """Run the levels without a rack in a new process with the environment of boards."""
-    return apart(run_bare, load(rack, ["clock.mode=lockstep"]), ticks)
+    return run_in_board_environment(run_bare, load(rack, ["clock.mode=lockstep"]), ticks)
 
 
 def run_bare(config: RackConfig, ticks: int) -> BareRun:
@@ -133,7 +135,7 @@ def run_bare(config: RackConfig, ticks: int) -> BareRun:
         return BareRun(ticks, processor_s, rack.serials, last)
 
 
-def _check(rack: str, options: Sequence[object], folder: Path) -> int:
+def _check_bare_run(rack: str, options: Sequence[object], folder: Path) -> int:
     """Record a rack in lockstep and compare it with its levels alone.
 
     Args:
@@ -147,11 +149,11 @@ def _check(rack: str, options: Sequence[object], folder: Path) -> int:
     Raises:
         Failure: If the levels alone did different work.
     """
-    this_tree = rack_commands(None)[0]
-    this_tree.run("run", rack, "--lockstep", *options, "--out", folder, bound_s=BOUND_S)
+    this_tree = build_rack_commands(None)[0]
+    this_tree.run("run", rack, "--lockstep", *options, "--out", folder, bound_s=RUN_TIMEOUT_S)
     recording = Recording(folder)
-    ticks = int(recording.ended["outcome"]["ticks"])
-    differing = list(differences(recording, _bare(rack, ticks)))
+    ticks = int(recording.end_counts["outcome"]["ticks"])
+    differing = list(find_differences(recording, _run_bare_apart(rack, ticks)))
     if differing:
         raise Failure(
             f"{rack}: its levels without a rack did different work, first in {differing[0]}"
@@ -159,25 +161,28 @@ def _check(rack: str, options: Sequence[object], folder: Path) -> int:
     return ticks
 
 
-def differences(recording: Recording, bare: BareRun) -> Iterator[str]:
+def find_differences(recording: Recording, bare: BareRun) -> Iterator[str]:
     """Yield every mailbox or message field in which a recorded run and its levels alone differ.
 
     The newest message that was visible before the end is compared. Later ones may not be recorded.
     """
     for name in sorted({*recording.mailboxes, *bare.serials}):
-        visible_rows = np.flatnonzero(recording.signal(name, "visible_at") < bare.ticks)
-        serial = recording.signal(name, "serial")[visible_rows[-1]] if len(visible_rows) else None
+        visible_rows = np.flatnonzero(recording.read_signal(name, "visible_at") < bare.ticks)
+        serial = (
+            recording.read_signal(name, "serial")[visible_rows[-1]] if len(visible_rows) else None
+        )
         if serial != bare.serials.get(name):
             yield f"the number of messages in {name}"
         elif serial is not None:
             last = bare.last[name]
-            for field in sorted(recording.fields(name) & set(last.dtype.names or ())):
+            for field in sorted(recording.list_fields(name) & set(last.dtype.names or ())):
                 if not np.array_equal(
-                    _plain(recording.signal(name, field)[visible_rows[-1]]), _plain(last[field])
+                    _to_plain_value(recording.read_signal(name, field)[visible_rows[-1]]),
+                    _to_plain_value(last[field]),
                 ):
                     yield f"{name}, field {field}"
 
 
-def _plain(value: Any) -> Any:
+def _to_plain_value(value: Any) -> Any:
     """Return a value of a message, with text converted as the recorder stores it."""
     return value.decode("ascii", "replace") if isinstance(value, bytes) else value

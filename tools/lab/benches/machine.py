@@ -22,44 +22,50 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rack.backplane.process import cores_kept_awake
+from rack.backplane.process import keep_cores_awake
 from rack.boards.config import RackConfig, load
-from rack.boards.config.layout import obtained_core
+from rack.boards.config.layout import find_core
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.console.tables import Blocks
 from rack.tools.lab.benches.cyclictest import (
     CYCLICTEST,
     WakeGrid,
-    absent_cyclictest,
-    cyclictest,
-    late_share,
-    permits_fifo,
+    compute_late_share,
+    find_missing_cyclictest,
+    is_fifo_permitted,
+    run_cyclictest,
 )
-from rack.tools.lab.benches.harness import Absent, Comparison, Sample, interleaved, shown
+from rack.tools.lab.benches.harness import (
+    Absent,
+    Comparison,
+    Sample,
+    call_interleaved,
+    format_value,
+)
 from rack.tools.lab.benches.observed import (
-    UNVIEWED,
+    UNVIEWED_SETTINGS,
+    compute_lateness_us,
     count_cycles,
-    endless,
-    lateness_us,
-    record,
+    record_rack,
+    remove_run_end,
 )
 
 RATES_HZ = (400.0, 500.0, 1000.0, 2000.0)
-PERMITTED = 0.001
+MAX_LATE_SHARE = 0.001
 """Largest share of late cycles at which a rate counts as held.
 
 It applies to the cycles that a board misses in addition to the machine's late wakes, and to the
 wakes of `cyclictest` that are late by a cycle.
 """
-STEP_MS = 0.5
+MAX_STEP_MS = 0.5
 """Longest time step of the simulated arm, ms, as in the bundled racks."""
 LAUNCH_S = 3.0
-AWAKE = ", idle cores awake"
+AWAKE_SUFFIX = ", idle cores awake"
 """Suffix of the name of the rack that runs with idle cores kept awake."""
 
 
-def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
+def change_rate(config: RackConfig, rate_hz: float) -> RackConfig:
     """Return a rack whose fastest board cycles at `rate_hz`, at every tick.
 
     The other boards keep their cycle times, and plans of the fastest board keep their time limit.
@@ -67,7 +73,7 @@ def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
     Raises:
         Failure: If the rack has no board at every tick.
     """
-    fastest = [name for name in config.board if config.every(name) == 1]
+    fastest = [name for name in config.board if config.find_period(name) == 1]
     if not fastest:
         raise Failure(
             f"rack '{config.name}': no board cycles at every tick of its clock, therefore no rate"
@@ -76,15 +82,15 @@ def at_rate(config: RackConfig, rate_hz: float) -> RackConfig:
     period_ms = 1e3 / rate_hz
     scale = config.clock.period_ms / period_ms
     boards = {}
-    for name, board in endless(config).board.items():
-        changes: dict[str, Any] = {"every": max(1, round(config.every(name) * scale))}
+    for name, board in remove_run_end(config).board.items():
+        changes: dict[str, Any] = {"every": max(1, round(config.find_period(name) * scale))}
         if name in fastest:
             changes = {"every": 1, "within_cycles": max(1, round(board.within_cycles * scale))}
         boards[name] = board.model_copy(update={**changes, "rate_hz": None})
     robot = config.robot
     if robot is not None:
         # Rounding makes 2.5 ms / 0.5 ms exactly 5.
-        robot = robot.model_copy(update={"substeps": math.ceil(round(period_ms / STEP_MS, 6))})
+        robot = robot.model_copy(update={"substeps": math.ceil(round(period_ms / MAX_STEP_MS, 6))})
     clock = config.clock.model_copy(
         update={"period_ms": period_ms, "mode": "realtime", "speed": 1.0}
     )
@@ -113,9 +119,9 @@ class RateFigures:
     def reason(self) -> str:
         """Reason for which the rate is not held. Empty if it is held."""
         late = self.late or 0.0
-        if self.failure or late > PERMITTED:
+        if self.failure or late > MAX_LATE_SHARE:
             return self.failure or "the machine is late"
-        return "the rack is late" if self.missed - late > PERMITTED else ""
+        return "the rack is late" if self.missed - late > MAX_LATE_SHARE else ""
 
     @property
     def verdict(self) -> str:
@@ -124,7 +130,7 @@ class RateFigures:
 
 
 @dataclass(frozen=True)
-class Machine(Comparison):
+class MachineComparison(Comparison):
     """Comparison of the lateness of a board with `cyclictest`, with a verdict on the machine.
 
     Attributes:
@@ -152,7 +158,7 @@ class Machine(Comparison):
         return self.is_fifo and self.highest_hz is not None
 
     @property
-    def verdict(self) -> Iterator[str]:
+    def verdict_lines(self) -> Iterator[str]:
         """Lines that tell up to which rate the machine is fit, and why not beyond."""
         highest = self.highest_hz
         if not self.is_fifo:
@@ -164,45 +170,50 @@ class Machine(Comparison):
         for rate in self.rates:
             late = "" if rate.late is None else f", {CYCLICTEST} late in {rate.late:.2%}"
             counts = f"missed {rate.missed:.2%} of {rate.cycles} cycles{late}"
-            yield (f"{rate.rate_hz:g} Hz {rate.verdict}; {counts}; {self._worst(rate.rate_hz)}")
+            yield (
+                f"{rate.rate_hz:g} Hz {rate.verdict}; {counts}; "
+                f"{self._format_worst_lateness(rate.rate_hz)}"
+            )
 
-    def _worst(self, rate_hz: float) -> str:
+    def _format_worst_lateness(self, rate_hz: float) -> str:
         """Format the worst lateness of the board and of `cyclictest` at a rate."""
-        samples = ((who, self.sample(_case(rate_hz), who)) for who in (self.who, CYCLICTEST))
-        known = (f"{who} {shown(sample.worst)} us" for who, sample in samples if sample)
+        samples = (
+            (who, self.find_sample(_format_case(rate_hz), who)) for who in (self.who, CYCLICTEST)
+        )
+        known = (f"{who} {format_value(sample.worst)} us" for who, sample in samples if sample)
         return f"worst lateness: {', '.join(known) or 'unknown'}"
 
-    def document(self) -> dict[str, Any]:
+    def to_document(self) -> dict[str, Any]:
         """Convert the comparison and the verdict to plain data, without the raw values."""
         rates = [{**asdict(rate), "held": not rate.reason} for rate in self.rates]
         return {
-            **super().document(),
+            **super().to_document(),
             "fit": self.is_fit,
             "highest_hz": self.highest_hz,
             "fifo": self.is_fifo,
-            "permitted": PERMITTED,
+            "permitted": MAX_LATE_SHARE,
             "rates": rates,
         }
 
-    def blocks(self) -> Blocks:
+    def format_blocks(self) -> Blocks:
         """Yield the verdict, then the lateness as a table."""
-        yield from self.verdict
+        yield from self.verdict_lines
         yield ""
-        yield from super().blocks()
+        yield from super().format_blocks()
 
 
-def _case(rate_hz: float) -> str:
+def _format_case(rate_hz: float) -> str:
     return f"{rate_hz:g} Hz"
 
 
-def measure(
+def measure_machine(
     name: str,
     rates_hz: Sequence[float],
     seconds: float,
     rounds: int,
     share: bool,
     progress: Progress,
-) -> Machine:
+) -> MachineComparison:
     """Run a rack at every rate, alternately with `cyclictest` on the core of its fastest board.
 
     Args:
@@ -219,57 +230,63 @@ def measure(
     Raises:
         Failure: If the rack has no board at every tick, or `cyclictest` fails.
     """
-    config = load(name, [f"name=bench-{os.getpid()}", *UNVIEWED])
-    racks = {rate_hz: at_rate(config, rate_hz) for rate_hz in sorted(set(rates_hz))}
-    fastest = next(board for board in config.board if config.every(board) == 1)
-    core = obtained_core(config.board[fastest].core)
+    config = load(name, [f"name=bench-{os.getpid()}", *UNVIEWED_SETTINGS])
+    racks = {rate_hz: change_rate(config, rate_hz) for rate_hz in sorted(set(rates_hz))}
+    fastest = next(board for board in config.board if config.find_period(board) == 1)
+    core = find_core(config.board[fastest].core)
     label = f"'{fastest}' of {Path(name).stem}"
-    absent = [*absent_cyclictest()]
+    absent = [*find_missing_cyclictest()]
     is_compared = not absent
-    with cores_kept_awake() as refusal:
+    with keep_cores_awake() as refusal:
         if refusal:
-            absent.append(Absent(label + AWAKE, refusal))
+            absent.append(Absent(label + AWAKE_SUFFIX, refusal))
     each_s = rounds * (3 * seconds + 2 * LAUNCH_S)
-    progress.total(len(racks) * each_s)
+    progress.set_total(len(racks) * each_s)
     rates = []
     samples = []
     for rate_hz, rack in racks.items():
-        progress.begin(_case(rate_hz))
+        progress.begin_run(_format_case(rate_hz))
         priority = config.board[fastest].priority or 1
         wakes = max(1, round(seconds * rate_hz))
         grid = WakeGrid(core, round(1e9 / rate_hz), wakes, priority)
         contestants: dict[str, Callable[[], RackRun]] = {
-            label: partial(_run, rack, fastest, seconds, share, awake=False)
+            label: partial(_run_rack, rack, fastest, seconds, share, awake=False)
         }
         if not refusal:
-            contestants[label + AWAKE] = partial(_run, rack, fastest, seconds, share, awake=True)
+            contestants[label + AWAKE_SUFFIX] = partial(
+                _run_rack, rack, fastest, seconds, share, awake=True
+            )
         if is_compared:
-            contestants[CYCLICTEST] = partial(_sleep, grid)
-        runs = interleaved(contestants, rounds)
+            contestants[CYCLICTEST] = partial(_run_cyclictest, grid)
+        runs = call_interleaved(contestants, rounds)
         for contestant, its_runs in runs.items():
             late_us = np.concatenate([run.late_us for run in its_runs])
             if len(late_us):
-                samples.append(Sample(_case(rate_hz), contestant, tuple(late_us.tolist()), "us"))
+                samples.append(
+                    Sample(_format_case(rate_hz), contestant, tuple(late_us.tolist()), "us")
+                )
         cycles = count_cycles(run.counts for run in runs[label])
         rates.append(
             RateFigures(
                 rate_hz=rate_hz,
                 cycles=cycles.due,
                 missed=cycles.share,
-                late=late_share([run.late_us for run in runs.get(CYCLICTEST, ())], grid.period_ns),
+                late=compute_late_share(
+                    [run.late_us for run in runs.get(CYCLICTEST, ())], grid.period_ns
+                ),
                 failure=next(filter(None, (run.failure for run in runs[label])), ""),
             )
         )
-        progress.end(each_s, rates[-1].verdict)
-    return Machine(
+        progress.end_run(each_s, rates[-1].verdict)
+    return MachineComparison(
         name="machine",
         title=f"lateness: from grid point to start, on core {core}",
         samples=tuple(samples),
-        baselines=dict.fromkeys(map(_case, racks), CYCLICTEST),
+        baselines=dict.fromkeys(map(_format_case, racks), CYCLICTEST),
         absent=tuple(absent),
         conclusion=compare_idle_cores(samples, label),
         who=label,
-        is_fifo=permits_fifo(),
+        is_fifo=is_fifo_permitted(),
         rates=tuple(rates),
     )
 
@@ -288,19 +305,19 @@ class RackRun(NamedTuple):
     failure: str = ""
 
 
-def _run(rack: RackConfig, board: str, seconds: float, share: bool, awake: bool) -> RackRun:
+def _run_rack(rack: RackConfig, board: str, seconds: float, share: bool, awake: bool) -> RackRun:
     """Run a rack once, and return the lateness of a board with its counts."""
     with (
         TemporaryDirectory(prefix="rack-bench-") as folder,
-        cores_kept_awake() if awake else nullcontext(),
+        keep_cores_awake() if awake else nullcontext(),
     ):
-        result, recording = record(rack, seconds, Path(folder), share)
-        late_us = lateness_us(recording, board)
+        result, recording = record_rack(rack, seconds, Path(folder), share)
+        late_us = compute_lateness_us(recording, board)
         return RackRun(late_us, result.tasks[board], result.outcome.failure)
 
 
-def _sleep(grid: WakeGrid) -> RackRun:
-    return RackRun(cyclictest(grid))
+def _run_cyclictest(grid: WakeGrid) -> RackRun:
+    return RackRun(run_cyclictest(grid))
 
 
 def compare_idle_cores(samples: Sequence[Sample], who: str) -> str:
@@ -318,13 +335,15 @@ def compare_idle_cores(samples: Sequence[Sample], who: str) -> str:
         The recommendation. Empty unless both settings were measured.
     """
     results = []
-    for setting, name in (("sleep", who), ("awake", who + AWAKE)):
+    for setting, name in (("sleep", who), ("awake", who + AWAKE_SUFFIX)):
         runs = [sample for sample in samples if sample.who == name]
         if not runs:
             return ""
         lost = sum(us >= 1e6 / float(each.case.split()[0]) for each in runs for us in each.values)
         worst_us = max(each.worst for each in runs)
-        figures = f'"{setting}", {lost} wake-ups late by a period, worst {shown(worst_us)} us'
+        figures = (
+            f'"{setting}", {lost} wake-ups late by a period, worst {format_value(worst_us)} us'
+        )
         results.append((lost, worst_us, figures))
     total = sum(lost for lost, _, _ in results)
     is_apart = abs(results[0][0] - results[1][0]) > 2.0 * math.sqrt(total)

@@ -21,25 +21,25 @@ from rack.backplane.layout import PROTOCOLS, InterruptSpec, Layout, MailboxSpec,
 from rack.backplane.mailbox.interrupt import open_inbox
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import AnyMessage, Command, field
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.silence_watch import ReadingTask
-from rack.backplane.watch.watched_reader import watched
-from rack.boards.config.layout import field_specs
-from rack.boards.faults.bounds import counting
-from rack.boards.run.port_tables import Line, ReadTable, WriteTable, can_read, can_write
+from rack.backplane.watch.watched_reader import open_watched
+from rack.boards.config.layout import build_field_specs
+from rack.boards.faults.bounds import format_count
+from rack.boards.run.port_tables import InputMailbox, ReadTable, WriteTable, can_read, can_write
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import (
     Absent,
     Comparison,
     Sample,
-    absent_package,
-    interleaved,
+    call_interleaved,
+    find_missing_package,
 )
 from rack.tools.lab.benches.transports import PEERS, Peer, Transport
 
-SIZES = {"64 B": 64, "200 B": 200, "2 kB": 2048, "16 kB": 16384}
+SIZE_BYTES = {"64 B": 64, "200 B": 200, "2 kB": 2048, "16 kB": 16384}
 """Message sizes in bytes. A message has a serial and three arrays of numbers."""
 READERS = (1, 4)
 BATCH_S = 0.001
@@ -51,7 +51,7 @@ CASE_S = 5.0
 """Approximate time of a case, s."""
 
 
-class Bench(Command, version=1):
+class BenchMessage(Command, version=1):
     """Message whose transport is measured."""
 
     position: np.ndarray = field(unit="rad", doc="joint positions", shape="joints")
@@ -68,19 +68,19 @@ class Case(NamedTuple):
     @property
     def name(self) -> str:
         """Name of the case for people."""
-        return f"{self.size}, {counting(self.readers, 'reader')}"
+        return f"{self.size}, {format_count(self.readers, 'reader')}"
 
     @property
     def lengths(self) -> dict[str, int]:
         """Lengths of the arrays that give the message its size."""
-        numbers = SIZES[self.size] // 8 - 1
+        numbers = SIZE_BYTES[self.size] // 8 - 1
         return {"joints": numbers // 3, "rest": numbers - 2 * (numbers // 3)}
 
 
-CASES = tuple(Case(size, readers) for readers in READERS for size in SIZES)
+CASES = tuple(Case(size, readers) for readers in READERS for size in SIZE_BYTES)
 
 
-def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Comparison:
+def measure_mailboxes(cases: Sequence[Case], rounds: int, progress: Progress) -> Comparison:
     """Measure every installed contestant in every case.
 
     Args:
@@ -91,19 +91,19 @@ def measure(cases: Sequence[Case], rounds: int, progress: Progress) -> Compariso
     Returns:
         Comparison with the best peer of each case.
     """
-    absentees = {peer.name: absent_package(peer.name, peer.module) for peer in PEERS}
+    absentees = {peer.name: find_missing_package(peer.name, peer.module) for peer in PEERS}
     present = [peer for peer in PEERS if not absentees[peer.name]]
-    progress.total(CASE_S * len(cases))
+    progress.set_total(CASE_S * len(cases))
     samples: list[Sample] = []
     for case in cases:
-        progress.begin(case.name)
+        progress.begin_run(case.name)
         samples += _measure_case(case, present, rounds)
-        progress.end(CASE_S)
+        progress.end_run(CASE_S)
     absent = tuple(absentee for each in absentees.values() for absentee in each)
-    return compare(samples, absent)
+    return build_comparison(samples, absent)
 
 
-def compare(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison:
+def build_comparison(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison:
     """Compare samples with the best peer of each case."""
     peers = {peer.name for peer in PEERS}
     baselines = {}
@@ -122,22 +122,24 @@ def compare(samples: Sequence[Sample], absent: tuple[Absent, ...]) -> Comparison
 
 def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample]:
     """Measure all contestants in one case."""
-    dtype = Bench.message_type.dtype(case.lengths)
+    dtype = BenchMessage.message_type.build_dtype(case.lengths)
     with ExitStack() as stack:
         transports: dict[str, Transport] = {
-            p: stack.enter_context(_mailbox(p, case)) for p in PROTOCOLS
+            p: stack.enter_context(_open_mailbox(p, case)) for p in PROTOCOLS
         }
         transports |= {
-            peer.name: stack.enter_context(peer.opened(dtype, case.readers)) for peer in peers
+            peer.name: stack.enter_context(peer.open_transport(dtype, case.readers))
+            for peer in peers
         }
         exchanges = {
-            name: exchange(name, transport, case.lengths) for name, transport in transports.items()
+            name: build_exchange(name, transport, case.lengths)
+            for name, transport in transports.items()
         }
-        times_us = interleaved(exchanges, rounds)
+        times_us = call_interleaved(exchanges, rounds)
     return [Sample(case.name, name, tuple(values), "us") for name, values in times_us.items()]
 
 
-def exchange(name: str, transport: Transport, lengths: dict[str, int]) -> Callable[[], float]:
+def build_exchange(name: str, transport: Transport, lengths: dict[str, int]) -> Callable[[], float]:
     """Build a function that makes many exchanges and returns the time of one, us.
 
     Args:
@@ -173,33 +175,33 @@ def exchange(name: str, transport: Transport, lengths: dict[str, int]) -> Callab
 
 
 @contextmanager
-def _mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
+def _open_mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
     """Open a mailbox of ours in a separate segment."""
     rack = f"bench-{os.getpid()}-{protocol}"
-    layout = _layout(rack, protocol, case)
+    layout = _build_layout(rack, protocol, case)
     with ExitStack() as names:
         # Register the clean-up before the names exist, because an interrupt may come at any time.
-        names.callback(unlink, rack)
+        names.callback(unlink_segment, rack)
         segment = Segment.create(layout, "")
         (box,) = layout.mailboxes
         writer = open_writer(segment, box.name)
-        readers = [_reading(segment, box, task) for task in box.readers]
+        readers = [_build_reader(segment, box, task) for task in box.readers]
     # An open segment needs no name. Nothing is left even if this process is killed.
     send = WriteTable([(writer, ())]).write if can_write(writer) else writer.write
     yield Transport(writer.message, send, readers)
 
 
-def _reading(segment: Segment, box: MailboxSpec, task: str) -> Callable[[int], AnyMessage]:
+def _build_reader(segment: Segment, box: MailboxSpec, task: str) -> Callable[[int], AnyMessage]:
     """Build a function that reads a mailbox as a board does.
 
     Where no machine code exists, the checks on the writer are left out.
     """
     inbox = open_inbox(segment, task)
-    watched_reader = watched(segment, box.name, AlarmWriter(segment, task), ReadingTask(inbox))
+    watched_reader = open_watched(segment, box.name, AlarmWriter(segment, task), ReadingTask(inbox))
     read = watched_reader.reader.read
     delay = box.delay
     message = watched_reader.reader.message
-    line = Line({}, box.name, watched_reader.read, watched_reader)
+    line = InputMailbox({}, box.name, watched_reader.read, watched_reader)
     if can_read(line):
         read_table = ReadTable([line]).read
 
@@ -215,7 +217,7 @@ def _reading(segment: Segment, box: MailboxSpec, task: str) -> Callable[[int], A
     return read_message
 
 
-def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
+def _build_layout(rack: str, protocol: Protocol, case: Case) -> Layout:
     readers = tuple(f"reader{number}" for number in range(case.readers))
     tasks = tuple(
         TaskSpec(n, n, "executor", 2 + i, 0, 0, 1, 1, 4) for i, n in enumerate(("writer", *readers))
@@ -235,10 +237,10 @@ def _layout(rack: str, protocol: Protocol, case: Case) -> Layout:
         every=1,
         delay=1,
         depth=64,
-        message=Bench.message_type.name,
-        version=Bench.message_type.version,
-        size=Bench.message_type.dtype(case.lengths).itemsize,
-        fields=field_specs(Bench.message_type, case.lengths),
+        message=BenchMessage.message_type.name,
+        version=BenchMessage.message_type.version,
+        size=BenchMessage.message_type.build_dtype(case.lengths).itemsize,
+        fields=build_field_specs(BenchMessage.message_type, case.lengths),
         interrupt=interrupt,
     )
     return Layout(rack, 2_500_000, tasks, (box,))

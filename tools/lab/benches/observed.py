@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.boards.timing.trace_times import lateness_ns, skipped
+from rack.boards.timing.trace_times import compute_lateness_ns, count_skipped
 from rack.tools.launch.launch import RunResult, run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
@@ -21,14 +21,14 @@ The peers are not measured at their start either.
 """
 
 
-class Recorded(NamedTuple):
+class RecordedRun(NamedTuple):
     """Result of a run, and its recording."""
 
     result: RunResult
     recording: Recording
 
 
-UNVIEWED = (
+UNVIEWED_SETTINGS = (
     "record.keep=600",
     "supervision.max_missed_fraction=1",
 )
@@ -39,12 +39,12 @@ kHz. Missed cycles are measured and therefore do not fail the run.
 """
 
 
-def record(
+def record_rack(
     config: RackConfig,
     seconds: float | None,
     folder: Path,
     share: bool = True,
-) -> Recorded:
+) -> RecordedRun:
     """Run a rack as `run_rack` does, without display, and record it.
 
     Args:
@@ -54,10 +54,10 @@ def record(
         share: Whether to run even on cores that another rack holds.
     """
     result = run_rack(config, seconds, folder, Display(), share=share)
-    return Recorded(result, Recording(folder))
+    return RecordedRun(result, Recording(folder))
 
 
-def endless(config: RackConfig) -> RackConfig:
+def remove_run_end(config: RackConfig) -> RackConfig:
     """Return a rack in which no board ends the run."""
     boards = {
         name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()
@@ -65,22 +65,22 @@ def endless(config: RackConfig) -> RackConfig:
     return config.model_copy(update={"board": boards})
 
 
-def with_commands(config: RackConfig, commands: Sequence[CommandConfig]) -> RackConfig:
+def add_commands(config: RackConfig, commands: Sequence[CommandConfig]) -> RackConfig:
     """Return a rack with additional operator commands, which follow the existing ones."""
     return config.model_copy(update={"command": (*config.command, *commands)})
 
 
-def lateness_us(recording: Recording, task: str) -> np.ndarray:
+def compute_lateness_us(recording: Recording, task: str) -> np.ndarray:
     """Return how late each cycle started, us, shape (n,), without the start of the run.
 
     After skipped releases the lateness counts from the first skipped one, as for any program that
     oversleeps grid points.
     """
-    rows = recording.trace(task)
+    rows = recording.read_trace(task)
     if len(rows):
         rows = rows[rows["release_ns"] >= rows["release_ns"][0] + SETTLE_NS]
-    period_ns = recording.layout.task(task).every * recording.layout.clock_ns
-    return np.asarray(lateness_ns(rows) + skipped(rows) * period_ns) * 1e-3
+    period_ns = recording.layout.find_task(task).every * recording.layout.clock_ns
+    return np.asarray(compute_lateness_ns(rows) + count_skipped(rows) * period_ns) * 1e-3
 
 
 class CycleCount(NamedTuple):

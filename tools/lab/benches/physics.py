@@ -12,15 +12,15 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from rack.boards.config.cell import built_cell
-from rack.levels.arm.simulation import restore_state, sleeping
+from rack.boards.config.cell import build_rack_cell
+from rack.levels.arm.simulation import enable_sleep, restore_state
 from rack.tools.console.answer import Failure
 from rack.tools.recording.recording import Recording
 
-SERVO = "servo"
+SERVO_BOARD = "servo"
 
 
-def replay(folder: Path, ticks: int) -> list[float]:
+def replay_physics(folder: Path, ticks: int) -> list[float]:
     """Replay the longest stretch of a run in which motors moved the arm and no cycle was missed.
 
     Call it by `run_in_board_environment`, because only that environment reproduces the physics of
@@ -38,19 +38,21 @@ def replay(folder: Path, ticks: int) -> list[float]:
     """
     recording = Recording(folder)
     config = recording.rack_config
-    cell = built_cell(config)
-    model = sleeping(cell.model, config.scene)
-    first, last = _stretch(recording)
-    status = f"{SERVO}.status"
-    command_ticks = recording.signal(status, "tick")
+    cell = build_rack_cell(config)
+    model = enable_sleep(cell.model, config.scene)
+    first, last = _find_longest_stretch(recording)
+    status = f"{SERVO_BOARD}.status"
+    command_ticks = recording.read_signal(status, "tick")
     is_in_stretch = (command_ticks >= first) & (command_ticks < last)
     controls = np.zeros((last - first, model.nu))
-    controls[:, cell.actuators] = recording.signal(status, "torque")[is_in_stretch]
+    controls[:, cell.actuators] = recording.read_signal(status, "torque")[is_in_stretch]
     if cell.gripper is not None:
-        controls[:, cell.gripper.actuator] = recording.signal(status, "grip_force")[is_in_stretch]
+        controls[:, cell.gripper.actuator] = recording.read_signal(status, "grip_force")[
+            is_in_stretch
+        ]
     data, recorded = mujoco.MjData(model), mujoco.MjData(model)
-    state_ticks = recording.signal(f"{SERVO}.state", "tick")
-    states = recording.signal(f"{SERVO}.state", "state")
+    state_ticks = recording.read_signal(f"{SERVO_BOARD}.state", "tick")
+    states = recording.read_signal(f"{SERVO_BOARD}.state", "state")
     for target, tick in ((data, first), (recorded, last)):
         restore_state(model, target, states[state_ticks == tick][0])
     substeps = round(config.clock_ns * 1e-9 / model.opt.timestep)
@@ -72,15 +74,15 @@ def replay(folder: Path, ticks: int) -> list[float]:
     return times_us
 
 
-def _stretch(recording: Recording) -> tuple[int, int]:
+def _find_longest_stretch(recording: Recording) -> tuple[int, int]:
     """Return the first and last tick of the longest stretch without brakes.
 
     The states of the arm at both ticks are recorded.
     """
-    status = f"{SERVO}.status"
-    ticks = recording.signal(status, "tick")[recording.signal(status, "braked") == 0]
+    status = f"{SERVO_BOARD}.status"
+    ticks = recording.read_signal(status, "tick")[recording.read_signal(status, "braked") == 0]
     stretches = np.split(ticks, np.flatnonzero(np.diff(ticks) != 1) + 1)
-    state_ticks = recording.signal(f"{SERVO}.state", "tick")
+    state_ticks = recording.read_signal(f"{SERVO_BOARD}.state", "tick")
     known_ticks = [np.intersect1d(stretch, state_ticks) for stretch in stretches]
     ends = [(int(stretch[0]), int(stretch[-1])) for stretch in known_ticks if len(stretch)]
     longest = max(ends, key=lambda pair: pair[1] - pair[0], default=(0, 0))

@@ -32,4 +32,4 @@ class Relay(Executor):
     def process(self, tick: int) -> None:
         """Pass on the newest message, or -1 before the first one."""
         self.status.state = State.EXECUTING
-        self.status.sent = self.message.message.sent if self.message.is_there else -1
+        self.status.sent = self.message.message.sent if self.message.has_message else -1

@@ -22,7 +22,7 @@ import numpy as np
 from rack.backplane.message import AnyMessage
 from rack.backplane.segment import SHM_FOLDER
 
-KEY = "rack"
+SERVICE_NAME = "rack"
 
 
 class Transport(NamedTuple):
@@ -53,17 +53,17 @@ class Peer(NamedTuple):
 
     name: str
     module: str
-    opened: Callable[[np.dtype, int], AbstractContextManager[Transport]]
+    open_transport: Callable[[np.dtype, int], AbstractContextManager[Transport]]
 
 
 @contextmanager
-def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
+def open_iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Update an entry of an iceoryx2 blackboard. Every reader copies its newest value."""
     message = AnyMessage(dtype)
-    with _iceoryx2_names() as (iceoryx2, node):
-        payload = _structure(dtype)
+    with _open_iceoryx2_node() as (iceoryx2, node):
+        payload = _build_structure(dtype)
         key = ctypes.c_uint64(0)
-        creator = node.service_builder(iceoryx2.ServiceName.new(KEY)).blackboard_creator(
+        creator = node.service_builder(iceoryx2.ServiceName.new(SERVICE_NAME)).blackboard_creator(
             ctypes.c_uint64
         )
         service = creator.add(key, payload()).max_readers(readers).create()
@@ -80,12 +80,12 @@ def iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
         return fetch
 
-    message_readers = [_into(dtype, build_fetch(reader)) for reader in entries]
+    message_readers = [_build_reader(dtype, build_fetch(reader)) for reader in entries]
     yield Transport(message, lambda tick: entry.update_with_copy(payload_bytes), message_readers)
 
 
 @contextmanager
-def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
+def open_multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Send the bytes through a pipe to each reader."""
     message = AnyMessage(dtype)
     pipes = [multiprocessing.Pipe(duplex=False) for _ in range(readers)]
@@ -96,7 +96,7 @@ def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
     try:
         yield Transport(
-            message, send, [_into(dtype, receiver.recv_bytes_into) for receiver, _ in pipes]
+            message, send, [_build_reader(dtype, receiver.recv_bytes_into) for receiver, _ in pipes]
         )
     finally:
         for end in (end for pipe in pipes for end in pipe):
@@ -104,7 +104,7 @@ def multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
 
 @contextmanager
-def horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
+def open_horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
     """Send the bytes as a grey image of one row through a HORUS topic.
 
     No other HORUS message carries an arbitrary number of bytes.
@@ -131,17 +131,21 @@ def horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
 
         return fetch
 
-    yield Transport(message, send, [_into(dtype, build_fetch(reader.recv)) for reader in topics])
+    yield Transport(
+        message, send, [_build_reader(dtype, build_fetch(reader.recv)) for reader in topics]
+    )
 
 
 PEERS = (
-    Peer("iceoryx2 blackboard", "iceoryx2", iceoryx2_blackboard),
-    Peer("HORUS image", "horus", horus_image),
-    Peer("multiprocessing pipe", "multiprocessing", multiprocessing_pipe),
+    Peer("iceoryx2 blackboard", "iceoryx2", open_iceoryx2_blackboard),
+    Peer("HORUS image", "horus", open_horus_image),
+    Peer("multiprocessing pipe", "multiprocessing", open_multiprocessing_pipe),
 )
 
 
-def _into(dtype: np.dtype, fetch: Callable[[memoryview], object]) -> Callable[[int], AnyMessage]:
+def _build_reader(
+    dtype: np.dtype, fetch: Callable[[memoryview], object]
+) -> Callable[[int], AnyMessage]:
     """Build a reader with a local message, whose bytes are filled by `fetch`."""
     message = AnyMessage(dtype)
     raw = message.raw
@@ -154,7 +158,7 @@ def _into(dtype: np.dtype, fetch: Callable[[memoryview], object]) -> Callable[[i
 
 
 @contextmanager
-def _iceoryx2_names() -> Iterator[tuple[Any, Any]]:
+def _open_iceoryx2_node() -> Iterator[tuple[Any, Any]]:
     """Open an iceoryx2 node for services.
 
     Its files and shared memory have names only while the context lasts.
@@ -177,7 +181,7 @@ def _iceoryx2_names() -> Iterator[tuple[Any, Any]]:
                 leftover.unlink(missing_ok=True)
 
 
-def _structure(dtype: np.dtype) -> type[ctypes.Structure]:
+def _build_structure(dtype: np.dtype) -> type[ctypes.Structure]:
     """Return a C structure of the size and alignment of a message."""
     words = ctypes.c_uint64 * (dtype.itemsize // 8)
     return type("Message", (ctypes.Structure,), {"_fields_": [("words", words)]})

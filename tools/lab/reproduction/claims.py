@@ -18,17 +18,17 @@ from rack.tools.lab.reproduction.experiments import (
     tasks,
 )
 from rack.tools.lab.reproduction.experiments.figures import (
-    BEHIND,
     BUFFERED,
     FIG2,
     FIG3,
     FIG4,
-    IN_LINE,
+    IN_BACKGROUND,
+    IN_CYCLE,
     LONG_2,
     OVERLOAD,
     SHORT_2,
     SHORT_3,
-    settings_of,
+    build_settings,
 )
 from rack.tools.lab.reproduction.experiments.nasrem import (
     DEADLINE,
@@ -43,7 +43,7 @@ from rack.tools.lab.reproduction.page import PaperClaim, Section
 from rack.tools.lab.reproduction.verdict import ClaimVerdict
 
 
-def _equation(
+def _build_equation_claim(
     number: str,
     form: str,
     quote: str,
@@ -72,7 +72,7 @@ def _equation(
     )
 
 
-def _system(
+def _build_system_claim(
     name: str,
     title: str,
     quote: str,
@@ -102,7 +102,7 @@ def _system(
 
 SYSTEMS = (NAME, tasks.STATE_TABLES, *tasks.TASKS)
 """Racks that model the paper's systems."""
-HURRIED = ("timing.response_ms=1000",)
+SHORT_RESPONSE = ("timing.response_ms=1000",)
 """Setting that demands a response within 1 s, too short for NASREM's four levels."""
 SECTIONS = (
     Section(
@@ -197,7 +197,7 @@ SECTIONS = (
                 " predictable level response.",
                 "No cycle of an executor was late while its planner computed.",
                 (FIG2.experiment, FIG4.experiment),
-                rules.judge_both,
+                rules.judge_concurrency,
             ),
             PaperClaim(
                 "bounded-waits",
@@ -237,28 +237,28 @@ SECTIONS = (
         "3.1",
         "System Response Time",
         (
-            _equation(
+            _build_equation_claim(
                 "3.1",
                 "t_proc + t_c = R_i ≤ R_max",
                 "... the ith level spends t_c seconds communicating/waiting for commands and"
                 " status, and t_proc processing.",
                 "fig4-overload",
             ),
-            _equation(
+            _build_equation_claim(
                 "3.2",
                 "R_s ≤ n R_max",
                 "An upper bound to the system response time R_s can be calculated.",
                 "nasrem",
-                HURRIED,
+                SHORT_RESPONSE,
             ),
-            _equation(
+            _build_equation_claim(
                 "3.3",
                 "R_s = Σ R_i + Σ R_j",
                 "This leads to a definition of R_s, system response time, as the sum of R_i"
                 " response times tied to the machine update rate, and the sum of R_j response"
                 " times arbitrarily set.",
                 "nasrem",
-                HURRIED,
+                SHORT_RESPONSE,
                 rules.judge_sum,
             ),
         ),
@@ -267,28 +267,28 @@ SECTIONS = (
         "3.2",
         "Low-Level Timing Requirements",
         (
-            _equation(
+            _build_equation_claim(
                 "3.4",
                 "t_exec < R_max",
                 "t_exec, the time the executor runs each cycle, is less than the level response"
                 " time limit maximum.",
                 "fig4-overload",
-                settings_of("fig4-overload", 6.0),
+                build_settings("fig4-overload", 6.0),
             ),
-            _equation(
+            _build_equation_claim(
                 "3.5",
                 "R_i = t_exec + t_comm + t_residual",
                 "R_i is composed of t_exec, ... t_comm, ... and t_residual, time remaining before"
                 " the next cycle.",
                 "fig4-overload",
             ),
-            _equation(
+            _build_equation_claim(
                 "3.6",
                 "0 < t_residual ≤ R_i - max t_exec - max t_comm",
                 "[The residual] must be bounded by a sum of the worst case times for both"
                 " processing and communication.",
                 "fig4",
-                settings_of("fig4", 3.0),
+                build_settings("fig4", 3.0),
             ),
         ),
     ),
@@ -302,7 +302,7 @@ SECTIONS = (
                 "Increased time at higher levels allows slower options to execute in the"
                 " background, such as secondary data storage.",
                 "Storing data in the background made no cycle late; storing it in the cycle does.",
-                (BEHIND.experiment, IN_LINE.experiment),
+                (IN_BACKGROUND.experiment, IN_CYCLE.experiment),
                 rules.judge_background,
             ),
             PaperClaim(
@@ -312,10 +312,10 @@ SECTIONS = (
                 " control system at the very highest levels.",
                 "The servo rack kept its cycles, and responded as much later as the network was"
                 " slower.",
-                (tasks.NETWORK, tasks.LATER),
-                rules.judge_loose,
+                (tasks.NETWORK, tasks.SLOWER_NETWORK),
+                rules.judge_loose_coupling,
             ),
-            _equation(
+            _build_equation_claim(
                 "3.7",
                 "t_i+1 = t_i + c",
                 "Levels execute every cycle and these cycles are of fixed time c.",
@@ -331,19 +331,19 @@ SECTIONS = (
                 (sharing.WAITS,),
                 rules.judge_waits,
             ),
-            _equation(
+            _build_equation_claim(
                 "3.8",
                 "t_plan / d < t_residual - 2 t_cs",
                 "The planner must finish any plan within d cycles.",
                 "fig3",
             ),
-            _equation(
+            _build_equation_claim(
                 "3.9",
                 "R_i = t_exec + t_comm + t_plan+residual + 2 t_cs",
                 "Including the planner on the same processor adds two extra context switches to a"
                 " cycle.",
                 "fig3",
-                settings_of("fig3", 3.0),
+                build_settings("fig3", 3.0),
             ),
             PaperClaim(
                 "update",
@@ -354,7 +354,7 @@ SECTIONS = (
                 (FIG3.experiment,),
                 rules.judge_update,
             ),
-            _equation(
+            _build_equation_claim(
                 "3.10",
                 "t_e,p-comm ≪ R_i",
                 "The planner to executor communication is small.",
@@ -368,7 +368,7 @@ SECTIONS = (
                 " slices or double-buffers for plan update.",
                 "With either no cycle of the executor was late.",
                 (FIG4.experiment, BUFFERED.experiment),
-                rules.judge_both,
+                rules.judge_concurrency,
             ),
         ),
     ),
@@ -458,7 +458,7 @@ SECTIONS = (
                 (switch.SWITCH,),
                 rules.judge_switch,
             ),
-            _system(
+            _build_system_claim(
                 "host-services",
                 "Services of hosts, over the adapter",
                 "The hosts provide non-real-time services.",
@@ -498,7 +498,7 @@ SECTIONS = (
                 (),
                 partial(rules.judge_layers, [name for name in SYSTEMS if name != tasks.BROWN]),
             ),
-            _system(
+            _build_system_claim(
                 "rccl",
                 "RCCL: a processor a joint",
                 "The joint control level operates at 1 kHz and assigns 1 processor per joint.",
@@ -509,33 +509,33 @@ SECTIONS = (
                 },
                 rules.judge_rccl,
             ),
-            _system(
+            _build_system_claim(
                 "hic",
                 "HIC: layers of servo loops",
                 "This model emphasis layers of servo loops with deterministic scheduling.",
                 {"tendon.command": 500, "joint.command": 500, "fingertip.command": 125},
             ),
-            _system(
+            _build_system_claim(
                 "condor",
                 "CONDOR: boards, an adapter and a workstation",
                 "... Motorola 68020 based boards connected by VME bus to VME bus adapter to a"
                 " SUN-3 workstation controlling the Utah/MIT hand.",
                 {"workstation.plan": 1, "adapter.plan": 1},
             ),
-            _system(
+            _build_system_claim(
                 "ibm",
                 "IBM: a real-time bridge",
                 "IBM extends the exchange of commands and status to include varying frequencies.",
                 {"bridge.requests": 1, "bridge.sensors": 50, "bridge.motion": 200},
             ),
-            _system(
+            _build_system_claim(
                 "chimera",
                 "CHIMERA: motion control and commands",
                 "... low-level real-time motion control connected to a non-real-time AML/X"
                 " command environment.",
                 {"command.requests": 1, "bridge.requests": 1},
             ),
-            _system(
+            _build_system_claim(
                 "penn",
                 "Pennsylvania: a server of forces and motions",
                 "... a robot coordinator issue force and motion commands to a real-time robot"
@@ -543,7 +543,7 @@ SECTIONS = (
                 {"coordinator.requests": 1, "bridge.requests": 1},
             ),
             # The servo rack begins later. It and the network pass four messages of five.
-            _system(
+            _build_system_claim(
                 "brown",
                 "Brown: servo systems on a network",
                 "... high-speed networks connecting a real-time servo systems and general"

@@ -15,7 +15,11 @@ from markdown_it import MarkdownIt
 from pydantic import TypeAdapter
 
 from rack.tools.console.answer import Document
-from rack.tools.lab.reproduction.experiments.experiment import Charted, Experiment, Kept
+from rack.tools.lab.reproduction.experiments.experiment import (
+    ChartedRecord,
+    Experiment,
+    StoredResult,
+)
 from rack.tools.lab.reproduction.verdict import Check, ClaimVerdict, Ruling, describe_unmet
 
 
@@ -79,7 +83,7 @@ class PaperClaim:
     judge: Callable[..., ClaimVerdict]
     predict: Callable[[], tuple[Evidence, ...]] = lambda: ()
 
-    def judge_by(self, results: Mapping[str, Kept | str]) -> JudgedClaim:
+    def judge_results(self, results: Mapping[str, StoredResult | str]) -> JudgedClaim:
         """Judge the claim by the results of its experiments.
 
         Args:
@@ -93,9 +97,9 @@ class PaperClaim:
                 return replace(unruled, why=f"{experiment.name}: {result}")
             if result.lacking:
                 return replace(unruled, ruling=Ruling.UNTESTABLE, why=result.lacking)
-            records.append(experiment.record(result.found))
+            records.append(experiment.parse_record(result.found))
         verdict = self.judge(*records)
-        charts = [Evidence(text=run.chart) for run in records if isinstance(run, Charted)]
+        charts = [Evidence(text=run.chart) for run in records if isinstance(run, ChartedRecord)]
         return replace(
             unruled,
             ruling=verdict.ruling,
@@ -124,7 +128,7 @@ class Page:
     rulings: dict[Ruling, int]
     sections: tuple[Section[JudgedClaim], ...]
 
-    def document(self) -> Document:
+    def to_document(self) -> Document:
         """Convert the page to plain data."""
         return dict(TypeAdapter(Page).dump_python(self, mode="json"))
 
@@ -142,15 +146,15 @@ LABELS = {
 
 def render_markdown(page: Page) -> str:
     """Render the page as Markdown."""
-    return _render("page.md.j2", page=page, labels=LABELS)
+    return _render_template("page.md.j2", page=page, labels=LABELS)
 
 
 def render_html(markdown: str) -> str:
     """Render the Markdown of the page as HTML."""
-    return _render("page.html.j2", body=MarkdownIt().enable("table").render(markdown))
+    return _render_template("page.html.j2", body=MarkdownIt().enable("table").render(markdown))
 
 
-def _render(template: str, **values: Any) -> str:
+def _render_template(template: str, **values: Any) -> str:
     loader = FileSystemLoader(Path(__file__).parent)
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return environment.get_template(template).render(values)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from rack.boards.config import load, rack_timing, wire
+from rack.boards.config import build_rack_timing, load, resolve_layout
 from rack.boards.errors import ConfigError
 from rack.boards.timing.forecast import Forecast
 from rack.tools.lab.reproduction.experiments.figures import FIG2, FigureRack
 from rack.tools.lab.reproduction.experiments.nasrem import NAME
 from rack.tools.lab.reproduction.page import Evidence
-from rack.tools.lab.reproduction.rules import PAPER_X, check_equations, check_planning
+from rack.tools.lab.reproduction.rules import PAPER_X_MS, check_equations, check_planning
 from rack.tools.timing.charts import figure5
 
 
@@ -20,15 +20,15 @@ def predict_equation(number: str, config: str, settings: tuple[str, ...]) -> tup
         config: Config of the rack that violates it.
         settings: Changes to this config, as for `--set`.
     """
-    return _equation(number, NAME, ()), _equation(number, config, settings)
+    return _predict_for_config(number, NAME, ()), _predict_for_config(number, config, settings)
 
 
-def _equation(number: str, config: str, settings: tuple[str, ...]) -> Evidence:
+def _predict_for_config(number: str, config: str, settings: tuple[str, ...]) -> Evidence:
     """Return both sides of an equation by the budgets of a config, or why it is refused."""
     source = " ".join(("rack check", config, *(f"--set {setting}" for setting in settings)))
     try:
         rack = load(config, settings)
-        verdicts = Forecast.of(rack_timing(rack, wire(rack))).verdicts
+        verdicts = Forecast.from_rack(build_rack_timing(rack, resolve_layout(rack))).verdicts
     except ConfigError as error:
         return Evidence(source, text=str(error))
     return Evidence(source, tuple(check_equations(v for v in verdicts if v.equation == number)))
@@ -36,16 +36,18 @@ def _equation(number: str, config: str, settings: tuple[str, ...]) -> Evidence:
 
 def predict_figure(figure: FigureRack) -> tuple[Evidence, ...]:
     """Return a figure in letters, as the paper draws it."""
-    return (Evidence(f"rack gantt {figure.config}", text=figure.letters(figure.panel())),)
+    return (
+        Evidence(f"rack gantt {figure.config}", text=figure.format_letters(figure.build_panel())),
+    )
 
 
 def predict_sweep() -> tuple[Evidence, ...]:
     """Return the paper's statements on figure 2's planner for every permitted X."""
-    checks = (check for process_ms in PAPER_X for check in check_planning(process_ms))
+    checks = (check for process_ms in PAPER_X_MS for check in check_planning(process_ms))
     return (Evidence(FIG2.config, tuple(checks)),)
 
 
 def predict_figure_5() -> tuple[Evidence, ...]:
     """Return the place of NASREM's levels in figure 5."""
-    text = "\n".join(figure5.lines(load(NAME)))
+    text = "\n".join(figure5.format_figure(load(NAME)))
     return (Evidence(f"rack gantt {NAME} --figure 5", text=text),)

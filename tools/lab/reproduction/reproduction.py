@@ -6,18 +6,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rack.tools.console.answer import Failure, as_failure, write_file, write_json
+from rack.tools.console.answer import Failure, convert_errors, write_file, write_json
 from rack.tools.console.progress import Progress
 from rack.tools.lab.reproduction.claims import SECTIONS
 from rack.tools.lab.reproduction.experiments.experiment import (
-    KEPT,
+    RESULTS_FOLDER,
     Experiment,
-    Kept,
+    StoredResult,
     Workshop,
-    kept,
-    machine,
-    made,
-    program,
+    compute_program_checksum,
+    describe_machine,
+    load_result,
+    make_and_store,
 )
 from rack.tools.lab.reproduction.page import (
     LABELS,
@@ -54,7 +54,7 @@ def list_experiments(sections: Sections) -> list[Experiment[Any]]:
     return list({each.name: each for claim in claims for each in claim.experiments}.values())
 
 
-def reproduce(
+def reproduce_paper(
     wanted: Sections,
     workshop: Workshop,
     progress: Progress,
@@ -74,36 +74,41 @@ def reproduce(
     workshop.prepare()
     if again:
         for experiment in list_experiments(wanted):
-            (workshop.folder / KEPT / f"{experiment.name}.json").unlink(missing_ok=True)
-    results: dict[str, Kept | str] = {
+            (workshop.folder / RESULTS_FOLDER / f"{experiment.name}.json").unlink(missing_ok=True)
+    results: dict[str, StoredResult | str] = {
         experiment.name: result
         for experiment in list_experiments(SECTIONS)
-        if (result := kept(experiment, workshop.folder))
+        if (result := load_result(experiment, workshop.folder))
     }
     needed = [each for each in list_experiments(wanted) if each.name not in results]
-    progress.total(sum(experiment.seconds for experiment in needed))
+    progress.set_total(sum(experiment.seconds for experiment in needed))
     for number, experiment in enumerate(needed, 1):
-        progress.begin(f"{number} of {len(needed)}: {experiment.about}")
+        progress.begin_run(f"{number} of {len(needed)}: {experiment.about}")
         try:
-            with as_failure():
-                result = made(experiment, workshop)
+            with convert_errors():
+                result = make_and_store(experiment, workshop)
         except Failure as error:
             results[experiment.name] = str(error)
-            progress.end(experiment.seconds, "failed", [f"{experiment.name}: {error}"])
+            progress.end_run(experiment.seconds, "failed", [f"{experiment.name}: {error}"])
         else:
             results[experiment.name] = result
-            progress.end(experiment.seconds, result.lacking or f"done in {result.took_s:.0f} s")
-    return _write(workshop, results)
+            progress.end_run(experiment.seconds, result.lacking or f"done in {result.took_s:.0f} s")
+    return _write_page(workshop, results)
 
 
-def _write(workshop: Workshop, results: dict[str, Kept | str]) -> Page:
+def _write_page(workshop: Workshop, results: dict[str, StoredResult | str]) -> Page:
     """Write the page into the folder in every form, and return it."""
-    facts = {name: str(value) for name, value in (machine() | {"program": program()}).items()}
+    facts = {
+        name: str(value)
+        for name, value in (describe_machine() | {"program": compute_program_checksum()}).items()
+    }
     for name, result in results.items():
-        if isinstance(result, Kept):
+        if isinstance(result, StoredResult):
             facts[name] = f"{result.made_at}, {result.took_s:g} s {result.lacking}"
     sections = tuple(
-        Section(each.section, each.title, tuple(claim.judge_by(results) for claim in each.claims))
+        Section(
+            each.section, each.title, tuple(claim.judge_results(results) for claim in each.claims)
+        )
         for each in SECTIONS
     )
     rulings = [claim.ruling for section in sections for claim in section.claims]
@@ -111,11 +116,11 @@ def _write(workshop: Workshop, results: dict[str, Kept | str]) -> Page:
     markdown = render_markdown(page)
     write_file(workshop.folder / MARKDOWN, markdown)
     write_file(workshop.folder / HTML, render_html(markdown))
-    write_json(workshop.folder / DATA, page.document())
+    write_json(workshop.folder / DATA, page.to_document())
     return page
 
 
-def has_worked(page: Page, wanted: Sections) -> bool:
+def has_succeeded(page: Page, wanted: Sections) -> bool:
     """Return True if every claim of these sections was tested and none failed."""
     names = [section.section for section in wanted]
     return not any(
@@ -126,7 +131,7 @@ def has_worked(page: Page, wanted: Sections) -> bool:
     )
 
 
-def summarize(page: Page, folder: Path) -> list[str]:
+def summarize_page(page: Page, folder: Path) -> list[str]:
     """Summarise the page in a few lines for the terminal."""
     lines = [
         f"{LABELS[claim.ruling]}: {claim.title}"

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from math import ceil, inf
 
-from rack.boards.config import load, rack_timing, wire
+from rack.boards.config import build_rack_timing, load, resolve_layout
 from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.lab.reproduction.experiments.figures import (
     FIG2,
-    LEAST_X,
     LEVEL,
-    MOST_X,
+    MAX_X_MS,
+    MIN_X_MS,
     MS,
     PLANNER,
     FigureRun,
-    settings_of,
+    build_settings,
 )
 from rack.tools.lab.reproduction.experiments.nasrem import (
     NAME,
@@ -28,47 +28,52 @@ from rack.tools.lab.reproduction.experiments.partition import Partition, Partiti
 from rack.tools.lab.reproduction.experiments.response import ResponseRun
 from rack.tools.lab.reproduction.experiments.sharing import LEVELS, Chains, Waits
 from rack.tools.lab.reproduction.experiments.switch import PAPER_US, SwitchRun
-from rack.tools.lab.reproduction.experiments.tasks import LATER_MS, NetworkRun, TableRuns, TaskRun
+from rack.tools.lab.reproduction.experiments.tasks import (
+    EXTRA_DELAY_MS,
+    NetworkRun,
+    TableRuns,
+    TaskRun,
+)
 from rack.tools.lab.reproduction.verdict import (
-    STRAY,
+    MAX_STRAY_SHARE,
     Check,
     ClaimVerdict,
     Ruling,
     check_none,
-    compare,
+    compare_value,
     describe_unmet,
     rule_on,
-    rule_strays,
+    rule_on_strays,
 )
 from rack.tools.timing.charts import figure5
 
-DONE = "task done"
+TASK_DONE = "task done"
 """Reason with which a run ends when its task is done."""
-MOSTLY = 0.5
+FAILING_SHARE = 0.5
 """Share of late cycles or plans above which a run counts as failing.
 
 A figure fails in all cycles or in none, therefore the exact value does not matter.
 """
-PAPER_X = [LEAST_X, 1.5, 2.0, 2.5, MOST_X]
+PAPER_X_MS = [MIN_X_MS, 1.5, 2.0, 2.5, MAX_X_MS]
 """Values of X in the figures over the range that the paper permits, ms."""
-LEAST_P_MS = 3.0
+MIN_PLAN_MS = 3.0
 """Shortest time of the planner per cycle, ms: "The planner runs at least 3 ms each cycle"."""
-EXCHANGE_MS = 40.0
+MAX_EXCHANGE_DIFFERENCE_MS = 40.0
 """Largest difference between two waits for an exchange, ms.
 
 A wait lasts up to one cycle of 20 ms above, and two of 10 ms on the network.
 """
 PAPER_HZ = {"servo": 400.0, "primitive": 50.0}
-NOMINAL = 0.01
+MAX_RATE_ERROR = 0.01
 """Largest relative error of a measured rate, which skipped cycles lower."""
-FEW = 0.01
+MAX_FEW_SHARE = 0.01
 """Largest share of missed cycles or plans that counts as stray."""
 ROUNDING_MS = 1e-6
 
 
 def check_done(*runs: TaskRun) -> list[Check]:
     """Check that all tasks were done."""
-    return check_none(tasks_not_done=sum(run.ended != DONE for run in runs))
+    return check_none(tasks_not_done=sum(run.ended != TASK_DONE for run in runs))
 
 
 def judge_determinism(runs: Sequence[ComparedRun]) -> ClaimVerdict:
@@ -87,27 +92,29 @@ def judge_determinism(runs: Sequence[ComparedRun]) -> ClaimVerdict:
             lockstep_runs_that_differ=sum(run.digest != digest for run in lockstep_runs),
             realtime_runs_that_differ_before_a_miss=diverged_early,
         ),
-        ideal=[compare("realtime_runs_equal", equal_count, ">=", 1)],
+        ideal=[compare_value("realtime_runs_equal", equal_count, ">=", 1)],
     )
 
 
 def judge_speedup(on_one: FigureRun, on_two: FigureRun) -> ClaimVerdict:
     """Compare the number of plans of a level on one processor and on two."""
     plans_on_one, plans_on_two = (run.tasks[PLANNER].jobs for run in (on_one, on_two))
-    needs = [compare("plans_on_one_processor", plans_on_one, ">=", 1)]
-    return rule_on(compare("plans_on_two_processors", plans_on_two, ">", plans_on_one), needs=needs)
+    needs = [compare_value("plans_on_one_processor", plans_on_one, ">=", 1)]
+    return rule_on(
+        compare_value("plans_on_two_processors", plans_on_two, ">", plans_on_one), needs=needs
+    )
 
 
 def judge_growth(chains: Chains) -> ClaimVerdict:
     """Count missed cycles after boards were added, which must not burden the others."""
     grown = chains.grown
-    on_time = compare("messages_on_time", grown.took.get(grown.boards, 0), ">=", 1)
-    return rule_strays("cycles_missed", grown.missed, grown.due, on_time)
+    on_time = compare_value("messages_on_time", grown.took.get(grown.boards, 0), ">=", 1)
+    return rule_on_strays("cycles_missed", grown.missed, grown.due, on_time)
 
 
 def judge_locks(chains: Chains) -> ClaimVerdict:
     """Count missed cycles of boards that lock, read and unlock as the paper's do."""
-    return rule_strays("cycles_missed", chains.locked.missed, chains.locked.due)
+    return rule_on_strays("cycles_missed", chains.locked.missed, chains.locked.due)
 
 
 def judge_pipeline(chains: Chains) -> ClaimVerdict:
@@ -118,18 +125,20 @@ def judge_pipeline(chains: Chains) -> ClaimVerdict:
     late = arrived - early - realtime_counts.get(LEVELS, 0)
     lockstep_off = sent - lockstep_counts.get(LEVELS, 0)
     # Each level may miss a stray share of its cycles.
-    share = compare("realtime_messages_late_share", late / max(arrived, 1), "<=", LEVELS * STRAY)
+    share = compare_value(
+        "realtime_messages_late_share", late / max(arrived, 1), "<=", LEVELS * MAX_STRAY_SHARE
+    )
     return rule_on(
         *check_none(lockstep_messages_off=lockstep_off, realtime_messages_early=early),
         ideal=check_none(realtime_messages_late=late),
         here=[share],
-        needs=[compare("messages", min(arrived, sent), ">=", 1)],
+        needs=[compare_value("messages", min(arrived, sent), ">=", 1)],
     )
 
 
 def judge_replication() -> ClaimVerdict:
     """Rule that replication is untestable: no experiment replaces a board by a replica."""
-    return rule_on(needs=[compare("replicas", 0, ">=", 1)])
+    return rule_on(needs=[compare_value("replicas", 0, ">=", 1)])
 
 
 def judge_communication(run: NasremRun, partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
@@ -141,7 +150,7 @@ def judge_communication(run: NasremRun, partitions: Sequence[PartitionFigures]) 
     loads = {each.partition: each.loads.values() for each in partitions}
     one_core, two_cores = (loads[Partition("tight", cores)] for cores in (1, 2))
     saved_ms = 1e3 * (sum(one_core) - max(two_cores))
-    return rule_on(compare("communication_ms_per_s", communication, "<", saved_ms))
+    return rule_on(compare_value("communication_ms_per_s", communication, "<", saved_ms))
 
 
 def judge_flow(run: NasremRun) -> ClaimVerdict:
@@ -152,14 +161,16 @@ def judge_flow(run: NasremRun) -> ClaimVerdict:
     missing = sum(max(0, run.due[box] - 1 - run.messages[box]) for box in boxes)
     used_ways = sum(any(run.messages[box] for box in way) for way in ways)
     due = sum(run.due[box] for box in boxes)
-    return rule_strays("messages_lacking", missing, due, compare("ways", used_ways, "=", len(ways)))
+    return rule_on_strays(
+        "messages_lacking", missing, due, compare_value("ways", used_ways, "=", len(ways))
+    )
 
 
 def judge_loop(run: NasremRun) -> ClaimVerdict:
     """Compare the number of missed cycles with the number of all cycles."""
     tasks = run.executors.values()
     bad = sum(task.missed for task in tasks)
-    return rule_strays("cycles_missed", bad, sum(task.cycles for task in tasks))
+    return rule_on_strays("cycles_missed", bad, sum(task.cycles for task in tasks))
 
 
 def judge_losses(*runs: LossesRun) -> ClaimVerdict:
@@ -171,7 +182,7 @@ def judge_losses(*runs: LossesRun) -> ClaimVerdict:
         tasks_not_done=sum(not run.worked for run in runs),
     )
     struck_count = sum(fault.struck >= 0 for fault in faults)
-    return rule_on(compare("losses", struck_count, "=", len(faults)), *failures)
+    return rule_on(compare_value("losses", struck_count, "=", len(faults)), *failures)
 
 
 def judge_goto(runs: GotoRuns) -> ClaimVerdict:
@@ -179,7 +190,7 @@ def judge_goto(runs: GotoRuns) -> ClaimVerdict:
     early, met = runs.early, runs.met
     begun = early.moved + (early.done_s is not None)
     done_s = inf if met.done_s is None else met.done_s
-    promised = compare("done_as_promised_s", done_s, "<=", met.by_s or 0.0)
+    promised = compare_value("done_as_promised_s", done_s, "<=", met.by_s or 0.0)
     return rule_on(*check_none(motions_begun_too_early=begun), promised)
 
 
@@ -189,7 +200,9 @@ def check_equations(verdicts: Iterable[EquationVerdict]) -> list[Check]:
     for verdict in verdicts:
         scale = MS if verdict.unit == "ns" else 1.0
         name = f"{verdict.subject}: {verdict.meaning}"
-        checks.append(compare(name, verdict.left * scale, verdict.sign, verdict.right * scale))
+        checks.append(
+            compare_value(name, verdict.left * scale, verdict.sign, verdict.right * scale)
+        )
     return checks
 
 
@@ -202,7 +215,7 @@ def judge_equation(number: str, run: NasremRun) -> ClaimVerdict:
     return rule_on(
         ideal=check_equations(each.measured for each in verdicts),
         here=check_none(failing_in_1_of_100_cycles=sum(not each.mostly for each in verdicts)),
-        needs=[compare("subjects", len(verdicts), ">=", 1)],
+        needs=[compare_value("subjects", len(verdicts), ">=", 1)],
     )
 
 
@@ -214,7 +227,7 @@ def judge_sum(run: NasremRun) -> ClaimVerdict:
     assert run.response is not None, "it is a hierarchy"
     ways = run.response.ways
     checks = [
-        compare(f"{name}_ms", way.longest_ms, "<=", run.response.sum_eq_3_3_ms)
+        compare_value(f"{name}_ms", way.longest_ms, "<=", run.response.sum_eq_3_3_ms)
         for name, way in ways.items()
         if way.longest_ms is not None
     ]
@@ -222,21 +235,27 @@ def judge_sum(run: NasremRun) -> ClaimVerdict:
     return rule_on(
         ideal=checks,
         here=check_none(beyond_grid_without_miss=unexplained),
-        needs=[compare("ways", len(checks), "=", 2)],
+        needs=[compare_value("ways", len(checks), "=", 2)],
     )
 
 
 def judge_background(background: FigureRun, in_cycle: FigureRun) -> ClaimVerdict:
     """Compare the late cycles while a level stores data in the background and in its cycle."""
     return rule_on(
-        compare("blocks_stored", background.tasks[PLANNER].jobs, ">=", 1),
-        compare("stored_in_cycle_late_share", in_cycle.late(LEVEL), ">=", MOSTLY),
+        compare_value("blocks_stored", background.tasks[PLANNER].jobs, ">=", 1),
+        compare_value(
+            "stored_in_cycle_late_share", in_cycle.compute_late_share(LEVEL), ">=", FAILING_SHARE
+        ),
         ideal=check_none(cycles_late=background.tasks[LEVEL].late),
-        here=[compare("cycles_late_share", background.late(LEVEL), "<=", STRAY)],
+        here=[
+            compare_value(
+                "cycles_late_share", background.compute_late_share(LEVEL), "<=", MAX_STRAY_SHARE
+            )
+        ],
     )
 
 
-def judge_loose(normal: NetworkRun, slower: NetworkRun) -> ClaimVerdict:
+def judge_loose_coupling(normal: NetworkRun, slower: NetworkRun) -> ClaimVerdict:
     """Compare the servo rack's cycles and response on a network and on a slower one."""
     later_ms = 0.0
     if normal.response_ms is not None and slower.response_ms is not None:
@@ -244,48 +263,64 @@ def judge_loose(normal: NetworkRun, slower: NetworkRun) -> ClaimVerdict:
     missed = max(normal.servo_missed, slower.servo_missed)
     return rule_on(
         *check_done(normal, slower),
-        compare("response_off_expected_ms", abs(later_ms - LATER_MS), "<=", EXCHANGE_MS),
+        compare_value(
+            "response_off_expected_ms",
+            abs(later_ms - EXTRA_DELAY_MS),
+            "<=",
+            MAX_EXCHANGE_DIFFERENCE_MS,
+        ),
         ideal=check_none(servo_missed_share=missed),
-        here=[compare("servo_missed_share", missed, "<=", STRAY)],
+        here=[compare_value("servo_missed_share", missed, "<=", MAX_STRAY_SHARE)],
     )
 
 
 def judge_waits(waits: Waits) -> ClaimVerdict:
     """Compare the lateness of cycles after polling and after blocking, us."""
-    return rule_on(compare("polling_late_median_us", waits.polling_us, "<", waits.blocking_us))
+    return rule_on(
+        compare_value("polling_late_median_us", waits.polling_us, "<", waits.blocking_us)
+    )
 
 
 def judge_update(run: FigureRun) -> ClaimVerdict:
     """Count the plan updates that were preempted, of those in which the executor was released."""
-    return rule_strays("updates_preempted", run.preempted, run.met)
+    return rule_on_strays("updates_preempted", run.preempted, run.met)
 
 
-def judge_both(*runs: FigureRun) -> ClaimVerdict:
+def judge_concurrency(*runs: FigureRun) -> ClaimVerdict:
     """Compare the executors' late cycles with all cycles of runs in which planners made plans."""
     late = sum(run.tasks[LEVEL].late for run in runs)
     due = sum(run.tasks[LEVEL].jobs for run in runs)
     plans = min(run.tasks[PLANNER].jobs for run in runs)
-    return rule_strays("cycles_late", late, due, compare("plans", plans, ">=", 1))
+    return rule_on_strays("cycles_late", late, due, compare_value("plans", plans, ">=", 1))
 
 
-def _compare_late(run: FigureRun, sign: str, name: str = "late_share") -> Check:
+def _compare_late_share(run: FigureRun, sign: str, name: str = "late_share") -> Check:
     """Compare the larger of the shares of late cycles and late plans with `FAILING_SHARE`."""
-    return compare(name, max(run.late(LEVEL), run.late(PLANNER)), sign, MOSTLY)
+    return compare_value(
+        name,
+        max(run.compute_late_share(LEVEL), run.compute_late_share(PLANNER)),
+        sign,
+        FAILING_SHARE,
+    )
 
 
-def _undisturbed(run: FigureRun) -> list[Check]:
+def _check_undisturbed(run: FigureRun) -> list[Check]:
     """Return the condition under which a run can show a figure.
 
     An executor is late in almost all cycles or in almost none. Anything between is a disturbance.
     """
-    late_share = run.late(LEVEL)
-    return [compare("executor_late_share", late_share, "<=", STRAY)] if late_share <= MOSTLY else []
+    late_share = run.compute_late_share(LEVEL)
+    return (
+        [compare_value("executor_late_share", late_share, "<=", MAX_STRAY_SHARE)]
+        if late_share <= FAILING_SHARE
+        else []
+    )
 
 
 def judge_working(run: FigureRun) -> ClaimVerdict:
     """Judge a figure that works according to the paper."""
     late = check_none(late=sum(count.late for count in run.tasks.values()))
-    return rule_on(ideal=late, here=[_compare_late(run, "<=")], needs=_undisturbed(run))
+    return rule_on(ideal=late, here=[_compare_late_share(run, "<=")], needs=_check_undisturbed(run))
 
 
 def judge_failing(paper_run: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
@@ -295,8 +330,10 @@ def judge_failing(paper_run: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
         paper_run: Run of the figure.
         shorter: Runs with the shortest X that the paper permits. They should fail as well.
     """
-    shortest = [_compare_late(run, ">", "shortest_X_late_share") for run in shorter]
-    return rule_on(_compare_late(paper_run, ">"), ideal=shortest, needs=_undisturbed(paper_run))
+    shortest = [_compare_late_share(run, ">", "shortest_X_late_share") for run in shorter]
+    return rule_on(
+        _compare_late_share(paper_run, ">"), ideal=shortest, needs=_check_undisturbed(paper_run)
+    )
 
 
 def check_planning(process_ms: float) -> tuple[Check, Check]:
@@ -307,26 +344,26 @@ def check_planning(process_ms: float) -> tuple[Check, Check]:
     Args:
         process_ms: X, ms.
     """
-    config = load(FIG2.config, settings_of(FIG2.config, process_ms))
-    level = rack_timing(config, wire(config)).level(LEVEL)
+    config = load(FIG2.config, build_settings(FIG2.config, process_ms))
+    level = build_rack_timing(config, resolve_layout(config)).build_level(LEVEL)
     # By the pattern "RXWPU" each cycle contains U, but a whole plan needs U only once.
     each_ms = (level.residual_ns - level.update_ns) * MS
     work_ns = (level.plan_ns or 0) + level.update_ns
     cycles = ceil(work_ns / level.residual_ns) if level.residual_ns > 0 else inf
     permitted = level.within_cycles or 0
     return (
-        compare(f"X={process_ms:g} planner_ms_per_cycle", each_ms, ">=", LEAST_P_MS),
-        compare(f"X={process_ms:g} cycles_per_plan", cycles, "<=", permitted),
+        compare_value(f"X={process_ms:g} planner_ms_per_cycle", each_ms, ">=", MIN_PLAN_MS),
+        compare_value(f"X={process_ms:g} cycles_per_plan", cycles, "<=", permitted),
     )
 
 
 def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
     """Compare two sentences of the paper with each other, by computation and in two runs."""
-    count = sum(bool(describe_unmet(check_planning(process_ms))) for process_ms in PAPER_X)
+    count = sum(bool(describe_unmet(check_planning(process_ms))) for process_ms in PAPER_X_MS)
     return rule_on(
-        compare("contradicting_X", count, ">=", 1),
-        _compare_late(short, "<=", "shortest_X_late_share"),
-        _compare_late(long, ">", "longest_X_late_share"),
+        compare_value("contradicting_X", count, ">=", 1),
+        _compare_late_share(short, "<=", "shortest_X_late_share"),
+        _compare_late_share(long, ">", "longest_X_late_share"),
         holding=Ruling.CONTRADICTS,
     )
 
@@ -336,7 +373,7 @@ def judge_tables(runs: TableRuns) -> ClaimVerdict:
     answering_rows = {*runs.disturbed.rows} - {*runs.undisturbed.rows}
     return rule_on(
         *check_done(runs.disturbed, runs.undisturbed),
-        compare("answering_transitions", len(answering_rows), ">=", 1),
+        compare_value("answering_transitions", len(answering_rows), ">=", 1),
     )
 
 
@@ -350,21 +387,23 @@ def judge_levels(run: NasremRun) -> ClaimVerdict:
     rates = check_done(run)
     gaps = []
     for name, task in run.executors.items():
-        every = config.every(name)
+        every = config.find_period(name)
         config_hz = 1e9 / (every * config.clock_ns)
         rate_hz = config_hz * task.done / -(-run.ticks // every)
         nominal_hz = PAPER_HZ.get(name, config_hz)
         rate_error = abs(rate_hz / nominal_hz - 1.0)
-        rates.append(compare(f"{name}_off_{nominal_hz:g}_Hz_share", rate_error, "<=", NOMINAL))
-        gaps.append(compare(f"{name}_gap_ms", task.largest_gap_ms, "<", 2.0 * task.slice_ms))
+        rates.append(
+            compare_value(f"{name}_off_{nominal_hz:g}_Hz_share", rate_error, "<=", MAX_RATE_ERROR)
+        )
+        gaps.append(compare_value(f"{name}_gap_ms", task.largest_gap_ms, "<", 2.0 * task.slice_ms))
     return rule_on(*rates, ideal=gaps)
 
 
 def judge_switch(run: SwitchRun) -> ClaimVerdict:
     """Compare this machine's context switch with the paper's and with the config's, us."""
     return rule_on(
-        compare("switch_median_us", run.switch_us["p50"], "<=", PAPER_US),
-        compare("switch_p99_us", run.switch_us["p99"], "<=", run.assumed_us),
+        compare_value("switch_median_us", run.switch_us["p50"], "<=", PAPER_US),
+        compare_value("switch_p99_us", run.switch_us["p99"], "<=", run.assumed_us),
         holding=Ruling.BOUNDED,
     )
 
@@ -375,8 +414,8 @@ def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
     Slow levels should manage with multitasking, and fast ones should need separate processors.
     """
     is_slow = {
-        one.level: figure5.region_of(one.cycle_s).name == "multitasking"
-        for one in figure5.placed(load(NAME))
+        one.level: figure5.find_region(one.cycle_s).name == "multitasking"
+        for one in figure5.place_levels(load(NAME))
     }
     tasks = [
         ("slow" if is_slow.get(task.board) else one.partition.coupling, task)
@@ -389,12 +428,12 @@ def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
         bad = sum(task.missed + task.skipped for task in group_tasks)
         return bad / max(sum(task.cycles for task in group_tasks), 1)
 
-    max_missed = missed_share("loose") + FEW
+    max_missed = missed_share("loose") + MAX_FEW_SHARE
     plans = min((task.cycles for _, task in tasks if task.role == "planner"), default=0)
     return rule_on(
-        compare("slow_levels_missed_share", missed_share("slow"), "<=", FEW),
-        ideal=[compare("fast_levels_missed_share", missed_share("tight"), ">", max_missed)],
-        needs=[compare("fewest_plans", plans, ">=", 1)],
+        compare_value("slow_levels_missed_share", missed_share("slow"), "<=", MAX_FEW_SHARE),
+        ideal=[compare_value("fast_levels_missed_share", missed_share("tight"), ">", max_missed)],
+        needs=[compare_value("fewest_plans", plans, ">=", 1)],
     )
 
 
@@ -418,7 +457,7 @@ def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimV
     return rule_on(
         *check_done(*runs),
         ideal=[
-            compare(name, way.longest_ms or 0.0, "<=", way.bound_ms + ROUNDING_MS)
+            compare_value(name, way.longest_ms or 0.0, "<=", way.bound_ms + ROUNDING_MS)
             for name, way in ways.items()
         ],
         here=check_none(late_without_miss=sum(way.unexplained for way in ways.values())),
@@ -428,9 +467,13 @@ def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimV
 def judge_layers(names: Iterable[str]) -> ClaimVerdict:
     """Count levels in configs, and systems in which a level is faster than one below it."""
     configs = {name: load(name) for name in names}
-    paths = {name: rack_timing(one, wire(one)).hierarchy for name, one in configs.items()}
+    paths = {
+        name: build_rack_timing(one, resolve_layout(one)).hierarchy for name, one in configs.items()
+    }
     faster = sum(sorted(path.cycles, reverse=True) != [*path.cycles] for path in paths.values())
-    levels = (compare(f"{name}_levels", len(path.levels), ">=", 2) for name, path in paths.items())
+    levels = (
+        compare_value(f"{name}_levels", len(path.levels), ">=", 2) for name, path in paths.items()
+    )
     return rule_on(*levels, *check_none(systems_with_a_faster_level_above=faster))
 
 
@@ -445,14 +488,14 @@ def judge_links(
         ideal: Further comparisons for the claim to hold. Without them it holds within bounds.
     """
     min_counts = {
-        box: (1.0 - STRAY) * rate_hz * run.lasted_s if rate_hz > 1 else 1
+        box: (1.0 - MAX_STRAY_SHARE) * rate_hz * run.lasted_s if rate_hz > 1 else 1
         for box, rate_hz in rates_hz.items()
     }
     return rule_on(
         *check_done(run),
-        compare("missed_share", run.missed, "<=", STRAY),
+        compare_value("missed_share", run.missed, "<=", MAX_STRAY_SHARE),
         *(
-            compare(f"{box}_messages", run.messages.get(box, 0), ">=", count)
+            compare_value(f"{box}_messages", run.messages.get(box, 0), ">=", count)
             for box, count in min_counts.items()
         ),
         ideal=ideal,
@@ -461,8 +504,10 @@ def judge_links(
 
 def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
     """Judge RCCL's links. For the claim to hold, every joint also needs a processor."""
-    joints = [task.core for task in wire(load("rccl")).tasks if task.board.startswith("joint")]
-    cores = compare("processors_of_joints", len(set(joints)), ">=", len(joints))
+    joints = [
+        task.core for task in resolve_layout(load("rccl")).tasks if task.board.startswith("joint")
+    ]
+    cores = compare_value("processors_of_joints", len(set(joints)), ">=", len(joints))
     return judge_links(rates_hz, run, [cores])
 
 
@@ -474,19 +519,21 @@ def judge_predictable(run: ResponseRun) -> ClaimVerdict:
     realtime = run.realtime
     upper_checks, sum_checks = (
         [
-            compare(f"{row['level']}_within_{bound}", row["max_from_reading_ms"], "<=", row[bound])
-            for row in realtime.rows()
+            compare_value(
+                f"{row['level']}_within_{bound}", row["max_from_reading_ms"], "<=", row[bound]
+            )
+            for row in realtime.build_rows()
             if row["commands"]
         ]
         for bound in ("bound_eq_3_2_ms", "sum_eq_3_3_ms")
     )
     return rule_on(
         *check_none(
-            lockstep_off_predicted_tick=len(run.lockstep.off),
+            lockstep_off_predicted_tick=len(run.lockstep.mispredicted_commands),
             lockstep_torque_off_predicted_tick=run.differs != run.predicted,
-            realtime_beyond_grid=len(realtime.beyond),
+            realtime_beyond_grid=len(realtime.commands_beyond_bound),
         ),
         *upper_checks,
         ideal=sum_checks,
-        needs=[compare("realtime_commands", len(realtime.measured), ">=", 1)],
+        needs=[compare_value("realtime_commands", len(realtime.measured_commands), ">=", 1)],
     )

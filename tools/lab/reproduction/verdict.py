@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-STRAY = 0.02
+MAX_STRAY_SHARE = 0.02
 """Largest share of missed cycles, plans or messages that is attributed to this machine.
 
 Up to this share the claim still holds within bounds.
@@ -54,7 +54,7 @@ class Check:
         return f"{self.compared} {self.measured:.6g}, not {self.sign} {self.demanded:.6g}"
 
 
-def compare(name: str, measured: float, sign: str, demanded: float) -> Check:
+def compare_value(name: str, measured: float, sign: str, demanded: float) -> Check:
     """Compare a measured value with a demanded one.
 
     Args:
@@ -82,7 +82,7 @@ class ClaimVerdict:
 
 def check_none(**counts: float) -> list[Check]:
     """Check that the counts of unwanted events are 0."""
-    return [compare(name, count, "=", 0) for name, count in counts.items()]
+    return [compare_value(name, count, "=", 0) for name, count in counts.items()]
 
 
 def rule_on(
@@ -115,7 +115,7 @@ def rule_on(
     return ClaimVerdict(ruling, tuple(dict.fromkeys((*needs, *always, *ideal, *here))))
 
 
-def rule_strays(name: str, bad: int, due: int, *needs: Check) -> ClaimVerdict:
+def rule_on_strays(name: str, bad: int, due: int, *needs: Check) -> ClaimVerdict:
     """Rule on an event that must not happen. A stray share is tolerated within bounds.
 
     Args:
@@ -125,7 +125,7 @@ def rule_strays(name: str, bad: int, due: int, *needs: Check) -> ClaimVerdict:
         needs: Conditions without which a run cannot test the claim.
     """
     return rule_on(
-        ideal=[compare(name, bad, "=", 0)],
-        here=[compare(f"{name}_share", bad / max(due, 1), "<=", STRAY)],
-        needs=[*needs, compare(f"{name}_of", due, ">=", 1)],
+        ideal=[compare_value(name, bad, "=", 0)],
+        here=[compare_value(f"{name}_share", bad / max(due, 1), "<=", MAX_STRAY_SHARE)],
+        needs=[*needs, compare_value(f"{name}_of", due, ">=", 1)],
     )

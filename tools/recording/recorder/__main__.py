@@ -16,7 +16,7 @@ from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING
 
-from rack.levels.references import module_and_name
+from rack.levels.references import import_reference
 
 if TYPE_CHECKING:
     from rack.backplane.segment import Segment
@@ -43,7 +43,7 @@ def main() -> None:
     launcher = os.getppid()
     from rack.backplane.segment import Segment
     from rack.backplane.words import System
-    from rack.tools.recording.recorder.process import UNWRITABLE, unwritable
+    from rack.tools.recording.recorder.process import UNWRITABLE, format_write_failure
     from rack.tools.recording.recorder.recorder import Recorder, SafeSink
 
     # The import takes half a second, so a thread does it while the rack is being launched.
@@ -53,11 +53,13 @@ def main() -> None:
         return
     name, folder, port = json.loads(line)
     segment = Segment.attach(name)
-    view = SafeSink.of(segment, port, lambda: _view(segment, Path(folder), port), _tell)
+    view = SafeSink.open_for(
+        segment, port, lambda: _open_view(segment, Path(folder), port), _print_message
+    )
     try:
         with Recorder(segment, Path(folder), view) as recorder:
-            _tell("recording")
-            recorder.follow(until=sys.stdin.fileno())
+            _print_message("recording")
+            recorder.record_until(until=sys.stdin.fileno())
             if segment.run_is_over:
                 # No boards are left that need the core. Only root may lower the niceness again.
                 with suppress(PermissionError):
@@ -69,7 +71,7 @@ def main() -> None:
                 view.hurry()
     except OSError as error:
         tick = segment.words[System.FOLLOWER_TICK]
-        print(unwritable(Path(folder), error, tick), file=sys.stderr, flush=True)
+        print(format_write_failure(Path(folder), error, tick), file=sys.stderr, flush=True)
         os._exit(UNWRITABLE)
 
 
@@ -77,17 +79,17 @@ def _import_view() -> None:
     """Import the module of the view ahead of time."""
     # If it is missing, opening the view reports that.
     with suppress(LookupError):
-        module_and_name(sys.argv[1])
+        import_reference(sys.argv[1])
 
 
-def _view(segment: Segment, folder: Path, port: int | None) -> Sink:
+def _open_view(segment: Segment, folder: Path, port: int | None) -> Sink:
     """Open the view of a run in `folder`, served on a port if one is given."""
-    module, name = module_and_name(sys.argv[1])
+    module, name = import_reference(sys.argv[1])
     sink: Sink = getattr(module, name)(segment, folder, port)
     return sink
 
 
-def _tell(text: str) -> None:
+def _print_message(text: str) -> None:
     """Print a message for the launcher."""
     # The launcher may be gone, but the files must still be finished.
     with suppress(OSError):

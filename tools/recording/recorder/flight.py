@@ -18,7 +18,7 @@ STRETCH_S = 1.0
 """Simulated time in a stretch."""
 
 
-class Sealed(NamedTuple):
+class FinishedStretch(NamedTuple):
     """A finished stretch that is not near any occasion so far.
 
     Attributes:
@@ -44,15 +44,15 @@ class FlightRecorder:
         self._words = segment.words
         self._occasions = Occasions(segment)
         self._length = round(STRETCH_S * 1e9 / segment.layout.clock_ns)
-        self._sealed: deque[Sealed] = deque()
+        self._sealed: deque[FinishedStretch] = deque()
         self._kept_until = -1
         self._began = 0
         if tally.number:
             # Rows may have been lost while no recorder was running.
-            self._mark(self._words[System.TICK])
-        self._path = self._begin(self._began, self._began)
+            self._keep_around(self._words[System.TICK])
+        self._path = self._begin_stretch(self._began, self._began)
 
-    def look(self, ring: str, rows: np.ndarray, lost: int) -> None:
+    def find_occasions(self, ring: str, rows: np.ndarray, lost: int) -> None:
         """Look for occasions in rows of a ring.
 
         Args:
@@ -62,23 +62,23 @@ class FlightRecorder:
                 content is unknown.
         """
         loss_ticks = [self._words[System.TICK]] if lost else []
-        for tick in (*loss_ticks, *self._occasions.within(ring, rows)):
-            self._mark(tick)
+        for tick in (*loss_ticks, *self._occasions.find_in_rows(ring, rows)):
+            self._keep_around(tick)
 
-    def advance(self, tick: int) -> None:
+    def advance_to(self, tick: int) -> None:
         """Continue after everything before `tick` has been added to the spool.
 
         Begins a new stretch if the current one is long enough, and deletes old ones.
         """
-        for alarm_tick in self._occasions.alarms():
-            self._mark(alarm_tick)
+        for alarm_tick in self._occasions.find_in_alarms():
+            self._keep_around(alarm_tick)
         if tick - self._began < self._length:
             return
         # Rows of cycles that began in the meantime may be in either stretch.
         next_tick = self._words[System.TICK] + 1
-        path = self._begin(next_tick, tick)
+        path = self._begin_stretch(next_tick, tick)
         if self._began > self._kept_until:
-            self._sealed.append(Sealed(self._path, next_tick))
+            self._sealed.append(FinishedStretch(self._path, next_tick))
         self._path = path
         self._began = tick
         while self._sealed and self._sealed[0].last < tick - self._retention.keep:
@@ -87,19 +87,19 @@ class FlightRecorder:
     def close(self) -> None:
         """Finish the last stretch. An empty one follows, whose head contains the final counts."""
         end = self._words[System.TICK] + 1
-        self._begin(end, end)
+        self._begin_stretch(end, end)
         self._spool.close(end)
 
-    def _begin(self, begin: int, end: int) -> Path:
+    def _begin_stretch(self, begin: int, end: int) -> Path:
         """Begin a stretch at tick `begin`, end the previous one at `end`, and return the file."""
         tally = self._tally
         stretch = StretchHead(tally.number + 1, begin, dict(tally.taken), dict(tally.rows))
-        tally.begin(stretch)
-        return self._spool.divert(stretch, end)
+        tally.begin_stretch(stretch)
+        return self._spool.begin_stretch(stretch, end)
 
-    def _mark(self, tick: int) -> None:
+    def _keep_around(self, tick: int) -> None:
         """Keep the stretches around an occasion."""
-        window = self._retention.around(tick)
+        window = self._retention.find_window(tick)
         self._kept_until = max(self._kept_until, window.last)
         while self._sealed and self._sealed[-1].last >= window.first:
             self._sealed.pop()

@@ -14,18 +14,18 @@ from math import inf
 from pathlib import Path
 
 from rack.backplane.json_text import encode_json
-from rack.backplane.process import STOPPED, processor_ns, readable, state_of
+from rack.backplane.process import STOPPED_STATES, read_processor_ns, read_state, wait_readable
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure
 
-VIEW = "rack.tools.viewer.sink:ViewSink"
+VIEW_CLASS = "rack.tools.viewer.sink:ViewSink"
 """Class that shows a recording, by name, because recording itself needs none of its libraries."""
-BEGUN = "recording"
+ATTACHED_LINE = "recording"
 """Line that the recorder prints once it has attached."""
 ATTACH_S = 30.0
 """Longest time to wait for the recorder to attach."""
-IDLE_LOOKS = 100
-STOPPED_LOOKS = 5
+MAX_IDLE_CHECKS = 100
+MAX_STOPPED_CHECKS = 5
 """Number of idle checks in a row after which a recorder is killed.
 
 A check finds the recorder idle if it has used no processor time since the check before, 0.2 s to 1
@@ -33,23 +33,23 @@ s earlier. On a busy machine a recorder is slow but never idle. The smaller numb
 recorder that a signal has stopped. The limits are checks, not seconds, because Ctrl-Z stops both
 processes.
 """
-LOOK_S = 0.2
+CHECK_PERIOD_S = 0.2
 """Shortest time between two of these checks."""
-RESTARTS = 3
+MAX_RESTARTS = 3
 UNWRITABLE = os.EX_IOERR
 """Exit status of a recorder whose files cannot be written, for example because the disk is full.
 
 It is not restarted, since another recorder would fail as well.
 """
 
-ENDS = "the recording ends at tick"
+END_CLAUSE = "the recording ends at tick"
 """Marks the line with the reason among the lines that such a recorder prints.
 
 The viewer's library may print more after it.
 """
 
 
-def unwritable(folder: Path, error: OSError, tick: int) -> str:
+def format_write_failure(folder: Path, error: OSError, tick: int) -> str:
     """Return a sentence that says why a recording ended before its run.
 
     Args:
@@ -59,10 +59,10 @@ def unwritable(folder: Path, error: OSError, tick: int) -> str:
     """
     # Messages of pyarrow are long, so prefer the text of the error number.
     why = os.strerror(error.errno) if error.errno else error
-    return f"{folder}: {why}: {ENDS} {tick}"
+    return f"{folder}: {why}: {END_CLAUSE} {tick}"
 
 
-class IdleLooks:
+class IdleCounter:
     """Counts the checks in a row in which a process has used no processor time."""
 
     def __init__(self, pid: int) -> None:
@@ -70,9 +70,9 @@ class IdleLooks:
         self._used_ns = 0
         self._count = 0
 
-    def look(self) -> int:
+    def count_idle_checks(self) -> int:
         """Check the process, and return the number of idle checks in a row, including this one."""
-        used_ns = processor_ns(self._pid)
+        used_ns = read_processor_ns(self._pid)
         self._count = self._count + 1 if used_ns == self._used_ns else 0
         self._used_ns = used_ns
         return self._count
@@ -102,7 +102,7 @@ class RecorderProcess:
     def _start(self) -> None:
         """Spawn a recorder process."""
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "rack.tools.recording.recorder", VIEW],
+            [sys.executable, "-P", "-m", "rack.tools.recording.recorder", VIEW_CLASS],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._complaints,
@@ -113,7 +113,7 @@ class RecorderProcess:
         self._has_begun = False
         self._is_gone = False
         self._is_killed = False
-        self._idle = IdleLooks(self.pid)
+        self._idle = IdleCounter(self.pid)
 
     @property
     def pid(self) -> int:
@@ -133,10 +133,10 @@ class RecorderProcess:
         """
         self._request = encode_json([rack, str(self.folder), port]).encode() + b"\n"
         self._words = words
-        self._ask()
-        return self.await_begun(ATTACH_S)
+        self._send_request()
+        return self.wait_until_attached(ATTACH_S)
 
-    def await_begun(self, bound_s: float = inf) -> bool:
+    def wait_until_attached(self, bound_s: float = inf) -> bool:
         """Wait until the recorder has attached, died or hung, but at most `bound_s`.
 
         Returns:
@@ -144,11 +144,11 @@ class RecorderProcess:
         """
         deadline = time.monotonic() + bound_s
         while not self._has_begun and time.monotonic() < deadline and self._process.poll() is None:
-            self._read(LOOK_S)
+            self._read_output(CHECK_PERIOD_S)
             self._kill_hung()
         return self._has_begun
 
-    def _ask(self) -> None:
+    def _send_request(self) -> None:
         """Send the name of the rack and the folder to the recorder."""
         assert self._process.stdin is not None, "it is a pipe"
         # From now on the clock waits for the recorder. Until it reads, the rings hold the rows.
@@ -157,50 +157,50 @@ class RecorderProcess:
             self._process.stdin.write(self._request)
             self._process.stdin.flush()
 
-    def news(self) -> list[str]:
+    def read_news(self) -> list[str]:
         """Return new messages for the user, and restart the recorder if it has died."""
         had_begun = self._has_begun
         if not self._is_gone:
             self._kill_hung()
-        while not self._is_gone and self._read(0.0):
+        while not self._is_gone and self._read_output(0.0):
             continue
         lines = self._lines
         self._lines = []
         if self._has_begun and not had_begun:
             lines.append("the recorder has begun")
         if not self._is_gone and self._process.poll() is not None:
-            lines.append(self._end_early())
+            lines.append(self._restart_or_give_up())
         return lines
 
     def _kill_hung(self) -> None:
         """Kill the recorder if it has been idle for too many checks."""
-        bound = STOPPED_LOOKS if state_of(self.pid) in STOPPED else IDLE_LOOKS
-        if self._idle.look() > bound and not self._is_killed:
+        bound = MAX_STOPPED_CHECKS if read_state(self.pid) in STOPPED_STATES else MAX_IDLE_CHECKS
+        if self._idle.count_idle_checks() > bound and not self._is_killed:
             self._is_killed = True
             self._lines.append("the recorder did not respond and was killed")
             self._process.kill()
 
-    def _end_early(self) -> str:
+    def _restart_or_give_up(self) -> str:
         """Restart a dead recorder unless it has died too often. Returns a message for the user."""
-        ended = self._ended()
-        if self._restarts == RESTARTS:
+        ended = self._describe_end()
+        if self._restarts == MAX_RESTARTS:
             self._is_gone = True
             self._set_follower(0)
             return f"{ended}; the run continues without a recording"
         self._restarts += 1
         self._close_pipes()
         self._start()
-        self._ask()
-        return f"{ended}; restarted, {self._restarts} of at most {RESTARTS} times"
+        self._send_request()
+        return f"{ended}; restarted, {self._restarts} of at most {MAX_RESTARTS} times"
 
-    def _ended(self) -> str:
+    def _describe_end(self) -> str:
         """Describe how the recorder ended, with the last line that it printed on stderr."""
         size = os.fstat(self._complaints).st_size
         status = self._process.returncode
         text = os.pread(self._complaints, 4096, max(0, size - 4096)).decode(errors="replace")
         lines = text.strip().splitlines()
         if status == UNWRITABLE:
-            raise Failure(next((line for line in reversed(lines) if ENDS in line), text))
+            raise Failure(next((line for line in reversed(lines) if END_CLAUSE in line), text))
         return ": ".join((f"the recorder ended with status {status}", *lines[-1:]))
 
     def _set_follower(self, pid: int) -> None:
@@ -225,15 +225,15 @@ class RecorderProcess:
                     self._process.stdin.close()
             while self._process.poll() is None:
                 with suppress(subprocess.TimeoutExpired):
-                    self._process.wait(LOOK_S)
+                    self._process.wait(CHECK_PERIOD_S)
                 self._kill_hung()
-            while self._read(0.0):
+            while self._read_output(0.0):
                 continue
             was_reported = self._is_gone
             self._is_gone = True
             self._close_pipes()
             try:
-                self._result = self._ended()
+                self._result = self._describe_end()
             finally:
                 os.close(self._complaints)
             if self._process.returncode and not was_reported:
@@ -248,18 +248,18 @@ class RecorderProcess:
                 with suppress(BrokenPipeError):
                     pipe.close()
 
-    def _read(self, timeout_s: float) -> bool:
+    def _read_output(self, timeout_s: float) -> bool:
         """Read the recorder's output.
 
         Returns:
             False if nothing came in time, or the output has ended.
         """
         stdout = self._process.stdout
-        if stdout is None or not readable(stdout.fileno(), timeout_s):
+        if stdout is None or not wait_readable(stdout.fileno(), timeout_s):
             return False
         block = os.read(stdout.fileno(), 1 << 16)
         *lines, self._unread = (self._unread + block).split(b"\n")
         texts = [line.decode(errors="replace") for line in lines]
-        self._has_begun |= BEGUN in texts
-        self._lines += [line for line in texts if line != BEGUN]
+        self._has_begun |= ATTACHED_LINE in texts
+        self._lines += [line for line in texts if line != ATTACHED_LINE]
         return bool(block)

@@ -17,19 +17,19 @@ import numpy as np
 from rack.backplane.process import is_alive
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
-from rack.boards.config.layout import KEPT_S
+from rack.boards.config.layout import RETAINED_S
 from rack.tools.console.answer import write_file
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreMeter
 from rack.tools.recording.file_names import PUBLISHED
 from rack.tools.recording.occasions import Retention
 from rack.tools.recording.recorder.flight import FlightRecorder
-from rack.tools.recording.recorder.process import LOOK_S, IdleLooks
-from rack.tools.recording.run_files import TABLES, RunFiles, Tally
-from rack.tools.recording.spool import Spool, rings
+from rack.tools.recording.recorder.process import CHECK_PERIOD_S, IdleCounter
+from rack.tools.recording.run_files import TABLE_PATTERNS, RunFiles, Tally
+from rack.tools.recording.spool import Spool, open_rings
 
-REALTIME_S = 0.05
-LOCKSTEP_S = 0.005
+REALTIME_PERIOD_S = 0.05
+LOCKSTEP_PERIOD_S = 0.005
 """Time between two drains of the rings, in real time and in lockstep.
 
 The rings hold two seconds of real time. A rack in lockstep runs faster and waits for its recorder.
@@ -40,17 +40,17 @@ HAND_OVER_S = 0.1
 
 Rows that boards write in that time are not in the spool yet.
 """
-OPENED_S = 120.0
+OPENING_TIMEOUT_S = 120.0
 """Longest time that a finishing recorder waits for its sink to open.
 
 On a busy machine, loading the viewer's library alone may take a minute.
 """
-OPENING_LOOKS = 25
+MAX_OPENING_CHECKS = 25
 """Number of idle checks in a row, 0.2 s apart, after which opening the sink counts as hung.
 
 The viewer's library waits forever for a file that cannot be written.
 """
-HURRIED_S = 0.5
+HURRIED_TIMEOUT_S = 0.5
 """Longest time that a hurried recorder waits for its sink to open.
 
 An interrupted run must end within 2 s.
@@ -90,18 +90,18 @@ class SafeSink:
         self._late = 0  # calls that were left waiting
         # A daemon thread, so that a hurried process can exit without it.
         self._opening = Thread(
-            target=self._guarded,
+            target=self._call_guarded,
             args=(lambda: setattr(self, "_sink", opened()),),
             daemon=True,
         )
         self._opening.start()
         if not in_background:
             self._opening.join()
-        self._patience_s = OPENED_S
+        self._patience_s = OPENING_TIMEOUT_S
         self._why_late = "the viewer's library has not opened it"
 
     @classmethod
-    def of(
+    def open_for(
         cls,
         segment: Segment,
         port: int | None,
@@ -120,7 +120,7 @@ class SafeSink:
             The sink. None for a flight recorder without a port, because `rack replay` makes the
             file of what it kept.
         """
-        if port is None and Retention.of(segment) is not None:
+        if port is None and Retention.from_config(segment) is not None:
             return None
         # The viewer's libraries may take long to load, or hang on a full disk, so a run does not
         # wait for them, unless the user wants to watch from the start.
@@ -138,30 +138,30 @@ class SafeSink:
         counted = dict(lost)
         self._waiting.append(lambda sink: sink.advance(tick, counted))
         if not self._opening.is_alive():
-            self._hand_over(time.monotonic() + HAND_OVER_S)
+            self._make_waiting_calls(time.monotonic() + HAND_OVER_S)
         self._late = len(self._waiting)
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
         """Finish the sink, waiting for it to open if necessary."""
         self._waiting.append(lambda sink: sink.close(tick, lost))
         until = time.monotonic() + self._patience_s
-        idle = IdleLooks(os.getpid())
+        idle = IdleCounter(os.getpid())
         while self._opening.is_alive() and time.monotonic() < until:
-            self._opening.join(min(LOOK_S, self._patience_s))
-            if idle.look() >= OPENING_LOOKS:
+            self._opening.join(min(CHECK_PERIOD_S, self._patience_s))
+            if idle.count_idle_checks() >= MAX_OPENING_CHECKS:
                 break
         if self._opening.is_alive():
             self._tell(f"run.rrd is missing: {self._why_late}; 'rack replay' makes it")
         else:
             self._late = 0
-            self._hand_over()
+            self._make_waiting_calls()
 
     def hurry(self) -> None:
         """Stop waiting for a sink that will not be open soon."""
-        self._patience_s = HURRIED_S
+        self._patience_s = HURRIED_TIMEOUT_S
         self._why_late = "the run was interrupted before the libraries of the viewer were loaded"
 
-    def _hand_over(self, until: float = 0.0) -> None:
+    def _make_waiting_calls(self, until: float = 0.0) -> None:
         """Make the waiting calls: all new ones, and older ones until the time `until`.
 
         The calls of a failed sink are dropped.
@@ -169,9 +169,9 @@ class SafeSink:
         while len(self._waiting) > self._late or (self._waiting and time.monotonic() < until):
             call = self._waiting.popleft()
             if (sink := self._sink) is not None:
-                self._guarded(partial(call, sink))
+                self._call_guarded(partial(call, sink))
 
-    def _guarded(self, call: Callable[[], None]) -> None:
+    def _call_guarded(self, call: Callable[[], None]) -> None:
         """Make a call. If it fails, drop the sink and report the error."""
         try:
             call()
@@ -180,7 +180,7 @@ class SafeSink:
             self._tell(f"run.rrd ends here: {' '.join(str(error).split()) or type(error).__name__}")
 
 
-RISKED_PART = 4
+RISKED_DIVISOR = 4
 """Divisor of the rings' length, in ticks.
 
 Lockstep may run ahead of the spool's file by this part of the rings.
@@ -205,22 +205,22 @@ class Recorder:
         self._spool = Spool(folder, layout, segment.launch)
         write_file(folder / PUBLISHED, segment.published)
         Checksums(folder).store(PUBLISHED)
-        retention = Retention.of(segment)
-        self._rings = rings(segment)
+        retention = Retention.from_config(segment)
+        self._rings = open_rings(segment)
         before = {name: ring.before for name, ring in self._rings.items()}
         self._files = None
         if retention is None:
             self._files = RunFiles(folder, layout, segment.launch, before=before)
         self._tally = self._files or Tally(layout, before)
-        for part in self._spool.resume():
-            self._tally.take(part)
+        for part in self._spool.read_rest():
+            self._tally.count_part(part)
         self._flight = (
             None
             if retention is None
             else FlightRecorder(segment, retention, self._spool, self._tally)
         )
         for name, taken in self._tally.taken.items():
-            self._rings[name].resume(taken)
+            self._rings[name].resume_after(taken)
         # In lockstep the machine cannot cause a deadline miss.
         self._cores = None if self._words[System.LOCKSTEP] else CoreMeter()
         follower = self._words[System.FOLLOWER_PID]
@@ -232,7 +232,7 @@ class Recorder:
         # continues where the last one stopped, even if that one died without writing a row. Any
         # other recorder begins now.
         self._safe_tick = self._words[System.FOLLOWER_TICK if is_awaited else System.TICK]
-        self._most_at_risk = round(KEPT_S * 1e9 / layout.clock_ns) // RISKED_PART
+        self._most_at_risk = round(RETAINED_S * 1e9 / layout.clock_ns) // RISKED_DIVISOR
         self._report_progress()
 
     def __enter__(self) -> Self:
@@ -246,15 +246,15 @@ class Recorder:
             # the spool.
             self._spool.close()
 
-    def drain(self) -> None:
+    def drain_rings(self) -> None:
         """Record everything written since the last call."""
         tick = self._words[System.TICK]
         for name, ring in self._rings.items():
-            rows, lost = ring.drain()
-            self._spool.add(name, rows, lost)
-            self._tally.add(name, rows, lost)
+            rows, lost = ring.read_new_rows()
+            self._spool.add_rows(name, rows, lost)
+            self._tally.add_rows(name, rows, lost)
             if self._flight is not None:
-                self._flight.look(name, rows, lost)
+                self._flight.find_occasions(name, rows, lost)
             if self._view is not None:
                 self._view.add(name, rows)
         if self._is_follower:
@@ -265,9 +265,9 @@ class Recorder:
         if self._spool.flush(now=is_late):
             self._safe_tick = tick
         if self._flight is not None:
-            self._flight.advance(tick)
+            self._flight.advance_to(tick)
         if self._cores is not None:
-            self._cores.look()
+            self._cores.read_counters()
         if self._view is not None:
             self._view.advance(tick, self._tally.lost)
         self._report_progress()
@@ -281,14 +281,14 @@ class Recorder:
             self._words[System.FOLLOWER_TICK] = self._safe_tick
             self._words[System.FOLLOWER_PID] = os.getpid()
 
-    def follow(self, until: int) -> None:
+    def record_until(self, until: int) -> None:
         """Record until a file descriptor is readable or closed."""
-        period_s = LOCKSTEP_S if self._words[System.LOCKSTEP] else REALTIME_S
+        period_s = LOCKSTEP_PERIOD_S if self._words[System.LOCKSTEP] else REALTIME_PERIOD_S
         watched = select.poll()
         watched.register(until, select.POLLIN)
         while not watched.poll(period_s * 1e3):
-            self.drain()
-        self.drain()
+            self.drain_rings()
+        self.drain_rings()
 
     def close(self) -> None:
         """Finish the files. The rack continues without a follower."""
@@ -298,8 +298,8 @@ class Recorder:
             self._flight.close()
         if self._files is not None:
             self._spool.flush(now=True)
-            self._files.close(UNMEASURED if self._cores is None else self._cores.record())
-            Checksums(self._folder).store(*TABLES)
+            self._files.close(UNMEASURED if self._cores is None else self._cores.build_record())
+            Checksums(self._folder).store(*TABLE_PATTERNS)
             self._spool.remove()
         if self._view is not None:
             self._view.close(self._words[System.TICK] + 1, self._tally.lost)

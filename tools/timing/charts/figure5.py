@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from rack.boards.config import RackConfig
 from rack.tools.console.answer import Document
-from rack.tools.console.pictures import paths_of, picture
+from rack.tools.console.pictures import list_picture_paths, open_figure
 from rack.tools.timing.tables import merge_rows
 
 if TYPE_CHECKING:
@@ -31,11 +31,11 @@ TICKS = {
     60.0: "1 min",
 }
 """Labels of the axis by cycle, s."""
-BANDS = ("#DDDDDD", "#F4C7B5", "#BFE3D8", "#C9DDF0")
+REGION_COLOURS = ("#DDDDDD", "#F4C7B5", "#BFE3D8", "#C9DDF0")
 """Colours from the fastest region to the slowest, light tints of Paul Tol's palette."""
-EDGE = "#222222"
-MARKERS = {"tight": ("s", EDGE), "loose": ("s", "white"), "none": ("x", EDGE)}
-MEANINGS = {
+EDGE_COLOUR = "#222222"
+MARKERS = {"tight": ("s", EDGE_COLOUR), "loose": ("s", "white"), "none": ("x", EDGE_COLOUR)}
+COUPLING_MEANINGS = {
     "tight": "planner on its executor's processor",
     "loose": "planner on a separate processor",
     "none": "no planner",
@@ -74,12 +74,12 @@ REGIONS = (
 
 A bound belongs to the faster region, except 1 ms.
 """
-COUPLING = {"tight": "multitasking", "loose": "asynchronous"}
+COUPLING_REGIONS = {"tight": "multitasking", "loose": "asynchronous"}
 """Short name of the region in which the figure has each coupling."""
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedLevel:
     """A level in the figure.
 
     Attributes:
@@ -97,42 +97,46 @@ class Placed:
     remark: str
 
 
-def placed(config: RackConfig) -> list[Placed]:
+def place_levels(config: RackConfig) -> list[PlacedLevel]:
     """Return the levels of a rack with their regions, beginning with the fastest one."""
     tick_s = config.tick_ns * 1e-9
-    cycles = {name: config.every(name) * tick_s for name in config.board}
+    cycles = {name: config.find_period(name) * tick_s for name in config.board}
     return [
-        Placed(
-            name, cycle_s, region.words, coupling, f"{region.words}: {_remark(region, coupling)}"
+        PlacedLevel(
+            name,
+            cycle_s,
+            region.words,
+            coupling,
+            f"{region.words}: {_format_remark(region, coupling)}",
         )
         for name, cycle_s in sorted(cycles.items(), key=lambda level: level[1])
-        for region, coupling in [(region_of(cycle_s), config.board[name].coupling)]
+        for region, coupling in [(find_region(cycle_s), config.board[name].coupling)]
     ]
 
 
-def together(levels: Sequence[Placed]) -> list[Placed]:
+def merge_levels(levels: Sequence[PlacedLevel]) -> list[PlacedLevel]:
     """Merge levels at the same place in the figure, because boards per joint need only one line."""
-    return [Placed(**row) for row in merge_rows(map(vars, levels), "level")]
+    return [PlacedLevel(**row) for row in merge_rows(map(vars, levels), "level")]
 
 
-def region_of(cycle_s: float) -> Region:
+def find_region(cycle_s: float) -> Region:
     """Return the region of a cycle."""
     return next(
         r for r in REGIONS if cycle_s < r.to_s or (cycle_s == r.to_s and r is not REGIONS[0])
     )
 
 
-def lines(config: RackConfig) -> Iterator[str]:
+def format_figure(config: RackConfig) -> Iterator[str]:
     """Yield the figure as text: every level with the kind of concurrency that suits it."""
     yield f"figure 5: levels of {config.name} in the regions of implementation, by their cycles"
     yield ""
     yield from (
-        f"{level.level}, {duration(level.cycle_s)}: {level.remark}"
-        for level in together(placed(config))
+        f"{level.level}, {format_duration(level.cycle_s)}: {level.remark}"
+        for level in merge_levels(place_levels(config))
     )
 
 
-def document(config: RackConfig) -> Document:
+def build_document(config: RackConfig) -> Document:
     """Return the figure as plain data. The last region has no end."""
     regions = [
         {"name": r.words, "to_s": None if r.to_s == float("inf") else r.to_s} for r in REGIONS
@@ -141,22 +145,22 @@ def document(config: RackConfig) -> Document:
         "rack": config.name,
         "figure": 5,
         "regions": regions,
-        "levels": [asdict(level) for level in placed(config)],
+        "levels": [asdict(level) for level in place_levels(config)],
     }
 
 
-def duration(cycle_s: float) -> str:
+def format_duration(cycle_s: float) -> str:
     """Format a cycle with a suitable unit."""
     if cycle_s >= 60.0:
         return f"{cycle_s / 60.0:g} min"
     return f"{cycle_s:g} s" if cycle_s >= 1.0 else f"{cycle_s * 1e3:g} ms"
 
 
-def save(config: RackConfig, stem: Path) -> list[Path]:
+def save_picture(config: RackConfig, stem: Path) -> list[Path]:
     """Draw the figure with the levels of a rack into `stem`.png and .svg. Returns their paths."""
-    levels = together(placed(config))
-    paths = paths_of(stem)
-    with picture(paths, 9.0, 1.7 + 0.36 * len(levels), layout="constrained") as figure:
+    levels = merge_levels(place_levels(config))
+    paths = list_picture_paths(stem)
+    with open_figure(paths, 9.0, 1.7 + 0.36 * len(levels), layout="constrained") as figure:
         axes = figure.subplots()
         _draw_regions(axes)
         _draw_levels(axes, levels)
@@ -171,7 +175,7 @@ def save(config: RackConfig, stem: Path) -> list[Path]:
 def _draw_regions(axes: Axes) -> None:
     starts = [SHORTEST_S, *(region.to_s for region in REGIONS[:-1])]
     ends = [*(region.to_s for region in REGIONS[:-1]), LONGEST_S]
-    for region, start, end, colour in zip(REGIONS, starts, ends, BANDS, strict=True):
+    for region, start, end, colour in zip(REGIONS, starts, ends, REGION_COLOURS, strict=True):
         axes.axvspan(start, end, color=colour, linewidth=0)
         words = (
             region.words.replace(" or ", "\nor ").replace(", ", ",\n").replace(" multi", "\nmulti")
@@ -185,28 +189,33 @@ def _draw_regions(axes: Axes) -> None:
     axes.set_xlabel("cycle")
 
 
-def _draw_levels(axes: Axes, levels: Sequence[Placed]) -> None:
+def _draw_levels(axes: Axes, levels: Sequence[PlacedLevel]) -> None:
     for row, level in enumerate(levels):
         marker, face = MARKERS[level.coupling]
         (point,) = axes.plot(
             [level.cycle_s], [row], marker, markersize=8, markeredgewidth=1.4, clip_on=False
         )
-        point.set(markerfacecolor=face, markeredgecolor=EDGE)
-        label = f"{level.level}, {duration(level.cycle_s)}"
+        point.set(markerfacecolor=face, markeredgecolor=EDGE_COLOUR)
+        label = f"{level.level}, {format_duration(level.cycle_s)}"
         axes.annotate(label, (level.cycle_s, row), (9, 0), textcoords="offset points", va="center")
     for coupling in dict.fromkeys(level.coupling for level in levels):
         marker, face = MARKERS[coupling]
         axes.plot(
-            [], [], marker, markerfacecolor=face, markeredgecolor=EDGE, label=MEANINGS[coupling]
+            [],
+            [],
+            marker,
+            markerfacecolor=face,
+            markeredgecolor=EDGE_COLOUR,
+            label=COUPLING_MEANINGS[coupling],
         )
 
 
-def _remark(region: Region, coupling: str) -> str:
+def _format_remark(region: Region, coupling: str) -> str:
     """Return a remark on a coupling in a region."""
     if coupling == "none":
         return "no planner to couple"
     actual = f"coupled {coupling}ly"
-    if COUPLING[coupling] == region.name:
+    if COUPLING_REGIONS[coupling] == region.name:
         return f"{actual}, as in the figure"
     asked = f"the figure gives the planner {region.asks}"
     if region.name == "asynchronous":

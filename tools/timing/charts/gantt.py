@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rack.backplane.layout import Layout
-from rack.boards.config import RackConfig, budgets, load, wire
+from rack.boards.config import RackConfig, load, read_budgets, resolve_layout
 from rack.tools.console.answer import Document, Failure
 from rack.tools.launch.folder import RUNS
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.charts.letters import column_for, lines
+from rack.tools.timing.charts.letters import choose_column_ns, format_panel
 from rack.tools.timing.charts.measured import TracedRun
 from rack.tools.timing.charts.panel import Panel
 from rack.tools.timing.charts.scheduled import Schedule
-from rack.tools.timing.charts.window import WindowOptions, shown_task
+from rack.tools.timing.charts.window import WindowOptions, choose_task
 
 NO_BUDGET = (
     "no board has a budget: give [board.<name>.budget], or --set board.<name>.budget.process_ms=1"
@@ -39,7 +39,7 @@ class Subject:
     folder: Path
 
 
-def subject_of(text: str, settings: Sequence[str], out: Path | None) -> Subject:
+def find_subject(text: str, settings: Sequence[str], out: Path | None) -> Subject:
     """Find the folder of a run, or else a config by name or path.
 
     Args:
@@ -60,7 +60,7 @@ def subject_of(text: str, settings: Sequence[str], out: Path | None) -> Subject:
     if "/" in text and not path.exists():
         raise Failure(f"{text}: there is no run folder and no config of this name", 2)
     config = load(text, settings)
-    return Subject(config, wire(config), None, out or RUNS / f"{config.name}-gantt")
+    return Subject(config, resolve_layout(config), None, out or RUNS / f"{config.name}-gantt")
 
 
 @dataclass(frozen=True)
@@ -73,31 +73,32 @@ class Gantt:
     column_ns: int
 
     @property
-    def spans(self) -> int:
+    def span_count(self) -> int:
         """Number of spans to draw."""
         return sum(len(panel.chart.spans) for panel in self.panels)
 
-    def text(self) -> str:
+    def format_text(self) -> str:
         """Format the chart as text."""
         panels = [
-            f"{self.rack}: " + "\n".join(lines(panel, self.column_ns)) for panel in self.panels
+            f"{self.rack}: " + "\n".join(format_panel(panel, self.column_ns))
+            for panel in self.panels
         ]
         return "\n\n".join([*panels, *self.notes])
 
-    def document(self) -> Document:
+    def to_document(self) -> Document:
         """Convert the chart to plain data."""
-        panels = [panel.document() for panel in self.panels]
+        panels = [panel.to_document() for panel in self.panels]
         return {"rack": self.rack, "panels": panels, "notes": list(self.notes)}
 
-    def save(self, folder: Path) -> list[Path]:
+    def save_pictures(self, folder: Path) -> list[Path]:
         """Draw the chart into an existing folder, and return the paths of the pictures."""
         # Import this only for pictures, because matplotlib takes a second.
-        from rack.tools.timing.charts.picture import save
+        from rack.tools.timing.charts.picture import save_picture
 
-        return save(self.panels, self.rack, folder / "gantt")
+        return save_picture(self.panels, self.rack, folder / "gantt")
 
 
-def gantt_of(
+def build_gantt(
     subject: Subject,
     options: WindowOptions,
     process_ns: Mapping[str, Sequence[int]],
@@ -119,24 +120,28 @@ def gantt_of(
     panels: list[Panel] = []
     notes: list[str] = []
     schedule = (
-        Schedule(subject.config, subject.layout, process_ns) if budgets(subject.config) else None
+        Schedule(subject.config, subject.layout, process_ns)
+        if read_budgets(subject.config)
+        else None
     )
     if run is not None and not run.is_lockstep:
-        task = shown_task(run.tasks)
-        start, end = options.window(task, run.end_ns, run.middle_ns(task))
-        panels.append(run.panel(start, end, progress))
+        task = choose_task(run.tasks)
+        start, end = options.choose_window(task, run.end_ns, run.find_middle_ns(task))
+        panels.append(run.build_panel(start, end, progress))
         if schedule is None:
             notes.append(f"no schedule: {NO_BUDGET}")
         else:
-            schedule.on_cores_of(run.recording.layout)
+            schedule.move_to_cores(run.recording.layout)
     else:
         no_run = f"{name} ran in lockstep: time stood still while its tasks computed"
         if schedule is None:
             raise Failure(f"{name}: {NO_BUDGET}" if run is None else f"{no_run}; {NO_BUDGET}", 2)
         if run is not None:
             notes.append(f"{no_run}; only the schedule is shown")
-        start, end = options.window(shown_task(schedule.tasks), None, 0, schedule.shown_ns)
+        start, end = options.choose_window(
+            choose_task(schedule.tasks), None, 0, schedule.default_length_ns
+        )
     if schedule is not None:
-        panels.append(schedule.panel(start, end))
+        panels.append(schedule.build_panel(start, end))
     shortest_ns = None if schedule is None else schedule.shortest_ns
-    return Gantt(name, tuple(panels), tuple(notes), column_for(end - start, shortest_ns))
+    return Gantt(name, tuple(panels), tuple(notes), choose_column_ns(end - start, shortest_ns))

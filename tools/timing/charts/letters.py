@@ -10,75 +10,78 @@ from collections.abc import Iterable, Iterator
 from itertools import count, groupby
 
 from rack.boards.timing.schedule import Chart, Job
-from rack.tools.console.tables import ms
+from rack.tools.console.tables import format_ms
 from rack.tools.timing.charts.panel import Panel
 from rack.tools.timing.charts.patterns import IDLE, Lane
 
-OTHER = "."
+OTHER_BOARD = "."
 """Sign of a column in which another board has the core."""
-COLUMNS = 100
+MAX_COLUMNS = 100
 """Maximum number of columns of a chart."""
-CYCLE_COLUMNS = 4
+MIN_CYCLE_COLUMNS = 4
 """Minimum number of columns of a cycle for its start to be marked."""
 LABEL_COLUMNS = 6
-REPEATED = 3
+MAX_WRITTEN_CYCLES = 3
 """Maximum number of equal successive cycles that are written individually."""
-SHOWN = 4
+MAX_LISTED = 4
 """Maximum number of patterns or late jobs in a list."""
 
 
-def lines(panel: Panel, column_ns: int) -> Iterator[str]:
+def format_panel(panel: Panel, column_ns: int) -> Iterator[str]:
     """Yield the lines of a panel."""
     chart = panel.chart
     yield (
-        f"{panel.kind}, {ms(chart.start_ns)} to {ms(chart.end_ns)} ms, a column is"
-        f" {ms(column_ns)} ms"
+        f"{panel.kind}, {format_ms(chart.start_ns)} to {format_ms(chart.end_ns)} ms, a column is"
+        f" {format_ms(column_ns)} ms"
     )
     margin = max(len(lane.title) for lane in panel.lanes) + 2
     if panel.frames:
         starts = [
             ((start - chart.start_ns) // column_ns, f"|{number}")
-            for number, start in numbered_frames(panel, column_ns)
+            for number, start in choose_frame_labels(panel, column_ns)
         ]
-        yield f"{'frame':{margin}}{label_row(starts)}"
+        yield f"{'frame':{margin}}{format_label_row(starts)}"
     unseen = []
     for lane in panel.lanes:
-        row = _row(chart, lane, column_ns)
+        row = _format_lane(chart, lane, column_ns)
         yield f"{lane.title:{margin}}{row}"
-        if not row.strip(IDLE + OTHER) and any(span.task in lane.tasks for span in chart.spans):
+        if not row.strip(IDLE + OTHER_BOARD) and any(
+            span.task in lane.tasks for span in chart.spans
+        ):
             unseen.append(lane.name)
-        marks = _marks(panel, lane, column_ns)
+        marks = _format_marks(panel, lane, column_ns)
         if marks:
             yield " " * margin + marks
     times = [
-        ((time - chart.start_ns) // column_ns, ms(time)) for time in label_times(panel, column_ns)
+        ((time - chart.start_ns) // column_ns, format_ms(time))
+        for time in choose_label_times(panel, column_ns)
     ]
-    yield f"{' ' * margin}{label_row(times)} ms"
+    yield f"{' ' * margin}{format_label_row(times)} ms"
     if unseen:
         yield f"too short for a column: {', '.join(unseen)}; show less time, or see the picture"
-    yield from _patterns(panel)
-    yield from _late(panel)
+    yield from _format_patterns(panel)
+    yield from _format_late_jobs(panel)
 
 
-def column_for(window_ns: int, shortest_ns: int | None) -> int:
+def choose_column_ns(window_ns: int, shortest_ns: int | None) -> int:
     """Return the time of a column, ns: 1, 2 or 5 times a power of ten.
 
     If `shortest_ns` is given and long enough, a column is no longer than that.
     """
     steps: list[int] = [digit * 10**power for power in range(3, 12) for digit in (1, 2, 5)]
-    fits = next((step for step in steps if window_ns <= COLUMNS * step), steps[-1])
+    fits = next((step for step in steps if window_ns <= MAX_COLUMNS * step), steps[-1])
     fine = max(
         (step for step in steps if shortest_ns is not None and step <= shortest_ns), default=fits
     )
     return max(fits, fine)
 
 
-def _row(chart: Chart, lane: Lane, column_ns: int) -> str:
+def _format_lane(chart: Chart, lane: Lane, column_ns: int) -> str:
     """Return the letters of a lane, in each column the unit function that took most of it."""
     columns = -(-(chart.end_ns - chart.start_ns) // column_ns)
     shares: list[Counter[str]] = [Counter() for _ in range(columns)]
     for span in (span for span in chart.spans if span.core == lane.core):
-        letter = span.unit.value if span.task in lane.tasks else OTHER
+        letter = span.unit.value if span.task in lane.tasks else OTHER_BOARD
         start, end = span.start_ns - chart.start_ns, span.end_ns - chart.start_ns
         for column in range(start // column_ns, -(-end // column_ns)):
             column_start = column * column_ns
@@ -89,20 +92,20 @@ def _row(chart: Chart, lane: Lane, column_ns: int) -> str:
     return "".join(max(share, key=share.__getitem__) for share in shares)
 
 
-def _marks(panel: Panel, lane: Lane, column_ns: int) -> str:
+def _format_marks(panel: Panel, lane: Lane, column_ns: int) -> str:
     """Return a row with "|" at starts of cycles and "!" at missed deadlines. Empty without any."""
     chart = panel.chart
     row = [" "] * (-(-(chart.end_ns - chart.start_ns) // column_ns) + 1)
-    if lane.cycle_ns >= CYCLE_COLUMNS * column_ns:
-        for start in range(lane.cycle_from(chart.start_ns), chart.end_ns + 1, lane.cycle_ns):
+    if lane.cycle_ns >= MIN_CYCLE_COLUMNS * column_ns:
+        for start in range(lane.find_cycle_start(chart.start_ns), chart.end_ns + 1, lane.cycle_ns):
             row[(start - chart.start_ns) // column_ns] = "|"
-    for job in panel.late(lane):
+    for job in panel.list_late_jobs(lane):
         if job.deadline_ns >= chart.start_ns:
             row[(job.deadline_ns - chart.start_ns) // column_ns] = "!"
     return "".join(row).rstrip()
 
 
-def label_row(labels: Iterable[tuple[int, str]]) -> str:
+def format_label_row(labels: Iterable[tuple[int, str]]) -> str:
     """Return a row of labels, each of which begins at its column or after the previous label."""
     row = ""
     for column, label in labels:
@@ -110,7 +113,9 @@ def label_row(labels: Iterable[tuple[int, str]]) -> str:
     return row
 
 
-def numbered_frames(panel: Panel, character_ns: int, prefix: str = "|") -> list[tuple[int, int]]:
+def choose_frame_labels(
+    panel: Panel, character_ns: int, prefix: str = "|"
+) -> list[tuple[int, int]]:
     """Return numbers and starts of the minor frames to be labelled, ns.
 
     Their distance is sufficient for the labels.
@@ -127,20 +132,20 @@ def numbered_frames(panel: Panel, character_ns: int, prefix: str = "|") -> list[
     return [(number, start) for number, start in frames.items() if number % step == 0]
 
 
-def label_times(panel: Panel, column_ns: int) -> range:
+def choose_label_times(panel: Panel, column_ns: int) -> range:
     """Return the times to write along the axis, ns, with sufficient distance for the numbers."""
     chart = panel.chart
     columns = 0
     widest = LABEL_COLUMNS
     while widest > columns:
         columns = widest
-        step = step_for(panel, columns * column_ns)
+        step = choose_label_step(panel, columns * column_ns)
         times = range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)
-        widest = max((len(ms(time)) + 2 for time in times), default=0)
+        widest = max((len(format_ms(time)) + 2 for time in times), default=0)
     return times
 
 
-def step_for(panel: Panel, narrowest_ns: int) -> int:
+def choose_label_step(panel: Panel, narrowest_ns: int) -> int:
     """Return the time between two labels of the axis, ns.
 
     It is the cycle of a lane, unless all cycles are too short or too long.
@@ -148,10 +153,10 @@ def step_for(panel: Panel, narrowest_ns: int) -> int:
     longest_ns = (panel.chart.end_ns - panel.chart.start_ns) // 2
     cycles = sorted(lane.cycle_ns for lane in panel.lanes)
     step = next((cycle for cycle in cycles if narrowest_ns <= cycle <= longest_ns), None)
-    return step or column_for(narrowest_ns * COLUMNS, None)
+    return step or choose_column_ns(narrowest_ns * MAX_COLUMNS, None)
 
 
-def _patterns(panel: Panel) -> Iterator[str]:
+def _format_patterns(panel: Panel) -> Iterator[str]:
     """Yield the patterns of every lane, beginning with the most frequent one."""
     for lane in panel.lanes:
         lane_patterns = panel.patterns.get(lane.name)
@@ -160,10 +165,10 @@ def _patterns(panel: Panel) -> Iterator[str]:
         cycles_name = "cycles without a plan" if lane.is_tight else "cycles"
         for counts, kind in ((lane_patterns.plans, "plans"), (lane_patterns.cycles, cycles_name)):
             if counts:
-                yield from _counted(lane.name, counts, kind)
+                yield from _format_counts(lane.name, counts, kind)
 
 
-def _counted(name: str, counts: Counter[str], kind: str) -> Iterator[str]:
+def _format_counts(name: str, counts: Counter[str], kind: str) -> Iterator[str]:
     """Yield the most frequent patterns with their counts.
 
     Args:
@@ -172,23 +177,24 @@ def _counted(name: str, counts: Counter[str], kind: str) -> Iterator[str]:
         kind: Name of the counted units, "plans" or "cycles".
     """
     ranked = counts.most_common()
-    (top, count), *others = ranked[:SHOWN]
+    (top, count), *others = ranked[:MAX_LISTED]
     margin = " " * len(name)
-    yield f"{name}: {_short(top)}: {count} of {counts.total()} {kind}"
-    yield from (f"{margin}  {_short(pattern)}: {number}" for pattern, number in others)
-    if hidden := ranked[SHOWN:]:
+    yield f"{name}: {_shorten_pattern(top)}: {count} of {counts.total()} {kind}"
+    yield from (f"{margin}  {_shorten_pattern(pattern)}: {number}" for pattern, number in others)
+    if hidden := ranked[MAX_LISTED:]:
         yield f"{margin}  and {len(hidden)} more patterns: {sum(n for _, n in hidden)}"
 
 
-def _short(pattern: str) -> str:
+def _shorten_pattern(pattern: str) -> str:
     """Shorten a pattern: long rows of equal cycles are written once."""
     runs = [(cycle, len(list(equal))) for cycle, equal in groupby(pattern.split(" | "))]
     return " | ".join(
-        " | ".join([cycle] * n) if n <= REPEATED else f"({cycle}) x {n}" for cycle, n in runs
+        " | ".join([cycle] * n) if n <= MAX_WRITTEN_CYCLES else f"({cycle}) x {n}"
+        for cycle, n in runs
     )
 
 
-def _late(panel: Panel) -> Iterator[str]:
+def _format_late_jobs(panel: Panel) -> Iterator[str]:
     """Yield the number of late jobs of each task, with the first ones of the window."""
     for lane in panel.lanes:
         for task in lane.tasks:
@@ -197,14 +203,17 @@ def _late(panel: Panel) -> Iterator[str]:
                 continue
             kind = "plans" if task == lane.planner else "cycles"
             skipped = f", {count.skipped} of them skipped" if count.skipped else ""
-            late = [job for job in panel.late(lane) if job.task == task]
+            late = [job for job in panel.list_late_jobs(lane) if job.task == task]
             yield f"late: {task}: {count.late} of {count.jobs} {kind}{skipped}"
-            yield from (f"  {_story(job)}" for job in late[:SHOWN])
+            yield from (f"  {_describe_late_job(job)}" for job in late[:MAX_LISTED])
 
 
-def _story(job: Job) -> str:
+def _describe_late_job(job: Job) -> str:
     """Describe the release, deadline and end of a late job."""
-    due = f"released at {ms(job.release_ns)} ms, due at {ms(job.deadline_ns)} ms"
+    due = f"released at {format_ms(job.release_ns)} ms, due at {format_ms(job.deadline_ns)} ms"
     if job.end_ns is None:
         return f"{due}: not done by then"
-    return f"{due}: done at {ms(job.end_ns)} ms, {ms(job.end_ns - job.deadline_ns)} ms late"
+    return (
+        f"{due}: done at {format_ms(job.end_ns)} ms, "
+        f"{format_ms(job.end_ns - job.deadline_ns)} ms late"
+    )

@@ -12,13 +12,26 @@ from functools import cached_property
 
 import numpy as np
 
-from rack.boards.config import RackConfig, rack_timing
+from rack.boards.config import RackConfig, build_rack_timing
 from rack.boards.timing.schedule import Chart, Job, Span
 from rack.boards.timing.tasks import Budget, TimedTask, Unit
-from rack.boards.timing.trace_times import UNITS, plans, response_ns, skipped, waking_ns
+from rack.boards.timing.trace_times import (
+    UNITS,
+    compute_response_ns,
+    compute_waking_ns,
+    count_skipped,
+    select_plans,
+)
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.charts.panel import Count, Panel, union, without
-from rack.tools.timing.charts.patterns import Detail, Lane, Patterns, Stretch, lanes_of, patterns
+from rack.tools.timing.charts.panel import JobCount, Panel, merge_stretches, subtract_stretches
+from rack.tools.timing.charts.patterns import (
+    Lane,
+    PatternDetail,
+    Patterns,
+    Stretch,
+    build_lanes,
+    count_patterns,
+)
 
 BLOCK_NS = 1_000_000_000
 """Time of a run that is read at once, ns. It keeps memory independent of the run's length."""
@@ -35,10 +48,12 @@ class TracedRun:
         self.recording = recording
         self.config: RackConfig = recording.rack_config
         layout = recording.layout
-        known = rack_timing(self.config, layout, dict.fromkeys(self.config.board, Budget())).tasks
+        known = build_rack_timing(
+            self.config, layout, dict.fromkeys(self.config.board, Budget())
+        ).tasks
         # Use the cores that the run obtained. The clock leaves no trace.
         self.tasks = tuple(
-            replace(t, core=layout.task(t.name).core) for t in known if t.role != "clock"
+            replace(t, core=layout.find_task(t.name).core) for t in known if t.role != "clock"
         )
 
     @property
@@ -46,7 +61,7 @@ class TracedRun:
         """Whether time stood still while tasks computed. Such a run has no chart."""
         return self.config.clock.mode == "lockstep"
 
-    def panel(self, start_ns: int, end_ns: int, progress: Callable[[float], None]) -> Panel:
+    def build_panel(self, start_ns: int, end_ns: int, progress: Callable[[float], None]) -> Panel:
         """Build the panel of a window.
 
         Args:
@@ -54,23 +69,28 @@ class TracedRun:
             end_ns: End of the window, ns.
             progress: Receives the fraction of the run that has been read.
         """
-        lanes = lanes_of(self.tasks)
-        details = {lane.name: Detail.measured(lane, self._medians(lane)) for lane in lanes}
-        counted = {lane.name: Patterns.none() for lane in lanes}
-        counts = {task.name: Count() for task in self.tasks}
+        lanes = build_lanes(self.tasks)
+        details = {
+            lane.name: PatternDetail.from_medians(lane, self._compute_medians(lane))
+            for lane in lanes
+        }
+        counted = {lane.name: Patterns.build_empty() for lane in lanes}
+        counts = {task.name: JobCount() for task in self.tasks}
         longest_period = max(task.period_ns for task in self.tasks)
         block_length = max(BLOCK_NS, 2 * longest_period)
         for start in range(0, self.end_ns, block_length):
             end = min(start + block_length, self.end_ns)
-            chart = self.chart(start, end + longest_period)
+            chart = self.build_chart(start, end + longest_period)
             for lane in lanes:
-                counted[lane.name].add(patterns(chart, lane, (start, end), details[lane.name]))
+                counted[lane.name].add_counts(
+                    count_patterns(chart, lane, (start, end), details[lane.name])
+                )
             for task, count in counts.items():
-                counts[task] = count + Count.of(chart, task, start, end)
+                counts[task] = count + JobCount.count_jobs(chart, task, start, end)
             progress(end / self.end_ns)
-        return Panel("measured", self.chart(start_ns, end_ns), lanes, counted, counts)
+        return Panel("measured", self.build_chart(start_ns, end_ns), lanes, counted, counts)
 
-    def _medians(self, lane: Lane) -> dict[Unit, int]:
+    def _compute_medians(self, lane: Lane) -> dict[Unit, int]:
         """Return the median time of each unit function of a lane, including preemption, ns."""
         medians_ns = {}
         for task in (task for task in self.tasks if task.name in lane.tasks):
@@ -79,7 +99,7 @@ class TracedRun:
                 medians_ns[unit] = int(np.median(rows[end] - rows[start])) if len(rows) else 0
         return medians_ns
 
-    def middle_ns(self, task: TimedTask) -> int:
+    def find_middle_ns(self, task: TimedTask) -> int:
         """Return the first release of a task, or of its plans, in the second half of the run, ns.
 
         0 if there is none.
@@ -94,29 +114,31 @@ class TracedRun:
         traces = self.recording.cycles.items()
         layout = self.recording.layout
         end_ticks = [
-            int(rows["tick"][-1]) + layout.task(task).every for task, rows in traces if len(rows)
+            int(rows["tick"][-1]) + layout.find_task(task).every
+            for task, rows in traces
+            if len(rows)
         ]
         return max(end_ticks, default=0) * self.config.tick_ns
 
-    def chart(self, start_ns: int, end_ns: int) -> Chart:
+    def build_chart(self, start_ns: int, end_ns: int) -> Chart:
         """Build the chart of the time from `start_ns` to `end_ns`."""
         traced = [
-            _Traced(task, self._cut(task, start_ns, end_ns), self.config.tick_ns)
+            _TaskTrace(task, self._select_rows(task, start_ns, end_ns), self.config.tick_ns)
             for task in self.tasks
         ]
         spans: list[Span] = []
         for core in {task.core for task in self.tasks}:
-            spans += _spans([each for each in traced if each.task.core == core])
-        jobs = [job for each in traced for job in each.jobs()]
+            spans += _list_spans([each for each in traced if each.task.core == core])
+        jobs = [job for each in traced for job in each.list_jobs()]
         whole = Chart(
             start_ns=0,
             end_ns=self.end_ns,
             spans=tuple(sorted(spans, key=lambda span: (span.start_ns, span.core))),
             jobs=tuple(sorted(jobs, key=lambda job: (job.release_ns, job.task))),
         )
-        return whole.window(start_ns, end_ns)
+        return whole.cut_window(start_ns, end_ns)
 
-    def _cut(self, task: TimedTask, start_ns: int, end_ns: int) -> np.ndarray:
+    def _select_rows(self, task: TimedTask, start_ns: int, end_ns: int) -> np.ndarray:
         """Return the trace records of a task that overlap a stretch of time."""
         rows, longest_ns = self._records[task.name]
         # A skipped release is noted in the record of the next one.
@@ -136,27 +158,30 @@ class TracedRun:
         """
         records = {}
         for task in self.tasks:
-            rows = self.recording.trace(task.name)
-            rows = plans(rows) if task.role == "planner" else rows
-            records[task.name] = rows, max(response_ns(rows).tolist(), default=0)
+            rows = self.recording.read_trace(task.name)
+            rows = select_plans(rows) if task.role == "planner" else rows
+            records[task.name] = rows, max(compute_response_ns(rows).tolist(), default=0)
         return records
 
 
 @dataclass(frozen=True)
-class _Traced:
+class _TaskTrace:
     """Trace of one task, with the length of a tick on the wall clock, ns."""
 
     task: TimedTask
     rows: np.ndarray
     tick_ns: int
 
-    def jobs(self) -> Iterator[Job]:
+    def list_jobs(self) -> Iterator[Job]:
         """Yield the jobs. A release that an executor skipped is a job without an end."""
         every = self.task.every_ns
         period = self.task.period_ns
-        skipped_counts = skipped(self.rows) * (self.task.role == "executor")
+        skipped_counts = count_skipped(self.rows) * (self.task.role == "executor")
         for release, count, end in zip(
-            self._at("release_ns"), skipped_counts.tolist(), self._at("end_ns"), strict=True
+            self._compute_times("release_ns"),
+            skipped_counts.tolist(),
+            self._compute_times("end_ns"),
+            strict=True,
         ):
             for before in range(count, 0, -1):
                 yield Job(
@@ -164,22 +189,24 @@ class _Traced:
                 )
             yield Job(self.task.name, release, release + period, end)
 
-    def units(self) -> Iterator[tuple[int, Unit, Stretch]]:
+    def list_units(self) -> Iterator[tuple[int, Unit, Stretch]]:
         """Yield the release, unit function and stretch of every computation."""
         for unit, *borders in UNITS[self.task.role]:
-            stamps = map(self._at, ("release_ns", *borders))
+            stamps = map(self._compute_times, ("release_ns", *borders))
             for release, start, end in zip(*stamps, strict=True):
                 if end > start:
                     yield release, unit, (start, end)
 
-    def waking(self) -> Iterator[Stretch]:
+    def list_wake_ups(self) -> Iterator[Stretch]:
         """Yield the stretches before cycles in which the task had the processor to wake up."""
-        took = waking_ns(self.rows).tolist()
+        took = compute_waking_ns(self.rows).tolist()
         yield from (
-            (start - ns, start) for start, ns in zip(self._at("start_ns"), took, strict=True) if ns
+            (start - ns, start)
+            for start, ns in zip(self._compute_times("start_ns"), took, strict=True)
+            if ns
         )
 
-    def _at(self, stamp: str) -> list[int]:
+    def _compute_times(self, stamp: str) -> list[int]:
         # Compute times from the release, because the origin of the machine's clock is arbitrary.
         """Return the times of a stamp in all records, ns since tick 0."""
         times_ns: list[int] = (
@@ -188,7 +215,7 @@ class _Traced:
         return times_ns
 
 
-def _spans(traced: Sequence[_Traced]) -> Iterator[Span]:
+def _list_spans(traced: Sequence[_TaskTrace]) -> Iterator[Span]:
     """Yield the spans of one core by descending priority.
 
     Time that tasks of higher priority took is cut out.
@@ -197,21 +224,21 @@ def _spans(traced: Sequence[_Traced]) -> Iterator[Span]:
     waking: dict[int, list[Stretch]] = defaultdict(list)
     for trace in traced:
         task = trace.task
-        for release, unit, stretch in trace.units():
+        for release, unit, stretch in trace.list_units():
             # A critical section runs at its ceiling. Tasks of equal priority cannot preempt it, but
             # it starts after them.
             is_locked = unit is Unit.UPDATE and task.ceiling > task.priority
             priority = task.ceiling if is_locked else task.priority
             levels[-priority, is_locked].append((task, release, unit, stretch))
         if task.role == "executor":
-            waking[-task.priority] += trace.waking()
+            waking[-task.priority] += trace.list_wake_ups()
     busy: list[Stretch] = []
     for level, is_locked in sorted(levels):
         taken: list[Stretch] = []
         for task, release, unit, stretch in sorted(
             levels[level, is_locked], key=lambda entry: entry[3]
         ):
-            for start, end in without(stretch, busy):
+            for start, end in subtract_stretches(stretch, busy):
                 yield Span(task.name, task.core, unit, start, end, release)
                 taken.append((start, end))
-        busy = union([*busy, *taken, *(waking.pop(level, []))])
+        busy = merge_stretches([*busy, *taken, *(waking.pop(level, []))])

@@ -18,7 +18,7 @@ NS_PER_MS = 1_000_000
 
 
 @dataclass(frozen=True)
-class Count:
+class JobCount:
     """Number of jobs of a task and of late ones. The skipped ones among them never began."""
 
     jobs: int = 0
@@ -26,7 +26,7 @@ class Count:
     skipped: int = 0
 
     @classmethod
-    def of(cls, chart: Chart, task: str, start_ns: int, end_ns: int) -> Count:
+    def count_jobs(cls, chart: Chart, task: str, start_ns: int, end_ns: int) -> JobCount:
         """Count the jobs that were released from `start_ns` up to `end_ns`.
 
         Args:
@@ -36,13 +36,15 @@ class Count:
             end_ns: End of the time, ns, not included.
         """
         releases = [job.release_ns for job in chart.jobs if job.task == task]
-        late = [job for job in chart.late(task) if start_ns <= job.release_ns < end_ns]
+        late = [job for job in chart.list_late_jobs(task) if start_ns <= job.release_ns < end_ns]
         # The newest job may still be running and does not count as skipped.
         skipped = sum(job.end_ns is None and job.release_ns < releases[-1] for job in late)
         return cls(sum(start_ns <= release < end_ns for release in releases), len(late), skipped)
 
-    def __add__(self, other: Count) -> Count:
-        return Count(self.jobs + other.jobs, self.late + other.late, self.skipped + other.skipped)
+    def __add__(self, other: JobCount) -> JobCount:
+        return JobCount(
+            self.jobs + other.jobs, self.late + other.late, self.skipped + other.skipped
+        )
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Panel:
     chart: Chart
     lanes: tuple[Lane, ...]
     patterns: Mapping[str, Patterns]
-    counts: Mapping[str, Count]
+    counts: Mapping[str, JobCount]
     frame_ns: int = 0
 
     @property
@@ -75,24 +77,24 @@ class Panel:
         )
         return {number: number * self.frame_ns for number in numbers}
 
-    def late(self, lane: Lane) -> list[Job]:
+    def list_late_jobs(self, lane: Lane) -> list[Job]:
         """Return the jobs of a lane that were late in the window, sorted by deadline."""
-        late_jobs = [job for task in lane.tasks for job in self.chart.late(task)]
+        late_jobs = [job for task in lane.tasks for job in self.chart.list_late_jobs(task)]
         return sorted(
             (job for job in late_jobs if job.deadline_ns <= self.chart.end_ns),
             key=lambda job: job.deadline_ns,
         )
 
-    def idle(self, lane: Lane) -> Iterator[Stretch]:
+    def list_idle_stretches(self, lane: Lane) -> Iterator[Stretch]:
         """Yield the stretches of the window in which the core of a lane was idle."""
-        busy = union(
+        busy = merge_stretches(
             (span.start_ns, span.end_ns) for span in self.chart.spans if span.core == lane.core
         )
-        yield from without((self.chart.start_ns, self.chart.end_ns), busy)
+        yield from subtract_stretches((self.chart.start_ns, self.chart.end_ns), busy)
 
-    def document(self) -> Document:
+    def to_document(self) -> Document:
         """Convert the panel to plain data, with times in ms."""
-        late = {job for lane in self.lanes for job in self.late(lane)}
+        late = {job for lane in self.lanes for job in self.list_late_jobs(lane)}
         return {
             "kind": self.kind,
             "from_ms": self.chart.start_ns / NS_PER_MS,
@@ -103,7 +105,7 @@ class Panel:
                     "core": lane.core,
                     "board": lane.board,
                     "tasks": list(lane.tasks),
-                    **_in_ms(lane, "cycle", "slice"),
+                    **_convert_to_ms(lane, "cycle", "slice"),
                 }
                 for lane in self.lanes
             ],
@@ -112,14 +114,14 @@ class Panel:
                     "task": span.task,
                     "core": span.core,
                     "unit": span.unit.value,
-                    **_in_ms(span, "start", "end", "release"),
+                    **_convert_to_ms(span, "start", "end", "release"),
                 }
                 for span in self.chart.spans
             ],
             "jobs": [
                 {
                     "task": job.task,
-                    **_in_ms(job, "release", "deadline", "end"),
+                    **_convert_to_ms(job, "release", "deadline", "end"),
                     "late": job in late,
                 }
                 for job in self.chart.jobs
@@ -132,7 +134,7 @@ class Panel:
         }
 
 
-def _in_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
+def _convert_to_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
     """Return some times of an entry by name, in ms."""
     times = {name: getattr(entry, f"{name}_ns") for name in names}
     return {
@@ -141,7 +143,7 @@ def _in_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
     }
 
 
-def without(stretch: Stretch, busy: Sequence[Stretch]) -> Iterator[Stretch]:
+def subtract_stretches(stretch: Stretch, busy: Sequence[Stretch]) -> Iterator[Stretch]:
     """Yield the parts of a stretch that are not in `busy`, which is sorted and without overlaps."""
     start, end = stretch
     for index in range(bisect_right(busy, start, key=lambda entry: entry[1]), len(busy)):
@@ -154,7 +156,7 @@ def without(stretch: Stretch, busy: Sequence[Stretch]) -> Iterator[Stretch]:
         yield start, end
 
 
-def union(stretches: Iterable[Stretch]) -> list[Stretch]:
+def merge_stretches(stretches: Iterable[Stretch]) -> list[Stretch]:
     """Return the union of the stretches, sorted and without overlaps."""
     merged: list[Stretch] = []
     for start, end in sorted(stretches):

@@ -20,14 +20,14 @@ from rack.boards.timing.tasks import TimedTask, Unit
 Stretch = tuple[int, int]
 """Start and end of a stretch of time, ns."""
 IDLE = "-"
-SHORT = 0.02
+MAX_REMNANT_CYCLE_FRACTION = 0.02
 """Fraction of a cycle below which a measured stretch may be a remnant.
 
 Remnants come from a late wake-up, or from a stretch that was cut in two.
 """
-REMNANT = 0.25
+MAX_REMNANT_MEDIAN_FRACTION = 0.25
 """Fraction of the median of its unit function below which such a stretch is left out."""
-GAP = 0.1
+MAX_GAP_CYCLE_FRACTION = 0.1
 """Fraction of a cycle below which a measured gap is left out.
 
 Waking up takes time and does not mean that the core is idle.
@@ -70,7 +70,7 @@ class Lane:
         """Name of the executor, or else of the planner."""
         return self.tasks[0]
 
-    def cycle_from(self, time_ns: int) -> int:
+    def find_cycle_start(self, time_ns: int) -> int:
         """Return the start of the first cycle that begins at `time_ns` or later."""
         return time_ns + (self.phase_ns - time_ns) % self.cycle_ns
 
@@ -85,7 +85,7 @@ class Lane:
         return self.executor is not None and self.planner is not None
 
 
-def lanes_of(tasks: Sequence[TimedTask]) -> tuple[Lane, ...]:
+def build_lanes(tasks: Sequence[TimedTask]) -> tuple[Lane, ...]:
     """Return the lanes of `tasks`, sorted by core and then by descending priority."""
     lanes = []
     for core, board in dict.fromkeys((task.core, task.board) for task in tasks):
@@ -118,18 +118,18 @@ class Patterns(NamedTuple):
     cycles: Counter[str]
 
     @classmethod
-    def none(cls) -> Patterns:
+    def build_empty(cls) -> Patterns:
         """Return empty counts."""
         return cls(Counter(), Counter())
 
-    def add(self, other: Patterns) -> None:
+    def add_counts(self, other: Patterns) -> None:
         """Add the counts of another stretch of time."""
         self.plans.update(other.plans)
         self.cycles.update(other.cycles)
 
 
 @dataclass(frozen=True)
-class Detail:
+class PatternDetail:
     """Longest stretches that patterns leave out, ns.
 
     Attributes:
@@ -141,17 +141,20 @@ class Detail:
     gap_ns: int = 0
 
     @classmethod
-    def measured(cls, lane: Lane, median_ns: Mapping[Unit, int]) -> Detail:
+    def from_medians(cls, lane: Lane, median_ns: Mapping[Unit, int]) -> PatternDetail:
         """Return the detail for measured patterns, by the medians of the lane's functions, ns."""
-        longest = round(SHORT * lane.cycle_ns)
-        short = {unit: min(longest, round(REMNANT * median)) for unit, median in median_ns.items()}
+        longest = round(MAX_REMNANT_CYCLE_FRACTION * lane.cycle_ns)
+        short = {
+            unit: min(longest, round(MAX_REMNANT_MEDIAN_FRACTION * median))
+            for unit, median in median_ns.items()
+        }
         if lane.is_tight:
             # The plan is in local memory. Reading it is not communication, unless it takes long.
             short[Unit.EXCHANGE] = longest
-        return cls(short, round(GAP * lane.cycle_ns))
+        return cls(short, round(MAX_GAP_CYCLE_FRACTION * lane.cycle_ns))
 
 
-def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patterns:
+def count_patterns(chart: Chart, lane: Lane, within: Stretch, detail: PatternDetail) -> Patterns:
     """Count the patterns of a lane that began within a stretch.
 
     The cycles of a plan are separated by " | ".
@@ -162,12 +165,12 @@ def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patte
         within: Start and end of the stretch, ns.
         detail: Longest stretches that patterns leave out.
     """
-    counted = Patterns.none()
+    counted = Patterns.build_empty()
     spans = [span for span in chart.spans if span.core == lane.core]
     starts = [span.start_ns for span in spans]
     # Without the maximum the ends may be unsorted, because ordinary scheduling mixes tasks.
     ends = list(accumulate((span.end_ns for span in spans), max))
-    for start, cycles, is_plan in _beginnings(chart, lane, within):
+    for start, cycles, is_plan in _list_plans_and_cycles(chart, lane, within):
         end = start + cycles * lane.cycle_ns
         # A planner on a separate processor has no cycles other than its plans.
         length = lane.cycle_ns if lane.executor is not None else end - start
@@ -175,13 +178,15 @@ def patterns(chart: Chart, lane: Lane, within: Stretch, detail: Detail) -> Patte
         for begin in range(start, end, length):
             candidates = spans[bisect_right(ends, begin) : bisect_left(starts, begin + length)]
             overlapping = [span for span in candidates if span.end_ns > begin]
-            orders.append(_order(overlapping, lane, (begin, begin + length), detail))
+            orders.append(_format_order(overlapping, lane, (begin, begin + length), detail))
         counter = counted.plans if is_plan else counted.cycles
         counter[" | ".join(orders)] += 1
     return counted
 
 
-def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int, int, bool]]:
+def _list_plans_and_cycles(
+    chart: Chart, lane: Lane, within: Stretch
+) -> Iterator[tuple[int, int, bool]]:
     """Yield the plans, and the cycles without a plan, that begin within a stretch.
 
     Each is a tuple of its start, ns, its number of cycles, and whether it is a plan.
@@ -189,14 +194,14 @@ def _beginnings(chart: Chart, lane: Lane, within: Stretch) -> Iterator[tuple[int
     slices = lane.slice_ns // lane.cycle_ns
     plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}
     planned = {plan + start_ns * lane.cycle_ns for plan in plans for start_ns in range(slices)}
-    for start_ns in range(lane.cycle_from(within[0]), within[1], lane.cycle_ns):
+    for start_ns in range(lane.find_cycle_start(within[0]), within[1], lane.cycle_ns):
         if start_ns in plans:
             yield start_ns, slices, True
         elif start_ns not in planned and lane.executor is not None:
             yield start_ns, 1, False
 
 
-def _order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Detail) -> str:
+def _format_order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: PatternDetail) -> str:
     """Format the order of the unit functions within a stretch, as in "R X W P -".
 
     Args:

@@ -11,9 +11,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from rack.boards.timing.tasks import Unit
-from rack.tools.console.pictures import paths_of, picture
-from rack.tools.console.tables import ms
-from rack.tools.timing.charts.letters import COLUMNS, label_times, numbered_frames
+from rack.tools.console.pictures import list_picture_paths, open_figure
+from rack.tools.console.tables import format_ms
+from rack.tools.timing.charts.letters import MAX_COLUMNS, choose_frame_labels, choose_label_times
 from rack.tools.timing.charts.panel import Panel
 from rack.tools.timing.charts.patterns import IDLE
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rack.boards.timing.schedule import Chart, Job
     from rack.tools.timing.charts.patterns import Lane
 
-COLOURS = {
+UNIT_COLOURS = {
     Unit.EXCHANGE: "#BBCC33",
     Unit.READ: "#77AADD",
     Unit.PROCESS: "#EE8866",
@@ -33,7 +33,7 @@ COLOURS = {
     Unit.UPDATE: "#FFAABB",
 }
 """Light colours for black letters, which colour-blind readers can distinguish (Paul Tol)."""
-NAMES = {
+UNIT_NAMES = {
     Unit.EXCHANGE: "C  exchange with the planner",
     Unit.READ: "R  read",
     Unit.PROCESS: "X  executor",
@@ -41,30 +41,30 @@ NAMES = {
     Unit.PLAN: "P  planner",
     Unit.UPDATE: "U  update of the plan",
 }
-EDGE = 0.2
-LATE = "#CC3311"
-GRID = "#555555"
-FLOOR = "#F3F3F3"
-FRAME = "#999999"
+EDGE_PT = 0.2
+LATE_COLOUR = "#CC3311"
+GRID_COLOUR = "#555555"
+BACKGROUND_COLOUR = "#F3F3F3"
+FRAME_COLOUR = "#999999"
 WIDTH_IN = 10.0
 LANE_IN = 0.55
 LEGEND_COLUMNS = 7
-BAR = 0.66
+BAR_HEIGHT = 0.66
 # Sizes of letters. A short span has a smaller letter, and a very short one has none.
 LETTER_PT = 9.0
-SMALLEST_PT = 5.0
-LETTER = 1 / 520
+MIN_LETTER_PT = 5.0
+LETTER_POINT_FRACTION = 1 / 520
 """Fraction of the window that each point of a letter's size takes.
 
 A W is as wide as high, and has a margin on both sides.
 """
-CYCLE = 0.024
+MIN_CYCLE_FRACTION = 0.024
 """Fraction of the window above which the start of a cycle is marked."""
-FRAME_CHARACTER = 1 / 120
+CHARACTER_FRACTION = 1 / 120
 """Fraction of the window that a character of a frame's label takes."""
 
 
-def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
+def save_picture(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
     """Draw panels, one above the other on one axis of time.
 
     Args:
@@ -77,21 +77,23 @@ def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
     """
     lanes = [len(panel.lanes) for panel in panels]
     height = LANE_IN * sum(lanes) + 0.45 * len(panels) + 1.2
-    paths = paths_of(stem)
-    with picture(paths, WIDTH_IN, height, layout="constrained") as figure:
+    paths = list_picture_paths(stem)
+    with open_figure(paths, WIDTH_IN, height, layout="constrained") as figure:
         rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=lanes)
         for axes, panel in zip(rows[:, 0], panels, strict=True):
-            draw(axes, panel)
+            draw_panel(axes, panel)
         rows[-1, 0].set_xlabel("time, ms")
         used = [
             unit
             for unit in Unit
             if any(span.unit is unit for panel in panels for span in panel.chart.spans)
         ]
-        handles: list[Artist] = [Patch(facecolor=COLOURS[unit], label=NAMES[unit]) for unit in used]
+        handles: list[Artist] = [
+            Patch(facecolor=UNIT_COLOURS[unit], label=UNIT_NAMES[unit]) for unit in used
+        ]
         handles.append(Patch(facecolor="none", label=f"{IDLE}  idle core"))
-        if any(panel.late(lane) for panel in panels for lane in panel.lanes):
-            handles.append(Line2D([], [], marker="v", color=LATE, label="missed deadline"))
+        if any(panel.list_late_jobs(lane) for panel in panels for lane in panel.lanes):
+            handles.append(Line2D([], [], marker="v", color=LATE_COLOUR, label="missed deadline"))
         figure.legend(
             handles=handles,
             loc="outside lower center",
@@ -103,7 +105,7 @@ def save(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
     return paths
 
 
-def draw(axes: Axes, panel: Panel) -> None:
+def draw_panel(axes: Axes, panel: Panel) -> None:
     """Draw one panel with the first lane on top. The axis is in ns, with labels in ms."""
     chart = panel.chart
     count = len(panel.lanes)
@@ -111,16 +113,18 @@ def draw(axes: Axes, panel: Panel) -> None:
         _draw_lane(axes, panel, lane, count - 1 - row)
     if panel.frames:
         starts = list(panel.frames.values())
-        axes.vlines(starts, -0.5, count - 0.5, colors=FRAME, linewidth=0.8, linestyles="dashed")
-        character_ns = round(FRAME_CHARACTER * (chart.end_ns - chart.start_ns))
-        for number, start in numbered_frames(panel, character_ns, "frame "):
+        axes.vlines(
+            starts, -0.5, count - 0.5, colors=FRAME_COLOUR, linewidth=0.8, linestyles="dashed"
+        )
+        character_ns = round(CHARACTER_FRACTION * (chart.end_ns - chart.start_ns))
+        for number, start in choose_frame_labels(panel, character_ns, "frame "):
             position = (start, count - 0.5)
-            axes.annotate(f"frame {number}", position, fontsize=7, va="bottom", color=GRID)
+            axes.annotate(f"frame {number}", position, fontsize=7, va="bottom", color=GRID_COLOUR)
     axes.set_xlim(chart.start_ns, chart.end_ns)
     axes.set_ylim(-0.5, count - 0.5)
     # Space the labels as in a chart in letters, which has the same width.
-    times = label_times(panel, (chart.end_ns - chart.start_ns) // COLUMNS)
-    axes.set_xticks(times, [ms(time) for time in times])
+    times = choose_label_times(panel, (chart.end_ns - chart.start_ns) // MAX_COLUMNS)
+    axes.set_xticks(times, [format_ms(time) for time in times])
     axes.set_yticks(range(count), [lane.title for lane in reversed(panel.lanes)])
     axes.tick_params(left=False)
     title_pad = 14 if panel.frames else None
@@ -131,31 +135,35 @@ def draw(axes: Axes, panel: Panel) -> None:
 
 def _draw_lane(axes: Axes, panel: Panel, lane: Lane, row: int) -> None:
     chart = panel.chart
-    low = row - BAR / 2
+    low = row - BAR_HEIGHT / 2
     window_ns = chart.end_ns - chart.start_ns
-    axes.broken_barh([(chart.start_ns, window_ns)], (low, BAR), facecolors=FLOOR)
+    axes.broken_barh([(chart.start_ns, window_ns)], (low, BAR_HEIGHT), facecolors=BACKGROUND_COLOUR)
     lane_spans = [span for span in chart.spans if span.task in lane.tasks]
     for unit in Unit:
         bars = [(s.start_ns, s.end_ns - s.start_ns) for s in lane_spans if s.unit is unit]
-        axes.broken_barh(bars, (low, BAR), color=COLOURS[unit], linewidth=EDGE)
+        axes.broken_barh(bars, (low, BAR_HEIGHT), color=UNIT_COLOURS[unit], linewidth=EDGE_PT)
     letters = [(span.unit.value, (span.start_ns, span.end_ns)) for span in lane_spans]
-    letters += [(IDLE, idle) for idle in panel.idle(lane)]
+    letters += [(IDLE, idle) for idle in panel.list_idle_stretches(lane)]
     for letter, (begin, end) in letters:
-        size = min((end - begin) / window_ns / LETTER, LETTER_PT)
+        size = min((end - begin) / window_ns / LETTER_POINT_FRACTION, LETTER_PT)
         # Small dashes would look like a dotted line.
-        if size >= (LETTER_PT if letter == IDLE else SMALLEST_PT):
+        if size >= (LETTER_PT if letter == IDLE else MIN_LETTER_PT):
             axes.text((begin + end) / 2, row, letter, ha="center", va="center", fontsize=size)
-    if lane.cycle_ns >= CYCLE * window_ns:
-        starts = range(lane.cycle_from(chart.start_ns), chart.end_ns + 1, lane.cycle_ns)
-        axes.vlines(list(starts), low - 0.1, low + BAR + 0.1, colors=GRID, linewidth=0.9)
-    for job in panel.late(lane):
-        _mark_late(axes, chart, job, low + BAR + 0.06)
+    if lane.cycle_ns >= MIN_CYCLE_FRACTION * window_ns:
+        starts = range(lane.find_cycle_start(chart.start_ns), chart.end_ns + 1, lane.cycle_ns)
+        axes.vlines(
+            list(starts), low - 0.1, low + BAR_HEIGHT + 0.1, colors=GRID_COLOUR, linewidth=0.9
+        )
+    for job in panel.list_late_jobs(lane):
+        _mark_late(axes, chart, job, low + BAR_HEIGHT + 0.06)
 
 
 def _mark_late(axes: Axes, chart: Chart, job: Job, height: float) -> None:
     """Mark a missed deadline, and the time from the deadline to the end of the job."""
     start_ns = max(job.deadline_ns, chart.start_ns)
     if start_ns == job.deadline_ns:
-        axes.plot([start_ns], [height], marker="v", markersize=6, color=LATE, clip_on=False)
+        axes.plot([start_ns], [height], marker="v", markersize=6, color=LATE_COLOUR, clip_on=False)
     if job.end_ns is not None:
-        axes.hlines(height, start_ns, min(job.end_ns, chart.end_ns), colors=LATE, linewidth=1.6)
+        axes.hlines(
+            height, start_ns, min(job.end_ns, chart.end_ns), colors=LATE_COLOUR, linewidth=1.6
+        )

@@ -8,19 +8,19 @@ from math import lcm
 from typing import TypeVar
 
 from rack.backplane.layout import Layout
-from rack.boards.config import RackConfig, rack_timing
-from rack.boards.timing.frames import core_frames
-from rack.boards.timing.schedule import Chart, Job, Span, simulate
+from rack.boards.config import RackConfig, build_rack_timing
+from rack.boards.timing.frames import compute_core_frames
+from rack.boards.timing.schedule import Chart, Job, Span, simulate_schedule
 from rack.boards.timing.tasks import Part, Unit
 from rack.tools.console.answer import Failure
-from rack.tools.timing.charts.panel import Count, Panel
-from rack.tools.timing.charts.patterns import Detail, lanes_of, patterns
+from rack.tools.timing.charts.panel import JobCount, Panel
+from rack.tools.timing.charts.patterns import PatternDetail, build_lanes, count_patterns
 
-SLICES = 10
+MIN_SLICES = 10
 """Minimum number of the slowest task's slices over which patterns are counted."""
-MOST_FRAMES = 24
+MAX_DEFAULT_FRAMES = 24
 """Maximum number of minor frames of a static schedule in a default chart."""
-MOST_CYCLES = 1_000_000
+MAX_SIMULATED_CYCLES = 1_000_000
 """Maximum number of simulated cycles of all tasks, which take about a minute."""
 
 
@@ -51,16 +51,20 @@ class Schedule:
         Raises:
             Failure: If a board in `process_ns` has no budget.
         """
-        timing = rack_timing(config, layout)
+        timing = build_rack_timing(config, layout)
         self.tasks = timing.tasks
         self.frame_ns = 0 if timing.schedule is None else timing.schedule.minor * timing.tick_ns
         # Show the frames of a static schedule up to the last one that differs from earlier ones.
-        alike = [each.frames[0] for each in core_frames(timing)]
-        self.shown_ns = min(max(alike) + 1, MOST_FRAMES) * self.frame_ns if alike else None
+        alike = [each.frames[0] for each in compute_core_frames(timing)]
+        self.default_length_ns = (
+            min(max(alike) + 1, MAX_DEFAULT_FRAMES) * self.frame_ns if alike else None
+        )
         self.switch_ns = round(config.timing.context_switch_ms * 1e6)
-        self._variants = {name: self._variant(name, times) for name, times in process_ns.items()}
+        self._variants = {
+            name: self._build_variants(name, times) for name, times in process_ns.items()
+        }
 
-    def on_cores_of(self, layout: Layout) -> None:
+    def move_to_cores(self, layout: Layout) -> None:
         """Move the tasks to the cores that a run obtained."""
         of_run = {task.name: task.core for task in layout.tasks}
         self.tasks = tuple(
@@ -72,7 +76,7 @@ class Schedule:
         """Shortest part of any task, ns."""
         return min((part.time_ns for task in self.tasks for part in task.parts), default=1)
 
-    def panel(self, start_ns: int, end_ns: int) -> Panel:
+    def build_panel(self, start_ns: int, end_ns: int) -> Panel:
         """Simulate the schedule and return the panel of a window.
 
         Raises:
@@ -87,28 +91,35 @@ class Schedule:
         has_phases = any(task.phase_ns for task in self.tasks)
         skipped_ns = max(0, start_ns // period_ns - has_phases) * period_ns
         longest_ns = max(task.period_ns for task in self.tasks)
-        counted_ns = SLICES * longest_ns
+        counted_ns = MIN_SLICES * longest_ns
         until_ns = max(end_ns - skipped_ns, counted_ns + longest_ns)
-        if (jobs := sum(until_ns // task.period_ns for task in self.tasks)) > MOST_CYCLES:
+        if (jobs := sum(until_ns // task.period_ns for task in self.tasks)) > MAX_SIMULATED_CYCLES:
             raise Failure(
-                f"no schedule: {SLICES} slices of the slowest task,"
+                f"no schedule: {MIN_SLICES} slices of the slowest task,"
                 f" {longest_ns * 1e-6:g} ms each, hold {jobs} cycles of all tasks;"
-                f" at most {MOST_CYCLES} are simulated",
+                f" at most {MAX_SIMULATED_CYCLES} are simulated",
                 2,
             )
-        chart = simulate(self.tasks, until_ns, self.switch_ns, self._variants)
-        lanes = lanes_of(self.tasks)
-        detail = Detail(gap_ns=2 * self.switch_ns)
+        chart = simulate_schedule(self.tasks, until_ns, self.switch_ns, self._variants)
+        lanes = build_lanes(self.tasks)
+        detail = PatternDetail(gap_ns=2 * self.switch_ns)
         return Panel(
             kind="schedule",
-            chart=_later(chart.window(start_ns - skipped_ns, end_ns - skipped_ns), skipped_ns),
+            chart=_shift_chart(
+                chart.cut_window(start_ns - skipped_ns, end_ns - skipped_ns), skipped_ns
+            ),
             lanes=lanes,
-            patterns={lane.name: patterns(chart, lane, (0, counted_ns), detail) for lane in lanes},
-            counts={task.name: Count.of(chart, task.name, 0, counted_ns) for task in self.tasks},
+            patterns={
+                lane.name: count_patterns(chart, lane, (0, counted_ns), detail) for lane in lanes
+            },
+            counts={
+                task.name: JobCount.count_jobs(chart, task.name, 0, counted_ns)
+                for task in self.tasks
+            },
             frame_ns=self.frame_ns,
         )
 
-    def _variant(self, board: str, times_ns: Sequence[int]) -> list[tuple[Part, ...]]:
+    def _build_variants(self, board: str, times_ns: Sequence[int]) -> list[tuple[Part, ...]]:
         """Return the parts of an executor's cycle for each time of X, ns."""
         executors = {task.name: task for task in self.tasks if task.role == "executor"}
         if board not in executors:
@@ -122,7 +133,7 @@ class Schedule:
         return [(*parts[:index], Part(Unit.PROCESS, time), *parts[index:]) for time in times_ns]
 
 
-def _later(chart: Chart, by_ns: int) -> Chart:
+def _shift_chart(chart: Chart, by_ns: int) -> Chart:
     """Return a chart with all times increased by `by_ns`."""
 
     def shift(entry: E) -> E:

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 from rack.boards.timing.tasks import TimedTask
 from rack.tools.console.answer import Failure
-from rack.tools.console.tables import ms
+from rack.tools.console.tables import format_ms
 from rack.tools.timing.charts.panel import NS_PER_MS
 
-SLICES = 2
+DEFAULT_SLICES = 2
 """Number of plans in a default chart."""
-MOST_CYCLES = 48
+MAX_DEFAULT_CYCLES = 48
 """Maximum number of the fastest task's cycles in a default chart."""
-LONGEST = 2000
+MAX_CYCLES = 2000
 """Maximum number of a level's cycles in any chart."""
 
 
@@ -25,7 +25,7 @@ class WindowOptions:
     from_ns: int | None = None
     to_ns: int | None = None
 
-    def window(
+    def choose_window(
         self, task: TimedTask, extent_ns: int | None, start_ns: int, length_ns: int | None = None
     ) -> tuple[int, int]:
         """Return the start and end of the window, ns.
@@ -40,27 +40,31 @@ class WindowOptions:
             Failure: If the window is empty, too long, or outside the run.
         """
         start = start_ns if self.from_ns is None else self.from_ns
-        end = start + (length_ns or SLICES * task.period_ns) if self.to_ns is None else self.to_ns
+        end = (
+            start + (length_ns or DEFAULT_SLICES * task.period_ns)
+            if self.to_ns is None
+            else self.to_ns
+        )
         if extent_ns is not None:
             if start >= extent_ns or (end > extent_ns and self.to_ns is not None):
                 raise Failure(
-                    f"{_window(start, end)}: is outside the run, which lasts from 0 to"
-                    f" {ms(extent_ns)} ms",
+                    f"{_format_window(start, end)}: is outside the run, which lasts from 0 to"
+                    f" {format_ms(extent_ns)} ms",
                     2,
                 )
             end = min(end, extent_ns)
         if start >= end:
-            raise Failure(f"{_window(start, end)}: --to-ms must be later than --from-ms", 2)
-        if end - start > (longest_ns := LONGEST * task.every_ns):
+            raise Failure(f"{_format_window(start, end)}: --to-ms must be later than --from-ms", 2)
+        if end - start > (longest_ns := MAX_CYCLES * task.every_ns):
             raise Failure(
-                f"{_window(start, end)}: a chart shows at most {LONGEST} cycles of"
-                f" '{task.board}', {ms(longest_ns)} ms",
+                f"{_format_window(start, end)}: a chart shows at most {MAX_CYCLES} cycles of"
+                f" '{task.board}', {format_ms(longest_ns)} ms",
                 2,
             )
         return start, end
 
 
-def shown_task(tasks: Sequence[TimedTask]) -> TimedTask:
+def choose_task(tasks: Sequence[TimedTask]) -> TimedTask:
     """Return the task whose cycles determine the default window.
 
     It is the slowest task that fits into a chart, if possible a tightly coupled planner.
@@ -68,7 +72,9 @@ def shown_task(tasks: Sequence[TimedTask]) -> TimedTask:
     tasks = [task for task in tasks if task.role != "clock"]
     fastest = min(task.every_ns for task in tasks)
     cores = {(task.board, task.core) for task in tasks if task.role == "executor"}
-    shown = [task for task in tasks if SLICES * task.period_ns <= MOST_CYCLES * fastest]
+    shown = [
+        task for task in tasks if DEFAULT_SLICES * task.period_ns <= MAX_DEFAULT_CYCLES * fastest
+    ]
     tight = [task for task in shown if task.role == "planner" and (task.board, task.core) in cores]
     return max(
         tight or shown or [min(tasks, key=lambda task: task.period_ns)],
@@ -76,7 +82,7 @@ def shown_task(tasks: Sequence[TimedTask]) -> TimedTask:
     )
 
 
-def times_of(process: Sequence[str]) -> dict[str, list[int]]:
+def parse_process_times(process: Sequence[str]) -> dict[str, list[int]]:
     """Parse times of X from texts such as "level=3,2", in ms.
 
     Returns:
@@ -101,5 +107,5 @@ def times_of(process: Sequence[str]) -> dict[str, list[int]]:
     return process_ns
 
 
-def _window(start_ns: int, end_ns: int) -> str:
-    return f"{ms(start_ns)} to {ms(end_ns)} ms"
+def _format_window(start_ns: int, end_ns: int) -> str:
+    return f"{format_ms(start_ns)} to {format_ms(end_ns)} ms"

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from rack.boards.config import resolve
-from rack.boards.config.files import Assembled, assembled
-from rack.boards.config.loader import validated
-from rack.boards.config.timing import rack_timing
+from rack.boards.config.files import Assembled, assemble
+from rack.boards.config.loader import validate
+from rack.boards.config.timing import build_rack_timing
 from rack.boards.errors import ConfigError
 from tests.snapshots import ROOT, Snapshots, digest
 
@@ -62,11 +62,11 @@ def others(value: Any) -> list[Any]:
 def outcome(tables: dict[str, Any]) -> str:
     """Return what is said of a config, or a digest of what comes of it."""
     try:
-        rack = resolve(validated(Assembled(tables)))
+        rack = resolve(validate(Assembled(tables)))
     except ConfigError as error:
         return str(error)
-    timing = rack_timing(rack.config, rack.layout)
-    return digest((rack.layout, rack.tasks, rack.hosts, rack.clock(None), timing))
+    timing = build_rack_timing(rack.config, rack.layout)
+    return digest((rack.layout, rack.tasks, rack.hosts, rack.build_clock_wiring(None), timing))
 
 
 @pytest.mark.parametrize("name", RACKS)
@@ -74,7 +74,7 @@ def test_every_changed_value_has_the_recorded_outcome(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1, 2, 3})
-    tables = assembled(ROOT / "configs" / name, (), None).tables
+    tables = assemble(ROOT / "configs" / name, (), None).tables
     parts: dict[str, object] = {}
     for path in places(tables):
         changed = deepcopy(tables)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import resolve
-from rack.boards.config.loader import loads
-from rack.boards.config.toml import override, parse, to_toml
+from rack.boards.config.loader import load_text
+from rack.boards.config.toml import apply_settings, parse_tables, to_toml
 from rack.boards.errors import ConfigError
 from tests.boards.host.test_board import HOSTED
 
@@ -103,7 +103,7 @@ MISTAKES = {
 def test_a_mistake_is_one_line(name: str) -> None:
     settings, line = MISTAKES[name]
     with pytest.raises(ConfigError) as error:
-        resolve(loads(to_toml(override(parse(HOSTED), settings, []))))
+        resolve(load_text(to_toml(apply_settings(parse_tables(HOSTED), settings, []))))
     (mistake,) = error.value.mistakes
     assert line in str(mistake)
 
@@ -112,7 +112,7 @@ def test_a_host_board_with_a_mistake_hides_none_of_another_and_causes_none() -> 
     other = 'program = "host_programs:Nobody"\nbelow = "bridge"'
     text = HOSTED.replace("[host.program]", "[host.program]\ncomputing_ms = -1")
     with pytest.raises(ConfigError) as caught:
-        loads(f"{text}\n[host.other]\n{other}\n")
+        load_text(f"{text}\n[host.other]\n{other}\n")
     assert [mistake.place for mistake in caught.value.mistakes] == [
         "host.program.computing_ms",
         "host.other.program",

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from rack.boards.config import load, resolve
-from rack.boards.config.loader import loads
-from rack.boards.config.toml import override, parse, to_toml
+from rack.boards.config.loader import load_text
+from rack.boards.config.toml import apply_settings, parse_tables, to_toml
 from rack.boards.errors import ConfigError
 from tests.boards.lan.racks import rack_text
 
@@ -164,7 +164,11 @@ MISTAKES = {
 
 def resolved(*settings: str) -> None:
     """Check the config with these settings, in lockstep if they do not say otherwise."""
-    resolve(loads(to_toml(override(parse(TEXT), ["clock.mode=lockstep", *settings], []))))
+    resolve(
+        load_text(
+            to_toml(apply_settings(parse_tables(TEXT), ["clock.mode=lockstep", *settings], []))
+        )
+    )
 
 
 @pytest.mark.parametrize("name", MISTAKES)
@@ -188,7 +192,7 @@ def test_valid_tables_have_no_mistakes() -> None:
 def test_the_loss_of_the_adapter_has_the_same_reaction_as_the_loss_of_a_peer() -> None:
     for rule, on_loss in (("hold", "hold"), ("stop", "stop"), ("go on", "hold")):
         text = rack_text("one", "", [], "two", lan=f'on_peer_loss = "{rule}"')
-        assert loads(text).board["lan"].on_loss == on_loss
+        assert load_text(text).board["lan"].on_loss == on_loss
 
 
 def test_endpoints_can_be_set_for_a_run(tmp_path: Path) -> None:
@@ -198,7 +202,7 @@ def test_endpoints_can_be_set_for_a_run(tmp_path: Path) -> None:
     assert config.adapter.lan is not None
     assert config.board["lan"].params["listen"] == ("tcp/127.0.0.1:7555",)
     # What a segment carries loads to the same config.
-    assert loads(config.text()) == config
+    assert load_text(config.to_toml_text()) == config
 
 
 def test_a_rack_without_zenoh_gets_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -221,10 +225,10 @@ def test_a_rack_without_zenoh_gets_one_line(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_an_adapter_in_a_rack_without_boards_hides_no_mistake() -> None:
-    tables = parse(TEXT)
+    tables = parse_tables(TEXT)
     del tables["board"]
     with pytest.raises(ConfigError, match=r"^board: missing; boards by name"):
-        loads(to_toml(tables))
+        load_text(to_toml(tables))
 
 
 @pytest.mark.slow

@@ -6,8 +6,8 @@ import pytest
 
 from rack.boards.config import resolve
 from rack.boards.config.files import Assembled
-from rack.boards.config.loader import validated
-from rack.boards.config.toml import override, parse
+from rack.boards.config.loader import validate
+from rack.boards.config.toml import apply_settings, parse_tables
 from rack.boards.errors import ConfigError
 from tests.boards.host.test_board import HOSTED
 from tests.boards.lan.racks import rack_text
@@ -16,7 +16,7 @@ from tests.boards.test_queues import QUEUES
 
 def mistake(text: str, *settings: str) -> str:
     with pytest.raises(ConfigError) as error:
-        resolve(validated(Assembled(override(parse(text), settings, []))))
+        resolve(validate(Assembled(apply_settings(parse_tables(text), settings, []))))
     (found,) = error.value.mistakes
     return str(found)
 

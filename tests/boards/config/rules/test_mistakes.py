@@ -202,7 +202,7 @@ def test_a_segment_too_large_for_any_machine_is_refused(small: Path) -> None:
 
 
 def test_a_phase_is_less_than_the_period(config: MakeConfig) -> None:
-    assert resolve(config("board.watch.phase=7")).layout.task("watch").phase == 7
+    assert resolve(config("board.watch.phase=7")).layout.find_task("watch").phase == 7
     with pytest.raises(ConfigError, match="period: 0 to 7 ticks"):
         resolve(config("board.watch.phase=8"))
 
@@ -213,9 +213,9 @@ def test_a_segment_may_have_its_largest_size(
     layout = resolve(config()).layout
     size = AddressMap(layout).size
     monkeypatch.setattr(levels, "MAX_SEGMENT_BYTES", size)
-    assert not [*levels.memory(layout)]
+    assert not [*levels.check_memory(layout)]
     monkeypatch.setattr(levels, "MAX_SEGMENT_BYTES", size - 1)
-    (mistake,) = levels.memory(layout)
+    (mistake,) = levels.check_memory(layout)
     assert f"needs {size} bytes; at most {size - 1} are possible" in mistake.why
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from rack.boards.config import load, resolve
 from rack.boards.config.connections import Wiring
-from rack.boards.config.rules.boards import schedule
+from rack.boards.config.rules.boards import check_schedule
 from rack.boards.errors import ConfigError
 
 FIT = (
@@ -60,7 +60,7 @@ def test_a_rate_is_refused_with_the_nearest_rates() -> None:
             "board.primitive.rate_hz=57.142857142857146",
         ],
     )
-    (found,) = schedule(Wiring(config))
+    (found,) = check_schedule(Wiring(config))
     assert found.place == "board.primitive.rate_hz"
     assert found.why.startswith("a cycle of 17.5 ms does not fit the schedule")
     assert found.why.endswith("nearest: 12.5 ms, 80 Hz or 20 ms, 50 Hz")
@@ -76,8 +76,8 @@ def test_every_frame_and_rate_that_a_refusal_suggests_is_accepted_as_typed(
     settings |= {"schedule.major_ms": 900.1, "board.primitive.rate_hz": 0.81}
     for key in ("schedule.minor_ms", "schedule.major_ms"):
         config = load("nasrem", [f"{name}={value}" for name, value in settings.items()])
-        (found,) = schedule(Wiring(config))
+        (found,) = check_schedule(Wiring(config))
         assert found.place == key
         settings[key] = float(found.why.partition("nearest: ")[2].split()[0])
     config = load("nasrem", [f"{name}={value}" for name, value in settings.items()])
-    assert not any(found.place.startswith("schedule") for found in schedule(Wiring(config)))
+    assert not any(found.place.startswith("schedule") for found in check_schedule(Wiring(config)))

@@ -60,7 +60,7 @@ class PlayedArm:
         """Take up what is said; return the report."""
         taken = self.taken
         asked, was_under_way = taken.is_asked, taken.is_under_way
-        taken.hear(PROGRAM if order[0] else 0, *order)
+        taken.process_order(PROGRAM if order[0] else 0, *order)
         if taken.is_asked and asked:
             self._plan(now_s)
         elif taken.is_under_way:
@@ -78,21 +78,21 @@ class PlayedArm:
 
     def _plan(self, now_s: float) -> None:
         if at(self.taken.order) in self.refuses:
-            self.taken.fail(Error.NO_PATH, "something is in the way")
+            self.taken.fail_order(Error.NO_PATH, "something is in the way")
         else:
-            self.taken.answer(Response.POSSIBLE)
+            self.taken.set_response(Response.POSSIBLE)
             self.until = now_s + self.keeps_s if self.keeps_s else 0.0
 
     def _move(self, is_first: bool) -> None:
         step = at(self.taken.order)
         self.moved = 0 if is_first else self.moved + 1
         if self.taken.stops:
-            self.taken.answer(Response.STOPPED)
+            self.taken.set_response(Response.STOPPED)
             self.stopped += 1
         elif self.moved == 2 and step in self.fails:
-            self.taken.fail(Error.GRASP_MISSED, "holds nothing")
+            self.taken.fail_order(Error.GRASP_MISSED, "holds nothing")
         elif self.moved == 2:
-            self.taken.answer(Response.DONE)
+            self.taken.set_response(Response.DONE)
             self.done[step] += 1
 
     def restart(self) -> None:
@@ -124,13 +124,13 @@ class Play:
             answer = arm.cycle(self.orders[name], self.now_s)
             if name not in lost:
                 self.answers[name] = answer
-        self.agreement.advance(self.answers, self.now_s)
-        self.agreement.write_to(self.progress)
+        self.agreement.advance_program(self.answers, self.now_s)
+        self.agreement.save_progress(self.progress)
         for name in ARMS:
             if f">{name}" not in lost:
                 self.orders[name] = (
-                    self.agreement.order,
-                    self.agreement.verb(name),
+                    self.agreement.order_id,
+                    self.agreement.choose_verb(name),
                     self.agreement.reason,
                 )
         self.check()
@@ -143,7 +143,7 @@ class Play:
             return
         self.agreement = Agreement(PROGRAM, STEPS, margin_s=1.0, farewell_s=50.0)
         if who == "cell":
-            self.agreement.recall(self.progress)
+            self.agreement.restore_progress(self.progress)
         else:
             self.answers = dict.fromkeys(ARMS, SILENCE)
 
@@ -272,6 +272,6 @@ def test_expired_promise_is_requested_a_limited_number_of_times(
 def test_order_that_was_not_promised_fails(said: list[OrderVerb]) -> None:
     taken = TakenOrder()
     for what in said:
-        taken.hear(PROGRAM, 3000, what)
+        taken.process_order(PROGRAM, 3000, what)
     assert (taken.response, taken.error) == (Response.FAILED, Error.GIVEN_UP)
     assert taken.reason == "told to do what it has not promised: its rack was launched anew"

@@ -91,7 +91,7 @@ class OrderBench(Lockstep):
     def see(self) -> None:
         """Show the world, with a new revision."""
         puma, world = cell("puma560"), self.message("world.model")
-        start = puma.start()
+        start = puma.build_start_data()
         self.revision += 1
         world.position, world.quaternion = start.xpos[puma.bodies], start.xquat[puma.bodies]
         world.revision = self.revision

@@ -97,7 +97,7 @@ class Hoist(ServoRig):
     @property
     def part(self) -> Array:
         """Pose of this rack's copy of the part, (7,)."""
-        return cast(SharingArm, self.servo.arm).pose(0)
+        return cast(SharingArm, self.servo.arm).read_pose(0)
 
     @property
     def said(self) -> Message:
@@ -111,7 +111,7 @@ class Hoist(ServoRig):
         return Claim(int(said["claim"]), bytes(said["owner"]))
 
 
-class Pair:
+class EquationPair:
     """Two racks that step together and read each other's messages one exchange, 20 ms, later;
     unless `apart`."""
 
@@ -152,8 +152,8 @@ class Pair:
 
 
 @pytest.fixture
-def pair(tmp_path: Path) -> Iterator[Pair]:
-    pair = Pair(tmp_path)
+def pair(tmp_path: Path) -> Iterator[EquationPair]:
+    pair = EquationPair(tmp_path)
     pair.run(0.1)
     yield pair
     for hoist in (pair.alpha, pair.beta):
@@ -163,7 +163,7 @@ def pair(tmp_path: Path) -> Iterator[Pair]:
 
 
 @pytest.mark.slow
-def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
+def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: EquationPair) -> None:
     assert pair.alpha.claim == pair.beta.claim == Claim(), "nobody has touched it yet"
     np.testing.assert_array_equal(pair.alpha.part, pair.beta.part)
     for number, (hoist, other) in enumerate(
@@ -183,7 +183,7 @@ def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
     )
 
 
-def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: Pair) -> None:
+def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: EquationPair) -> None:
     hoists = pair.alpha, pair.beta
     for hoist in hoists:
         hoist.go(0.0)
@@ -200,7 +200,7 @@ def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: Pair
     "restarted", [lambda pair: pair.alpha, lambda pair: pair.beta], ids=["owner", "other"]
 )
 def test_the_part_stays_in_place_during_a_restart_of_a_servo_board(
-    pair: Pair, restarted: Callable[[Pair], Hoist]
+    pair: EquationPair, restarted: Callable[[EquationPair], Hoist]
 ) -> None:
     pair.lift(pair.alpha)
     hoist = restarted(pair)
@@ -223,16 +223,18 @@ def word(rack: bytes, claim: Claim, x: float, name: bytes = b"part") -> Message:
     message = SharedBodies.zeros({})
     message.rack = rack
     speaker = SharedBody(name, rack, claim)
-    speaker.show(message.bodies[0], np.array([x, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
+    speaker.write_entry(message.bodies[0], np.array([x, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
     return message
 
 
 def test_only_the_owner_reports_the_pose_of_a_body() -> None:
     body = SharedBody(b"part", b"alpha")
     owned = Claim(3, b"beta")
-    assert body.hear(word(b"gamma", owned, 1.0)) is not None, "the claim is news, from wherever"
+    assert body.process_message(word(b"gamma", owned, 1.0)) is not None, (
+        "the claim is news, from wherever"
+    )
     assert body.claim == owned
-    assert body.hear(word(b"gamma", owned, 2.0)) is None, "its copy is late"
-    told = body.hear(word(b"beta", owned, 3.0))
+    assert body.process_message(word(b"gamma", owned, 2.0)) is None, "its copy is late"
+    told = body.process_message(word(b"beta", owned, 3.0))
     assert told is not None
     assert told[0] == 3.0

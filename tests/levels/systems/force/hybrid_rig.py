@@ -12,7 +12,7 @@ from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import WorldState
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.planning.pose import pose
+from rack.levels.planning.pose import make_pose
 from rack.levels.robot.cell import build_cell
 from rack.levels.systems.force.arm_executor import ForceArmExecutor
 from rack.levels.systems.force.hybrid import HybridExecutor
@@ -40,7 +40,9 @@ class HybridRig:
     ) -> None:
         robot, scene = pad(folder)
         ik = InverseKinematics(build_cell(robot, scene, CLOCK_NS), 1)
-        home = ik.solutions(pose(start, DOWN), np.array(robot.home), lambda q: True)[0]
+        home = ik.find_free_solutions(make_pose(start, DOWN), np.array(robot.home), lambda q: True)[
+            0
+        ]
         robot = robot.model_copy(update={"home": tuple(home)})
         self.cell, self.ik = build_cell(robot, scene, CLOCK_NS), ik
         boards = [
@@ -102,7 +104,7 @@ class HybridRig:
     @property
     def tool(self) -> Array:
         """Position of the tool, (3,), m."""
-        return self.ik.tool_at(self.output("arm", "status").position).position
+        return self.ik.compute_tool_pose(self.output("arm", "status").position).position
 
     def output(self, board: str, port: str) -> Message:
         return cast(Message, self.rack.tasks[board].written[port])

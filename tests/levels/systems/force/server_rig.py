@@ -10,7 +10,7 @@ from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.planning.pose import Pose, pose
+from rack.levels.planning.pose import Pose, make_pose
 from rack.levels.systems.force.messages import ForceStatus, Mode, ServerRequest
 from rack.levels.systems.force.server import ForceServer
 from rack.levels.systems.trajectory.messages import MotionKind
@@ -92,10 +92,12 @@ class ServerRig(TrajectoryRig):
                 self.offset += PERIOD_S * float(
                     np.clip(YIELD * missing, -wanted.speed[2], wanted.speed[2])
                 )
-            status.target = self._joints(self._lowered(self.ik.tool_at(command.position)), before)
+            status.target = self._joints(
+                self._lowered(self.ik.compute_tool_pose(command.position)), before
+            )
         status.holding, status.position = not follows, status.target
         status.target_velocity = 0.0 if not follows else (status.target - before) / PERIOD_S
-        place = self.ik.tool_at(status.target).position
+        place = self.ik.compute_tool_pose(status.target).position
         floor = self.floor - STEP * (place[1] > EDGE)
         press = STIFFNESS * max(0.0, floor - float(place[2]))
         force.echo, force.sensed, force.wrench[2] = wanted.id, self.tick, -press
@@ -105,9 +107,9 @@ class ServerRig(TrajectoryRig):
         self.places.append(place)
 
     def _lowered(self, tool: Pose) -> Pose:
-        return pose(tool.position - [0.0, 0.0, self.offset], tool.quaternion)
+        return make_pose(tool.position - [0.0, 0.0, self.offset], tool.quaternion)
 
     def _joints(self, tool: Pose, near: Array) -> Array:
-        found = self.ik.nearby(tool, near)
+        found = self.ik.find_nearby(tool, near)
         assert found is not None
         return found

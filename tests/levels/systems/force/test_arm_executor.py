@@ -13,7 +13,7 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import norm
 from rack.levels.messages import Error
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.planning.pose import pose
+from rack.levels.planning.pose import make_pose
 from rack.levels.robot.cell import build_cell
 from rack.levels.robot.dynamics import Dynamics
 from rack.levels.systems.force.arm_executor import ForceArmExecutor
@@ -45,8 +45,8 @@ class PressRig:
             BoardSpec("servo", 1, JointServo, above="level", below="arm"),
         ]
         ik = InverseKinematics(build_cell(robot, scene, CLOCK_NS), 1)
-        self._near = ik.solutions(
-            pose((FREE_M, 0.0, 0.75), FORWARD), np.array(robot.home), lambda q: True
+        self._near = ik.find_free_solutions(
+            make_pose((FREE_M, 0.0, 0.75), FORWARD), np.array(robot.home), lambda q: True
         )[0]
         robot = robot.model_copy(update={"home": tuple(self._near)})
         cell = build_cell(robot, scene, CLOCK_NS)
@@ -76,7 +76,7 @@ class PressRig:
         cycles = round(seconds / (PERIOD * 1e-3))
         for to in np.linspace(self.x, x, cycles + 1)[1:]:
             speed, before = (x - self.x) / seconds, self._near
-            self._near = self._ik.nearby(pose((to, 0.0, 0.75), FORWARD), before)
+            self._near = self._ik.find_nearby(make_pose((to, 0.0, 0.75), FORWARD), before)
             assert self._near is not None
             still = to == x
             velocity = (
@@ -131,7 +131,7 @@ def test_free_motion_is_no_contact(tmp_path: Path, resolution: float, most: floa
     rig.go(FREE_M - 0.10, 0.2)
     assert max(rig.forces) < most
     # A sensor at the end of its range is a finding.
-    rig.arm.contact.take(
+    rig.arm.contact.take_sample(
         np.array([150.0, 0, 0, 0, 0, 0]), np.array([rig.arm.cell.home, np.zeros(6)]), np.zeros(6)
     )
     assert rig.arm.contact.saturated

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import copied
+from rack.backplane.message import copy_message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.systems.force.client import ForceMotions, ForceProgram
@@ -62,7 +62,7 @@ class Bus:
         return Reading(self.status, Verdict.NEW)
 
     def send(self) -> bool:
-        self.requests.append(copied(self.message))
+        self.requests.append(copy_message(self.message))
         return True
 
     def finish(self) -> None:
@@ -177,5 +177,5 @@ def test_an_impossible_contact_is_refused_at_once(
 def test_an_impossible_program_is_reported_before_the_launch(
     table: Any, key: str, reason: str
 ) -> None:
-    found = list(ForceProgram.model_validate(table).misfits(ROBOT, SCENE))
+    found = list(ForceProgram.model_validate(table).find_mismatches(ROBOT, SCENE))
     assert [(place, why) for place, _, why in found] == [(key, reason)]

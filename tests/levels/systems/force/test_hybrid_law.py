@@ -17,7 +17,7 @@ from rack.levels.systems.force.hybrid_law import (
     HybridGains,
     HybridLaw,
     ToolKinematics,
-    damped_inverse,
+    solve_damped,
 )
 from tests.levels.systems.force.pad import pad
 
@@ -45,7 +45,7 @@ def task(exerted: Array | None, rotation: Array | None = None) -> ForceTask:
 def place(cell: Cell, q: Array) -> Array:
     """Return the position of the tool at `q`, m."""
     tool = ToolKinematics(cell)
-    tool.look(q, np.zeros(6))
+    tool.evaluate_at(q, np.zeros(6))
     return tool.pose.position
 
 
@@ -53,17 +53,17 @@ def test_the_inverse_gives_the_wanted_velocity_and_is_finite_at_a_singularity(
     cell: Cell,
 ) -> None:
     tool, twist = ToolKinematics(cell), np.array([0.02, -0.01, 0.03, 0.1, 0.0, -0.1])
-    tool.look(cell.home, np.zeros(6))
+    tool.evaluate_at(cell.home, np.zeros(6))
     assert (
-        np.abs(tool.jacobian @ damped_inverse(tool.jacobian, twist) - twist).max()
+        np.abs(tool.jacobian @ solve_damped(tool.jacobian, twist) - twist).max()
         < 0.01 * np.abs(twist).max()
     )
     straight = cell.home.copy()
     straight[4] = 0.0  # joints 4 and 6 turn about one axis
-    tool.look(straight, np.zeros(6))
+    tool.evaluate_at(straight, np.zeros(6))
     assert np.linalg.svd(tool.jacobian, compute_uv=False)[-1] < 1e-6
     for axis in range(6):
-        velocity = damped_inverse(tool.jacobian, np.eye(6)[axis])
+        velocity = solve_damped(tool.jacobian, np.eye(6)[axis])
         assert np.abs(velocity).max() <= 0.5 / np.sqrt(DAMPING)
 
 
@@ -102,7 +102,7 @@ def test_every_joint_keeps_its_acceleration(cell: Cell) -> None:
         ).all()
         assert command.acceleration == pytest.approx((command.velocity - before) / PERIOD_S)
         before = command.velocity
-    assert law.rests
+    assert law.is_at_rest
 
 
 def test_without_force_axes_the_difference_from_the_motion_stays_constant(cell: Cell) -> None:
@@ -110,13 +110,13 @@ def test_without_force_axes_the_difference_from_the_motion_stays_constant(cell: 
     assert np.array_equal(law.step(resting(cell), None, PERIOD_S, EMPTY).position, cell.home)
     for _ in range(50):
         law.step(resting(cell), task(np.zeros(6)), PERIOD_S, EMPTY)
-    while not law.rests:
+    while not law.is_at_rest:
         command = law.step(resting(cell), None, PERIOD_S, EMPTY)
     away = command.position - cell.home
     assert np.abs(away).max() > 1e-4
     moved = law.step(resting(cell, 0.05), None, PERIOD_S, EMPTY)
     assert moved.position == pytest.approx(cell.home + 0.05 + away)
-    law.begin()
+    law.reset_offset()
     assert np.array_equal(law.step(resting(cell), None, PERIOD_S, EMPTY).position, cell.home)
 
 
@@ -125,6 +125,6 @@ def test_the_wanted_force_is_fed_forward_as_joint_torques(cell: Cell) -> None:
     exact = np.where(Z, 20.0, 0.0)
     for _ in range(300):
         command = law.step(resting(cell), task(exact), PERIOD_S, EMPTY)
-    tool.look(command.position, command.velocity)
+    tool.evaluate_at(command.position, command.velocity)
     expected = tool.terms.bias + tool.jacobian.T @ exact
     assert command.load == pytest.approx(expected, abs=1e-2)

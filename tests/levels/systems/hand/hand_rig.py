@@ -46,8 +46,8 @@ class Swing(Executor):
 
     def process(self, tick: int) -> None:
         status, command, hand = self.below.message, self.command, self.hand
-        if not self.below.is_there or self.is_blind:
-            command.sampled = -1 if not self.below.is_there else command.sampled
+        if not self.below.has_message or self.is_blind:
+            command.sampled = -1 if not self.below.has_message else command.sampled
             return
         wanted = np.array(self.context.robot.home) + AMPLITUDE_RAD * np.sin(
             RATE * tick * self.context.tick_s

@@ -98,6 +98,7 @@ WRONG: dict[str, tuple[dict[str, Any], str, str]] = {
 def test_mistakes_of_a_program_name_key_and_what_is_permitted(case: str) -> None:
     task, key, reason = WRONG[case]
     found = {
-        key: why for key, _, why in GraspProgram.model_validate(task).misfits(*config("utah_mit"))
+        key: why
+        for key, _, why in GraspProgram.model_validate(task).find_mismatches(*config("utah_mit"))
     }
     assert reason in found[key]

@@ -14,7 +14,7 @@ from tests.levels.arms import cell
 HAND = cell("utah_mit")
 CAN_RADIUS_M = 0.024
 RULES = GraspRules()
-START = HAND.start()
+START = HAND.build_start_data()
 AT, UPRIGHT = START.xpos[HAND.bodies[0]].copy(), np.array([1.0, 0.0, 0.0, 0.0])
 
 

@@ -201,6 +201,6 @@ def test_every_joint_must_be_driven_by_one_board(
     above: dict[str, str | None], why: str | None
 ) -> None:
     own, *others = context(above)
-    found = [misfit[2] for misfit in HandExecutor.misfits(own, others, [])]
+    found = [misfit[2] for misfit in HandExecutor.find_mismatches(own, others, [])]
     assert found[:1] == ([] if why is None else [why])
     assert len(found) in (0, 4)

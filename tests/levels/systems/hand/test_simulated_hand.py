@@ -10,7 +10,7 @@ import pytest
 from rack.backplane.message import Message
 from rack.levels.algebra import Array
 from rack.levels.messages import ArmState
-from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.robot.cell import build_cell, compute_sizes
 from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.levels.systems.hand.simulated import SimulatedHand
 from tests.levels.arms import config
@@ -29,14 +29,14 @@ def hand_of(stiff: float | None = None) -> SimulatedHand:
 
 
 def saved(hand: SimulatedHand) -> Message:
-    state = ArmState.zeros(sizes(hand.cell))
+    state = ArmState.zeros(compute_sizes(hand.cell))
     hand.save(state)
     return state
 
 
 def flexed(hand: SimulatedHand, joint: int, flexor: float) -> Array:
     """Return the tensions at the start, with another one of a flexor."""
-    tension = np.array(hand.wanted)
+    tension = np.array(hand.commanded_tensions)
     tension[FLEXOR, joint] = flexor
     return tension
 
@@ -81,7 +81,7 @@ def test_contact_pushes_a_fingertip_away_from_what_it_touches() -> None:
     hand = hand_of()
     around = np.array([0.0, 0.70, 0.86, 0.75] * 3 + [0.0, 0.40, 0.72, 0.75])
     for _ in range(300):
-        sample, tension = hand.sense(), np.array(hand.wanted)
+        sample, tension = hand.sense(), np.array(hand.commanded_tensions)
         torque = 1.5 * (around - sample.position) - 0.1 * sample.velocity
         tension[FLEXOR], tension[EXTENSOR] = (
             20.0 + torque / (2 * hand.hand.arms),
@@ -116,7 +116,7 @@ def test_a_restored_hand_continues_bit_for_bit(closes: bool) -> None:
                 hand.apply_tensions(flexed(hand, INDEX1, 40.0 + 20.0 * np.sin(0.3 * cycle)))
             hand.step(EVERY)
 
-    first, again, middle = hand_of(), hand_of(), ArmState.zeros(sizes(hand_of().cell))
+    first, again, middle = hand_of(), hand_of(), ArmState.zeros(compute_sizes(hand_of().cell))
     run(first, range(60))
     first.save(middle)
     run(first, range(60, 90))

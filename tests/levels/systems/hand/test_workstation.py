@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import Message, copied
+from rack.backplane.message import Message, copy_message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.messages import WorldState
@@ -16,7 +16,7 @@ from rack.levels.systems.hand.workstation import Workstation
 from tests.levels.arms import cell, config
 
 HAND = cell("utah_mit")
-START = HAND.start()
+START = HAND.build_start_data()
 SIZES = {"joints": 16, "fingers": 4, "bodies": 1, "state": 1}
 
 
@@ -39,7 +39,7 @@ class Sent:
         self.plans: list[GraspPlan] = []
 
     def send(self) -> bool:
-        self.plans.append(copied(self.message))
+        self.plans.append(copy_message(self.message))
         return True
 
 

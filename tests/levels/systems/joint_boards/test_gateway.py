@@ -11,7 +11,7 @@ from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import Message, State
 from rack.levels.level import LevelContext, Pace
 from rack.levels.messages import Error
-from rack.levels.robot.cell import sizes
+from rack.levels.robot.cell import compute_sizes
 from rack.levels.systems.joint_boards.gateway import JointGateway
 from rack.levels.systems.joint_boards.messages import JointReference, JointStatus
 from tests.levels.arms import cell, config
@@ -24,7 +24,7 @@ LATENCY = DELAY + 2 * EVERY
 SPEED = 0.5
 """Velocity of every joint, rad/s."""
 BOARDS = ("near", "far")
-SIZES = sizes(cell("puma560"))
+SIZES = compute_sizes(cell("puma560"))
 
 
 def message(kind: type[M]) -> M:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rack.levels.systems.state_table.checks import flaws
-from rack.levels.systems.state_table.level import vocabulary
+from rack.levels.systems.state_table.checks import find_flaws
+from rack.levels.systems.state_table.level import build_vocabulary
 from rack.levels.systems.state_table.table import StateTable, read_table
 from rack.levels.tables import Positive, Table
 
@@ -73,7 +73,7 @@ class DoorPlan(Table):
     width: Positive = 1.0
 
 
-DOORS = vocabulary(
+DOORS = build_vocabulary(
     conditions={
         "lock": ("free", "stuck", "locked"),
         "place": ("open", "between", "shut"),
@@ -87,7 +87,7 @@ LEXICON = {"colour": ("red", "green")}
 
 def find_mistakes(folder: Path, text: str) -> list[str]:
     """Return the mistakes in the text of a table."""
-    return flaws(read_table(write_table(folder, text), DOORS), DOORS, LEXICON)
+    return find_flaws(read_table(write_table(folder, text), DOORS), DOORS, LEXICON)
 
 
 def table(folder: Path, text: str = DOOR) -> StateTable:

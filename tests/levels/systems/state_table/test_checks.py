@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rack.levels.systems.state_table.checks import flaws
+from rack.levels.systems.state_table.checks import find_flaws
 from rack.levels.systems.state_table.table import RowConfig, StateTable, TableError, read_table
 from tests.levels.systems.state_table.tables import DOOR, DOORS, LEXICON, find_mistakes, write_table
 
@@ -176,16 +176,16 @@ def test_a_table_passes_exactly_if_one_row_fires_in_every_case(
 ) -> None:
     configs = {number: row_config(number, *row) for number, row in enumerate(rows, 1)}
     table = StateTable("on", 1.0, configs, DOORS.plan(), 0, ())
-    complaints = flaws(table, DOORS, LEXICON)
+    complaints = find_flaws(table, DOORS, LEXICON)
     cases = [
         dict(zip(NAMES, values, strict=True))
         for values in product(*(DOORS.conditions[name] for name in NAMES))
     ]
     on = table.rows["on"]
-    fires = [[row for row in on.values() if row.matches(case)] for case in cases]
+    fires = [[row for row in on.values() if row.matches_case(case)] for case in cases]
     assert any("hole" in line for line in complaints) == any(not rows for rows in fires)
     assert any("overlaps" in line for line in complaints) == any(
         not row.otherwise for rows in fires for row in rows[1:]
     )
     if not complaints:
-        assert all(table.decide("on", case)[0] for case in cases)
+        assert all(table.choose_row("on", case)[0] for case in cases)

@@ -11,14 +11,14 @@ import pytest
 from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import Message
-from rack.backplane.segment import Segment, unlink
+from rack.backplane.segment import Segment, unlink_segment
 from rack.boards.classes import find_class
 from rack.boards.config import load
 from rack.boards.config.resolved import Resolved, resolve
 from rack.boards.run.control_loop import VirtualControlLoop
 from rack.levels.level import Executor
 from rack.levels.messages import WorldState
-from rack.levels.systems.state_table.elemental_move import STILL_M_S, MoveTable
+from rack.levels.systems.state_table.elemental_move import MAX_REST_SPEED_M_S, MoveTable
 from rack.levels.systems.state_table.level import WordCommand
 from rack.levels.systems.state_table.primitive import JointMoveStatus
 
@@ -28,7 +28,7 @@ LAST = {"words": "pick block1", "in_state": "reaching", "sent": 7, "reached": 1,
 
 
 @dataclass
-class Bench:
+class BenchMessage:
     """Segment of the rack without any process, and the plan from which its level starts."""
 
     segment: Segment
@@ -49,21 +49,23 @@ class Bench:
         task = VirtualControlLoop(self.segment, wiring, level)
         assert isinstance(level, MoveTable)
         task.inputs.read(50)
-        level.recall()
-        level.give(50)
+        level.restore_state()
+        level.write_outputs(50)
         return level, level.command
 
 
 @pytest.fixture
-def bench(rack_name: str) -> Iterator[Bench]:
+def bench(rack_name: str) -> Iterator[BenchMessage]:
     plan = resolve(load("nist-state-table", [f"name={rack_name}", "clock.mode=lockstep"]))
     segment = Segment.create(plan.layout, "")
-    yield Bench(segment, plan)
-    unlink(segment.rack)
+    yield BenchMessage(segment, plan)
+    unlink_segment(segment.rack)
     segment.close()
 
 
-def test_a_restarted_level_continues_with_its_last_command_to_the_level_below(bench: Bench) -> None:
+def test_a_restarted_level_continues_with_its_last_command_to_the_level_below(
+    bench: BenchMessage,
+) -> None:
     joints = np.linspace(0.1, 0.6, 6)
     bench.write("status", **LAST)
     bench.write(
@@ -84,7 +86,7 @@ def test_a_restarted_level_continues_with_its_last_command_to_the_level_below(be
     np.testing.assert_array_equal(command.aim, (1.0, 2.0, 3.0))
 
 
-def test_a_restarted_level_without_a_last_command_starts_at_home(bench: Bench) -> None:
+def test_a_restarted_level_without_a_last_command_starts_at_home(bench: BenchMessage) -> None:
     bench.write("status", **LAST)
     level, command = bench.restart()
     home = level._cell.home
@@ -94,7 +96,7 @@ def test_a_restarted_level_without_a_last_command_starts_at_home(bench: Bench) -
     np.testing.assert_array_equal(command.joints, home)
 
 
-def test_a_board_that_starts_for_the_first_time_restores_nothing(bench: Bench) -> None:
+def test_a_board_that_starts_for_the_first_time_restores_nothing(bench: BenchMessage) -> None:
     level, command = bench.restart()
     assert (level.state, level.words, command.id, command.words) == ("idle", [], 0, "")
 
@@ -102,7 +104,7 @@ def test_a_board_that_starts_for_the_first_time_restores_nothing(bench: Bench) -
 class Arm:
     """The level, whose inputs from the arm and the world are set by the test."""
 
-    def __init__(self, bench: Bench) -> None:
+    def __init__(self, bench: BenchMessage) -> None:
         wiring = next(wiring for wiring in bench.plan.tasks if wiring.task == LEVEL)
         level = find_class(wiring.target, Executor)(wiring.context)
         assert isinstance(level, MoveTable)
@@ -120,11 +122,11 @@ class Arm:
         vars(self.level).update(
             world=Reading(self.world, Verdict.NEW, lost), below=Reading(self.below, Verdict.NEW)
         )
-        return self.level.look(50)
+        return self.level.evaluate_conditions(50)
 
 
 @pytest.fixture
-def arm(bench: Bench) -> Arm:
+def arm(bench: BenchMessage) -> Arm:
     return Arm(bench)
 
 
@@ -143,9 +145,9 @@ def test_a_target_is_there_while_it_rests_where_it_was(arm: Arm) -> None:
     moved = arm.level.table.plan.moved
     for offset, speed, seen in (
         (0.0, 0.0, "there"),
-        (0.99 * moved, 0.99 * STILL_M_S, "there"),
+        (0.99 * moved, 0.99 * MAX_REST_SPEED_M_S, "there"),
         (1.01 * moved, 0.0, "displaced"),
-        (0.0, 1.01 * STILL_M_S, "moving"),
+        (0.0, 1.01 * MAX_REST_SPEED_M_S, "moving"),
     ):
         arm.world.position[0] = arm.place + np.array([0.0, offset, 0.0])
         arm.world.velocity[0] = (speed, 0.0, 0.0)

@@ -20,7 +20,7 @@ from rack.levels.systems.state_table.level import (
     StateTableExecutor,
     TableCommand,
     TableStatus,
-    answer_of,
+    classify_answer,
 )
 from rack.levels.systems.state_table.table import Lexicon
 from rack.levels.tables import SceneConfig
@@ -42,17 +42,17 @@ class Door(StateTableExecutor):
         self.drives: list[str] = []
 
     @classmethod
-    def lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
+    def build_lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
         return LEXICON
 
-    def look(self, tick: int) -> dict[str, str]:
+    def evaluate_conditions(self, tick: int) -> dict[str, str]:
         return {"lock": self.lock, "place": self.place}
 
     def do_drive(self, speed: str) -> None:
         self.drives.append(speed)
 
 
-class Bench:
+class BenchMessage:
     """A door and its mailboxes, without a bus."""
 
     def __init__(self, folder: Path) -> None:
@@ -118,15 +118,15 @@ class Bench:
         last.copy_from(self.status)
         self.last = Reading(last, Verdict.NEW)
         self.operator = Reading(
-            self.operator.message, Verdict.NEW if self.operator.is_there else Verdict.NONE
+            self.operator.message, Verdict.NEW if self.operator.has_message else Verdict.NONE
         )
         self.status = TableStatus.zeros({})
         self.door = Door(self.context)
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Bench:
-    return Bench(tmp_path)
+def bench(tmp_path: Path) -> BenchMessage:
+    return BenchMessage(tmp_path)
 
 
 def brief(status: Message) -> tuple[str, int, str, str, int]:
@@ -134,7 +134,7 @@ def brief(status: Message) -> tuple[str, int, str, str, int]:
     return status.in_state, status.row, status.fired, status.words, State(status.state)
 
 
-def test_a_command_from_above_is_taken_done_and_answered(bench: Bench) -> None:
+def test_a_command_from_above_is_taken_done_and_answered(bench: BenchMessage) -> None:
     assert brief(bench.cycle()) == ("shut", 3, "stay shut", "", State.IDLE)
     assert bench.status.operator == 0
     bench.command(4, "open")
@@ -154,7 +154,7 @@ def test_a_command_from_above_is_taken_done_and_answered(bench: Bench) -> None:
     assert (status.fired, status.echo, status.done) == ("open it", 5, 4)
 
 
-def test_a_command_that_no_row_takes_is_not_in_force(bench: Bench) -> None:
+def test_a_command_that_no_row_takes_is_not_in_force(bench: BenchMessage) -> None:
     bench.door.lock = "locked"
     bench.command(1, "open")
     status = bench.cycle()
@@ -170,7 +170,7 @@ def test_a_command_that_no_row_takes_is_not_in_force(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("place", ["between", "open"])
-def test_a_state_is_late_after_more_than_its_patience(bench: Bench, place: str) -> None:
+def test_a_state_is_late_after_more_than_its_patience(bench: BenchMessage, place: str) -> None:
     bench.command(1, "open")
     bench.cycle()
     bench.door.place = "between"
@@ -184,20 +184,20 @@ def test_a_state_is_late_after_more_than_its_patience(bench: Bench, place: str) 
         assert status.done == 0
 
 
-def test_the_level_above_holds_this_one_while_it_executes(bench: Bench) -> None:
+def test_the_level_above_holds_this_one_while_it_executes(bench: BenchMessage) -> None:
     bench.command(1, "open", hold=True, operator=9)
     status = bench.cycle()
-    assert (status.state, bench.door.holds, status.operator) == (State.HOLDING, True, 9)
+    assert (status.state, bench.door.is_held, status.operator) == (State.HOLDING, True, 9)
     assert "above" in status.reason
     bench.command(1, "open", operator=9)
     bench.door.place = "between"
-    assert (bench.cycle().state, bench.door.holds) == (State.EXECUTING, False)
+    assert (bench.cycle().state, bench.door.is_held) == (State.EXECUTING, False)
     assert bench.above is not None
     bench.above = bench.above._replace(is_lost=True)
-    assert (bench.cycle().state, bench.door.holds) == (State.HOLDING, True)
+    assert (bench.cycle().state, bench.door.is_held) == (State.HOLDING, True)
 
 
-def test_an_operators_hold_is_done_when_all_is_at_rest(bench: Bench) -> None:
+def test_an_operators_hold_is_done_when_all_is_at_rest(bench: BenchMessage) -> None:
     bench.command(1, "open")
     bench.cycle()
     bench.door.place = "between"
@@ -207,7 +207,7 @@ def test_an_operators_hold_is_done_when_all_is_at_rest(bench: Bench) -> None:
     bench.door.resting = True
     assert bench.cycle().answer == Answer.DONE
     bench.order(2, Operation.RESUME)
-    assert (bench.cycle().state, bench.door.holds) == (State.EXECUTING, False)
+    assert (bench.cycle().state, bench.door.is_held) == (State.EXECUTING, False)
     # A case that no row takes is an error with the case.
     bench.door.place = "nowhere"
     status = bench.cycle()
@@ -215,7 +215,7 @@ def test_an_operators_hold_is_done_when_all_is_at_rest(bench: Bench) -> None:
     assert status.reason.startswith("no row of 'moving' takes lock = free, place = nowhere")
 
 
-def test_an_operators_command_takes_precedence_over_the_level_above(bench: Bench) -> None:
+def test_an_operators_command_takes_precedence_over_the_level_above(bench: BenchMessage) -> None:
     bench.command(7, "paint red")
     status = bench.order(3, Operation.DO, "open")
     assert brief(status) == ("moving", 1, "open it", "open", State.EXECUTING)
@@ -226,10 +226,10 @@ def test_an_operators_command_takes_precedence_over_the_level_above(bench: Bench
     # After its release the level continues with the command from above.
     bench.order(4, Operation.RESUME)
     assert bench.cycle().echo == 0
-    assert not bench.door.holds
+    assert not bench.door.is_held
 
 
-def test_a_refusal_names_the_invalid_word_and_the_valid_tables(bench: Bench) -> None:
+def test_a_refusal_names_the_invalid_word_and_the_valid_tables(bench: BenchMessage) -> None:
     status = bench.order(1, Operation.DO, "paint blue")
     assert (status.answer, status.standing, status.words) == (Answer.REFUSED, Operation.NONE, "")
     assert "blue" in status.objection
@@ -239,7 +239,7 @@ def test_a_refusal_names_the_invalid_word_and_the_valid_tables(bench: Bench) -> 
     assert status.table == "normal"
 
 
-def test_a_restarted_board_continues_from_its_last_status(bench: Bench) -> None:
+def test_a_restarted_board_continues_from_its_last_status(bench: BenchMessage) -> None:
     bench.order(1, Operation.TABLE, "careful")
     bench.order(2, Operation.TABLE, "normal")
     bench.command(6, "open")
@@ -280,6 +280,6 @@ def test_the_level_below_has_answered_when_it_echoes_the_newest_command(
     status = TableStatus.zeros({})
     status.state = state
     status.echo = echo
-    assert answer_of(Reading(status, Verdict.OLD), serial) == expected
-    assert answer_of(Reading(status, Verdict.NONE), serial) == "waiting"
-    assert answer_of(Reading(status, Verdict.OLD, is_lost=True), serial) == "lost"
+    assert classify_answer(Reading(status, Verdict.OLD), serial) == expected
+    assert classify_answer(Reading(status, Verdict.NONE), serial) == "waiting"
+    assert classify_answer(Reading(status, Verdict.OLD, is_lost=True), serial) == "lost"

@@ -31,7 +31,7 @@ def context() -> LevelContext:
     return next(wiring.context for wiring in plan.tasks if wiring.task == "primitive")
 
 
-class Bench:
+class BenchMessage:
     """The level with messages that the test fills. The arm is initially where it is commanded."""
 
     def __init__(self, context: LevelContext) -> None:
@@ -64,11 +64,11 @@ class Bench:
             statuses=dict(zip(BOARDS, self.readings, strict=True)),
             arm=Reading(self.arm, Verdict.NEW),
         )
-        return self.level.look(self.tick)
+        return self.level.evaluate_conditions(self.tick)
 
     def give(self) -> Message:
         """Write the set point, move the arm there, and return the set point."""
-        self.level.give(self.tick)
+        self.level.write_outputs(self.tick)
         command = self.level.command
         for below in self.below:
             below.position = command.position
@@ -83,11 +83,11 @@ class Bench:
 
 
 @pytest.fixture
-def bench(context: LevelContext) -> Bench:
-    return Bench(context)
+def bench(context: LevelContext) -> BenchMessage:
+    return BenchMessage(context)
 
 
-def test_a_motion_leads_straight_from_rest_to_rest(bench: Bench) -> None:
+def test_a_motion_leads_straight_from_rest_to_rest(bench: BenchMessage) -> None:
     bench.follow()
     # A motion to the present position never begins.
     bench.command(bench.home)
@@ -119,7 +119,7 @@ def test_a_motion_leads_straight_from_rest_to_rest(bench: Bench) -> None:
     np.testing.assert_array_equal(bench.level.status.end, goal)
 
 
-def test_half_the_speed_takes_longer_and_a_speed_is_at_most_the_limit(bench: Bench) -> None:
+def test_half_the_speed_takes_longer_and_a_speed_is_at_most_the_limit(bench: BenchMessage) -> None:
     bench.follow()
     ends = {}
     for speed in (0.0, 0.01, 0.5, 1.0, 3.0):
@@ -139,7 +139,7 @@ def test_half_the_speed_takes_longer_and_a_speed_is_at_most_the_limit(bench: Ben
 
 
 @pytest.mark.parametrize("action", ["do_halt", "do_begin"])
-def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: Bench, action: str) -> None:
+def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: BenchMessage, action: str) -> None:
     bench.follow()
     bench.command(bench.home + 0.5)
     bench.look()
@@ -163,7 +163,7 @@ def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: Bench, action: s
     assert bench.level._curve is None
 
 
-def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: Bench) -> None:
+def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: BenchMessage) -> None:
     bench.follow()
     bench.below[1].stopped = 1
     bench.below[1].reason = "brakes"
@@ -198,7 +198,7 @@ def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: Bench) ->
     ],
 )
 def test_a_gripper_that_cannot_close_completely_holds_something(
-    bench: Bench, is_closed: bool, off: float, speed: float, expected: str
+    bench: BenchMessage, is_closed: bool, off: float, speed: float, expected: str
 ) -> None:
     gripper = bench.level._gripper
     bench.level._closed = is_closed
@@ -207,7 +207,7 @@ def test_a_gripper_that_cannot_close_completely_holds_something(
     assert bench.look()["gripper"] == expected
 
 
-def test_a_restarted_board_restores_its_gripper_and_its_set_point(bench: Bench) -> None:
+def test_a_restarted_board_restores_its_gripper_and_its_set_point(bench: BenchMessage) -> None:
     last = bench.message(JointMoveStatus)
     last.closed = 1
     last.held = 1
@@ -222,8 +222,8 @@ def test_a_restarted_board_restores_its_gripper_and_its_set_point(bench: Bench) 
     vars(level).update(
         last_status=Reading(last, Verdict.NEW), last_command=Reading(command, Verdict.NEW)
     )
-    level.recall()
-    assert (level._closed, level._held, level._object) == (True, True, 1)
+    level.restore_state()
+    assert (level._closed, level._held, level._held_row) == (True, True, 1)
     np.testing.assert_allclose(level._point[0], bench.home + 0.1)
     np.testing.assert_allclose(level._end, bench.home + 0.2)
     assert level.command.id == 77

@@ -20,7 +20,7 @@ KILLED = 'fault=[{ kind = "kill", board = "primitive", at = 0.3 }]'
 
 def list_fired_rows(rack: Rack, level: str) -> list[str]:
     """Return the names of the rows that fired in a level, in order, without repetitions."""
-    names = MailboxRing(rack.segment, f"{level}.status").drain().rows["message"]["fired"]
+    names = MailboxRing(rack.segment, f"{level}.status").read_new_rows().rows["message"]["fired"]
     return [name.decode() for at, name in enumerate(names) if not at or name != names[at - 1]]
 
 
@@ -29,7 +29,7 @@ def test_the_rack_picks_up_a_block_although_a_board_dies(rack_name: str) -> None
     config = load("nist-state-table", [f"name={rack_name}", "clock.mode=lockstep", KILLED])
     with Rack(config) as rack:
         outcome = rack.run(4.3)
-        model = MailboxRing(rack.segment, "world.model").drain().rows["message"]["position"]
+        model = MailboxRing(rack.segment, "world.model").read_new_rows().rows["message"]["position"]
         moves, motions = list_fired_rows(rack, "elemental_move"), list_fired_rows(rack, "primitive")
     assert not outcome.faults
     assert "at rest on the way: go on" in motions
@@ -57,7 +57,9 @@ def test_objects_that_the_scene_lacks_are_named() -> None:
         {"step": [{"object": "a", "place": "x"}, {"object": "b", "place": "x"}]}
     )
     scene = SceneConfig(objects=("a", "c"))
-    assert TaskTable.plan_flaws(scene, plan) == ["plan.step[1].object: unknown 'b'; objects: a, c"]
+    assert TaskTable.find_plan_flaws(scene, plan) == [
+        "plan.step[1].object: unknown 'b'; objects: a, c"
+    ]
 
 
 def test_a_command_that_one_table_of_a_level_does_not_know_is_refused(tmp_path: Path) -> None:

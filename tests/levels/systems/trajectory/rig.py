@@ -13,7 +13,7 @@ from rack.levels.algebra import Array
 from rack.levels.level import InputPort, LevelContext, Pace
 from rack.levels.messages import WorldState
 from rack.levels.operator import Operation, OperatorCommand
-from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.robot.cell import build_cell, compute_sizes
 from rack.levels.systems.joint_boards.messages import JointStatus
 from rack.levels.systems.trajectory.executor import TrajectoryExecutor
 from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest
@@ -34,7 +34,7 @@ class TrajectoryRig:
     def __init__(self, arm: str = "puma560_crossing", boards: int = 2, **params: Any) -> None:
         robot, scene = config(arm)
         self.cell = build_cell(robot, scene, CLOCK_NS)
-        self.sizes = sizes(self.cell)
+        self.sizes = compute_sizes(self.cell)
         self._kinds: dict[type[Message], np.dtype] = {}
         self.tick = 0
         paces = {f"joints{k}": Pace(1, 1) for k in range(boards)}
@@ -78,7 +78,7 @@ class TrajectoryRig:
 
     def message(self, kind: type[M]) -> M:
         if kind not in self._kinds:
-            self._kinds[kind] = kind.message_type.dtype(self.sizes)
+            self._kinds[kind] = kind.message_type.build_dtype(self.sizes)
         return kind(self._kinds[kind])
 
     def request(self, kind: MotionKind, **fields: Any) -> int:
@@ -118,8 +118,8 @@ class TrajectoryRig:
 
     def read(self) -> None:
         taken, self.queue = (
-            self.queue[: self.level.room("requests")],
-            self.queue[self.level.room("requests") :],
+            self.queue[: self.level.max_messages("requests")],
+            self.queue[self.level.max_messages("requests") :],
         )
         empty = self.message(self.request_type)
         requests = (

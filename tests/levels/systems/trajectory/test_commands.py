@@ -7,7 +7,7 @@ from collections import deque
 import pytest
 
 from rack.backplane.mailbox.mailbox import Reading, Verdict
-from rack.backplane.message import copied
+from rack.backplane.message import copy_message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext
 from rack.levels.systems.trajectory.commands import Motions
@@ -73,7 +73,7 @@ class Level:
         if len(self.queue) >= self.room:
             return False
         self.sent += 1
-        self.queue.append(copied(self.message))
+        self.queue.append(copy_message(self.message))
         self.message.clear()
         return True
 

@@ -17,14 +17,14 @@ from rack.levels.errors import ProgramError
 from rack.levels.level import LevelContext, Sender
 from rack.levels.messages import Error, WorldState
 from rack.levels.planning.ik import InverseKinematics
-from rack.levels.robot.cell import build_cell, sizes
+from rack.levels.robot.cell import build_cell, compute_sizes
 from rack.levels.systems.trajectory.messages import MotionKind, MotionRequest, MotionStatus
 from rack.levels.systems.trajectory.planner import MotionProgram, RequestExecutor, RequestPlanner
 from tests.levels.arms import config
 
 ROBOT, SCENE = config("puma560_crossing")
 CELL = build_cell(ROBOT, SCENE, 1_000_000)
-SIZES = sizes(CELL)
+SIZES = compute_sizes(CELL)
 EVERY = 100
 MOVES = [{"do": "move", "joints": [0.1 * k, 1.4, -3.1, 0.0, -1.44, 0.0]} for k in range(6)]
 
@@ -120,7 +120,7 @@ def test_tool_goals_become_joint_positions_near_those_before() -> None:
     )
     rig.run(3)
     ik = InverseKinematics(CELL, 1)
-    assert np.allclose(ik.tool_at(rig.sent[0]["joints"]).position, place, atol=1e-4)
+    assert np.allclose(ik.compute_tool_pose(rig.sent[0]["joints"]).position, place, atol=1e-4)
     assert [record["kind"] for record in rig.sent] == [
         MotionKind.JOINTS,
         MotionKind.POSE,
@@ -132,7 +132,7 @@ def test_tool_goals_become_joint_positions_near_those_before() -> None:
     assert rig.sent[4]["position"].tolist() == [3.0, 0.0, 0.5]
     assert np.array_equal(rig.sent[2]["joints"], CELL.home)
     assert rig.sent[1]["body"] == -1
-    assert np.allclose(rig.sent[1]["quaternion"], ik.tool_at(CELL.home).quaternion)
+    assert np.allclose(rig.sent[1]["quaternion"], ik.compute_tool_pose(CELL.home).quaternion)
 
 
 @pytest.mark.parametrize(

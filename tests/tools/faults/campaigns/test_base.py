@@ -11,14 +11,14 @@ from typing import Any
 
 import pytest
 
-from rack.boards.config import RackConfig, load, wire
+from rack.boards.config import RackConfig, load, resolve_layout
 from rack.boards.crate.line import WarmCrate
 from rack.boards.faults.kind import KINDS
 from rack.tools.faults.campaigns import base as base_rack
 from rack.tools.faults.campaigns.base import BaseRack, Start
 from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans
 from rack.tools.faults.campaigns.plan import Kill, Plan, Targets, needs_real_time
-from rack.tools.faults.campaigns.results import result_of
+from rack.tools.faults.campaigns.results import judge_trial
 from rack.tools.faults.campaigns.trial import Trial, run_trial
 from tests.conftest import EXHAUSTIVE
 
@@ -38,7 +38,7 @@ def crate() -> Iterator[WarmCrate]:
         yield crate
 
 
-class Bench:
+class BenchMessage:
     """One rack's trials, whole or from its faultless run."""
 
     def __init__(self, config: RackConfig, name: str, crate: WarmCrate) -> None:
@@ -56,15 +56,17 @@ class Bench:
 
 def verdict(trial: Trial) -> dict[str, Any]:
     """Return all that is judged of a trial, wherever it ends."""
-    found = {key: value for key, value in asdict(result_of(trial)).items() if key not in OF_ONE_RUN}
-    found["unexplained"] = [replace(e, time_ns=0) for e in result_of(trial).unexplained]
+    found = {
+        key: value for key, value in asdict(judge_trial(trial)).items() if key not in OF_ONE_RUN
+    }
+    found["unexplained"] = [replace(e, time_ns=0) for e in judge_trial(trial).unexplained]
     return found
 
 
 def one_of_each(config: RackConfig, kinds: Sequence[str]) -> list[Plan]:
     """Return a plan for each kind, with one fault at a place that a campaign draws, while the arm
     moves."""
-    targets = Targets(config, wire(config))
+    targets = Targets(config, resolve_layout(config))
     drawn = RackUnderTest(targets, round(SECONDS * 400), 400.0, 1.0)
     plans = []
     for number, kind in enumerate(kinds, 1):
@@ -81,14 +83,14 @@ def test_every_kind_of_fault_has_the_verdict_of_a_whole_trial(
     rack_name: str, crate: WarmCrate
 ) -> None:
     config = load("nasrem").model_copy(update={"fault": ()})
-    targets = Targets(config, wire(config)).by_kind
+    targets = Targets(config, resolve_layout(config)).by_kind
     kinds = [kind for kind, at in targets.items() if at and not needs_real_time(kind)]
     # All that there are in lockstep; only a hand has tendons.
     others = {kind.name for kind in KINDS if not kind.realtime} - set(kinds)
     assert others == {"tendon-torn"}
     if not EXHAUSTIVE:
         kinds = random.Random(43).sample(kinds, SAMPLE)
-    bench = Bench(config, rack_name, crate)
+    bench = BenchMessage(config, rack_name, crate)
     idle = set[str]()
     cut = 0
     for plan in one_of_each(config, kinds):
@@ -96,13 +98,13 @@ def test_every_kind_of_fault_has_the_verdict_of_a_whole_trial(
         whole = bench.run(plan, whole=True)
         assert verdict(continued) == verdict(whole), plan
         assert (whole.start.tick, whole.start.whole, whole.is_cut) == (0, "as asked", False)
-        (fault,) = result_of(continued).faults
-        if not plan.first:
+        (fault,) = judge_trial(continued).faults
+        if not plan.first_tick:
             assert (continued.start.tick, fault.found_as) == (0, "not armed")
             continue
         assert continued.start.tick == 800
         cut += continued.is_cut
-        if fault.struck < plan.first:
+        if fault.struck < plan.first_tick:
             idle.add(fault.kind)
     # The others have been something to judge, and many were certain before the end.
     assert len(idle) <= 3, idle
@@ -110,14 +112,16 @@ def test_every_kind_of_fault_has_the_verdict_of_a_whole_trial(
 
 
 @pytest.fixture
-def bench(small: Path, rack_name: str, crate: WarmCrate, monkeypatch: pytest.MonkeyPatch) -> Bench:
+def bench(
+    small: Path, rack_name: str, crate: WarmCrate, monkeypatch: pytest.MonkeyPatch
+) -> BenchMessage:
     monkeypatch.setattr(base_rack, "EVERY_S", 0.25)
-    return Bench(load(small), rack_name, crate)
+    return BenchMessage(load(small), rack_name, crate)
 
 
 @pytest.mark.slow
 def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
-    bench: Bench,
+    bench: BenchMessage,
 ) -> None:
     plan = Plan(1, "faults", True, (MUTE, {**MUTE, "tick": 520}))
     for _ in range(2):
@@ -136,7 +140,7 @@ def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
 
 
 @pytest.mark.slow
-def test_trials_with_kills_from_outside_run_to_the_end(bench: Bench) -> None:
+def test_trials_with_kills_from_outside_run_to_the_end(bench: BenchMessage) -> None:
     plan = Plan(1, "kills", True, (), (Kill("lower", 600, 0.5),))
     found = bench.run(plan)
     assert not found.is_cut
@@ -144,13 +148,13 @@ def test_trials_with_kills_from_outside_run_to_the_end(bench: Bench) -> None:
 
 
 @pytest.mark.slow
-def test_a_trial_that_cannot_continue_from_a_snapshot_says_why(bench: Bench) -> None:
+def test_a_trial_that_cannot_continue_from_a_snapshot_says_why(bench: BenchMessage) -> None:
     soon = Plan(1, "faults", True, (MUTE,))
     early = Plan(1, "faults", True, ({"kind": "self-test", "board": "lower"},))
-    assert bench.base.start_of(replace(soon, lockstep=False), None, SECONDS) == Start(
+    assert bench.base.find_start(replace(soon, lockstep=False), None, SECONDS) == Start(
         whole="real time"
     )
-    assert bench.base.start_of(early, bench.crate, SECONDS).whole == "a fault prevents the launch"
+    assert bench.base.find_start(early, bench.crate, SECONDS).whole == "a fault prevents the launch"
 
 
 @pytest.mark.slow
@@ -164,6 +168,6 @@ def test_a_rack_without_snapshots_runs_whole_trials(
     )
     text = small.read_text().replace('two_levels:Lower"\nplanner', 'holding_levels:Lower"\nplanner')
     small.write_text(text.replace("python_path = [", f'python_path = ["{tmp_path}", '))
-    trial = Bench(load(small), rack_name, crate).run(Plan(1, "faults", True, (MUTE,)))
+    trial = BenchMessage(load(small), rack_name, crate).run(Plan(1, "faults", True, (MUTE,)))
     assert trial.start.whole.startswith("no snapshots: lower: it holds socket:")
-    assert result_of(trial).shortfalls == ()
+    assert judge_trial(trial).shortfalls == ()

@@ -134,7 +134,7 @@ def test_faults_that_did_not_act_are_drawn_again_and_finally_reported(make: Make
     results = campaign.run()
     kinds = [table["kind"] for plan in trials.made for table in plan.faults]
     # Each round more of them, up to four of each that is missing.
-    again = sum(min(turn + 1, module.MOST_AGAIN) for turn in range(1, module.ROUNDS))
+    again = sum(min(turn + 1, module.MAX_DRAWS) for turn in range(1, module.ROUNDS))
     assert (kinds.count("mute"), kinds.count("drop")) == (3 + 3 * again, 3)
     assert results.lacking == [f"mute acted only 0 of 3 times in {module.ROUNDS} rounds"]
 
@@ -198,7 +198,7 @@ def test_a_trial_with_shortfalls_leaves_a_plan_that_repeats_it(make: MakeCampaig
     campaign.run()
     (path,) = campaign.folder.glob("trial-*.toml")
     assert path.name == "trial-0001.toml"
-    assert path.read_text() == trials.made[1].toml("small")
+    assert path.read_text() == trials.made[1].format_faults("small")
 
 
 def test_short_runs_are_repeated_to_fill_the_faultless_time(

@@ -9,23 +9,23 @@ from typing import Any
 
 import pytest
 
-from rack.boards.config import load, wire
-from rack.boards.config.injections import fault_mistakes, places
-from rack.boards.config.published import publish
+from rack.boards.config import load, resolve_layout
+from rack.boards.config.injections import find_fault_mistakes, list_faults
+from rack.boards.config.published import gather_facts
 from rack.boards.config.schema import RackConfig
 from rack.boards.faults.bounds import cycle_ticks
 from rack.boards.faults.kind import KINDS
 from rack.tools.console.answer import Failure
 from rack.tools.faults.campaigns.draw import (
-    EPISODE,
-    HOLDS_UP_S,
+    ARM_STOP_S,
+    EPISODE_READS,
     LEAD_S,
-    MOST_FAULTS,
+    MAX_FAULTS,
     RackUnderTest,
     fault_plans,
     size_plans,
 )
-from rack.tools.faults.campaigns.plan import Plan, Targets, kinds_for, needs_real_time
+from rack.tools.faults.campaigns.plan import Plan, Targets, needs_real_time, select_kinds
 from rack.tools.faults.ending import EXTERNAL
 
 BOTH = (True, False)
@@ -40,12 +40,12 @@ def config() -> RackConfig:
 
 @pytest.fixture(scope="module")
 def course(config: RackConfig) -> RackUnderTest:
-    return RackUnderTest(Targets(config, wire(config)), TICKS, SECOND, 2.0)
+    return RackUnderTest(Targets(config, resolve_layout(config)), TICKS, SECOND, 2.0)
 
 
 @pytest.fixture(scope="module")
 def kinds(course: RackUnderTest) -> list[str]:
-    return kinds_for(None, course.targets, realtime=True)
+    return select_kinds(None, course.targets, realtime=True)
 
 
 def drawn(course: RackUnderTest, kinds: Sequence[str], seed: str, lockstep: bool) -> list[Plan]:
@@ -57,9 +57,11 @@ def test_every_plan_fits_its_rack(
     course: RackUnderTest, kinds: list[str], config: RackConfig
 ) -> None:
     for plan in [*drawn(course, kinds, "3", True), *drawn(course, kinds, "3", False)]:
-        planned = plan.config(config, "other")
+        planned = plan.to_config(config, "other")
         assert (
-            fault_mistakes(places(planned), planned, publish(planned).levels, course.targets.layout)
+            find_fault_mistakes(
+                list_faults(planned), planned, gather_facts(planned).levels, course.targets.layout
+            )
             == []
         )
     assert size_plans(course, kinds, 10, 3, 61)[0].number == 61
@@ -84,7 +86,7 @@ def test_faults_of_a_trial_follow_each_other_with_time_to_recover(
 ) -> None:
     plans = drawn(course, kinds, "2", lockstep)
     for plan in plans:
-        assert 1 <= len(plan.faults) + len(plan.kills) <= MOST_FAULTS
+        assert 1 <= len(plan.faults) + len(plan.kills) <= MAX_FAULTS
         ends = [
             (
                 t.get("tick", 0),
@@ -102,14 +104,14 @@ def test_faults_of_a_trial_follow_each_other_with_time_to_recover(
         for table in plan.faults:
             assert (
                 table.get("tick", 0)
-                <= course.first + course.room + (LEAD_S + stops * HOLDS_UP_S) * SECOND
+                <= course.first_tick + course.room_ticks + (LEAD_S + stops * ARM_STOP_S) * SECOND
             )
             stops += KINDS[table["kind"]].where == "arm"
     assert max(len(plan.faults) + len(plan.kills) for plan in plans) > 8
 
 
 def _undone(kind: str, board: str, course: RackUnderTest) -> int:
-    return KINDS[kind].recovery_ticks(board, course.targets.layout, course.restart_s)
+    return KINDS[kind].compute_recovery_ticks(board, course.targets.layout, course.restart_s)
 
 
 def test_a_mailbox_is_affected_again_only_if_its_readers_would_report_it(
@@ -121,12 +123,12 @@ def test_a_mailbox_is_affected_again_only_if_its_readers_would_report_it(
     ):
         quiet_from: dict[str, int] = {}
         for table in plan.faults:
-            box = layout.mailbox(table["mailbox"])
+            box = layout.find_mailbox(table["mailbox"])
             cycle = cycle_ticks(layout, box.writer)
             slowest = max(cycle, min(cycle_ticks(layout, reader) for reader in box.readers))
             if box.name in quiet_from:
                 again += 1
-                assert table["tick"] - quiet_from[box.name] >= EPISODE * slowest
+                assert table["tick"] - quiet_from[box.name] >= EPISODE_READS * slowest
             quiet_from[box.name] = table["tick"] + _lasts(table) + int(table.get("by", 0)) * cycle
     assert again > 0
 
@@ -153,7 +155,7 @@ def test_an_impossible_kind_is_refused_in_one_line(
     course: RackUnderTest, wanted: str, lockstep: bool, why: str
 ) -> None:
     with pytest.raises(Failure) as refused:
-        kinds_for(wanted, course.targets, realtime=not lockstep)
+        select_kinds(wanted, course.targets, realtime=not lockstep)
     assert refused.value.status == 2
     assert str(refused.value).startswith(why)
     assert "\n" not in str(refused.value)

@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import pytest
 
-from rack.boards.config import load, wire
+from rack.boards.config import load, resolve_layout
 from rack.tools.faults.campaigns.draw import RackUnderTest, fault_plans, kill_plans, size_plans
-from rack.tools.faults.campaigns.plan import Plan, Targets, kinds_for, needs_real_time
+from rack.tools.faults.campaigns.plan import Plan, Targets, needs_real_time, select_kinds
 from tests.snapshots import ROOT, Snapshots
 
 SNAPSHOTS = Snapshots(__file__)
@@ -17,18 +17,18 @@ SEED, COUNT, SECONDS = 90251, 3, 14.0
 
 def documents(plans: list[Plan], config: str) -> list[object]:
     """Return plans as a campaign keeps them."""
-    return [(plan, plan.toml(config)) for plan in plans]
+    return [(plan, plan.format_faults(config)) for plan in plans]
 
 
 @pytest.mark.parametrize("name", RACKS)
 @pytest.mark.parametrize("seed", [SEED, SEED + 1])
 def test_the_plans_of_a_seed_are_unchanged(name: str, seed: int) -> None:
     config = load(ROOT / "configs" / name)
-    layout = wire(config)
+    layout = resolve_layout(config)
     targets = Targets(config, layout)
     second = 1e9 / layout.clock_ns
     rack = RackUnderTest(targets, round(SECONDS * second), second, 0.25)
-    kinds = kinds_for(None, targets, realtime=True)
+    kinds = select_kinds(None, targets, realtime=True)
     quick = [kind for kind in kinds if not needs_real_time(kind)]
     swept = [kind for kind in quick if kind != "killed from outside"]
     parts: dict[str, object] = {
@@ -39,7 +39,7 @@ def test_the_plans_of_a_seed_are_unchanged(name: str, seed: int) -> None:
             fault_plans(rack, dict.fromkeys(kinds, COUNT), str(seed), False, 7), name
         ),
         "kills": documents([*kill_plans(rack, 7, seed, (True, False), 3)], name),
-        "span": (rack.first, rack.first + rack.room),
+        "span": (rack.first_tick, rack.first_tick + rack.room_ticks),
     }
     if targets.joints:
         from rack.boards.faults.kind import KINDS

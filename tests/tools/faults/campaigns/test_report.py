@@ -9,8 +9,8 @@ import pytest
 
 from rack.tools.faults.campaigns.campaign import Campaign, Order
 from rack.tools.faults.campaigns.plan import Plan
-from rack.tools.faults.campaigns.report import SHOWN, CampaignReport
-from rack.tools.faults.campaigns.results import Faultless, Results, TrialResult
+from rack.tools.faults.campaigns.report import MAX_SHOWN, CampaignReport
+from rack.tools.faults.campaigns.results import FaultlessTime, Results, TrialResult
 from tests.tools.fault_events import LAYOUT, TICK_NS, found
 from tests.tools.faults.campaigns.test_statistics import judgement
 
@@ -53,7 +53,7 @@ TRIALS = [
 ]
 
 
-class Made:
+class CredentialFiles:
     """The part of a campaign that its report reads."""
 
     layout = LAYOUT
@@ -63,7 +63,7 @@ class Made:
 
 def report_of(results: Results) -> CampaignReport:
     """Return the report of these results."""
-    campaign = Made()
+    campaign = CredentialFiles()
     campaign.order = cast(Order, Ordered())
     return CampaignReport(cast(Campaign, campaign), results, 61.26)
 
@@ -78,7 +78,7 @@ def made() -> CampaignReport:
         RUN,
         list(TRIALS),
         [swept],
-        [Faultless("a load", 20.0, (calm,))],
+        [FaultlessTime("a load", 20.0, (calm,))],
         ["overrun: did not strike"],
     )
     return report_of(results)
@@ -87,7 +87,7 @@ def made() -> CampaignReport:
 @pytest.fixture
 def report(made: CampaignReport) -> dict[str, Any]:
     """Return its document."""
-    return made.document()
+    return made.to_document()
 
 
 class Ordered:
@@ -129,7 +129,7 @@ def test_the_figures_summarise_the_right_runs(report: dict[str, Any]) -> None:
 
 
 def test_the_text_agrees_with_the_document(made: CampaignReport) -> None:
-    lines = made.markdown().splitlines()
+    lines = made.to_markdown().splitlines()
     assert lines[0] == "# Campaign on small, seed 9: fell short"
     assert lines[2].startswith("3 trials, lockstep and realtime, in 61 s on ")
     assert lines[3] == "- no real time"
@@ -154,7 +154,7 @@ def test_the_text_agrees_with_the_document(made: CampaignReport) -> None:
 
 
 def test_a_campaign_without_shortfalls_has_passed() -> None:
-    text = report_of(Results(RUN, is_interrupted=True)).markdown()
+    text = report_of(Results(RUN, is_interrupted=True)).to_markdown()
     assert text.startswith("# Campaign on small, seed 9: passed\n")
     assert "The campaign was interrupted." in text
     assert not any(
@@ -163,7 +163,7 @@ def test_a_campaign_without_shortfalls_has_passed() -> None:
 
 
 def test_the_text_shows_the_first_of_many_shortfalls() -> None:
-    many = report_of(Results(RUN, lacking=[f"line {k}" for k in range(SHOWN + 1)]))
-    assert f"## Shortfalls: {SHOWN + 1}" in many.markdown()
-    assert many.markdown().endswith(f"- line {SHOWN - 1}\n")
-    assert len(many.document()["shortfalls"]) == SHOWN + 1
+    many = report_of(Results(RUN, lacking=[f"line {k}" for k in range(MAX_SHOWN + 1)]))
+    assert f"## Shortfalls: {MAX_SHOWN + 1}" in many.to_markdown()
+    assert many.to_markdown().endswith(f"- line {MAX_SHOWN - 1}\n")
+    assert len(many.to_document()["shortfalls"]) == MAX_SHOWN + 1

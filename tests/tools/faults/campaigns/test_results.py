@@ -10,11 +10,11 @@ import pytest
 from rack.boards.events import Cause, Event, Outcome
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.results import (
-    Faultless,
+    FaultlessTime,
     TrialResult,
-    keep,
-    kept,
-    result_of,
+    judge_trial,
+    load_result,
+    save_result,
 )
 from rack.tools.faults.campaigns.trial import Trial
 from rack.tools.faults.ending import ArmEnd, Strike
@@ -50,7 +50,7 @@ GOOD, NAN = trial(SEEN, FLOWS), strike("command-nan", "lower", 100, 110)
 def refused(kind: str, why: str, again: Outcome | None = None) -> TrialResult:
     plan = Plan(1, "faults", True, ({"kind": kind, "board": "lower"},))
     made = replace(trial(strikes=()), plan=plan, run=None, outcome=None, refused=why, again=again)
-    return result_of(made)
+    return judge_trial(made)
 
 
 MUTED = "mute of lower.status at tick 100"
@@ -92,15 +92,15 @@ BAD = [
 
 @pytest.mark.parametrize(("bad", "line"), BAD)
 def test_each_shortfall_is_one_line(bad: Trial, line: str) -> None:
-    assert (result_of(GOOD).ended, result_of(GOOD).shortfalls) == ("task done", ())
-    assert result_of(bad).shortfalls == (line,)
+    assert (judge_trial(GOOD).ended, judge_trial(GOOD).shortfalls) == ("task done", ())
+    assert judge_trial(bad).shortfalls == (line,)
 
 
 def test_a_task_is_safely_stopped_if_the_arm_is_at_rest_within_its_limits() -> None:
     lost = replace(GOOD, outcome=outcome("board lost", "board 'lower' ended"))
-    assert result_of(lost).ended == "safely stopped"
-    assert result_of(replace(lost, arm=ArmEnd(is_at_rest=False))).ended == "neither"
-    assert result_of(replace(lost, arm=ArmEnd(violations=1))).ended == "neither"
+    assert judge_trial(lost).ended == "safely stopped"
+    assert judge_trial(replace(lost, arm=ArmEnd(is_at_rest=False))).ended == "neither"
+    assert judge_trial(replace(lost, arm=ArmEnd(violations=1))).ended == "neither"
 
 
 def test_a_task_that_faults_have_made_late_may_give_up_and_any_other_may_not() -> None:
@@ -108,9 +108,9 @@ def test_a_task_that_faults_have_made_late_may_give_up_and_any_other_may_not() -
     released = event(110, "recovery", "brakes_opened")
     braked = trial(*events, released, strikes=(NAN,))
     late = replace(braked, outcome=outcome("task refused"), is_late=True)
-    assert result_of(late).shortfalls == ()
-    assert result_of(replace(late, is_late=False)).shortfalls != ()
-    assert result_of(replace(late, strikes=(FAULT,), events=(SEEN, FLOWS))).shortfalls != ()
+    assert judge_trial(late).shortfalls == ()
+    assert judge_trial(replace(late, is_late=False)).shortfalls != ()
+    assert judge_trial(replace(late, strikes=(FAULT,), events=(SEEN, FLOWS))).shortfalls != ()
 
 
 def test_a_self_test_that_fails_is_found_when_the_rack_does_not_arm_because_of_it() -> None:
@@ -124,7 +124,7 @@ def test_a_self_test_that_fails_is_found_when_the_rack_does_not_arm_because_of_i
             "self-test of lower at tick 0: not armed was never undone (bound in ticks: None)",
         )
     assert refused("self-test", why.replace("lower", "upper")).faults[0].seen == "missed"
-    launched = result_of(trial(strikes=(strike("self-test", "lower", 0),)))
+    launched = judge_trial(trial(strikes=(strike("self-test", "lower", 0),)))
     assert launched.faults[0].seen == "missed"
 
 
@@ -136,11 +136,11 @@ def test_a_rack_that_does_not_launch_without_a_reason_falls_short() -> None:
 
 def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
     calm = [
-        result_of(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())),
-        result_of(trial(found(70, "stale", "upper", "lower.status"), strikes=())),
+        judge_trial(trial(event(50, "miss", "late"), event(60, "miss", "late"), strikes=())),
+        judge_trial(trial(found(70, "stale", "upper", "lower.status"), strikes=())),
     ]
-    stretch = Faultless("stress-ng --cpu 2 --io 1", 1800.0, tuple(calm))
-    document = stretch.document()
+    stretch = FaultlessTime("stress-ng --cpu 2 --io 1", 1800.0, tuple(calm))
+    document = stretch.to_document()
     # One in half an hour: below 4.74 in that time, with 95 %.
     assert (document["trips"], document["trips_per_hour"]) == (1, {"an_hour": 2.0, "below": 9.488})
     assert document["misses"] == stretch.misses == {"late": 2}
@@ -151,7 +151,7 @@ def test_trips_are_counted_by_the_hour_and_misses_beside_them() -> None:
 def test_a_trial_is_saved_atomically(tmp_path: Path) -> None:
     made = trial(SEEN, FLOWS, found(9000, "gap", "upper", "lower.status"))
     path = tmp_path / "trials" / "1.json"
-    assert kept(path) is None
-    keep(made, path)
-    assert kept(path) == result_of(made)
+    assert load_result(path) is None
+    save_result(made, path)
+    assert load_result(path) == judge_trial(made)
     assert [file.name for file in path.parent.iterdir()] == ["1.json"]

@@ -25,7 +25,7 @@ def bus(make: MakeBus, pid: int, lockstep: bool = True) -> Segment:
     """Return the memory of a rack whose board `level` is this process, and whose clock stands at
     tick 0."""
     segment = make(task("level"), task("other", slot=3))
-    words, block = segment.words, segment.block("level")
+    words, block = segment.words, segment.get_block("level")
     words[System.PERIOD_NS], words[System.LOCKSTEP], words[System.TICK] = PERIOD_NS, lockstep, 0
     words[System.EPOCH_NS] = time.monotonic_ns()
     block[Block.PID], block[Block.STATE] = pid, TaskState.RUNNING
@@ -37,15 +37,15 @@ def test_a_board_is_killed_once_at_its_tick_and_not_before(make_bus: MakeBus) ->
         segment = bus(make_bus, pid)
         killer = Killer(segment, [Kill(board="level", tick=5, phase=0.0)])
         segment.words[System.TICK] = 4
-        killer.advance()
+        killer.kill_due_board()
         assert killer.done == []
         segment.words[System.TICK] = 5
         before = time.monotonic_ns()
-        killer.advance()
+        killer.kill_due_board()
         (kill,) = killer.done
         assert (kill.board, kill.tick) == ("level", 5)
         assert before <= kill.time_ns <= time.monotonic_ns()
-        killer.advance()
+        killer.kill_due_board()
         assert killer.done == [kill]
         assert exit_status(pid) == -9
 
@@ -57,14 +57,14 @@ def test_a_board_that_is_not_running_is_killed_as_soon_as_it_is(
 ) -> None:
     with forked(lambda: time.sleep(BOUND_S)) as pid:
         segment = bus(make_bus, pid)
-        block, place = segment.block("level"), getattr(Block, word)
+        block, place = segment.get_block("level"), getattr(Block, word)
         sound, block[place] = block[place], TaskState.STARTING if word == "STATE" else 1
         killer = Killer(segment, [Kill(board="level", tick=0, phase=0.0)])
-        killer.advance()
+        killer.kill_due_board()
         assert killer.done == []
         assert os.waitpid(pid, os.WNOHANG) == (0, 0)
         block[place] = sound
-        wait_until(lambda: killer.advance() or killer.done)
+        wait_until(lambda: killer.kill_due_board() or killer.done)
         assert exit_status(pid) == -9
 
 

@@ -13,7 +13,7 @@ import pytest
 from rack.backplane.process import is_alive
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
-from rack.tools.console.interrupt import INTERRUPT, descendants
+from rack.tools.console.interrupt import INTERRUPT, list_descendants
 from rack.tools.faults.campaigns.plan import Plan
 from rack.tools.faults.campaigns.workers import TrialJob, Workers
 from tests.processes import FORKS, forked, wait_until
@@ -56,8 +56,8 @@ def test_workers_end_with_a_campaign_that_is_killed(config: RackConfig, tmp_path
 
     with forked(campaign) as pid:
         # A worker, its crate, and a board at least.
-        wait_until(lambda: len([*descendants(pid)]) > 3)
-        family = [*descendants(pid)]
+        wait_until(lambda: len([*list_descendants(pid)]) > 3)
+        family = [*list_descendants(pid)]
         os.kill(pid, signal.SIGKILL)
         wait_until(lambda: not any(map(is_alive, family)))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.checkout import RackCommand, checkout, rack_commands
+from rack.tools.lab.benches.checkout import RackCommand, build_checkout_command, build_rack_commands
 from tests.tools.command_line import BOUND_S, ROOT
 
 PYTHON = """#!/bin/sh
@@ -36,7 +36,7 @@ def test_a_checkout_runs_in_its_own_environment(
 ) -> None:
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("VIRTUAL_ENV", str(tmp_path))
-    this, other = rack_commands(create_tree(tmp_path / "other", tmp_path / "other"))
+    this, other = build_rack_commands(create_tree(tmp_path / "other", tmp_path / "other"))
     assert (this.name, other.name) == ("this tree", "other")
     assert other.run("run", 3, bound_s=BOUND_S) == "own run 3\n"
     assert "Usage: rack" in this.run("--help", bound_s=BOUND_S)
@@ -62,7 +62,7 @@ def test_a_tree_without_a_separate_environment_is_refused_in_one_line(tmp_path: 
     }
     for tree, reason in mistakes.items():
         with pytest.raises(Failure) as refused:
-            checkout(tree)
+            build_checkout_command(tree)
         assert str(refused.value).startswith(f"{tree}: {reason}")
         assert len(str(refused.value).splitlines()) == 1
         assert refused.value.status == 2

@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.cyclictest import WakeGrid, absent_cyclictest, cyclictest, late_share
+from rack.tools.lab.benches.cyclictest import (
+    WakeGrid,
+    compute_late_share,
+    find_missing_cyclictest,
+    run_cyclictest,
+)
 from tests.machine import needs_fifo
 from tests.tools.lab.benches import peers
 
@@ -22,7 +27,7 @@ needs_cyclictest = pytest.mark.skipif(
 @needs_fifo
 @needs_cyclictest
 def test_every_wake_has_its_lateness() -> None:
-    found = cyclictest(GRID)
+    found = run_cyclictest(GRID)
     assert len(found) == GRID.wakes
     assert (found >= 0).all()
 
@@ -31,7 +36,7 @@ def test_wakes_beyond_the_histogram_count_as_the_latest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)))
-    found = cyclictest(GRID)
+    found = run_cyclictest(GRID)
     assert np.unique(found, return_counts=True)[1].tolist() == [47, 1, 2]
     assert found.max() == 150_000.0
 
@@ -41,25 +46,25 @@ def test_a_refusal_by_cyclictest_is_a_failure_with_its_message(
 ) -> None:
     monkeypatch.setenv("PATH", str(peers.program(tmp_path, "cyclictest", peers.REFUSED)))
     with pytest.raises(Failure, match="cyclictest: Unable to change scheduling policy!"):
-        cyclictest(GRID)
+        run_cyclictest(GRID)
 
 
 def test_cyclictest_is_absent_without_the_program_or_the_permission(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    (absent,) = absent_cyclictest()
-    assert "apt-get install rt-tests" in absent.line
+    (absent,) = find_missing_cyclictest()
+    assert "apt-get install rt-tests" in absent.message
     peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
     monkeypatch.setattr("rack.tools.lab.benches.cyclictest.permits_fifo", lambda: False)
-    (absent,) = absent_cyclictest()
-    assert "SCHED_FIFO is refused" in absent.line
+    (absent,) = find_missing_cyclictest()
+    assert "SCHED_FIFO is refused" in absent.message
 
 
 def test_a_wake_is_late_at_each_grid_point_that_it_passed() -> None:
     period_ns = 1_000_000
-    assert late_share([np.array([0.0, 999.0])], period_ns) == 0.0
+    assert compute_late_share([np.array([0.0, 999.0])], period_ns) == 0.0
     # The second wake was 3.2 cycles late. It lost three points, two of which had no wake.
-    assert late_share([np.array([0.0, 3200.0])], period_ns) == 3 / 4
-    assert late_share([np.array([])], period_ns) == 0.0
-    assert late_share([], period_ns) is None
+    assert compute_late_share([np.array([0.0, 3200.0])], period_ns) == 3 / 4
+    assert compute_late_share([np.array([])], period_ns) == 0.0
+    assert compute_late_share([], period_ns) is None

@@ -16,14 +16,14 @@ from types import ModuleType
 import pytest
 
 from rack.tools.console.tables import render_text
-from rack.tools.lab.benches.cyclictest import absent_cyclictest
+from rack.tools.lab.benches.cyclictest import find_missing_cyclictest
 from rack.tools.lab.benches.harness import (
-    EXTRA,
+    INSTALL_COMMAND,
     Absent,
     Comparison,
     Sample,
-    absent_package,
-    interleaved,
+    call_interleaved,
+    find_missing_package,
 )
 
 SAMPLES = (
@@ -59,17 +59,17 @@ def test_a_sample_has_median_p99_best_and_count() -> None:
 
 def test_ratios_are_to_the_baseline_of_the_same_case() -> None:
     small, theirs, large, _ = SAMPLES
-    assert BOTH.ratio(small) == 0.5
-    assert BOTH.ratio(theirs) == 1.0
-    assert BOTH.ratio(small, "best") == 0.25
-    assert BOTH.ratio(large) is None, "the baseline's median is 0"
-    assert Comparison("pair", "", SAMPLES, {"small": "nobody"}).ratio(small) is None
-    assert Comparison("pair", "", SAMPLES, {}).ratio(small) is None
+    assert BOTH.compute_ratio(small) == 0.5
+    assert BOTH.compute_ratio(theirs) == 1.0
+    assert BOTH.compute_ratio(small, "best") == 0.25
+    assert BOTH.compute_ratio(large) is None, "the baseline's median is 0"
+    assert Comparison("pair", "", SAMPLES, {"small": "nobody"}).compute_ratio(small) is None
+    assert Comparison("pair", "", SAMPLES, {}).compute_ratio(small) is None
 
 
 def test_the_document_has_every_statistic_and_names_absent_contestants() -> None:
     missing = Absent("cyclictest", "no program 'cyclictest'", "apt-get install rt-tests")
-    found = replace(BOTH, absent=(missing,)).document()
+    found = replace(BOTH, absent=(missing,)).to_document()
     assert json.loads(json.dumps(found)) == found
     names = ("case", "who", "unit", "count", "median", "best", "ratio")
     first = found["samples"][0]
@@ -80,32 +80,34 @@ def test_the_document_has_every_statistic_and_names_absent_contestants() -> None
 
 
 def test_the_table_fits_the_terminal_and_names_absent_contestants() -> None:
-    missing = Absent("iceoryx2", "No module named 'iceoryx2'", EXTRA)
+    missing = Absent("iceoryx2", "No module named 'iceoryx2'", INSTALL_COMMAND)
     found = Comparison("pair", "Two contestants", SAMPLES, BOTH.baselines, (missing,))
-    lines = list(render_text(found.blocks()))
+    lines = list(render_text(found.format_blocks()))
     assert lines[0] == "Two contestants"
-    assert lines[-1] == "absent: iceoryx2: No module named 'iceoryx2'; to install: " + EXTRA
+    assert (
+        lines[-1] == "absent: iceoryx2: No module named 'iceoryx2'; to install: " + INSTALL_COMMAND
+    )
     assert " ".join(lines[2].split()) == "small ours 3 2 2.98 1 3 us 0.50 0.30"
-    assert max(map(len, list(render_text(found.blocks(), 50))[1:-1])) <= 50
+    assert max(map(len, list(render_text(found.format_blocks(), 50))[1:-1])) <= 50
 
 
 def test_a_missing_package_or_program_is_absent(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    assert not absent_package("JSON", "json")
+    assert not find_missing_package("JSON", "json")
     monkeypatch.setattr(sys, "meta_path", [Hidden("iceoryx2"), *sys.meta_path])
     monkeypatch.delitem(sys.modules, "iceoryx2", raising=False)
-    hidden = Absent("blackboard", "No module named 'iceoryx2'", EXTRA)
-    assert absent_package("blackboard", "iceoryx2") == (hidden,)
+    hidden = Absent("blackboard", "No module named 'iceoryx2'", INSTALL_COMMAND)
+    assert find_missing_package("blackboard", "iceoryx2") == (hidden,)
     monkeypatch.setenv("PATH", str(tmp_path))
     missing = Absent("cyclictest", "no program 'cyclictest'", "apt-get install rt-tests")
-    assert absent_cyclictest() == (missing,)
+    assert find_missing_cyclictest() == (missing,)
 
 
 def test_each_contestant_is_called_once_per_round_in_a_changing_order() -> None:
     order: list[str] = []
     contestants = {name: partial(order.append, name) for name in "abcd"}
-    interleaved(contestants, 50)
+    call_interleaved(contestants, 50)
     rounds = [order[at : at + 4] for at in range(0, 200, 4)]
     assert all(sorted(each) == list("abcd") for each in rounds)
     pairs = Counter(pair for each in rounds for pair in pairwise(each))
@@ -113,5 +115,5 @@ def test_each_contestant_is_called_once_per_round_in_a_changing_order() -> None:
     assert max(pairs.values()) < 30
     first = order.copy()
     order.clear()
-    interleaved(contestants, 50)
+    call_interleaved(contestants, 50)
     assert order == first, "every run of a bench has the same order"

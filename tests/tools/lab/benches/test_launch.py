@@ -11,8 +11,8 @@ import pytest
 from rack.boards.config import load
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.launch import (
-    fastest,
-    first_cycle_ns,
+    find_fastest_board,
+    find_first_cycle_ns,
     measure_kills,
 )
 
@@ -27,17 +27,17 @@ def write_trace(folder: Path, tasks: list[str], started_ns: list[int]) -> Path:
 
 def test_the_first_cycle_is_the_earliest_of_its_task(tmp_path: Path) -> None:
     run = write_trace(tmp_path, ["servo", "task", "servo", "servo"], [70, 10, 50, 60])
-    assert first_cycle_ns(run, "servo") == 50
+    assert find_first_cycle_ns(run, "servo") == 50
 
 
 def test_a_run_without_a_cycle_of_the_task_is_a_failure(tmp_path: Path) -> None:
     with pytest.raises(Failure, match="no cycle of 'servo' was recorded"):
-        first_cycle_ns(write_trace(tmp_path, ["task"], [10]), "servo")
+        find_first_cycle_ns(write_trace(tmp_path, ["task"], [10]), "servo")
 
 
 def test_the_board_with_the_shortest_period_is_found(small: Path) -> None:
-    assert fastest(load(small)) == "lower"
-    assert fastest(load("nasrem")) == "servo"
+    assert find_fastest_board(load(small)) == "lower"
+    assert find_fastest_board(load("nasrem")) == "servo"
 
 
 def test_a_rack_without_an_arm_has_no_brakes(small: Path) -> None:

@@ -20,9 +20,15 @@ from rack.backplane.layout import PROTOCOLS
 from rack.backplane.segment import SHM_FOLDER
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
-from rack.tools.lab.benches.harness import EXTRA, Absent, Sample, absent_package
-from rack.tools.lab.benches.mailbox import Bench, Case, compare, exchange, measure
-from rack.tools.lab.benches.transports import PEERS, Peer, Transport, multiprocessing_pipe
+from rack.tools.lab.benches.harness import INSTALL_COMMAND, Absent, Sample, find_missing_package
+from rack.tools.lab.benches.mailbox import (
+    BenchMessage,
+    Case,
+    build_comparison,
+    build_exchange,
+    measure_mailboxes,
+)
+from rack.tools.lab.benches.transports import PEERS, Peer, Transport, open_multiprocessing_pipe
 from tests.processes import BOUND_S
 from tests.tools.lab.benches.test_harness import Hidden
 
@@ -38,7 +44,7 @@ def list_leftovers(pid: int) -> list[str]:
 def test_every_reader_receives_every_message_and_nothing_is_left(
     peer: Peer, tmp_path: Path
 ) -> None:
-    if absent_package(peer.name, peer.module):
+    if find_missing_package(peer.name, peer.module):
         pytest.skip(f"{peer.module} is not installed")
     user = get_context("spawn").Process(target=exchange_messages, args=(peer, tmp_path))
     user.start()
@@ -54,7 +60,9 @@ def test_every_reader_receives_every_message_and_nothing_is_left(
 def exchange_messages(peer: Peer, folder: Path) -> None:
     tempfile.tempdir = str(folder)
     case = Case("2 kB", 3)
-    with peer.opened(Bench.message_type.dtype(case.lengths), case.readers) as transport:
+    with peer.open_transport(
+        BenchMessage.message_type.build_dtype(case.lengths), case.readers
+    ) as transport:
         # No name is left even while messages pass.
         assert not list(folder.iterdir())
         assert not list_leftovers(os.getpid())
@@ -74,15 +82,17 @@ def test_a_transport_that_loses_messages_is_noticed() -> None:
 
     @contextmanager
     def lossy() -> Iterator[Transport]:
-        with multiprocessing_pipe(Bench.message_type.dtype(case.lengths), 1) as transport:
-            stale = Bench.zeros(case.lengths)
+        with open_multiprocessing_pipe(
+            BenchMessage.message_type.build_dtype(case.lengths), 1
+        ) as transport:
+            stale = BenchMessage.zeros(case.lengths)
             yield transport._replace(readers=[*transport.readers, lambda tick: stale])
 
     with (
         lossy() as transport,
         pytest.raises(Failure, match=r"^lossy: a reader received another message"),
     ):
-        exchange("lossy", transport, case.lengths)
+        build_exchange("lossy", transport, case.lengths)
 
 
 def test_the_baseline_of_a_case_is_its_best_peer() -> None:
@@ -93,9 +103,9 @@ def test_the_baseline_of_a_case_is_its_best_peer() -> None:
     }
     samples = [Sample("64 B", who, (value,), "us") for who, value in medians.items()]
     samples += [Sample("200 B", "time-slice", (3.0,), "us")]
-    found = compare(samples, ())
+    found = build_comparison(samples, ())
     assert found.baselines == {"64 B": "multiprocessing pipe"}
-    assert [found.ratio(sample) for sample in samples] == [0.75, 1.25, 1.0, None]
+    assert [found.compute_ratio(sample) for sample in samples] == [0.75, 1.25, 1.0, None]
 
 
 def test_a_bench_measures_every_protocol_and_names_absent_contestants(
@@ -105,7 +115,7 @@ def test_a_bench_measures_every_protocol_and_names_absent_contestants(
     for name in [name for name in sys.modules if name.partition(".")[0] == "iceoryx2"]:
         monkeypatch.delitem(sys.modules, name)
     cases = (Case("200 B", 1), Case("200 B", 4))
-    found = measure(cases, 3, Progress())
+    found = measure_mailboxes(cases, 3, Progress())
     names = {"200 B, 1 reader", "200 B, 4 readers"}
     assert {sample.case for sample in found.samples} == set(found.baselines) == names
     assert {sample.who for sample in found.samples} >= {
@@ -113,6 +123,8 @@ def test_a_bench_measures_every_protocol_and_names_absent_contestants(
         "multiprocessing pipe",
     }
     assert all(sample.count == 3 and sample.best > 0 for sample in found.samples)
-    assert Absent("iceoryx2 blackboard", "No module named 'iceoryx2'", EXTRA) in found.absent
+    assert (
+        Absent("iceoryx2 blackboard", "No module named 'iceoryx2'", INSTALL_COMMAND) in found.absent
+    )
     assert set(found.baselines.values()) <= {peer.name for peer in PEERS}
     assert not list_leftovers(os.getpid())

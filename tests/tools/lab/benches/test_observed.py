@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from rack.backplane.trace import RECORD, SKIPPED_SHIFT, Flag
-from rack.boards.config import loads, wire
+from rack.boards.config import load_text, resolve_layout
 from rack.tools.lab.benches.chain import Chain
-from rack.tools.lab.benches.observed import count_cycles, lateness_us, record
+from rack.tools.lab.benches.observed import compute_lateness_us, count_cycles, record_rack
 from rack.tools.recording.recording import Recording
 
-LAYOUT = wire(loads(Chain(1, 400).text()))
+LAYOUT = resolve_layout(load_text(Chain(1, 400).format_config()))
 
 
 class Overslept(Recording):
@@ -24,7 +24,7 @@ class Overslept(Recording):
     def __init__(self) -> None:
         pass
 
-    def trace(self, task: str) -> np.ndarray:
+    def read_trace(self, task: str) -> np.ndarray:
         rows = np.zeros(3, RECORD)
         rows["release_ns"] = np.array([0, 200, 203]) * LAYOUT.clock_ns
         rows["start_ns"] = rows["release_ns"] + 100_000
@@ -34,13 +34,13 @@ class Overslept(Recording):
 
 def test_a_board_that_overslept_grid_points_is_late_from_the_first_of_them() -> None:
     # The start of the run does not count.
-    assert lateness_us(Overslept(), "board1").tolist() == [100.0, 5100.0]
+    assert compute_lateness_us(Overslept(), "board1").tolist() == [100.0, 5100.0]
 
 
 @pytest.mark.slow
 def test_a_chain_passes_a_message_on_in_every_cycle(tmp_path: Path) -> None:
     chain = Chain(2, 400, "lockstep")
-    result, recording = record(loads(chain.text()), 0.1, tmp_path / "run")
+    result, recording = record_rack(load_text(chain.format_config()), 0.1, tmp_path / "run")
     assert result.outcome.ticks == 40
     assert count_cycles(result.tasks[name] for name in chain.names) == (0, 80)
-    assert recording.signal("board2.status", "sent").tolist() == [-1, *range(39)]
+    assert recording.read_signal("board2.status", "sent").tolist() == [-1, *range(39)]

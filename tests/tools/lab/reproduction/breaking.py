@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rack.boards.config.schema import RackConfig
-from rack.tools.lab.benches.observed import Recorded
+from rack.tools.lab.benches.observed import RecordedRun
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 
 CHAIN = "chain"
@@ -34,7 +34,7 @@ class BreakingWorkshop(Workshop):
         self.about = f"{changes}, {most_s} s, {self._scripts}"
         self.prepare()
 
-    def source(self, name: str) -> str:
+    def find_source(self, name: str) -> str:
         """Return the path of a changed config, or the changed text of a chain.
 
         Changes that a chain cannot take are left out: a second protocol, or an overrun in lockstep.
@@ -50,15 +50,15 @@ class BreakingWorkshop(Workshop):
         base = "" if changes.startswith("name") else f'extends = ["{name}"]\n'
         return self._written(name, f"format = 2\n{base}{changes}")
 
-    def config(
+    def load_config(
         self, name: str, settings: Sequence[str] = (), faults: str | None = None
     ) -> RackConfig:
         """Load a changed config with the changed script of this name."""
         if faults in self._scripts:
             faults = self._written(f"script-{faults}", self._scripts[faults])
-        return super().config(name, settings, faults)
+        return super().load_config(name, settings, faults)
 
-    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> Recorded:
+    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> RecordedRun:
         """Run a rack for no longer than permitted."""
         return super().run(label, config, min(seconds or self._most_s, self._most_s))
 

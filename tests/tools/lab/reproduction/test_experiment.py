@@ -11,19 +11,19 @@ import pytest
 from rack.tools.console.answer import Failure
 from rack.tools.lab.reproduction.experiments import experiment
 from rack.tools.lab.reproduction.experiments.experiment import (
-    KEPT,
+    RESULTS_FOLDER,
     Experiment,
-    Lacking,
+    RequirementMissing,
     Workshop,
-    depends,
-    kept,
-    made,
-    program_files,
+    describe_dependencies,
+    list_program_files,
+    load_result,
+    make_and_store,
 )
 
 
 @dataclass(frozen=True)
-class Times:
+class LegTimes:
     """Number of times that an experiment was made."""
 
     times: int
@@ -35,12 +35,12 @@ class Counted:
     def __init__(self) -> None:
         self.times = 0
 
-    def make(self, workshop: Workshop) -> Times:
+    def make(self, workshop: Workshop) -> LegTimes:
         self.times += 1
-        return Times(self.times)
+        return LegTimes(self.times)
 
-    def experiment(self) -> Experiment[Times]:
-        return Experiment("counted", "counting", 1.0, Times, self.make)
+    def experiment(self) -> Experiment[LegTimes]:
+        return Experiment("counted", "counting", 1.0, LegTimes, self.make)
 
 
 @pytest.fixture
@@ -54,46 +54,46 @@ def test_a_result_is_valid_until_the_program_changes(
     workshop: Workshop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = Counted().experiment()
-    assert kept(one, workshop.folder) is None
-    first = made(one, workshop)
-    assert kept(one, workshop.folder) == first
+    assert load_result(one, workshop.folder) is None
+    first = make_and_store(one, workshop)
+    assert load_result(one, workshop.folder) == first
     # The dependencies are stored with the result.
-    document = json.loads((workshop.folder / KEPT / "counted.json").read_text())
-    assert document["depends"] == json.loads(json.dumps(depends()))
+    document = json.loads((workshop.folder / RESULTS_FOLDER / "counted.json").read_text())
+    assert document["depends"] == json.loads(json.dumps(describe_dependencies()))
     assert {"program", "machine"} <= set(document["depends"])
-    monkeypatch.setattr(experiment, "program", lambda: "another")
-    assert kept(one, workshop.folder) is None
-    assert made(one, workshop).found["times"] == 2
+    monkeypatch.setattr(experiment, "compute_program_checksum", lambda: "another")
+    assert load_result(one, workshop.folder) is None
+    assert make_and_store(one, workshop).found["times"] == 2
 
 
 @pytest.mark.parametrize(
     "rest", ['{"found": ', "[]", "{}", '{"found": 1, "took_s": 1, "made_at": "", "lacking": ""}']
 )
 def test_an_experiment_with_an_invalid_result_is_made_again(rest: str, workshop: Workshop) -> None:
-    (workshop.folder / KEPT / "counted.json").write_text(rest)
-    assert kept(Counted().experiment(), workshop.folder) is None
+    (workshop.folder / RESULTS_FOLDER / "counted.json").write_text(rest)
+    assert load_result(Counted().experiment(), workshop.folder) is None
 
 
 def test_a_missing_requirement_is_stored_as_a_reason_and_a_failure_is_not(
     workshop: Workshop,
 ) -> None:
-    def lack(workshop: Workshop) -> Times:
-        raise Lacking("no second processor")
+    def lack(workshop: Workshop) -> LegTimes:
+        raise RequirementMissing("no second processor")
 
-    def fail(workshop: Workshop) -> Times:
+    def fail(workshop: Workshop) -> LegTimes:
         raise Failure("the rack did not run")
 
-    lacking, failing = (Experiment(make.__name__, "", 1.0, Times, make) for make in (lack, fail))
-    made(lacking, workshop)
-    found = kept(lacking, workshop.folder)
+    lacking, failing = (Experiment(make.__name__, "", 1.0, LegTimes, make) for make in (lack, fail))
+    make_and_store(lacking, workshop)
+    found = load_result(lacking, workshop.folder)
     assert found is not None
     assert found.lacking == "no second processor"
     with pytest.raises(Failure, match="did not run"):
-        made(failing, workshop)
-    assert kept(failing, workshop.folder) is None
+        make_and_store(failing, workshop)
+    assert load_result(failing, workshop.folder) is None
 
 
 def test_results_depend_on_the_program_but_not_on_the_modules_that_write_the_page() -> None:
-    folders = {path.parent.name for path in program_files()}
+    folders = {path.parent.name for path in list_program_files()}
     assert {"mailbox", "servo", "benches", "experiments", "configs"} <= folders
     assert not {"reproduction", "sections"} & folders

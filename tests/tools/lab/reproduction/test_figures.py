@@ -6,14 +6,14 @@ import pytest
 
 from rack.tools.lab.reproduction.experiments.figures import FIG2, FigureRun
 from rack.tools.lab.reproduction.predictions import predict_figure
-from rack.tools.lab.reproduction.rules import PAPER_X, check_planning
+from rack.tools.lab.reproduction.rules import PAPER_X_MS, check_planning
 from rack.tools.lab.reproduction.verdict import Ruling, describe_unmet
-from rack.tools.timing.charts.panel import Count
+from rack.tools.timing.charts.panel import JobCount
 from tests.tools.lab.reproduction.test_rules import rule_on
 
 
 def test_the_contradiction_of_figure_2_is_found_by_computation() -> None:
-    rows = {process_ms: check_planning(process_ms) for process_ms in PAPER_X}
+    rows = {process_ms: check_planning(process_ms) for process_ms in PAPER_X_MS}
     # R X W P U in 8 ms: P has 5 - X ms a cycle, 2 ms with the longest X, not "at least 3 ms".
     assert {x: each.measured for x, (each, _) in rows.items()} == {
         1.0: 4.0,
@@ -29,7 +29,7 @@ def test_the_contradiction_of_figure_2_is_found_by_computation() -> None:
 
 def build_run(late: int, jobs: int = 100) -> FigureRun:
     """Return the record of a run of a figure with some late plans."""
-    counts = {"level": Count(jobs), "level.planner": Count(jobs, late)}
+    counts = {"level": JobCount(jobs), "level.planner": JobCount(jobs, late)}
     return FigureRun(counts, 0, 0)
 
 

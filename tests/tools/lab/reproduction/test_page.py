@@ -15,7 +15,7 @@ from rack.tools.lab.reproduction.page import (
     render_html,
     render_markdown,
 )
-from rack.tools.lab.reproduction.verdict import Ruling, compare
+from rack.tools.lab.reproduction.verdict import Ruling, compare_value
 
 CLAIM = JudgedClaim(
     "equation-3.8",
@@ -24,7 +24,7 @@ CLAIM = JudgedClaim(
     (Evidence("rack check fig3 --set a=1", text="R X W P | <U>"),),
     (
         Evidence(text="R X | W"),
-        Evidence(checks=(compare("servo: t_plan < R_i", 1.5, "<", 1.0),)),
+        Evidence(checks=(compare_value("servo: t_plan < R_i", 1.5, "<", 1.0),)),
     ),
     Ruling.CONTRADICTS,
     "Both cannot be <so>.",
@@ -92,7 +92,7 @@ def test_markdown_keeps_charts_and_tables_whole() -> None:
 
 
 def test_the_page_converts_to_plain_data() -> None:
-    data = json.loads(json.dumps(PAGE.document()))
+    data = json.loads(json.dumps(PAGE.to_document()))
     assert (data["facts"], data["rulings"]) == ({"cores": "2"}, {"contradicts": 1, "holds": 0})
     (section,) = data["sections"]
     (claim,) = section["claims"]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.tools.lab.reproduction.experiments.experiment import KEPT, kept
+from rack.tools.lab.reproduction.experiments.experiment import RESULTS_FOLDER, load_result
 from rack.tools.lab.reproduction.experiments.nasrem import DEADLINE
 from tests.processes import RACK, wait_until
 from tests.tools.command_line import BOUND_S, rack
@@ -37,13 +37,13 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.alone
 @pytest.mark.slow
 def test_a_killed_command_leaves_whole_results_and_can_be_continued(killed: Path) -> None:
-    assert not list((killed / KEPT).iterdir())
+    assert not list((killed / RESULTS_FOLDER).iterdir())
     done = rack("reproduce", "--out", killed, "--only", SECTION, "--share", "--json")
     found = json.loads(done.stdout)
     (claim,) = next(one for one in found["sections"] if one["section"] == SECTION)["claims"]
     assert (done.returncode, done.stderr, claim["ruling"]) == (0, "", "holds")
-    assert [path.name for path in (killed / KEPT).iterdir()] == ["goto.json"]
-    assert kept(DEADLINE, killed) is not None
+    assert [path.name for path in (killed / RESULTS_FOLDER).iterdir()] == ["goto.json"]
+    assert load_result(DEADLINE, killed) is not None
     page, text = ((killed / name).read_text() for name in ("index.html", "README.md"))
     targets = re.findall(r'(?:src|href)="([^"]+)"', page)
     assert not [target for target in targets if not target.startswith(("#", "data:"))]

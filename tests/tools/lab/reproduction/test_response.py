@@ -7,16 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import load, rack_timing, wire
-from rack.boards.timing.command_path import command_paths
+from rack.boards.config import build_rack_timing, load, resolve_layout
+from rack.boards.timing.command_path import find_command_paths
 from rack.tools.lab.reproduction.experiments import response
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 from rack.tools.lab.reproduction.experiments.response import (
-    MOVING_AT,
-    RUN_S,
-    first_difference,
+    MAX_RUN_S,
+    MOVING_HOLD_TICK,
+    find_first_difference,
     list_commands,
-    run_commanded,
+    run_with_commands,
 )
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
@@ -26,14 +26,14 @@ pytestmark = pytest.mark.thorough
 
 def test_each_command_follows_the_longest_response_to_the_previous_one() -> None:
     config = load("nasrem")
-    layout = wire(config)
-    found = command_paths(rack_timing(config, layout), layout)
+    layout = resolve_layout(config)
+    found = find_command_paths(build_rack_timing(config, layout), layout)
     commands = list_commands()
     assert {command.level for command in commands} == found.keys()
-    assert MOVING_AT in {command.tick for command in commands if command.what == "hold"}
+    assert MOVING_HOLD_TICK in {command.tick for command in commands if command.what == "hold"}
     ticks = [(command.tick or 0, found[command.level].longest) for command in commands]
     assert all(tick + longest < following for (tick, longest), (following, _) in pairwise(ticks))
-    assert ticks[-1][0] + ticks[-1][1] < RUN_S / 0.0025
+    assert ticks[-1][0] + ticks[-1][1] < MAX_RUN_S / 0.0025
 
 
 @pytest.mark.slow
@@ -42,16 +42,16 @@ def test_the_torque_of_a_run_differs_from_a_twin_at_the_predicted_tick(
 ) -> None:
     holds = (("primitive", 2243, 2330), ("elemental_move", 2500, 2760))
     monkeypatch.setattr(response, "HOLDS", holds)
-    monkeypatch.setattr(response, "MOVING_AT", 2500)
-    monkeypatch.setattr(response, "RUN_S", 6.9)
+    monkeypatch.setattr(response, "MOVING_HOLD_TICK", 2500)
+    monkeypatch.setattr(response, "MAX_RUN_S", 6.9)
     workshop = Workshop(tmp_path, share=True)
     workshop.prepare()
-    run, found = run_commanded(workshop, "lockstep")
-    assert found.held
+    run, found = run_with_commands(workshop, "lockstep")
+    assert found.is_within_bounds
     # 2243 is read at 2248, and at 2256; 2500 at 2600, 2704 and 2712.
-    predicted = {command.given: command.predicted for command in found.measured}
+    predicted = {command.given: command.predicted for command in found.measured_commands}
     assert (predicted[2243], predicted[2500]) == (2256, 2712)
-    assert first_difference(run, response._twin(workshop, 2712)) == 2712
+    assert find_first_difference(run, response._run_twin(workshop, 2712)) == 2712
     # A run has no difference from itself.
-    assert first_difference(run, run) is None
-    assert first_difference(run, Recording(nasrem_run(tmp_path_factory))) == 2256
+    assert find_first_difference(run, run) is None
+    assert find_first_difference(run, Recording(nasrem_run(tmp_path_factory))) == 2256

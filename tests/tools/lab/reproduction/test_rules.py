@@ -14,7 +14,7 @@ import pytest
 
 from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Failure
-from rack.tools.lab.reproduction.experiments.experiment import Kept
+from rack.tools.lab.reproduction.experiments.experiment import StoredResult
 from rack.tools.lab.reproduction.experiments.figures import LEVEL, PLANNER, FigureRun
 from rack.tools.lab.reproduction.experiments.nasrem import (
     ComparedRun,
@@ -38,13 +38,13 @@ from rack.tools.lab.reproduction.experiments.tasks import (
     TableRuns,
     TaskRun,
     WayResponse,
-    response_from,
+    parse_response,
 )
 from rack.tools.lab.reproduction.reproduction import SECTIONS, list_experiments, select_sections
-from rack.tools.lab.reproduction.rules import DONE
+from rack.tools.lab.reproduction.rules import TASK_DONE
 from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet
 from rack.tools.recording.divergence import Difference
-from rack.tools.timing.charts.panel import Count
+from rack.tools.timing.charts.panel import JobCount
 
 CLAIMS = {claim.name: claim for section in SECTIONS for claim in section.claims}
 NUMBERS = ["abstract", "1", "2", "3", "3.1", "3.2", "3.3", "3.4", "4", "4.1", "5"]
@@ -52,7 +52,7 @@ EQUATIONS = [f"equation-3.{number}" for number in range(1, 11)]
 HOLDS, BOUNDED, FAILS = Ruling.HOLDS, Ruling.BOUNDED, Ruling.FAILS
 WAY = WayResponse(3.0, 5.0, 0)
 RESPONSE = SystemResponse(4.0, {"command": WAY, "status": WAY})
-RUN = NasremRun(DONE, 2.0, 0.0, {}, RESPONSE, 800, (), {}, {})
+RUN = NasremRun(TASK_DONE, 2.0, 0.0, {}, RESPONSE, 800, (), {}, {})
 
 
 def test_every_section_equation_and_figure_of_the_paper_is_on_the_page_in_its_order() -> None:
@@ -85,7 +85,7 @@ def rule_on(name: str, *found: Any) -> ClaimVerdict:
     claim = CLAIMS[name]
     pairs = list(zip(claim.experiments, found, strict=True))
     return claim.judge(
-        *(one.record(json.loads(json.dumps(one.document(run)))) for one, run in pairs)
+        *(one.parse_record(json.loads(json.dumps(one.to_document(run)))) for one, run in pairs)
     )
 
 
@@ -116,26 +116,26 @@ def goto(refused: bool, done_s: float) -> GotoRuns:
     return GotoRuns(early, GotoRun(10.0, done_s, None, True))
 
 
-def tables(*rows: str, ended: str = DONE) -> TableRuns:
+def tables(*rows: str, ended: str = TASK_DONE) -> TableRuns:
     """Return runs in which only the row "pick" fires without a disturbance."""
-    calm = TableRun(DONE, 9.0, 0.0, {}, None, ("pick",))
+    calm = TableRun(TASK_DONE, 9.0, 0.0, {}, None, ("pick",))
     return TableRuns(replace(calm, ended=ended, rows=rows), calm)
 
 
 def background(late: int, blocks: int, in_line: int) -> tuple[FigureRun, FigureRun]:
     """Return runs of 100 cycles in which blocks are stored in the background and in the cycle."""
     behind, line = (
-        FigureRun({LEVEL: Count(100, bad), PLANNER: Count(blocks, 0)}, 0, 0)
+        FigureRun({LEVEL: JobCount(100, bad), PLANNER: JobCount(blocks, 0)}, 0, 0)
         for bad in (late, in_line)
     )
     return behind, line
 
 
 def networks(
-    missed: float, response_ms: float | None, ended: str = DONE
+    missed: float, response_ms: float | None, ended: str = TASK_DONE
 ) -> tuple[NetworkRun, NetworkRun]:
     """Return a run of two racks, and one with a network slower by 100 ms."""
-    plain = NetworkRun(DONE, 8.0, 0.0, {}, None, 0.0, 50.0)
+    plain = NetworkRun(TASK_DONE, 8.0, 0.0, {}, None, 0.0, 50.0)
     return plain, replace(plain, ended=ended, servo_missed=missed, response_ms=response_ms)
 
 
@@ -170,19 +170,19 @@ def response(delay: str) -> NasremRun:
     beyond the grid, delayed by this."""
     way = {"measured_ms": {"max": 6.0}, "bound_ms": 5.0, "beyond": [{"delayed_by": [delay]}]}
     found = {"command": way, "status": {"measured_ms": None, "bound_ms": 5.0, "beyond": []}}
-    late = response_from({**found, "sum_eq_3_3_ms": 4.0, "crosses_racks": False})
+    late = parse_response({**found, "sum_eq_3_3_ms": 4.0, "crosses_racks": False})
     assert late is not None
     return replace(RUN, response=replace(late, ways={**late.ways, "status": WAY}))
 
 
-def whole_tasks(longest_ms: float, unexplained: int, ended: str = DONE) -> list[Any]:
+def whole_tasks(longest_ms: float, unexplained: int, ended: str = TASK_DONE) -> list[Any]:
     """Return the whole tasks of all systems, one of which responded within 5 ms at most, or
     not."""
     way = WayResponse(longest_ms, 5.0, unexplained)
     answer = SystemResponse(4.0, {"command": way, "status": WAY})
     run = TaskRun(ended, 8.0, 0.0, {}, answer)
-    network = NetworkRun(DONE, 8.0, 0.0, {}, None, 0.0, 50.0)
-    runs = [network, run, *[replace(run, response=None, ended=DONE)] * (len(TASKS) - 2)]
+    network = NetworkRun(TASK_DONE, 8.0, 0.0, {}, None, 0.0, 50.0)
+    runs = [network, run, *[replace(run, response=None, ended=TASK_DONE)] * (len(TASKS) - 2)]
     return [RUN, tables("pick"), *runs]
 
 
@@ -256,12 +256,12 @@ def test_unmet_comparisons_are_described_with_their_values() -> None:
 
 
 def test_a_claim_without_results_shows_the_reason() -> None:
-    lacking = Kept({}, 1.0, "now", "this machine has one processor")
+    lacking = StoredResult({}, 1.0, "now", "this machine has one processor")
     for results, ruling, why in (
         ({}, Ruling.UNMADE, "nasrem: not run yet"),
         ({"nasrem": "the rack did not run"}, Ruling.UNMADE, "nasrem: the rack did not run"),
         ({"nasrem": lacking}, Ruling.UNTESTABLE, "this machine has one processor"),
     ):
-        judged = CLAIMS["equation-3.1"].judge_by(results)
+        judged = CLAIMS["equation-3.1"].judge_results(results)
         assert (judged.ruling, judged.why) == (ruling, why)
         assert judged.predicted

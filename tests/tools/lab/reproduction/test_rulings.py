@@ -102,7 +102,7 @@ def by_experiments(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdic
     for one in claim.experiments:
         key = one.name, workshop.about
         if key not in FOUND:
-            FOUND[key] = one.make(workshop)
+            FOUND[key] = one.measure_if_possible(workshop)
         found.append(FOUND[key])
     return claim.judge(*found)
 
@@ -112,7 +112,7 @@ def with_polling_later(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVe
 
     No rack causes this reliably, and on some machines it happens without any change.
     """
-    found = WAITS.make(workshop)
+    found = WAITS.measure_if_possible(workshop)
     sooner, later = sorted((found.blocking_us, found.polling_us))
     return claim.judge(replace(found, blocking_us=sooner, polling_us=later))
 
@@ -230,11 +230,11 @@ ROWS = (
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorten runs that are not limited by the workshop."""
     monkeypatch.setattr(figures, "SECONDS", 1.0)
-    monkeypatch.setattr(figures, "ATTEMPTS", 1)
+    monkeypatch.setattr(figures, "MAX_ATTEMPTS", 1)
     monkeypatch.setattr(sharing, "SECONDS", 0.7)
     monkeypatch.setattr(partition, "SECONDS", 2.5)
     monkeypatch.setattr(response, "HOLDS", response.HOLDS[:2])
-    monkeypatch.setattr(response, "MOVING_AT", response.HOLDS[1][1])
+    monkeypatch.setattr(response, "MOVING_HOLD_TICK", response.HOLDS[1][1])
     monkeypatch.setattr(switch, "WAKES", 200)
 
 

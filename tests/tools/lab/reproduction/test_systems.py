@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rack.boards.config import names
+from rack.boards.config import list_names
 from rack.boards.config.files import CONFIGS
 from rack.tools.lab.reproduction.claims import SYSTEMS
 from rack.tools.lab.reproduction.rules import judge_layers
@@ -15,7 +15,7 @@ from tests.boards.conftest import PLAIN
 def test_the_systems_are_nasrem_and_every_bundled_rack_with_a_folder() -> None:
     folders = {path.stem for path in CONFIGS.glob("*/*.toml") if path.stem == path.parent.name}
     # A cell of several racks is none of the paper's systems.
-    expected = {"nasrem", *folders & {*names()}} - {"cell"}
+    expected = {"nasrem", *folders & {*list_names()}} - {"cell"}
     assert {name.partition("/")[0] for name in SYSTEMS} == expected
     assert len(set(SYSTEMS)) == len(SYSTEMS)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rack.boards.config import load
-from rack.tools.timing.charts.figure5 import placed, region_of
+from rack.tools.timing.charts.figure5 import find_region, place_levels
 
 
 @pytest.mark.parametrize(
@@ -21,11 +21,11 @@ from rack.tools.timing.charts.figure5 import placed, region_of
     ],
 )
 def test_a_cycle_falls_into_the_region_of_the_figure(cycle_s: float, region: str) -> None:
-    assert region_of(cycle_s).name == region
+    assert find_region(cycle_s).name == region
 
 
 def test_the_levels_of_nasrem_fall_where_the_paper_has_them() -> None:
-    found = {level.level: level for level in placed(load("nasrem"))}
+    found = {level.level: level for level in place_levels(load("nasrem"))}
     assert list(found) == ["servo", "primitive", "world", "elemental_move", "task"]
     assert {name: level.region for name, level in found.items()} == {
         **dict.fromkeys(

@@ -10,7 +10,7 @@ import pytest
 from rack.boards.config import load
 from rack.boards.timing.schedule import Chart
 from rack.tools.timing.charts.measured import TracedRun
-from rack.tools.timing.charts.panel import union, without
+from rack.tools.timing.charts.panel import merge_stretches, subtract_stretches
 from tests.tools.recordings import cycle, recorded
 
 TICK_US = 2000
@@ -45,7 +45,7 @@ def fig2(
 
 def test_a_cycle_becomes_its_unit_functions_at_their_times_on_the_grid(folder: Path) -> None:
     run = fig2(folder, [executor(1, 8100, 8200, 9200, 11_200, 12_200)], [])
-    chart = run.chart(0, run.end_ns)
+    chart = run.build_chart(0, run.end_ns)
     assert spans(chart) == [
         ("C", 8100, 8200),
         ("R", 8200, 9200),
@@ -61,7 +61,7 @@ def test_a_cycle_becomes_its_unit_functions_at_their_times_on_the_grid(folder: P
 def test_a_planner_has_the_core_only_while_its_executor_does_not_run(folder: Path) -> None:
     cycles = [executor(0, 100, 100, 200, 300, 400), executor(1, 8100, 8100, 8200, 8300, 8400)]
     run = fig2(folder, cycles, [plan(0, 500, 9000, 9500)])
-    planner = [found for found in spans(run.chart(0, run.end_ns)) if found[0] in "PU"]
+    planner = [found for found in spans(run.build_chart(0, run.end_ns)) if found[0] in "PU"]
     assert planner == [("P", 500, 8100), ("P", 8400, 9000), ("U", 9000, 9500)]
 
 
@@ -69,31 +69,31 @@ def test_wake_up_time_of_an_executor_is_cut_from_its_planner(folder: Path) -> No
     # 150 us of processor time more than between start and end; released at 8000.
     cycles = [executor(1, 8200, 8200, 8200, 8300, 8400, processor_us=350)]
     run = fig2(folder, cycles, [plan(0, 500, 9000, 9500)])
-    planner = [found for found in spans(run.chart(0, run.end_ns)) if found[0] == "P"]
+    planner = [found for found in spans(run.build_chart(0, run.end_ns)) if found[0] == "P"]
     assert planner == [("P", 500, 8050), ("P", 8400, 9000)]
     # The executor cannot wake up before its release.
     cycles = [executor(1, 8200, 8200, 8200, 8300, 8400, processor_us=5000)]
     run = fig2(folder, cycles, [plan(0, 500, 9000, 9500)])
-    assert ("P", 500, 8000) in spans(run.chart(0, run.end_ns))
+    assert ("P", 500, 8000) in spans(run.build_chart(0, run.end_ns))
 
 
 def test_skipped_releases_are_jobs_without_an_end(folder: Path) -> None:
     late = executor(3, 24_000, 24_000, 24_000, 24_000, 25_000, skipped=2)
     run = fig2(folder, [executor(0, 0, 0, 0, 0, 21_000), late], [])
-    chart = run.chart(0, run.end_ns)
+    chart = run.build_chart(0, run.end_ns)
     assert [(job.release_ns, job.end_ns) for job in chart.jobs if job.end_ns is None] == [
         (8_000_000, None),
         (16_000_000, None),
     ]
-    assert [job.release_ns for job in chart.late("level")] == [0, 8_000_000, 16_000_000]
-    counted = run.panel(0, run.end_ns, lambda part: None).counts["level"]
+    assert [job.release_ns for job in chart.list_late_jobs("level")] == [0, 8_000_000, 16_000_000]
+    counted = run.build_panel(0, run.end_ns, lambda part: None).counts["level"]
     assert (counted.jobs, counted.late, counted.skipped) == (4, 3, 2)
 
 
 def test_a_release_without_a_plan_is_not_drawn(folder: Path) -> None:
     asked = cycle(4, TICK_US, 8500, 8500, 8550, 8600, 8700, skipped=1)
     run = fig2(folder, [], [plan(0, 500, 6000, 7000), asked])
-    chart = run.chart(0, 100_000_000)
+    chart = run.build_chart(0, 100_000_000)
     assert [job.release_ns for job in chart.jobs] == [0]
     assert spans(chart) == [("P", 500, 6000), ("U", 6000, 7000)]
 
@@ -101,7 +101,9 @@ def test_a_release_without_a_plan_is_not_drawn(folder: Path) -> None:
 def test_a_window_shows_spans_that_began_long_before_it(folder: Path) -> None:
     rows = [executor(n, *[n * 8000 + 100] * 4, n * 8000 + 200) for n in range(50)]
     run = fig2(folder, rows, [plan(0, 500, 300_000, 301_000)])
-    assert [(found, start) for found, start, _ in spans(run.chart(200_000_000, 204_000_000))] == [
+    assert [
+        (found, start) for found, start, _ in spans(run.build_chart(200_000_000, 204_000_000))
+    ] == [
         ("P", 200_000),
         ("W", 200_100),
         ("P", 200_200),
@@ -116,10 +118,10 @@ def test_patterns_and_counts_do_not_depend_on_the_blocks_that_are_read_at_once(
         plan(n, n * 8000 + 4000, n * 8000 + 14_000, n * 8000 + 15_000) for n in range(0, 60, 2)
     ]
     run = fig2(folder, rows, plans)
-    at_once = run.panel(0, 1, lambda part: None)
+    at_once = run.build_panel(0, 1, lambda part: None)
     parts: list[float] = []
     monkeypatch.setattr("rack.tools.timing.charts.measured.BLOCK_NS", 1)
-    in_blocks = run.panel(0, 1, parts.append)
+    in_blocks = run.build_panel(0, 1, parts.append)
     assert len(parts) > 10
     assert parts[-1] == 1.0
     assert (in_blocks.patterns, in_blocks.counts) == (at_once.patterns, at_once.counts)
@@ -129,10 +131,10 @@ def test_patterns_and_counts_do_not_depend_on_the_blocks_that_are_read_at_once(
 def test_a_stretch_is_divided_into_busy_and_idle_parts() -> None:
     chance = random.Random(5)
     for _ in range(200):
-        taken = union(
+        taken = merge_stretches(
             (a, a + chance.randint(1, 9)) for a in (chance.randint(0, 60) for _ in range(5))
         )
-        left = list(without((10, 50), taken))
+        left = list(subtract_stretches((10, 50), taken))
         moments = sorted(
             at for start, end in [*taken, *left] for at in range(start, end) if 10 <= at < 50
         )

@@ -6,9 +6,15 @@ from dataclasses import replace
 
 import pytest
 
-from rack.boards.timing.schedule import Chart, Job, Span, simulate
+from rack.boards.timing.schedule import Chart, Job, Span, simulate_schedule
 from rack.boards.timing.tasks import Part, TimedTask, Unit
-from rack.tools.timing.charts.patterns import Detail, Lane, Patterns, lanes_of, patterns
+from rack.tools.timing.charts.patterns import (
+    Lane,
+    PatternDetail,
+    Patterns,
+    build_lanes,
+    count_patterns,
+)
 
 
 def task(
@@ -23,10 +29,12 @@ EXECUTOR = task("a", "R100 X200 W100", 800)
 PLANNER = task("a.planner", "P600 U100", 800, 2, priority=0)
 
 
-def count(tasks: list[TimedTask], lane: str, end: int, detail: Detail | None = None) -> Patterns:
-    chart = simulate(tasks, 2 * end)
-    found = next(found for found in lanes_of(tasks) if found.name == lane)
-    return patterns(chart, found, (0, end), detail or Detail())
+def count(
+    tasks: list[TimedTask], lane: str, end: int, detail: PatternDetail | None = None
+) -> Patterns:
+    chart = simulate_schedule(tasks, 2 * end)
+    found = next(found for found in build_lanes(tasks) if found.name == lane)
+    return count_patterns(chart, found, (0, end), detail or PatternDetail())
 
 
 def test_a_plan_has_one_pattern_over_all_its_cycles() -> None:
@@ -43,12 +51,12 @@ def test_a_planner_on_a_separate_core_has_no_cycles_and_its_executor_no_plans() 
 
 
 def test_cycles_in_which_no_plan_is_under_way_are_counted_apart() -> None:
-    chart = simulate([EXECUTOR, PLANNER], 8000)
+    chart = simulate_schedule([EXECUTOR, PLANNER], 8000)
     # Remove the jobs and spans of the last three of five plans.
     kept = tuple(job for job in chart.jobs if job.task == "a" or job.release_ns < 3200)
     spans = tuple(span for span in chart.spans if span.task == "a" or span.release_ns < 3200)
-    found = patterns(
-        Chart(0, 8000, spans, kept), lanes_of([EXECUTOR, PLANNER])[0], (0, 6400), Detail()
+    found = count_patterns(
+        Chart(0, 8000, spans, kept), build_lanes([EXECUTOR, PLANNER])[0], (0, 6400), PatternDetail()
     )
     assert dict(found.plans) == {"R X W P | R X W P U -": 2}
     assert dict(found.cycles) == {"R X W -": 4}
@@ -63,21 +71,25 @@ def test_a_core_that_another_board_has_is_not_idle() -> None:
 LANE = Lane(1, "a", "a", None, 80, 1000, 1000, 0)
 
 
-def find_pattern(*stretches: tuple[str, int, int], detail: Detail) -> str:
+def find_pattern(*stretches: tuple[str, int, int], detail: PatternDetail) -> str:
     spans = tuple(Span("a", 1, Unit(unit), start, end, 0) for unit, start, end in stretches)
-    found = patterns(Chart(0, 2000, spans, (Job("a", 0, 1000, 900),)), LANE, (0, 1000), detail)
+    found = count_patterns(
+        Chart(0, 2000, spans, (Job("a", 0, 1000, 900),)), LANE, (0, 1000), detail
+    )
     (pattern,) = found.cycles
     return pattern
 
 
 def test_measured_patterns_leave_out_remnants_and_short_gaps() -> None:
-    detail = Detail.measured(LANE, {Unit.PLAN: 300, Unit.READ: 20})
+    detail = PatternDetail.from_medians(LANE, {Unit.PLAN: 300, Unit.READ: 20})
     measured = (("P", 0, 15), ("R", 60, 75), ("X", 75, 400), ("P", 420, 990))
     assert find_pattern(*measured, detail=detail) == "R X P"
-    assert find_pattern(*measured, detail=Detail()) == "P - R X - P -"
+    assert find_pattern(*measured, detail=PatternDetail()) == "P - R X - P -"
 
 
 @pytest.mark.parametrize("start", [0, 1, 799, 800])
 def test_patterns_begin_on_the_grid_and_in_the_stretch(start: int) -> None:
-    chart, lane = simulate([EXECUTOR], 8000), lanes_of([EXECUTOR])[0]
-    assert patterns(chart, lane, (start, 4000), Detail()).cycles.total() == (5 if start == 0 else 4)
+    chart, lane = simulate_schedule([EXECUTOR], 8000), build_lanes([EXECUTOR])[0]
+    assert count_patterns(chart, lane, (start, 4000), PatternDetail()).cycles.total() == (
+        5 if start == 0 else 4
+    )

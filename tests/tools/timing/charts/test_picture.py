@@ -8,18 +8,18 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from matplotlib.transforms import Bbox
 
-from rack.boards.config import load, wire
+from rack.boards.config import load, resolve_layout
 from rack.boards.timing.tasks import Unit
-from rack.tools.timing.charts.letters import column_for, lines
+from rack.tools.timing.charts.letters import choose_column_ns, format_panel
 from rack.tools.timing.charts.panel import NS_PER_MS, Panel
-from rack.tools.timing.charts.picture import WIDTH_IN, draw
+from rack.tools.timing.charts.picture import WIDTH_IN, draw_panel
 from rack.tools.timing.charts.scheduled import Schedule
 
 
 def build_panel(rack: str, start_ms: float, end_ms: float) -> Panel:
     config = load(rack)
-    schedule = Schedule(config, wire(config), {})
-    return schedule.panel(round(start_ms * NS_PER_MS), round(end_ms * NS_PER_MS))
+    schedule = Schedule(config, resolve_layout(config), {})
+    return schedule.build_panel(round(start_ms * NS_PER_MS), round(end_ms * NS_PER_MS))
 
 
 def draw_texts(panel: Panel) -> tuple[list[Text], Figure]:
@@ -27,7 +27,7 @@ def draw_texts(panel: Panel) -> tuple[list[Text], Figure]:
     figure = Figure(figsize=(WIDTH_IN, 5.0), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots()
-    draw(axes, panel)
+    draw_panel(axes, panel)
     canvas.draw()
     return list(axes.texts), figure
 
@@ -54,15 +54,15 @@ def test_a_letter_is_no_wider_than_its_span(end_ms: float) -> None:
 
 def test_the_numbers_of_frames_stand_above_their_columns() -> None:
     panel = build_panel("cyclic", 0.0, 200.0)
-    column_ns = column_for(200 * NS_PER_MS, None)
-    frames = next(line for line in lines(panel, column_ns) if line.startswith("frame"))
+    column_ns = choose_column_ns(200 * NS_PER_MS, None)
+    frames = next(line for line in format_panel(panel, column_ns) if line.startswith("frame"))
     margin = frames.index("|")
     for number in (0, 2, 48):
         assert frames[margin + 2 * number :].startswith(f"|{number}")
 
 
 def test_a_chart_in_letters_names_tasks_that_are_too_short_for_its_columns() -> None:
-    coarse = list(lines(build_panel("cell", 1000.0, 1200.0), 2 * NS_PER_MS))
+    coarse = list(format_panel(build_panel("cell", 1000.0, 1200.0), 2 * NS_PER_MS))
     assert "too short for a column: clock, lan, task; show less time, or see the picture" in coarse
-    fine = list(lines(build_panel("cell", 1000.0, 1008.0), NS_PER_MS // 10))
+    fine = list(format_panel(build_panel("cell", 1000.0, 1008.0), NS_PER_MS // 10))
     assert not [line for line in fine if line.startswith("too short")]

@@ -6,7 +6,7 @@ import pytest
 
 from rack.boards.timing.tasks import TimedTask
 from rack.tools.console.answer import Failure
-from rack.tools.timing.charts.window import WindowOptions, shown_task, times_of
+from rack.tools.timing.charts.window import WindowOptions, choose_task, parse_process_times
 
 MS = 1_000_000
 
@@ -29,9 +29,9 @@ NASREM = [
 
 
 def test_a_default_window_shows_two_plans_of_the_slowest_level_that_fits() -> None:
-    level = shown_task(NASREM)
+    level = choose_task(NASREM)
     assert level.name == "primitive.planner"
-    assert WindowOptions().window(level, None, 40 * MS) == (40 * MS, 120 * MS)
+    assert WindowOptions().choose_window(level, None, 40 * MS) == (40 * MS, 120 * MS)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def test_a_window_begins_and_ends_as_requested(
     from_ms: float, to_ms: float | None, extent_ms: int | None, seen: tuple[float, float]
 ) -> None:
     extent = None if extent_ms is None else extent_ms * MS
-    start, end = build_options(from_ms, to_ms).window(NASREM[0], extent, 0)
+    start, end = build_options(from_ms, to_ms).choose_window(NASREM[0], extent, 0)
     assert (start / MS, end / MS) == seen
 
 
@@ -70,7 +70,7 @@ def test_a_bad_window_is_refused(
     from_ms: float, to_ms: float, extent_ms: int, message: str
 ) -> None:
     with pytest.raises(Failure, match=message) as failure:
-        build_options(from_ms, to_ms).window(NASREM[0], extent_ms * MS, 0)
+        build_options(from_ms, to_ms).choose_window(NASREM[0], extent_ms * MS, 0)
     assert failure.value.status == 2
 
 
@@ -79,4 +79,4 @@ def test_a_bad_window_is_refused(
 )
 def test_bad_times_are_refused(text: str) -> None:
     with pytest.raises(Failure, match=f"--process {text}: give a level and its times"):
-        times_of([text])
+        parse_process_times([text])

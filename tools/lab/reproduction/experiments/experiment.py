@@ -24,23 +24,23 @@ import xxhash
 from pydantic import TypeAdapter, ValidationError
 
 from rack.backplane.errors import SegmentError
-from rack.backplane.segment import racks
+from rack.backplane.segment import list_racks
 from rack.boards.config import load
 from rack.boards.config.schema import RackConfig
-from rack.boards.crate.clean import remove_dead
+from rack.boards.crate.clean import remove_dead_rack
 from rack.tools.console.answer import Failure, write_json
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.lab.benches.cyclictest import permits_fifo
-from rack.tools.lab.benches.observed import UNVIEWED, Recorded, record
+from rack.tools.lab.benches.cyclictest import is_fifo_permitted
+from rack.tools.lab.benches.observed import UNVIEWED_SETTINGS, RecordedRun, record_rack
 
 # Subfolders for the results of experiments and for the recordings of their runs.
-KEPT = "parts"
-RUNS = "runs"
+RESULTS_FOLDER = "parts"
+RUNS_FOLDER = "runs"
 PROGRAM = Path(__file__).resolve().parents[4]
-FLOORS = ("backplane", "levels", "boards", "tools", "configs")
-RACK = "reproduce"
+PRODUCT_FOLDERS = ("backplane", "levels", "boards", "tools", "configs")
+RACK_PREFIX = "reproduce"
 """Prefix of the names of racks in shared memory."""
-NO_FIFO = (
+NO_FIFO_REASON = (
     "this machine refuses real-time priorities (SCHED_FIFO); without them an executor cannot"
     " preempt its planner"
 )
@@ -50,7 +50,7 @@ Document = dict[str, Any]
 Found = TypeVar("Found")
 
 
-class Lacking(Failure):
+class RequirementMissing(Failure):
     """Raised if this machine lacks something that an experiment needs.
 
     The claims of the experiment are then untestable, which is not a failure.
@@ -72,19 +72,19 @@ class Workshop:
     @property
     def rack(self) -> str:
         """Name of its racks in shared memory. Only one of them runs at a time."""
-        return f"{RACK}-{os.getpid()}"
+        return f"{RACK_PREFIX}-{os.getpid()}"
 
     def prepare(self) -> None:
         """Create the folders, and remove racks that a killed command left in shared memory."""
-        for name in (KEPT, RUNS):
+        for name in (RESULTS_FOLDER, RUNS_FOLDER):
             (self.folder / name).mkdir(parents=True, exist_ok=True)
-        for rack in racks():
-            if rack.startswith(f"{RACK}-"):
+        for rack in list_racks():
+            if rack.startswith(f"{RACK_PREFIX}-"):
                 # The rack of a running command is in use and cannot be removed.
                 with suppress(SegmentError):
-                    remove_dead(rack)
+                    remove_dead_rack(rack)
 
-    def config(
+    def load_config(
         self, name: str, settings: Sequence[str] = (), faults: str | None = None
     ) -> RackConfig:
         """Load a config under the workshop's rack name, without a recording for the viewer.
@@ -97,16 +97,18 @@ class Workshop:
         Raises:
             ConfigError: If the config is not valid.
         """
-        return load(self.source(name), [*settings, *UNVIEWED, f"name={self.rack}"], faults)
+        return load(
+            self.find_source(name), [*settings, *UNVIEWED_SETTINGS, f"name={self.rack}"], faults
+        )
 
-    def source(self, name: str) -> str:
+    def find_source(self, name: str) -> str:
         """Return the config that is loaded for a name or a text.
 
         Tests override this method to substitute a rack that violates a claim.
         """
         return name
 
-    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> Recorded:
+    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> RecordedRun:
         """Run a rack and record it in the folder.
 
         A recording of an earlier run with this label is replaced.
@@ -116,13 +118,13 @@ class Workshop:
             config: Rack to run.
             seconds: Time of the run, s. None to run until a board ends it.
         """
-        folder = self.folder / RUNS / label
+        folder = self.folder / RUNS_FOLDER / label
         shutil.rmtree(folder, ignore_errors=True)
-        return record(config, seconds, folder, self.share)
+        return record_rack(config, seconds, folder, self.share)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Charted:
+class ChartedRecord:
     """Record with a chart in letters, or a table, for the page."""
 
     chart: str = ""
@@ -149,30 +151,32 @@ class Experiment(Generic[Found]):
     measure: Callable[[Workshop], Found]
     cores: int = 1
 
-    def make(self, workshop: Workshop) -> Found:
+    def measure_if_possible(self, workshop: Workshop) -> Found:
         """Run the experiment. Raises `RequirementMissing` if this machine does not suffice."""
-        if self.cores and not permits_fifo():
-            raise Lacking(NO_FIFO)
+        if self.cores and not is_fifo_permitted():
+            raise RequirementMissing(NO_FIFO_REASON)
         if (available := len(os.sched_getaffinity(0))) < self.cores:
-            raise Lacking(f"it needs {self.cores} processors; this machine has {available}")
+            raise RequirementMissing(
+                f"it needs {self.cores} processors; this machine has {available}"
+            )
         return self.measure(workshop)
 
-    def record(self, data: Any) -> Found:
+    def parse_record(self, data: Any) -> Found:
         """Convert plain data to a record."""
         return TypeAdapter(self.kind).validate_python(data)
 
-    def document(self, record: Found) -> Any:
+    def to_document(self, record: Found) -> Any:
         """Convert a record to plain data."""
         return TypeAdapter(self.kind).dump_python(record, mode="json")
 
 
-def depends() -> Document:
+def describe_dependencies() -> Document:
     """Describe everything on which a result depends at present."""
-    return {"program": program(), "machine": machine()}
+    return {"program": compute_program_checksum(), "machine": describe_machine()}
 
 
 @dataclass(frozen=True)
-class Kept:
+class StoredResult:
     """A stored result of an experiment.
 
     Attributes:
@@ -190,37 +194,37 @@ class Kept:
     depends: Document = field(default_factory=dict)
 
 
-def kept(experiment: Experiment[Any], folder: Path) -> Kept | None:
+def load_result(experiment: Experiment[Any], folder: Path) -> StoredResult | None:
     """Return the stored result of an experiment. None if it is missing or no longer valid."""
     try:
-        text = (folder / KEPT / f"{experiment.name}.json").read_bytes()
-        result = TypeAdapter(Kept).validate_json(text)
+        text = (folder / RESULTS_FOLDER / f"{experiment.name}.json").read_bytes()
+        result = TypeAdapter(StoredResult).validate_json(text)
     except (OSError, ValidationError):
         return None
-    return result if result.depends == depends() else None
+    return result if result.depends == describe_dependencies() else None
 
 
-def made(experiment: Experiment[Any], workshop: Workshop) -> Kept:
+def make_and_store(experiment: Experiment[Any], workshop: Workshop) -> StoredResult:
     """Run an experiment and store its result. Raises `Failure` and the exceptions of a rack."""
     start_s = time.monotonic()
-    dependencies = depends()
+    dependencies = describe_dependencies()
     data: Any = None
     missing = ""
     try:
-        data = experiment.document(experiment.make(workshop))
-    except Lacking as reason:
+        data = experiment.to_document(experiment.measure_if_possible(workshop))
+    except RequirementMissing as reason:
         missing = str(reason)
     if INTERRUPT.number:
         # After a signal the run has ended in order, but too early.
-        INTERRUPT.end()
+        INTERRUPT.end_process()
     took_s = round(time.monotonic() - start_s, 1)
-    result = Kept(data, took_s, time.strftime("%Y-%m-%d %H:%M:%S"), missing, dependencies)
-    write_json(workshop.folder / KEPT / f"{experiment.name}.json", vars(result))
+    result = StoredResult(data, took_s, time.strftime("%Y-%m-%d %H:%M:%S"), missing, dependencies)
+    write_json(workshop.folder / RESULTS_FOLDER / f"{experiment.name}.json", vars(result))
     return result
 
 
 @cache
-def machine() -> Document:
+def describe_machine() -> Document:
     """Describe the properties of this machine that affect the measurements."""
     cpu = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     model = next(
@@ -232,25 +236,25 @@ def machine() -> Document:
         "cores": len(os.sched_getaffinity(0)),
         "kernel": platform.release(),
         "python": platform.python_version(),
-        "real-time priorities": permits_fifo(),
+        "real-time priorities": is_fifo_permitted(),
         "libraries": ", ".join(f"{name} {version(name)}" for name in LIBRARIES),
     }
 
 
 @cache
-def program() -> str:
+def compute_program_checksum() -> str:
     """Return a checksum of the program and its configs."""
     digest = xxhash.xxh3_64()
-    for path in program_files():
+    for path in list_program_files():
         digest.update(str(path.relative_to(PROGRAM)).encode())
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
-def program_files() -> Iterator[Path]:
+def list_program_files() -> Iterator[Path]:
     """Yield the files on which results depend. The modules that write the page are left out."""
     page = Path(__file__).resolve().parents[1]
-    for floor in FLOORS:
+    for floor in PRODUCT_FOLDERS:
         for path in sorted((PROGRAM / floor).rglob("*.*")):
             is_source = path.suffix in (".py", ".toml", ".xml") and path.is_file()
             if is_source and path.parent != page:

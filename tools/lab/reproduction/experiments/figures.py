@@ -7,20 +7,20 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from rack.boards.config import RackConfig, load, wire
-from rack.boards.timing.trace_times import plans
+from rack.boards.config import RackConfig, load, resolve_layout
+from rack.boards.timing.trace_times import select_plans
 from rack.tools.lab.reproduction.experiments import storing
-from rack.tools.lab.reproduction.experiments.experiment import Charted, Experiment, Workshop
-from rack.tools.timing.charts.letters import column_for, lines
+from rack.tools.lab.reproduction.experiments.experiment import ChartedRecord, Experiment, Workshop
+from rack.tools.timing.charts.letters import choose_column_ns, format_panel
 from rack.tools.timing.charts.measured import TracedRun
-from rack.tools.timing.charts.panel import Count, Panel
+from rack.tools.timing.charts.panel import JobCount, Panel
 from rack.tools.timing.charts.scheduled import Schedule
 
 # The paper's X, ms: "will range from 1 to 3 ms".
-LEAST_X = 1.0
-MOST_X = 3.0
+MIN_X_MS = 1.0
+MAX_X_MS = 3.0
 SECONDS = 3.0
-ATTEMPTS = 3
+MAX_ATTEMPTS = 3
 """Maximum number of runs of a figure until no cycle of its executor is disturbed."""
 LAUNCH_S = 2.5
 # Tasks of these racks.
@@ -55,7 +55,7 @@ class FigureRack:
     @cached_property
     def schedule(self) -> Schedule:
         """Schedule that follows from the budget."""
-        return Schedule(self.rack, wire(self.rack), {})
+        return Schedule(self.rack, resolve_layout(self.rack), {})
 
     @property
     def experiment(self) -> Experiment[FigureRun]:
@@ -65,26 +65,26 @@ class FigureRack:
             f"{self.label} by real processes",
             SECONDS + LAUNCH_S,
             FigureRun,
-            partial(_measure, self),
+            partial(_measure_figure, self),
             cores=2 if self.rack.board[LEVEL].coupling == "loose" else 1,
         )
 
     @property
     def window_ns(self) -> int:
         """Time that the charts show, ns."""
-        return self.cycles * self.rack.every(LEVEL) * self.rack.clock_ns
+        return self.cycles * self.rack.find_period(LEVEL) * self.rack.clock_ns
 
-    def panel(self) -> Panel:
+    def build_panel(self) -> Panel:
         """Compute the scheduled panel from the first cycle on."""
-        return self.schedule.panel(0, self.window_ns)
+        return self.schedule.build_panel(0, self.window_ns)
 
-    def letters(self, panel: Panel) -> str:
+    def format_letters(self, panel: Panel) -> str:
         """Format a panel of this figure in letters, as the paper draws it."""
-        column_ns = column_for(self.window_ns, self.schedule.shortest_ns)
-        return "\n".join((self.label, *lines(panel, column_ns)))
+        column_ns = choose_column_ns(self.window_ns, self.schedule.shortest_ns)
+        return "\n".join((self.label, *format_panel(panel, column_ns)))
 
 
-def settings_of(name: str, process_ms: float) -> tuple[str, ...]:
+def build_settings(name: str, process_ms: float) -> tuple[str, ...]:
     """Return the settings that give the executor of a figure a certain X.
 
     They change both the budget and the parameters of the board.
@@ -103,12 +103,12 @@ def settings_of(name: str, process_ms: float) -> tuple[str, ...]:
     )
 
 
-def _with_x(name: str, cycles: int, process_ms: float) -> FigureRack:
+def _build_figure_with_x(name: str, cycles: int, process_ms: float) -> FigureRack:
     label = f"{name}-x{process_ms:g}"
-    return FigureRack(name, cycles, label, settings_of(name, process_ms))
+    return FigureRack(name, cycles, label, build_settings(name, process_ms))
 
 
-def _storing(task: str, key: str) -> FigureRack:
+def _build_storing_figure(task: str, key: str) -> FigureRack:
     """Build a variant of figure 2 in which a task stores data.
 
     Args:
@@ -132,15 +132,15 @@ OVERLOAD = FigureRack("fig4-overload", 3, "fig4-overload")
 BUFFERED = FigureRack(
     "fig4", 2, "fig4-double-buffer", (f'protocol.mailbox={{ "{LEVEL}.plan" = "double-buffer" }}',)
 )
-BEHIND = _storing("planner", "plan_ms")
-IN_LINE = _storing("executor", "process_ms")
-SHORT_2 = _with_x("fig2", 2, LEAST_X)
-LONG_2 = _with_x("fig2", 3, MOST_X)
-SHORT_3 = _with_x("fig3", 3, LEAST_X)
+IN_BACKGROUND = _build_storing_figure("planner", "plan_ms")
+IN_CYCLE = _build_storing_figure("executor", "process_ms")
+SHORT_2 = _build_figure_with_x("fig2", 2, MIN_X_MS)
+LONG_2 = _build_figure_with_x("fig2", 3, MAX_X_MS)
+SHORT_3 = _build_figure_with_x("fig3", 3, MIN_X_MS)
 
 
 @dataclass(frozen=True)
-class FigureRun(Charted):
+class FigureRun(ChartedRecord):
     """A run of a figure.
 
     Attributes:
@@ -149,49 +149,49 @@ class FigureRun(Charted):
         preempted: Number of updates of the plan during which the executor began.
     """
 
-    tasks: dict[str, Count]
+    tasks: dict[str, JobCount]
     met: int
     preempted: int
 
-    def late(self, task: str) -> float:
+    def compute_late_share(self, task: str) -> float:
         """Return the fraction of a task's jobs that were late. 1 if it had no jobs."""
         count = self.tasks[task]
         return count.late / count.jobs if count.jobs else 1.0
 
 
-def _measure(figure: FigureRack, workshop: Workshop) -> FigureRun:
+def _measure_figure(figure: FigureRack, workshop: Workshop) -> FigureRun:
     """Run a figure and draw the middle of the run."""
-    run = _least_disturbed(figure, workshop)
-    start_ns = run.middle_ns(next(task for task in run.tasks if task.name == PLANNER))
-    executor = run.recording.trace(LEVEL)
-    updates = plans(run.recording.trace(PLANNER))
-    panel = run.panel(start_ns, start_ns + figure.window_ns, lambda part: None)
+    run = _find_least_disturbed_run(figure, workshop)
+    start_ns = run.find_middle_ns(next(task for task in run.tasks if task.name == PLANNER))
+    executor = run.recording.read_trace(LEVEL)
+    updates = select_plans(run.recording.read_trace(PLANNER))
+    panel = run.build_panel(start_ns, start_ns + figure.window_ns, lambda part: None)
     return FigureRun(
         tasks=dict(panel.counts),
-        met=_within(updates, executor["release_ns"]),
-        preempted=_within(updates, executor["start_ns"]),
-        chart=figure.letters(panel),
+        met=_count_updates_around(updates, executor["release_ns"]),
+        preempted=_count_updates_around(updates, executor["start_ns"]),
+        chart=figure.format_letters(panel),
     )
 
 
-def _within(updates: np.ndarray, times_ns: np.ndarray) -> int:
+def _count_updates_around(updates: np.ndarray, times_ns: np.ndarray) -> int:
     """Return the number of updates of a plan that contain one of these times."""
     first, last = (np.searchsorted(times_ns, updates[field]) for field in ("process_ns", "end_ns"))
     return int(np.count_nonzero(last > first))
 
 
-def _least_disturbed(figure: FigureRack, workshop: Workshop) -> TracedRun:
+def _find_least_disturbed_run(figure: FigureRack, workshop: Workshop) -> TracedRun:
     """Return the run with the fewest late cycles of the executor.
 
     Other programs may take cores away, therefore a run with late cycles is repeated. An executor
     that is late by its own schedule runs only once.
     """
     runs: list[tuple[int, TracedRun]] = []
-    is_late_by_schedule = bool(figure.panel().chart.late(LEVEL))
-    for attempt in range(1, ATTEMPTS + 1):
-        config = workshop.config(figure.config, figure.settings)
+    is_late_by_schedule = bool(figure.build_panel().chart.list_late_jobs(LEVEL))
+    for attempt in range(1, MAX_ATTEMPTS + 1):
+        config = workshop.load_config(figure.config, figure.settings)
         run = TracedRun(workshop.run(f"{figure.label}-{attempt}", config, SECONDS).recording)
-        late = len(run.chart(0, run.end_ns).late(LEVEL))
+        late = len(run.build_chart(0, run.end_ns).list_late_jobs(LEVEL))
         runs.append((late, run))
         if is_late_by_schedule or not late:
             break

@@ -15,18 +15,18 @@ from pydantic import TypeAdapter
 
 from rack.boards.config import load
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.trace_times import counts, gaps_ns
+from rack.boards.timing.trace_times import compute_gaps_ns, count_misses_and_skips
 from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Failure
-from rack.tools.faults.judge import Judgement, faults
-from rack.tools.lab.benches.observed import Recorded
+from rack.tools.faults.judge import Judgement, report_faults
+from rack.tools.lab.benches.observed import RecordedRun
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
-from rack.tools.lab.reproduction.experiments.tasks import TaskRun, task_run
+from rack.tools.lab.reproduction.experiments.tasks import TaskRun, summarize_task
 from rack.tools.recording.cycles import Cycles
-from rack.tools.recording.divergence import Difference, first_difference
-from rack.tools.recording.history import misses
+from rack.tools.recording.divergence import Difference, find_first_difference
+from rack.tools.recording.history import list_misses
 from rack.tools.recording.recording import Recording
-from rack.tools.report.analysis import Analysis, slice_ns
+from rack.tools.report.analysis import Analysis, compute_slice_ns
 
 NAME = "nasrem"
 TASK_S = 34.0
@@ -36,11 +36,11 @@ MS = 1e-6
 COMPARED_S = 6.0
 """Simulated time of runs that are compared, s. It is long enough for the arm to move."""
 LAUNCH_S = 3.0
-ATTEMPTS = 3
+MAX_ATTEMPTS = 3
 """Maximum number of compared runs in real time until one has no missed deadline."""
-ABOVE_M = 0.12
+HEIGHT_ABOVE_M = 0.12
 """Height of A above the place to which the rack's program takes its first object, m."""
-TOO_EARLY = 0.5
+TOO_EARLY_FRACTION = 0.5
 """Fraction of the time in soft time that is demanded first."""
 GOTO_S = 32.0
 
@@ -91,14 +91,14 @@ class NasremRun(TaskRun):
     due: dict[str, int]
 
 
-def _measure(workshop: Workshop) -> NasremRun:
-    result, recording = workshop.run(NAME, workshop.config(NAME))
-    analysis = Analysis.of(recording)
-    failing = {pair.measured.key for pair in analysis.mostly if pair.measured and pair.fails}
+def _measure_task(workshop: Workshop) -> NasremRun:
+    result, recording = workshop.run(NAME, workshop.load_config(NAME))
+    analysis = Analysis.from_recording(recording)
+    failing = {pair.measured.key for pair in analysis.mostly if pair.measured and pair.is_failed}
     ticks = result.outcome.ticks
     layout = recording.layout
     return NasremRun(
-        **vars(task_run(result, recording)),
+        **vars(summarize_task(result, recording)),
         ticks=ticks,
         verdicts=tuple(
             MeasuredVerdict(pair.measured, pair.measured.key not in failing)
@@ -106,29 +106,29 @@ def _measure(workshop: Workshop) -> NasremRun:
             if pair.measured
         ),
         executors={
-            name: _executor(cycles, analysis.predicted)
+            name: _summarize_executor(cycles, analysis.predicted)
             for name, cycles in analysis.cycles.items()
             if cycles.task.role == "executor"
         },
-        due={name: -(-ticks // layout.mailbox(name).every) for name in recording.mailboxes},
+        due={name: -(-ticks // layout.find_mailbox(name).every) for name in recording.mailboxes},
     )
 
 
-NASREM = Experiment(NAME, "nasrem in real time, its whole task", TASK_S, NasremRun, _measure)
+NASREM = Experiment(NAME, "nasrem in real time, its whole task", TASK_S, NasremRun, _measure_task)
 
 
-def _executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
+def _summarize_executor(cycles: Cycles, rack: RackTiming) -> ExecutorCycles:
     """Summarise the cycles of an executor."""
     is_judged = cycles.is_judged
     rows = cycles.rows[is_judged]
     parts_ns = (cycles.exchange_ns, cycles.read_ns, cycles.write_ns)
     return ExecutorCycles(
         cycles=len(rows),
-        missed=sum(counts(rows)),
+        missed=sum(count_misses_and_skips(rows)),
         done=len(cycles.rows),
-        slice_ms=slice_ns(rack, cycles.task) * MS,
+        slice_ms=compute_slice_ns(rack, cycles.task) * MS,
         # Use all cycles, because a cycle that was prolonged by a stall leaves a gap as well.
-        largest_gap_ms=float(gaps_ns(cycles.rows).max()) * MS,
+        largest_gap_ms=float(compute_gaps_ns(cycles.rows).max()) * MS,
         communication_us=sum(float(np.median(part_ns[is_judged])) for part_ns in parts_ns) * US,
     )
 
@@ -152,11 +152,11 @@ class ComparedRun:
 
 def _compare_modes(workshop: Workshop) -> tuple[ComparedRun, ...]:
     """Run the rack twice in lockstep, then in real time until no deadline is missed."""
-    first, second = (_recorded(workshop, f"{NAME}-lockstep-{k}", "lockstep") for k in (1, 2))
-    runs = [_compared(first, None), _compared(second, first.recording)]
-    for attempt in range(1, ATTEMPTS + 1):
-        run = _recorded(workshop, f"{NAME}-realtime-{attempt}", "realtime")
-        runs.append(_compared(run, first.recording))
+    first, second = (_record_run(workshop, f"{NAME}-lockstep-{k}", "lockstep") for k in (1, 2))
+    runs = [_compare_run(first, None), _compare_run(second, first.recording)]
+    for attempt in range(1, MAX_ATTEMPTS + 1):
+        run = _record_run(workshop, f"{NAME}-realtime-{attempt}", "realtime")
+        runs.append(_compare_run(run, first.recording))
         if runs[-1].first_miss is None:
             break
     return tuple(runs)
@@ -172,18 +172,18 @@ DETERMINISM = Experiment(
 )
 
 
-def _recorded(workshop: Workshop, label: str, mode: str) -> Recorded:
-    return workshop.run(label, workshop.config(NAME, [f"clock.mode={mode}"]), COMPARED_S)
+def _record_run(workshop: Workshop, label: str, mode: str) -> RecordedRun:
+    return workshop.run(label, workshop.load_config(NAME, [f"clock.mode={mode}"]), COMPARED_S)
 
 
-def _compared(run: Recorded, reference: Recording | None) -> ComparedRun:
+def _compare_run(run: RecordedRun, reference: Recording | None) -> ComparedRun:
     """Return the digest of a run, and its first difference from a reference."""
     result, recording = run
     return ComparedRun(
         mode=recording.rack_config.clock.mode,
         digest=result.outcome.digest,
-        first_miss=min((miss["tick"] for miss in misses(recording)), default=None),
-        difference=None if reference is None else first_difference(recording, reference),
+        first_miss=min((miss["tick"] for miss in list_misses(recording)), default=None),
+        difference=None if reference is None else find_first_difference(recording, reference),
     )
 
 
@@ -202,8 +202,8 @@ class LossesRun:
 
 def _measure_losses(script: str, workshop: Workshop) -> LossesRun:
     """Run the rack's whole task in real time with a script of faults."""
-    result, recording = workshop.run(script, workshop.config(NAME, (), script))
-    judgements = faults(recording.events, recording.layout)["faults"]
+    result, recording = workshop.run(script, workshop.load_config(NAME, (), script))
+    judgements = report_faults(recording.events, recording.layout)["faults"]
     return LossesRun(TypeAdapter(tuple[Judgement, ...]).validate_python(judgements), result.worked)
 
 
@@ -243,19 +243,19 @@ class GotoRuns:
 
 def _measure_goto(workshop: Workshop) -> GotoRuns:
     """Run GOTO A in soft time, by a time that is too early, and by a possible time."""
-    soft = _goto(workshop, "goto", None)
+    soft = _run_goto(workshop, "goto", None)
     if soft.done_s is None:
         raise Failure("goto without a time was not done")
-    early = _goto(workshop, "goto-too-early", round(TOO_EARLY * soft.done_s, 2))
+    early = _run_goto(workshop, "goto-too-early", round(TOO_EARLY_FRACTION * soft.done_s, 2))
     # Without a refusal, demand the time of the first run.
     by_s = ceil((early.earliest_s or soft.done_s) * 10) / 10
-    return GotoRuns(early, _goto(workshop, "goto-by", by_s))
+    return GotoRuns(early, _run_goto(workshop, "goto-by", by_s))
 
 
 DEADLINE = Experiment("goto", "goto in soft time, and by a time", GOTO_S, GotoRuns, _measure_goto)
 
 
-def _goto(workshop: Workshop, label: str, by_s: float | None) -> GotoRun:
+def _run_goto(workshop: Workshop, label: str, by_s: float | None) -> GotoRun:
     """Run GOTO A, GOTO B.
 
     A is above the goal of the first object that the program moves. B is the start.
@@ -267,16 +267,17 @@ def _goto(workshop: Workshop, label: str, by_s: float | None) -> GotoRun:
     """
     x, y, z = next(action["to"] for action in load(NAME).task["action"] if "to" in action)
     by = "" if by_s is None else f", by = {by_s!r}"
-    place = [x, y, round(z + ABOVE_M, 6)]
+    place = [x, y, round(z + HEIGHT_ABOVE_M, 6)]
     program = f'task.action=[{{ do = "goto", position = {place}{by} }}, {{ do = "home" }}]'
-    recording = workshop.run(label, workshop.config(NAME, [program])).recording
+    recording = workshop.run(label, workshop.load_config(NAME, [program])).recording
     done, ticks, moves = (
-        recording.signal("task.status", name) for name in ("action", "visible_at", "moves_done")
+        recording.read_signal("task.status", name)
+        for name in ("action", "visible_at", "moves_done")
     )
     times_s = ticks[done >= 1] * recording.layout.clock_ns * 1e-9
     earliest_s = np.zeros(0)
     if "task.plan" in recording.mailboxes:
-        earliest_s = recording.signal("task.plan", "earliest")
+        earliest_s = recording.read_signal("task.plan", "earliest")
     return GotoRun(
         by_s=by_s,
         done_s=next(iter(times_s.tolist()), None),

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rack.backplane.layout import TaskSpec
-from rack.boards.config import RackConfig, loads, rack_timing, resolve
+from rack.boards.config import RackConfig, build_rack_timing, load_text, resolve
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, BoardConfig, Coupling
-from rack.boards.timing.trace_times import counts, plans
+from rack.boards.timing.trace_times import count_misses_and_skips, select_plans
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
-from rack.tools.recording.cycles import cycles_of
+from rack.tools.recording.cycles import read_cycles
 from rack.tools.recording.recording import Recording
-from rack.tools.report.analysis import core_loads
+from rack.tools.report.analysis import compute_core_loads
 
 NAME = "nasrem"
 SECONDS = 12.0
@@ -30,7 +30,7 @@ class Partition:
     coupling: Coupling
     cores: int
 
-    def of(self, config: RackConfig) -> RackConfig:
+    def apply_to(self, config: RackConfig) -> RackConfig:
         """Return the rack in this partition, in real time.
 
         A loose planner gets a separate board on the next core, or on the same core if there is only
@@ -41,15 +41,15 @@ class Partition:
         """
         taken = {board.slot for board in config.board.values()}
         free = (slot for slot in range(CLOCK_SLOT + 1, LAST_SLOT + 1) if slot not in taken)
-        boards = {name: self._board(board, free) for name, board in config.board.items()}
+        boards = {name: self._place_board(board, free) for name, board in config.board.items()}
         clock = config.clock.model_copy(
             update={"mode": "realtime", "core": config.clock.core % self.cores}
         )
         changed = config.model_copy(update={"board": boards, "clock": clock})
         # A copy is not validated, therefore load and check it like a user's config.
-        return resolve(loads(changed.text())).config
+        return resolve(load_text(changed.to_toml_text())).config
 
-    def _board(self, board: BoardConfig, free_slots: Iterator[int]) -> BoardConfig:
+    def _place_board(self, board: BoardConfig, free_slots: Iterator[int]) -> BoardConfig:
         core = board.core % self.cores
         changes: dict[str, object] = {"core": core, "planner_slot": None, "planner_core": None}
         if board.planner is not None:
@@ -90,11 +90,11 @@ class PartitionFigures:
     loads: dict[int, float]
 
 
-def _measure(workshop: Workshop) -> tuple[PartitionFigures, ...]:
-    config = workshop.config(NAME)
+def _measure_partitions(workshop: Workshop) -> tuple[PartitionFigures, ...]:
+    config = workshop.load_config(NAME)
     # Check all configs before the first rack runs.
-    racks = [(partition, partition.of(config)) for partition in PARTITIONS]
-    return tuple(_figures(workshop, *pair) for pair in racks)
+    racks = [(partition, partition.apply_to(config)) for partition in PARTITIONS]
+    return tuple(_measure_partition(workshop, *pair) for pair in racks)
 
 
 PARTITION = Experiment(
@@ -102,24 +102,30 @@ PARTITION = Experiment(
     "nasrem with its planners on one core and on two",
     len(PARTITIONS) * (SECONDS + LAUNCH_S),
     tuple[PartitionFigures, ...],
-    _measure,
+    _measure_partitions,
     cores=2,
 )
 
 
-def _figures(workshop: Workshop, partition: Partition, rack: RackConfig) -> PartitionFigures:
+def _measure_partition(
+    workshop: Workshop, partition: Partition, rack: RackConfig
+) -> PartitionFigures:
     """Run a rack in a partition, and return the counts of its tasks."""
     run = workshop.run(f"partition-{partition.coupling}-{partition.cores}", rack, SECONDS).recording
-    loads = core_loads(run, cycles_of(run), rack_timing(run.rack_config, run.layout))
-    return PartitionFigures(partition, tuple(_task(task, run) for task in run.layout.tasks), loads)
+    loads = compute_core_loads(
+        run, read_cycles(run), build_rack_timing(run.rack_config, run.layout)
+    )
+    return PartitionFigures(
+        partition, tuple(_count_task(task, run) for task in run.layout.tasks), loads
+    )
 
 
-def _task(task: TaskSpec, run: Recording) -> TaskFigures:
+def _count_task(task: TaskSpec, run: Recording) -> TaskFigures:
     """Count the cycles of a task, or the plans of a planner."""
-    rows = run.trace(task.name)
+    rows = run.read_trace(task.name)
     # Releases without a plan are traced only if they were late. Only their skipped releases count.
-    _, skipped = counts(rows)
+    _, skipped = count_misses_and_skips(rows)
     if task.role == "planner":
-        rows = plans(rows)
-    missed, _ = counts(rows)
+        rows = select_plans(rows)
+    missed, _ = count_misses_and_skips(rows)
     return TaskFigures(task.board, task.role, len(rows), missed, skipped)

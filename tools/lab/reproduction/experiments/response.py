@@ -14,10 +14,10 @@ import numpy as np
 from rack.boards.config.schema import CommandConfig
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import render_text
-from rack.tools.lab.benches.observed import with_commands
-from rack.tools.lab.reproduction.experiments.experiment import Charted, Experiment, Workshop
+from rack.tools.lab.benches.observed import add_commands
+from rack.tools.lab.reproduction.experiments.experiment import ChartedRecord, Experiment, Workshop
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.operator_response import OperatorResponse, response_of
+from rack.tools.timing.operator_response import OperatorResponse, measure_response
 
 NAME = "nasrem"
 HOLDS = (
@@ -32,11 +32,11 @@ HOLDS = (
 
 Each command follows the previous one by more than the longest response.
 """
-MOVING_AT = 5659
+MOVING_HOLD_TICK = 5659
 """Tick of the hold that is given while the arm moves."""
-RUN_S = 24.0
+MAX_RUN_S = 24.0
 """Longest simulated time of a run, s."""
-LASTS_S = 62.0
+EXPECTED_S = 62.0
 TWIN_EXTRA_TICKS = 40
 """Number of ticks that the twin runs after the predicted one."""
 STATUS = "servo.status"
@@ -44,7 +44,7 @@ STATUS = "servo.status"
 
 
 @dataclass(frozen=True)
-class ResponseRun(Charted):
+class ResponseRun(ChartedRecord):
     """Responses to an operator in lockstep and in real time.
 
     Attributes:
@@ -61,42 +61,42 @@ class ResponseRun(Charted):
     differs: int | None
 
 
-def _measure(workshop: Workshop) -> ResponseRun:
-    run, lockstep = run_commanded(workshop, "lockstep")
-    _, realtime = run_commanded(workshop, "realtime")
-    predicted = next((c.predicted for c in lockstep.commands if c.given == MOVING_AT), None)
+def _measure_response(workshop: Workshop) -> ResponseRun:
+    run, lockstep = run_with_commands(workshop, "lockstep")
+    _, realtime = run_with_commands(workshop, "realtime")
+    predicted = next((c.predicted for c in lockstep.commands if c.given == MOVING_HOLD_TICK), None)
     if predicted is None:
-        raise Failure(f"{NAME}: no hold was given at tick {MOVING_AT}")
+        raise Failure(f"{NAME}: no hold was given at tick {MOVING_HOLD_TICK}")
     return ResponseRun(
         lockstep,
         realtime,
         predicted,
-        first_difference(run, _twin(workshop, predicted)),
-        chart="\n".join(render_text(realtime.blocks())),
+        find_first_difference(run, _run_twin(workshop, predicted)),
+        chart="\n".join(render_text(realtime.format_blocks())),
     )
 
 
 RESPONSE = Experiment(
-    "response", "holds and resumes by an operator", LASTS_S, ResponseRun, _measure
+    "response", "holds and resumes by an operator", EXPECTED_S, ResponseRun, _measure_response
 )
 
 
-def run_commanded(workshop: Workshop, mode: str) -> tuple[Recording, OperatorResponse]:
+def run_with_commands(workshop: Workshop, mode: str) -> tuple[Recording, OperatorResponse]:
     """Run the rack with all commands. Raises `Failure` if none of them had a response."""
-    config = with_commands(workshop.config(NAME, [f"clock.mode={mode}"]), list_commands())
-    run = workshop.run(f"response-{mode}", config, RUN_S).recording
-    response = response_of(run)
-    if response is None or not response.measured:
+    config = add_commands(workshop.load_config(NAME, [f"clock.mode={mode}"]), list_commands())
+    run = workshop.run(f"response-{mode}", config, MAX_RUN_S).recording
+    response = measure_response(run)
+    if response is None or not response.measured_commands:
         raise Failure(f"{NAME}: no command of the run had a response")
     return run, response
 
 
-def _twin(workshop: Workshop, predicted: int) -> Recording:
+def _run_twin(workshop: Workshop, predicted: int) -> Recording:
     """Run the rack in lockstep with only the commands before `MOVING_HOLD_TICK`."""
-    config = workshop.config(NAME, ["clock.mode=lockstep"])
-    before = [command for command in list_commands() if (command.tick or 0) < MOVING_AT]
+    config = workshop.load_config(NAME, ["clock.mode=lockstep"])
+    before = [command for command in list_commands() if (command.tick or 0) < MOVING_HOLD_TICK]
     seconds = (predicted + TWIN_EXTRA_TICKS) * config.clock_ns * 1e-9
-    return workshop.run("response-twin", with_commands(config, before), seconds).recording
+    return workshop.run("response-twin", add_commands(config, before), seconds).recording
 
 
 def list_commands() -> list[CommandConfig]:
@@ -111,14 +111,14 @@ def list_commands() -> list[CommandConfig]:
     ]
 
 
-def first_difference(first: Recording, second: Recording) -> int | None:
+def find_first_difference(first: Recording, second: Recording) -> int | None:
     """Return the first tick at which the torques of two lockstep runs differ in any bit.
 
     Only ticks that both runs contain are compared. None if the torques never differ.
     """
-    torques = [run.signal(STATUS, "torque").view(np.uint64) for run in (first, second)]
+    torques = [run.read_signal(STATUS, "torque").view(np.uint64) for run in (first, second)]
     # In lockstep the level writes in every cycle, therefore messages with the same index have the
     # same tick.
     length = min(map(len, torques))
     is_different = (torques[0][:length] != torques[1][:length]).any(axis=1)
-    return next(iter(first.signal(STATUS, "tick")[:length][is_different].tolist()), None)
+    return next(iter(first.read_signal(STATUS, "tick")[:length][is_different].tolist()), None)

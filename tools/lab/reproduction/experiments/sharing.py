@@ -12,19 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from rack.backplane.layout import Wake
-from rack.boards.config import loads
+from rack.boards.config import load_text
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.chain import Chain
-from rack.tools.lab.benches.observed import Recorded, count_cycles, lateness_us
+from rack.tools.lab.benches.observed import RecordedRun, compute_lateness_us, count_cycles
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 LEVELS = 5
 """Number of levels of the pipeline: "it would take 5 control cycles"."""
-GROWN = 10
+GROWN_BOARDS = 10
 RATE_HZ = 400
 SECONDS = 2.0
 LAUNCH_S = 2.0
-LOCKS = '\n[protocol]\ndefault = "lock"\n'
+LOCK_PROTOCOL = '\n[protocol]\ndefault = "lock"\n'
 
 
 @dataclass(frozen=True)
@@ -56,27 +56,27 @@ class Chains:
 
 def _measure_chains(workshop: Workshop) -> Chains:
     return Chains(
-        lockstep=_chain("chain-lockstep", workshop, Chain(LEVELS, RATE_HZ, "lockstep")),
-        realtime=_chain("chain-realtime", workshop, Chain(LEVELS, RATE_HZ)),
-        locked=_chain("chain-locked", workshop, Chain(LEVELS, RATE_HZ), LOCKS),
-        grown=_chain("chain-grown", workshop, Chain(GROWN, RATE_HZ)),
+        lockstep=_measure_chain("chain-lockstep", workshop, Chain(LEVELS, RATE_HZ, "lockstep")),
+        realtime=_measure_chain("chain-realtime", workshop, Chain(LEVELS, RATE_HZ)),
+        locked=_measure_chain("chain-locked", workshop, Chain(LEVELS, RATE_HZ), LOCK_PROTOCOL),
+        grown=_measure_chain("chain-grown", workshop, Chain(GROWN_BOARDS, RATE_HZ)),
     )
 
 
-def _chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> ChainRun:
+def _measure_chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> ChainRun:
     """Run a chain of boards, and count the cycles that its messages took."""
-    run = _run(label, workshop, chain, protocol)
+    run = _run_chain(label, workshop, chain, protocol)
     missed, due = count_cycles(run.result.tasks[name] for name in chain.names)
     last = f"{chain.names[-1]}.status"
-    sent, visible_at = (run.recording.signal(last, name) for name in ("sent", "visible_at"))
+    sent, visible_at = (run.recording.read_signal(last, name) for name in ("sent", "visible_at"))
     # Count a message once, even if a missed cycle repeats it. -1 is sent before the first message.
     sent, first = np.unique(sent, return_index=True)
     took = Counter((visible_at[first] - sent)[sent >= 0].tolist())
     return ChainRun(chain.boards, due, missed, dict(sorted(took.items())))
 
 
-def _run(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> Recorded:
-    config = loads(workshop.source(chain.text() + protocol))
+def _run_chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> RecordedRun:
+    config = load_text(workshop.find_source(chain.format_config() + protocol))
     return workshop.run(label, config.model_copy(update={"name": workshop.rack}), SECONDS)
 
 
@@ -99,12 +99,14 @@ class Waits:
 
 
 def _measure_waits(workshop: Workshop) -> Waits:
-    return Waits(_median_us(workshop, "signal"), _median_us(workshop, "poll"))
+    return Waits(_measure_median_us(workshop, "signal"), _measure_median_us(workshop, "poll"))
 
 
-def _median_us(workshop: Workshop, wake: Wake) -> float:
+def _measure_median_us(workshop: Workshop, wake: Wake) -> float:
     chain = Chain(1, RATE_HZ, wake=wake)
-    late_us = lateness_us(_run(f"waits-{wake}", workshop, chain).recording, chain.names[0])
+    late_us = compute_lateness_us(
+        _run_chain(f"waits-{wake}", workshop, chain).recording, chain.names[0]
+    )
     if not len(late_us):
         raise Failure(f"a board that waits by {wake} ran no cycle")
     return float(np.median(late_us))

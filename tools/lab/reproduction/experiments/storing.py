@@ -24,7 +24,7 @@ class Storage:
     def _file(self) -> IO[bytes]:
         return tempfile.TemporaryFile()
 
-    def put(self) -> None:
+    def store_block(self) -> None:
         """Compress a block, overwrite the previous one in the file, and force it to the disk."""
         os.pwrite(self._file.fileno(), zlib.compress(self._block), 0)
         os.fsync(self._file.fileno())
@@ -38,7 +38,7 @@ class StoringPlanner(FigurePlanner):
     def plan(self, tick: int) -> None:
         """Write the plan, then store a block."""
         self.output.made_at = tick
-        self.storage.put()
+        self.storage.store_block()
 
 
 class StoringExecutor(FigureExecutor):
@@ -49,4 +49,4 @@ class StoringExecutor(FigureExecutor):
     def process(self, tick: int) -> None:
         """Run the cycle of the figure, then store a block."""
         super().process(tick)
-        self.storage.put()
+        self.storage.store_block()

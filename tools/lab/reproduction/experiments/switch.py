@@ -20,10 +20,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rack.backplane.process import die_with_parent, pin, set_priority
-from rack.boards.timing.trace_times import Distribution, distribution
+from rack.backplane.process import die_with_parent, pin_to_core, set_priority
+from rack.boards.timing.trace_times import Distribution, compute_distribution
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import pinned
+from rack.tools.lab.benches.harness import stay_on_core
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 NAME = "nasrem"
@@ -33,10 +33,10 @@ WAKES = 1000
 PERIOD_S = 0.002
 HEAD_START_S = 0.0005
 # SCHED_FIFO priorities. No task under ordinary scheduling runs between the two.
-EXECUTOR = 80
-PLANNER = 1
-PATIENCE_NS = 20_000_000
-READY_S = 20.0
+EXECUTOR_PRIORITY = 80
+PLANNER_PRIORITY = 1
+MAX_GAP_WAIT_NS = 20_000_000
+READY_TIMEOUT_S = 20.0
 LAUNCH_S = 3.0
 
 
@@ -54,12 +54,17 @@ class SwitchRun:
     assumed_us: float
 
 
-def _measure(workshop: Workshop) -> SwitchRun:
-    return SwitchRun(measure_switch(), 1e3 * workshop.config(NAME).timing.context_switch_ms)
+def _measure_and_compare(workshop: Workshop) -> SwitchRun:
+    return SwitchRun(measure_switch(), 1e3 * workshop.load_config(NAME).timing.context_switch_ms)
 
 
 SWITCH = Experiment(
-    "switch", "the context switch", WAKES * PERIOD_S + LAUNCH_S, SwitchRun, _measure, cores=2
+    "switch",
+    "the context switch",
+    WAKES * PERIOD_S + LAUNCH_S,
+    SwitchRun,
+    _measure_and_compare,
+    cores=2,
 )
 
 
@@ -87,16 +92,16 @@ def measure_switch() -> Distribution:
     wake, work = spawn.Semaphore(0), spawn.Semaphore(0)
     with ExitStack() as stack:
         processes = []
-        for loop, semaphore in ((_execute, wake), (_plan, work)):
-            process = spawn.Process(target=_start, args=(loop, semaphore, shared), daemon=True)
+        for loop, semaphore in ((_run_executor, wake), (_run_planner, work)):
+            process = spawn.Process(target=_start_loop, args=(loop, semaphore, shared), daemon=True)
             process.start()
             stack.callback(process.join)
             stack.callback(process.kill)
             processes.append(process)
         # Keep this process off the measured core.
-        stack.enter_context(pinned(cores[0]))
+        stack.enter_context(stay_on_core(cores[0]))
         try:
-            shared.start.wait(READY_S)
+            shared.start.wait(READY_TIMEOUT_S)
         except BrokenBarrierError:
             raise Failure(
                 "a process of the measurement did not start, or SCHED_FIFO is refused"
@@ -107,23 +112,23 @@ def measure_switch() -> Distribution:
             wake.release()
             time.sleep(PERIOD_S - HEAD_START_S)
         for process in processes:
-            process.join(READY_S)
-    return switch_times_us(np.reshape(gaps, (-1, 2)), np.reshape(awake, (-1, 2)))
+            process.join(READY_TIMEOUT_S)
+    return compute_switch_times_us(np.reshape(gaps, (-1, 2)), np.reshape(awake, (-1, 2)))
 
 
-def _start(
+def _start_loop(
     loop: Callable[[Semaphore, _Shared], None], semaphore: Semaphore, shared: _Shared
 ) -> None:
     """Pin this process, set its priority, wait for the other one, and run its loop."""
     die_with_parent(shared.parent)
-    pin(shared.core)
-    if not set_priority(EXECUTOR if loop is _execute else PLANNER):
+    pin_to_core(shared.core)
+    if not set_priority(EXECUTOR_PRIORITY if loop is _run_executor else PLANNER_PRIORITY):
         shared.start.abort()
-    shared.start.wait(READY_S)
+    shared.start.wait(READY_TIMEOUT_S)
     loop(semaphore, shared)
 
 
-def _execute(semaphore: Semaphore, shared: _Shared) -> None:
+def _run_executor(semaphore: Semaphore, shared: _Shared) -> None:
     """Run the executor, which wakes up, notes the time and waits again."""
     awake = shared.awake
     for number in range(shared.wakes):
@@ -132,7 +137,7 @@ def _execute(semaphore: Semaphore, shared: _Shared) -> None:
         awake[2 * number + 1] = monotonic_ns()
 
 
-def _plan(semaphore: Semaphore, shared: _Shared) -> None:
+def _run_planner(semaphore: Semaphore, shared: _Shared) -> None:
     """Run the planner, which computes until it is interrupted, and keep the longest gap."""
     gaps = shared.gaps
     awake = shared.awake
@@ -142,7 +147,7 @@ def _plan(semaphore: Semaphore, shared: _Shared) -> None:
         longest_ns = 0
         end_index = 2 * number + 1
         awake_ns = 0
-        while not awake_ns and last_ns - begin_ns < PATIENCE_NS:
+        while not awake_ns and last_ns - begin_ns < MAX_GAP_WAIT_NS:
             # Read this before the clock. Wherever the executor interrupts this loop, the next value
             # of the clock then shows the gap.
             awake_ns = awake[end_index]
@@ -155,7 +160,7 @@ def _plan(semaphore: Semaphore, shared: _Shared) -> None:
             last_ns = now_ns
 
 
-def switch_times_us(gaps: np.ndarray, awake: np.ndarray) -> Distribution:
+def compute_switch_times_us(gaps: np.ndarray, awake: np.ndarray) -> Distribution:
     """Return the time of a switch for the wake-ups that interrupted the planner, us.
 
     Args:
@@ -167,7 +172,7 @@ def switch_times_us(gaps: np.ndarray, awake: np.ndarray) -> Distribution:
     """
     is_interrupted = (gaps[:, 0] > 0) & (gaps[:, 0] <= awake[:, 0]) & (awake[:, 1] <= gaps[:, 1])
     both_us = np.diff(gaps - awake, axis=1)[is_interrupted, 0] * 1e-3
-    times = distribution(both_us / 2)
+    times = compute_distribution(both_us / 2)
     if times is None:
         raise Failure("no wake-up interrupted the planner: the machine is too busy to measure")
     return times

@@ -16,14 +16,14 @@ import numpy as np
 
 from rack.boards.config import RackConfig, load
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.observed import UNVIEWED, count_cycles
-from rack.tools.lab.reproduction.experiments.experiment import RUNS, Experiment, Workshop
+from rack.tools.lab.benches.observed import UNVIEWED_SETTINGS, count_cycles
+from rack.tools.lab.reproduction.experiments.experiment import RUNS_FOLDER, Experiment, Workshop
 from rack.tools.launch.launch import RunResult
-from rack.tools.monitor.host_side import entries_of
-from rack.tools.recording.history import fired_rows
+from rack.tools.monitor.host_side import list_entries
+from rack.tools.recording.history import list_fired_rows
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.time_line import RackGrid
-from rack.tools.timing.measured_response import system_response
+from rack.tools.timing.measured_response import measure_system_response
 
 TASKS_S = {
     "brown/one-machine": 8.3,
@@ -39,7 +39,7 @@ TASKS_S = {
 NASREM and the state tables have separate experiments.
 """
 STATE_TABLES = "nist-state-table"
-UNDISTURBED = ("scene.motion=[]", "clock.mode=lockstep")
+UNDISTURBED_SETTINGS = ("scene.motion=[]", "clock.mode=lockstep")
 """Settings with which only the arm moves in the cell.
 
 In lockstep, the rows that fire then depend on no clock.
@@ -48,16 +48,16 @@ TABLES_S = 55.0
 BROWN = "brown"
 SERVO = "brown/servo"
 BROWN_S = 8.3
-PATIENCE = 2.0
+TIMEOUT_FACTOR = 2.0
 """Multiple of its time after which a task is ended.
 
 A machine that is too slow may never finish it.
 """
-ATTEMPTS = 3
+MAX_ATTEMPTS = 3
 LAUNCH_S = 3.0
-LATER_MS = 100
+EXTRA_DELAY_MS = 100
 """Additional delay of messages from the machine above in the second run, ms."""
-DELAYED = ("lan.reference", "lan.modifications")
+DELAYED_MAILBOXES = ("lan.reference", "lan.modifications")
 MODIFICATION = "pd"
 """The first modification of the task."""
 
@@ -85,18 +85,18 @@ class SystemResponse:
     ways: dict[str, WayResponse]
 
 
-def response_from(report: Mapping[str, Any] | None) -> SystemResponse | None:
+def parse_response(report: Mapping[str, Any] | None) -> SystemResponse | None:
     """Return the response in a report.
 
     None without a hierarchy, or if the hierarchy crosses racks and therefore has no bound.
     """
     if report is None or report["crosses_racks"]:
         return None
-    ways = {way: _way_response(report[way]) for way in ("command", "status")}
+    ways = {way: _parse_way_response(report[way]) for way in ("command", "status")}
     return SystemResponse(report["sum_eq_3_3_ms"], ways)
 
 
-def _way_response(direction: Mapping[str, Any]) -> WayResponse:
+def _parse_way_response(direction: Mapping[str, Any]) -> WayResponse:
     delays = [beyond["delayed_by"] for beyond in direction["beyond"]]
     times = direction["measured_ms"]
     return WayResponse(
@@ -139,26 +139,28 @@ class NetworkRun(TaskRun):
     response_ms: float | None
 
 
-def _measure(name: str, workshop: Workshop) -> TaskRun:
+def _measure_task(name: str, workshop: Workshop) -> TaskRun:
     label = f"task-{name.replace('/', '-')}"
-    return task_run(*workshop.run(label, workshop.config(name), PATIENCE * TASKS_S[name]))
+    return summarize_task(
+        *workshop.run(label, workshop.load_config(name), TIMEOUT_FACTOR * TASKS_S[name])
+    )
 
 
-def task_run(result: RunResult, *recordings: Recording) -> TaskRun:
+def summarize_task(result: RunResult, *recordings: Recording) -> TaskRun:
     """Summarise a run of a whole task from the recordings of its racks."""
-    boxes = {box: each.signal(box, "serial") for each in recordings for box in each.mailboxes}
+    boxes = {box: each.read_signal(box, "serial") for each in recordings for box in each.mailboxes}
     messages = {box: len(np.unique(serials)) for box, serials in boxes.items()}
     first = recordings[0]
-    for status, entry, source in entries_of(first.layout, first.config):
+    for status, entry, source in list_entries(first.layout, first.config):
         if source not in messages and status in first.mailboxes:
             # Count the messages of a host board where they enter the rack.
-            messages[source] = int(first.signal(status, f"{entry}.passed")[-1])
+            messages[source] = int(first.read_signal(status, f"{entry}.passed")[-1])
     return TaskRun(
         ended=result.outcome.cause,
         lasted_s=result.outcome.ticks * first.layout.clock_ns * 1e-9,
-        missed=_missed(*recordings),
+        missed=_compute_missed_share(*recordings),
         messages=messages,
-        response=response_from(system_response(first)),
+        response=parse_response(measure_system_response(first)),
     )
 
 
@@ -184,14 +186,16 @@ class TableRuns:
 
 def _measure_tables(workshop: Workshop) -> TableRuns:
     calm = f"{STATE_TABLES}-undisturbed"
-    return TableRuns(_table_run(workshop, STATE_TABLES), _table_run(workshop, calm, UNDISTURBED))
+    return TableRuns(
+        _run_tables(workshop, STATE_TABLES), _run_tables(workshop, calm, UNDISTURBED_SETTINGS)
+    )
 
 
-def _table_run(workshop: Workshop, label: str, settings: Sequence[str] = ()) -> TableRun:
-    result, recording = workshop.run(label, workshop.config(STATE_TABLES, settings))
-    fired = fired_rows(recording).items()
+def _run_tables(workshop: Workshop, label: str, settings: Sequence[str] = ()) -> TableRun:
+    result, recording = workshop.run(label, workshop.load_config(STATE_TABLES, settings))
+    fired = list_fired_rows(recording).items()
     rows = (f"{level}: {row['name']}" for level, rows in fired for row in rows)
-    return TableRun(**vars(task_run(result, recording)), rows=tuple(rows))
+    return TableRun(**vars(summarize_task(result, recording)), rows=tuple(rows))
 
 
 TABLES = Experiment(
@@ -203,66 +207,77 @@ TABLES = Experiment(
 )
 
 
-def _missed(*recordings: Recording) -> float:
-    return count_cycles(task for each in recordings for task in each.ended["tasks"].values()).share
+def _compute_missed_share(*recordings: Recording) -> float:
+    return count_cycles(
+        task for each in recordings for task in each.end_counts["tasks"].values()
+    ).share
 
 
-def _measure_two(later_ms: int, workshop: Workshop) -> NetworkRun:
+def _measure_two_racks(later_ms: int, workshop: Workshop) -> NetworkRun:
     """Run Brown's racks with a network that is slower by `later_ms`.
 
     Two recorders share two cores with eight boards and may lose records. The run is then repeated,
     up to `MAX_ATTEMPTS` runs in total.
     """
     lost: list[str] = []
-    for attempt in range(1, ATTEMPTS + 1):
-        result, general, servo = _two_recorded(later_ms, workshop, attempt)
-        lost = [each.layout.rack for each in (general, servo) if each.lost]
+    for attempt in range(1, MAX_ATTEMPTS + 1):
+        result, general, servo = _record_two_racks(later_ms, workshop, attempt)
+        lost = [each.layout.rack for each in (general, servo) if each.lost_rows]
         if not lost:
             return NetworkRun(
-                **vars(task_run(result, general, servo)),
-                servo_missed=_missed(servo),
-                response_ms=_response_ms(general, servo),
+                **vars(summarize_task(result, general, servo)),
+                servo_missed=_compute_missed_share(servo),
+                response_ms=_compute_response_ms(general, servo),
             )
-    raise Failure(f"{' and '.join(lost)} lost records in each of {ATTEMPTS} runs")
+    raise Failure(f"{' and '.join(lost)} lost records in each of {MAX_ATTEMPTS} runs")
 
 
-def _two_recorded(
+def _record_two_racks(
     later_ms: int, workshop: Workshop, attempt: int
 ) -> tuple[RunResult, Recording, Recording]:
     """Run both of Brown's racks, and return the result and both recordings."""
     label = f"task-{BROWN}-{later_ms}-{attempt}"
     path = workshop.folder / f"{label}-servo.toml"
-    path.write_text(_servo(workshop, later_ms).text(), encoding="utf-8")
-    lan_settings = f'adapter.lan.connect=["{_socket(workshop)}"]', f'adapter.lan.launch=["{path}"]'
+    path.write_text(_build_servo_config(workshop, later_ms).to_toml_text(), encoding="utf-8")
+    lan_settings = (
+        f'adapter.lan.connect=["{_format_socket(workshop)}"]',
+        f'adapter.lan.launch=["{path}"]',
+    )
     with chdir(workshop.folder):
         # The rack that is launched by this one records its run below the working folder.
-        result, general = workshop.run(label, _renamed(workshop, BROWN, lan_settings))
+        result, general = workshop.run(label, _load_renamed(workshop, BROWN, lan_settings))
     (launched,) = result.others
     assert launched.folder is not None, "it is recorded, as the other is"
-    folder = workshop.folder / RUNS / f"{label}-servo"
+    folder = workshop.folder / RUNS_FOLDER / f"{label}-servo"
     shutil.rmtree(folder, ignore_errors=True)
     return result, general, Recording((workshop.folder / launched.folder).rename(folder))
 
 
-def _servo(workshop: Workshop, later_ms: int) -> RackConfig:
+def _build_servo_config(workshop: Workshop, later_ms: int) -> RackConfig:
     """Build the config of the servo rack, with delayed messages if the network is slower."""
     peer = f"lan.peer_{workshop.rack.replace('-', '_')}"
-    added = [f'adapter.lan.listen=["{_socket(workshop)}"]', f'board.supervisor.reads.peer="{peer}"']
+    added = [
+        f'adapter.lan.listen=["{_format_socket(workshop)}"]',
+        f'board.supervisor.reads.peer="{peer}"',
+    ]
     if later_ms:
         config = load(SERVO)
         assert config.adapter.lan is not None
         cycles = round(1e-3 * later_ms * config.adapter.lan.rate_hz)
-        faults = [f'{{kind="delay", board="lan", mailbox="{box}", by={cycles}}}' for box in DELAYED]
+        faults = [
+            f'{{kind="delay", board="lan", mailbox="{box}", by={cycles}}}'
+            for box in DELAYED_MAILBOXES
+        ]
         delay_s = config.board["supervisor"].params["delay"] + 1e-3 * later_ms
         added += [f"board.supervisor.params.delay={delay_s}", f"fault=[{', '.join(faults)}]"]
-    return _renamed(workshop, SERVO, added)
+    return _load_renamed(workshop, SERVO, added)
 
 
-def _socket(workshop: Workshop) -> str:
+def _format_socket(workshop: Workshop) -> str:
     return f"unix/{workshop.rack}-servo"
 
 
-def _renamed(workshop: Workshop, name: str, added: Sequence[str]) -> RackConfig:
+def _load_renamed(workshop: Workshop, name: str, added: Sequence[str]) -> RackConfig:
     """Load one of both racks with added settings, under a unique name.
 
     The other rack uses this name in its imports.
@@ -274,42 +289,47 @@ def _renamed(workshop: Workshop, name: str, added: Sequence[str]) -> RackConfig:
         f'adapter.lan.import.{port}.from="{names[entry.rack]}/{entry.mailbox}"'
         for port, entry in config.adapter.lan.imports.items()
     ]
-    return load(workshop.source(name), [*imports, *added, *UNVIEWED, f"name={names[config.name]}"])
+    return load(
+        workshop.find_source(name),
+        [*imports, *added, *UNVIEWED_SETTINGS, f"name={names[config.name]}"],
+    )
 
 
-def _response_ms(general: Recording, servo: Recording) -> float | None:
+def _compute_response_ms(general: Recording, servo: Recording) -> float | None:
     """Return the time from the first request for a modification until a status reports it.
 
     None if either message is missing.
     """
-    begin_ns = _first_ns(general, "modifications.command", "wanted")
-    end_ns = _first_ns(servo, "shoulder.status", "reason")
+    begin_ns = _find_first_ns(general, "modifications.command", "wanted")
+    end_ns = _find_first_ns(servo, "shoulder.status", "reason")
     return None if begin_ns is None or end_ns is None else 1e-6 * (end_ns - begin_ns)
 
 
-def _first_ns(recording: Recording, box: str, field: str) -> int | None:
+def _find_first_ns(recording: Recording, box: str, field: str) -> int | None:
     """Return the time at which the first message that names the modification is visible, ns.
 
     It is CLOCK_MONOTONIC time, or simulated time in lockstep.
     """
-    is_named = [MODIFICATION in str(text) for text in recording.signal(box, field)]
-    ticks = recording.signal(box, "visible_at")[is_named]
+    is_named = [MODIFICATION in str(text) for text in recording.read_signal(box, field)]
+    ticks = recording.read_signal(box, "visible_at")[is_named]
     if not len(ticks):
         return None
     grid = RackGrid(recording)
     if grid.is_lockstep:
         return int(ticks[0]) * grid.clock_ns
-    return int(grid.stamp_ns(ticks[:1])[0])
+    return int(grid.convert_ticks(ticks[:1])[0])
 
 
-def _two_racks(later_ms: int, about: str) -> Experiment[NetworkRun]:
+def _build_network_experiment(later_ms: int, about: str) -> Experiment[NetworkRun]:
     name = f"task-{BROWN}-later" if later_ms else f"task-{BROWN}"
-    measure = partial(_measure_two, later_ms)
+    measure = partial(_measure_two_racks, later_ms)
     return Experiment(name, about, BROWN_S + 2 * LAUNCH_S, NetworkRun, measure)
 
 
-NETWORK = _two_racks(0, "the whole task of brown's two racks in real time")
-LATER = _two_racks(LATER_MS, f"the same, with a network slower by {LATER_MS} ms")
+NETWORK = _build_network_experiment(0, "the whole task of brown's two racks in real time")
+SLOWER_NETWORK = _build_network_experiment(
+    EXTRA_DELAY_MS, f"the same, with a network slower by {EXTRA_DELAY_MS} ms"
+)
 TASKS: dict[str, Experiment[Any]] = {
     BROWN: NETWORK,
     **{
@@ -318,7 +338,7 @@ TASKS: dict[str, Experiment[Any]] = {
             f"the whole task of {name} in real time",
             lasts_s + LAUNCH_S,
             TaskRun,
-            partial(_measure, name),
+            partial(_measure_task, name),
         )
         for name, lasts_s in TASKS_S.items()
     },
