@@ -167,7 +167,7 @@ def _compile_function(marked: compiled[..., Any]) -> Any:
     function: Any = marked._function
     known = function.__globals__
     called = {
-        name: known[name].load()
+        name: known[name].load_machine_code()
         for name in function.__code__.co_names
         if isinstance(known.get(name), compiled)
     }

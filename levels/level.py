@@ -18,7 +18,7 @@ Ports
 - Ports are attributes of the class. The input from the level above is called `above`, the input
   from the level below `below`: `above = Input(TaskCommand, "above.command")`.
 - An input is a `Reading` in every cycle, with `self.above.message` and its `verdict`. Before the
-  first message all fields are 0 (`is_there` is False). Later it repeats the newest message
+  first message all fields are 0 (`has_message` is False). Later it repeats the newest message
   (`is_new` is False). `is_lost` means that its writer is dead or silent. A level that moves the arm
   must then hold, and report the reason.
 - `Inputs` reads the mailbox of every neighbour and maps each board to its `Reading`.

@@ -357,7 +357,7 @@ def _kill(session: int) -> None:
 
 
 @dataclass
-class BenchMessage:
+class Bench:
     """A folder for mutated copies, one after the other, and one with the unchanged tree."""
 
     folder: Path
@@ -430,9 +430,9 @@ def main() -> int:
     chosen = random.Random(options.seed).sample(sites, min(options.count, len(sites)))
     counts: Counter[str] = Counter()
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
-        benches: SimpleQueue[BenchMessage] = SimpleQueue()
+        benches: SimpleQueue[Bench] = SimpleQueue()
         for number in range(options.jobs):
-            benches.put(BenchMessage(Path(folder) / str(number)))
+            benches.put(Bench(Path(folder) / str(number)))
 
         def examine(mutation: Mutation) -> None:
             bench, began = benches.get(), time.monotonic()

@@ -61,7 +61,7 @@ def configs(name: str, folder: Path, more: str = "") -> list[Path]:
     return found
 
 
-class RunContext(NamedTuple):
+class Ran(NamedTuple):
     """A run of both racks: digests of servo rack and general machine, and mailboxes."""
 
     digests: list[str]
@@ -79,7 +79,7 @@ class RunContext(NamedTuple):
         return float(np.abs(self.values("arm.status", "target_velocity", first, last)).max())
 
 
-def ran(name: str, folder: Path) -> RunContext:
+def ran(name: str, folder: Path) -> Ran:
     racks = [load(path, ["clock.mode=lockstep"]) for path in configs(name, folder, LINK_OUT)]
     with running(racks) as (servo, general):
         for rack in (servo, general):
@@ -92,7 +92,7 @@ def ran(name: str, folder: Path) -> RunContext:
     assert [one.outcome.cause for one in found] == ["time over"] * 2, [one.texts for one in found]
     shown = zip(rows["tick"], rows["message"]["order"], rows["message"]["answer"], strict=True)
     answers = [(int(tick), int(order), int(answer)) for tick, order, answer in shown]
-    return RunContext([one.outcome.digest for one in found], boxes, answers)
+    return Ran([one.outcome.digest for one in found], boxes, answers)
 
 
 @pytest.fixture(scope="module")
@@ -102,13 +102,13 @@ def name() -> str:
 
 
 @pytest.fixture(scope="module")
-def run(name: str, tmp_path_factory: pytest.TempPathFactory) -> RunContext:
+def run(name: str, tmp_path_factory: pytest.TempPathFactory) -> Ran:
     return ran(name, tmp_path_factory.mktemp("brown"))
 
 
 @pytest.mark.slow
 def test_a_modification_of_the_general_machine_is_put_in_over_the_network_without_a_step(
-    run: RunContext,
+    run: Ran,
 ) -> None:
     # Commanded at 1.2 s; on each of its ways it waits for a cycle of 20 ms and two of 10 ms.
     reasons = run.values("shoulder.status", "reason", 1200, 1300)
@@ -127,7 +127,7 @@ def test_a_modification_of_the_general_machine_is_put_in_over_the_network_withou
 
 @pytest.mark.slow
 def test_while_the_link_is_out_the_servo_rack_extrapolates_holds_and_then_goes_on(
-    run: RunContext,
+    run: Ran,
 ) -> None:
     status = run.boxes["supervisor.status"]
     held = status["tick"][status["message"]["reason"] == HELD.encode()]
@@ -142,7 +142,7 @@ def test_while_the_link_is_out_the_servo_rack_extrapolates_holds_and_then_goes_o
 
 
 @pytest.mark.thorough
-def test_both_racks_repeat_bit_for_bit(run: RunContext, name: str, tmp_path: Path) -> None:
+def test_both_racks_repeat_bit_for_bit(run: Ran, name: str, tmp_path: Path) -> None:
     assert ran(name, tmp_path).digests == run.digests
 
 
@@ -168,7 +168,7 @@ def test_one_command_runs_both_to_the_end_of_the_program(tmp_path: Path) -> None
         SNAPSHOTS.check("lockstep", digests)
 
 
-class LaunchedProcess:
+class Launched:
     """`rack run` of both racks in lockstep, until the general machine runs."""
 
     def __init__(self, folder: Path, name: str, *words: str) -> None:
@@ -198,9 +198,9 @@ class LaunchedProcess:
 
 
 @contextmanager
-def launched(folder: Path, name: str, *words: str) -> Iterator[LaunchedProcess]:
+def launched(folder: Path, name: str, *words: str) -> Iterator[Launched]:
     """Launch both; should they still run at the end, both are killed."""
-    both = LaunchedProcess(folder, name, *words)
+    both = Launched(folder, name, *words)
     try:
         yield both
     finally:

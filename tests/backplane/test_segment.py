@@ -253,4 +253,4 @@ def test_a_segment_detects_that_its_name_leads_to_another(make_bus: MakeBus) -> 
     unlink_segment(first.rack)
     assert not first.is_named
     second = make_bus()
-    assert (first.is_named, second.has_its_name) == (False, True)
+    assert (first.is_named, second.is_named) == (False, True)

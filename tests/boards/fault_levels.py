@@ -14,7 +14,7 @@ class Place(Status, version=1):
     mode: int = field("i2", unit="1", doc="how it moves")
 
 
-class AppliedTorque(Executor):
+class Driven(Executor):
     """Reports that it stands still."""
 
     status = Output(Place)
@@ -36,7 +36,9 @@ class Follower(Watch):
     def process(self, tick: int) -> None:
         """Follow the wave, wait for it, or give up."""
         super().process(tick)
-        self._since = (self._since or tick) if self.below.is_there and self.below.is_lost else None
+        self._since = (
+            (self._since or tick) if self.below.has_message and self.below.is_lost else None
+        )
         if self._since is not None and tick - self._since > self._patience:
             self._latched = f"nothing heard of the wave for {tick - self._since} ticks"
         waits = f"waiting for the wave; latched at tick {(self._since or 0) + self._patience}"

@@ -17,7 +17,7 @@ WHAT = ("serial", "tick", "visible_at", "basis", "chain")
 
 
 @dataclass(frozen=True)
-class WrittenMessages:
+class Written:
     """The messages of a run by mailbox, and its cycles by task; complete if the run is shorter than
     the rings."""
 
@@ -25,7 +25,7 @@ class WrittenMessages:
     cycles: dict[str, np.ndarray]
 
     @classmethod
-    def on(cls, segment: Segment) -> WrittenMessages:
+    def on(cls, segment: Segment) -> Written:
         """Read everything from a segment, once the cycles that were under way at the end of the run
         have ended."""
         blocks = [segment.get_block(task.name) for task in segment.layout.tasks]

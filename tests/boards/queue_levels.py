@@ -19,7 +19,7 @@ class Sent(Status, version=1):
     refused: int = field(unit="1", doc="refused: queue full")
 
 
-class MonitoredPort(Status, version=1):
+class Taken(Status, version=1):
     taken: int = field(unit="1", doc="requests taken")
     newest: int = field("u4", unit="1", doc="id of the newest request taken")
     repeated: int = field(unit="1", doc="requests not newer than the one before")
@@ -64,8 +64,8 @@ class Answering(Executor):
     """Takes at most `most` requests a cycle, and counts what is repeated or missing."""
 
     requests = Input(Request, "above.requests")
-    own = Input(MonitoredPort, "own.status")
-    status = Output(MonitoredPort)
+    own = Input(Taken, "own.status")
+    status = Output(Taken)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -86,7 +86,7 @@ class Steady(Executor):
     """Follows the plan of its planner, a queue, as a level that reads requests does."""
 
     plan = Input(Request, "own.plan")
-    status = Output(MonitoredPort)
+    status = Output(Taken)
 
     def process(self, tick: int) -> None:
         if self.plan.is_new:
@@ -114,7 +114,7 @@ class Filing(Planner):
     """Plans what it has taken: its slice is several cycles, in which requests wait."""
 
     requests = Input(Request, "above.requests")
-    output = Output(MonitoredPort)
+    output = Output(Taken)
 
     def wanted(self, tick: int) -> bool:
         return bool(self.requests.is_new)
@@ -126,8 +126,8 @@ class Filing(Planner):
 class Filed(Executor):
     """Shows its planner's counts."""
 
-    plan = Input(MonitoredPort, "own.plan")
-    status = Output(MonitoredPort)
+    plan = Input(Taken, "own.plan")
+    status = Output(Taken)
 
     def process(self, tick: int) -> None:
         self.status.copy_from(self.plan.message)

@@ -52,7 +52,7 @@ class Order(Message, version=1):
 TICK_MS = CLOCK_NS * 1e-6
 
 
-class EventClue(Message, version=1, message="command"):
+class Told(Message, version=1, message="command"):
     """A command."""
 
     id: int = field("u4", unit="1", doc="serial")
@@ -83,7 +83,7 @@ def bus(make_bus: MakeBus) -> Segment:
         box("upper.status", LevelStatus, "upper"),
         box("lower.status", Braked, "lower"),
         box("lower.scene", Scene, "lower"),
-        box("lower.command", EventClue, "lower"),
+        box("lower.command", Told, "lower"),
     )
 
 

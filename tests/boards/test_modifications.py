@@ -78,7 +78,7 @@ SWITCHED = commands(
 )
 
 
-class RunContext(NamedTuple):
+class Ran(NamedTuple):
     """A run: its digest, its events, and the statuses of the board of the shoulder by tick."""
 
     digest: str
@@ -102,11 +102,11 @@ def rack_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., RackConfi
 
 
 @pytest.fixture(scope="module")
-def run(rack_of: Callable[..., RackConfig]) -> Callable[..., RunContext]:
-    def run(*settings: str) -> RunContext:
+def run(rack_of: Callable[..., RackConfig]) -> Callable[..., Ran]:
+    def run(*settings: str) -> Ran:
         with Rack(rack_of(*settings)) as rack:
             outcome = rack.run(SECONDS)
-            return RunContext(
+            return Ran(
                 outcome.digest,
                 rack.events,
                 MailboxRing(rack.segment, "shoulder.status").read_new_rows().rows,
@@ -116,18 +116,18 @@ def run(rack_of: Callable[..., RackConfig]) -> Callable[..., RunContext]:
 
 
 @pytest.fixture(scope="module")
-def switched(run: Callable[..., RunContext]) -> RunContext:
+def switched(run: Callable[..., Ran]) -> Ran:
     return run(SWITCHED)
 
 
 @pytest.fixture(scope="module")
-def without(run: Callable[..., RunContext]) -> RunContext:
+def without(run: Callable[..., Ran]) -> Ran:
     return run("board.shoulder.params.modifications={}")
 
 
 @pytest.mark.slow
 def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step(
-    switched: RunContext, without: RunContext
+    switched: Ran, without: Ran
 ) -> None:
     for tick, reason in (
         (300, ""),
@@ -147,7 +147,7 @@ def test_a_modification_is_in_force_from_the_cycle_after_its_tick_without_a_step
 
 @pytest.mark.slow
 def test_a_run_with_switches_repeats_and_equals_an_unmodified_run_up_to_the_first_switch(
-    switched: RunContext, without: RunContext, run: Callable[..., RunContext]
+    switched: Ran, without: Ran, run: Callable[..., Ran]
 ) -> None:
     again = run(SWITCHED)
     assert again.digest == switched.digest != without.digest
@@ -160,7 +160,7 @@ def test_a_run_with_switches_repeats_and_equals_an_unmodified_run_up_to_the_firs
 
 @pytest.mark.slow
 def test_a_failed_modification_is_removed_with_its_reason_and_the_arm_continues(
-    switched: RunContext,
+    switched: Ran,
 ) -> None:
     assert switched.reason(649) == "modified by pd, breaks"
     assert (

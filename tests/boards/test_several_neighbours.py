@@ -16,7 +16,7 @@ from rack.boards.errors import ConfigError
 from rack.boards.timing.command_path import find_command_paths
 from rack.boards.timing.system_response import find_path_mailboxes
 from tests.boards.conftest import MakeConfig
-from tests.boards.messages import WrittenMessages
+from tests.boards.messages import Written
 from tests.boards.runs import faulty, kill
 from tests.boards.vector_racks import JOINTED
 
@@ -29,11 +29,11 @@ def jointed(config: MakeConfig) -> MakeConfig:
     return lambda *settings: config(*settings, text=JOINTED)
 
 
-def run(config: RackConfig, *faults: dict[str, Any]) -> tuple[str, WrittenMessages]:
+def run(config: RackConfig, *faults: dict[str, Any]) -> tuple[str, Written]:
     """Run the rack; return its digest and everything that it wrote."""
     with Rack(faulty(config, *faults)) as rack:
         digest = rack.run(SECONDS).digest
-        return digest, WrittenMessages.on(rack.segment)
+        return digest, Written.on(rack.segment)
 
 
 def at(rows: np.ndarray, tick: int) -> np.void:

@@ -14,7 +14,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.errors import ConfigError
 from tests.boards.commanded_racks import commands
 from tests.boards.conftest import MakeConfig
-from tests.boards.messages import WrittenMessages
+from tests.boards.messages import Written
 from tests.boards.table_racks import HOLE, SAW, counting
 
 SWAP = 'level = "counter", what = "table", name = "slow", tick = 39'
@@ -28,9 +28,7 @@ def counted(config: RackConfig, seconds: float = 0.25) -> tuple[np.ndarray, str]
     """Run a rack; return the statuses of its counter, one a cycle, and the digest."""
     with Rack(config) as rack:
         outcome = rack.run(seconds)
-        return WrittenMessages.on(rack.segment).messages["counter.status"][
-            "message"
-        ], outcome.digest
+        return Written.on(rack.segment).messages["counter.status"]["message"], outcome.digest
 
 
 @pytest.fixture
@@ -56,7 +54,7 @@ def test_a_restarted_board_reads_its_file_again_and_continues_in_its_state(
     with Rack(counter(EDIT)) as rack:
         (tmp_path / "saw.toml").write_text(SAW.replace('name = "count up"', 'name = "up it goes"'))
         rack.run(0.9)
-        statuses = WrittenMessages.on(rack.segment).messages["counter.status"]["message"]
+        statuses = Written.on(rack.segment).messages["counter.status"]["message"]
     names = [name.decode() for name in statuses["fired"]]
     assert "count up" in names[:10]
     assert "count up" not in names[10:]

@@ -75,7 +75,7 @@ def test_a_port_with_the_name_of_another_attribute_is_an_error_of_the_class(
         # The constructor sets it: that is found when a board connects the port.
         level = type("Bad", (Base,), body)(CONTEXT)
         with pytest.raises(LevelError, match="class Bad: attribute 'context' has the name of a"):
-            level.input_table("context")
+            level.find_input_table("context")
         return
     with pytest.raises(LevelError, match=f"^class Bad: {why}"):
         type("Bad", (Base,), body)

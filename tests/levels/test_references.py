@@ -78,7 +78,7 @@ def test_a_module_cannot_end_or_block_the_process_that_checks_a_config(
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr("rack.levels.references.SLOW_S", 0.2)
-    monkeypatch.setattr("rack.levels.references.IMPORT_S", 0.5)
+    monkeypatch.setattr("rack.levels.references.MAX_IMPORT_S", 0.5)
     monkeypatch.syspath_prepend(tmp_path)
     source, reason = ENDING[name]
     (tmp_path / f"it_{name}.py").write_text(source)

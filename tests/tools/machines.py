@@ -29,7 +29,7 @@ ERROR_NS = 200 * US
 
 
 @dataclass(frozen=True)
-class MachineComparison:
+class Machine:
     """A machine, and the rack on it: its CLOCK_MONOTONIC at true time 0, its drift, and when the
     rack's tick 0 was."""
 
@@ -64,7 +64,7 @@ class MachineComparison:
         return max(0, (self.shows(true_ns) - self.epoch_ns) * self.speed)
 
 
-def config_of(machine: MachineComparison, others: Sequence[str], folder: Path) -> RackConfig:
+def config_of(machine: Machine, others: Sequence[str], folder: Path) -> RackConfig:
     folder.mkdir(parents=True)
     path = folder / "rack.toml"
     heard = others[0] if others and machine.mode == "lockstep" else ""
@@ -73,8 +73,8 @@ def config_of(machine: MachineComparison, others: Sequence[str], folder: Path) -
 
 
 def recorded(
-    machine: MachineComparison,
-    others: Sequence[MachineComparison],
+    machine: Machine,
+    others: Sequence[Machine],
     folder: Path,
     seed: int = 1,
     counts_from: int = 0,
@@ -116,9 +116,7 @@ def recorded(
     return Recording(folder)
 
 
-def sightings(
-    machine: MachineComparison, other: MachineComparison, box: MailboxSpec, seed: int
-) -> np.ndarray:
+def sightings(machine: Machine, other: Machine, box: MailboxSpec, seed: int) -> np.ndarray:
     random = np.random.default_rng(seed)
     rows = np.zeros(TICKS // EVERY, build_row_dtype(box))
     rows["tick"] = rows["basis"] = np.arange(0, TICKS, EVERY)
@@ -141,6 +139,6 @@ def sightings(
     return rows
 
 
-A = MachineComparison("a", 5000 * S, begins_ns=1 * S)
-B = MachineComparison("b", 777_000 * S + 123, drift_ppm=DRIFT_PPM // 2, begins_ns=2 * S + 345_678)
-C = MachineComparison("c", 12 * S, drift_ppm=-DRIFT_PPM // 2, begins_ns=500 * MS, speed=2)
+A = Machine("a", 5000 * S, begins_ns=1 * S)
+B = Machine("b", 777_000 * S + 123, drift_ppm=DRIFT_PPM // 2, begins_ns=2 * S + 345_678)
+C = Machine("c", 12 * S, drift_ppm=-DRIFT_PPM // 2, begins_ns=500 * MS, speed=2)

@@ -220,6 +220,6 @@ def _remove_racks(killed: list[int]) -> None:
     """Remove the racks of this process, whose `killed` children cannot do so."""
     # Look the module up instead of importing it: a signal handler may run in the middle of an
     # import. If it is not loaded, this process has not made any racks.
-    remove_own = getattr(sys.modules.get("rack.boards.crate.clean"), "remove_own", None)
+    remove_own = getattr(sys.modules.get("rack.boards.crate.clean"), "remove_own_racks", None)
     if remove_own is not None:
         remove_own(killed=killed)

@@ -73,7 +73,7 @@ def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Documen
     report = build_report(recording)
     report |= measure_sizes(folder, report["simulated_s"])
     if against is not None:
-        report["against"] = import_module(COMPARISON).compared(recording, against)
+        report["against"] = import_module(COMPARISON).compare_runs(recording, against)
     text = format_markdown(report)
     write_json(folder / "report.json", report)
     write_file(folder / "report.md", text)

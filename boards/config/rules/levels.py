@@ -55,7 +55,7 @@ def check_sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Mistakes:
     """
     for mailbox, (ports, output) in wiring.writers.items():
         try:
-            output.message.message_type.dtype(sizes)
+            output.message.message_type.build_dtype(sizes)
         except MailboxError as error:
             yield Mistake(f"mailbox {mailbox}", ports.task, str(error))
 

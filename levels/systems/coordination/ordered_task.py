@@ -220,7 +220,7 @@ class OrderedTaskExecutor(TaskExecutor):
             return "the world model knows nothing yet"
         if self.ports["order"].message.by and self._table.coordinator:
             peer = self.ports["peer"]
-            if not (peer.is_there and peer.message.uncertainty >= 0.0):
+            if not (peer.has_message and peer.message.uncertainty >= 0.0):
                 return f"the clock of {self._source} has not been compared yet"
         return ""
 

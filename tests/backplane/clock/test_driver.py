@@ -108,16 +108,16 @@ def test_the_controller_works_before_and_after_the_releases_of_each_tick(
             is_released = segment.get_block("poller")[Block.RELEASED] == tick
             work.append((step, tick, is_released))
 
-        def begin(self, tick: int) -> None:
-            self.note("begin", tick)
+        def begin_tick(self, tick: int) -> None:
+            self.note("begin_tick", tick)
 
-        def released(self, tick: int) -> None:
-            self.note("released", tick)
+        def finish_release(self, tick: int) -> None:
+            self.note("finish_release", tick)
 
     driver.controller = Noting()
     driver.run()
-    ticks = [tick for step, tick, _ in work if step == "begin"]
-    both = [[("begin", tick, False), ("released", tick, True)] for tick in ticks]
+    ticks = [tick for step, tick, _ in work if step == "begin_tick"]
+    both = [[("begin_tick", tick, False), ("finish_release", tick, True)] for tick in ticks]
     assert len(ticks) > 1
     assert work == [step for steps in both for step in steps]
     # A task that polls is released without a post: the one is the end's.
@@ -155,11 +155,11 @@ class Lagging:
     def __init__(self) -> None:
         self.ticks: list[int] = []
 
-    def begin(self, tick: int) -> None:
+    def begin_tick(self, tick: int) -> None:
         self.ticks.append(tick)
         time.sleep(0.006)
 
-    def released(self, tick: int) -> None:
+    def finish_release(self, tick: int) -> None:
         pass
 
 

@@ -140,7 +140,7 @@ def test_lockstep_waits_without_a_bound_for_a_recorder_that_lives(
             segment.words[System.FOLLOWER_TICK] = 3 * HISTORY
         return process.read_state(pid)
 
-    monkeypatch.setattr("rack.backplane.clock.lockstep.state_of", state_of)
+    monkeypatch.setattr("rack.backplane.clock.lockstep.read_state", state_of)
     with forked(signal.pause) as follower:
         segment.words[System.FOLLOWER_PID] = follower
         _, ticks = lockstep(segment, 3 * HISTORY, False)
@@ -153,7 +153,7 @@ def test_lockstep_waits_without_a_bound_for_a_recorder_that_lives(
 def test_the_wait_for_a_dead_recorder_is_bounded(
     make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    monkeypatch.setattr("rack.backplane.clock.lockstep.IDLE_S", 0.05)
+    monkeypatch.setattr("rack.backplane.clock.lockstep.MAX_RECORDER_WAIT_S", 0.05)
     segment = make_bus(task("fast"))
     with forked(signal.pause) as follower:
         os.kill(follower, number)

@@ -19,7 +19,7 @@ from tests.processes import FORKS, forked, wait_until
 PERIOD_NS = 2_500_000
 
 
-class MailboxWatcher:
+class Watched:
     """A task played by the test, and the watchdog's alarms."""
 
     def __init__(self, segment: Segment, pid: int) -> None:
@@ -47,7 +47,7 @@ class MailboxWatcher:
 
 
 def test_a_late_cycle_counts_as_one_miss(make_bus: MakeBus) -> None:
-    watched = MailboxWatcher(make_bus(), os.getpid())
+    watched = Watched(make_bus(), os.getpid())
     watched.release(True)
     assert [watched.release(True) for _ in range(5)] == [[]] * 5
     rung = [watched.release(answered) for answered in (False, False, True, True, False)]
@@ -55,7 +55,7 @@ def test_a_late_cycle_counts_as_one_miss(make_bus: MakeBus) -> None:
 
 
 def test_a_process_that_could_run_is_starved_and_not_lost(make_bus: MakeBus) -> None:
-    watched = MailboxWatcher(make_bus(), os.getpid())
+    watched = Watched(make_bus(), os.getpid())
     watched.release(True)
     rung = [watched.release(False) for _ in range(3 * RELEASES_MISSED)]
     assert [alarms for alarms in rung if alarms] == [[Alarm.LATE], [Alarm.STARVED]]
@@ -63,7 +63,7 @@ def test_a_process_that_could_run_is_starved_and_not_lost(make_bus: MakeBus) -> 
     assert (watched.losses, watched.task.lost_tick) == (0, -1)
 
 
-def silent(watched: MailboxWatcher) -> list[Alarm]:
+def silent(watched: Watched) -> list[Alarm]:
     """Release a task for longer than any may be silent; return the alarms of the next release."""
     watched.release(True)
     assert not any(Alarm.HANG in watched.release(False) for _ in range(MIN_HANG_NS // PERIOD_NS))
@@ -81,23 +81,23 @@ def test_a_process_that_waits_for_something_else_is_lost_in_the_end(make_bus: Ma
     segment = make_bus()
     with forked(lambda: time.sleep(60)) as pid:
         wait_until(lambda: read_state(pid) == "S")
-        watched = MailboxWatcher(segment, pid)
+        watched = Watched(segment, pid)
         assert silent(watched) == [Alarm.HANG]
     assert watched.task.lost_tick == watched.tick
 
 
 def test_a_process_that_gets_no_processor_time_is_never_lost(make_bus: MakeBus) -> None:
     # This process runs, and its releases go by faster than it could use the time.
-    assert silent(MailboxWatcher(make_bus(), os.getpid())) == []
+    assert silent(Watched(make_bus(), os.getpid())) == []
 
 
 def test_a_process_that_computes_and_never_ends_its_cycle_is_lost_in_the_end(
     make_bus: MakeBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "rack.backplane.clock.released_task.LEAST_NS", 4 * RELEASES_MISSED * PERIOD_NS
+        "rack.backplane.clock.released_task.MIN_HANG_NS", 4 * RELEASES_MISSED * PERIOD_NS
     )
-    watched = MailboxWatcher(make_bus(), os.getpid())
+    watched = Watched(make_bus(), os.getpid())
     watched.release(True)
     rung = [watched.release(False) for _ in range(5 * RELEASES_MISSED)]
     assert not any(Alarm.HANG in alarms for alarms in rung)
@@ -109,7 +109,7 @@ def test_a_process_that_computes_and_never_ends_its_cycle_is_lost_in_the_end(
 def test_a_stopped_process_is_lost_after_four_releases(make_bus: MakeBus) -> None:
     segment = make_bus()
     with forked(lambda: time.sleep(60)) as pid:
-        watched = MailboxWatcher(segment, pid)
+        watched = Watched(segment, pid)
         watched.release(True)
         os.kill(pid, signal.SIGSTOP)
         wait_until(lambda: read_state(pid) == "T")
@@ -120,7 +120,7 @@ def test_a_stopped_process_is_lost_after_four_releases(make_bus: MakeBus) -> Non
 
 
 def test_a_task_that_finishes_every_cycle_too_late_is_late_and_not_lost(make_bus: MakeBus) -> None:
-    watched = MailboxWatcher(make_bus(), os.getpid())
+    watched = Watched(make_bus(), os.getpid())
     watched.release(True)
     rung = []
     for tick in range(1, 20 * MIN_HANG_NS // PERIOD_NS):

@@ -55,7 +55,7 @@ def site(config: MakeConfig, journal: Journal) -> Iterator[Site]:
     class Crate:
         """Notes what it is asked."""
 
-        def ask(self, request: object) -> None:
+        def try_request(self, request: object) -> None:
             """Note it."""
             asked.append(request)
 

@@ -100,7 +100,7 @@ def test_a_stopped_process_is_reported_as_hanging(
 def test_a_stopped_crate_does_not_stop_the_run_nor_its_end(
     config: MakeConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rack.boards.crate.rack.LEAVE_S", 0.2)
+    monkeypatch.setattr("rack.boards.crate.rack.BOARDS_END_S", 0.2)
     with Rack(config(REALTIME)) as rack:
         rack.start(0.25)
         wait_until(lambda: rack.segment.words[System.TICK] > 5)

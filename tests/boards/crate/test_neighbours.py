@@ -36,7 +36,7 @@ executor = "wave_levels:Wave"
 @pytest.fixture
 def first(config: MakeConfig, rack_name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Rack]:
     """A rack whose wave holds core 0; no other test's racks are seen."""
-    monkeypatch.setattr("rack.boards.crate.neighbours.racks", lambda: [rack_name])
+    monkeypatch.setattr("rack.boards.crate.neighbours.list_racks", lambda: [rack_name])
     with Rack(config(*FIFO, "board.wave.core=0", text=PLAIN)) as rack:
         yield rack
 
@@ -86,7 +86,7 @@ def test_a_core_held_by_another_users_rack_is_seen(first: Rack) -> None:
 def test_a_task_that_has_reserved_time_is_seen_without_its_segment(
     rack_name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rack.boards.crate.neighbours.racks", lambda: [rack_name])
+    monkeypatch.setattr("rack.boards.crate.neighbours.list_racks", lambda: [rack_name])
 
     def reserve() -> None:
         take_core(0, 0, Reservation(100_000, 10_000_000))

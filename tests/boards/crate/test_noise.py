@@ -49,7 +49,7 @@ NOISE = 8 * 32
 """Address behind the head, whose words are checked when a program attaches."""
 
 
-class RunContext(NamedTuple):
+class Ran(NamedTuple):
     """A rack at the end of a run: its segment's memory, and what stands in the head's texts."""
 
     memory: bytes
@@ -138,7 +138,7 @@ def looks(segment: Segment) -> dict[str, Callable[[], object]]:
 
 
 @pytest.fixture(scope="module")
-def ran(tmp_path_factory: pytest.TempPathFactory) -> RunContext:
+def ran(tmp_path_factory: pytest.TempPathFactory) -> Ran:
     """A rack after a run with commands, faults and alarms."""
     path = tmp_path_factory.mktemp("noise") / "rack.toml"
     path.write_text(COMMANDED)
@@ -149,11 +149,11 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> RunContext:
         memory = bytes(one.segment.bytes)
         segment = one.segment
     assert {event.kind for event in one.events} >= {"fault", "detection", "command"}
-    return RunContext(memory, segment)
+    return Ran(memory, segment)
 
 
 @pytest.fixture
-def copy(ran: RunContext, rack_name: str) -> Iterator[Segment]:
+def copy(ran: Ran, rack_name: str) -> Iterator[Segment]:
     """A segment like that of the rack."""
     found = ran.segment
     made = Segment.create(replace(found.layout, rack=rack_name), found.config, found.published)
@@ -164,9 +164,7 @@ def copy(ran: RunContext, rack_name: str) -> Iterator[Segment]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("region", REGIONS)
-def test_every_tool_refuses_or_reads_a_damaged_rack(
-    region: str, ran: RunContext, copy: Segment
-) -> None:
+def test_every_tool_refuses_or_reads_a_damaged_rack(region: str, ran: Ran, copy: Segment) -> None:
     refused = 0
     end = copy.map.size
     for seed in range(SEEDS):

@@ -57,7 +57,7 @@ def test_a_wait_is_reported_each_time_it_has_doubled(clock: Clock) -> None:
     assert wait.left_s == pytest.approx(16.0 - 8.1)
 
 
-class InputMailbox:
+class Line:
     """A crate that answers at its times; each wait for it moves the clock on."""
 
     def __init__(self, clock: Clock, *answers: tuple[float, object]) -> None:
@@ -73,17 +73,17 @@ class InputMailbox:
         self._clock.now += timeout_s + 0.001
         return False
 
-    def receive(self) -> object:
+    def receive_message(self) -> object:
         return self._answers.popleft()[1]
 
-    def printed(self) -> list[str]:
+    def read_output(self) -> list[str]:
         return self.output
 
 
 def opened(clock: Clock, *answers: tuple[float, object], output: str = "") -> tuple[list[str], str]:
     """Wait for a crate with these answers; return what was said, and why it failed."""
     journal = Journal(None)
-    line = InputMailbox(clock, *answers)
+    line = Line(clock, *answers)
     line.output = output.split("\n") if output else []
     why = ""
     try:

@@ -15,7 +15,7 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.events import Event, Outcome
 from tests.boards.conftest import LOOSE, PLAIN, MakeConfig
-from tests.boards.messages import WrittenMessages
+from tests.boards.messages import Written
 from tests.boards.runs import end_of, faulty, kill
 
 TASKS = ("wave", "wave.planner", "watch")
@@ -68,7 +68,7 @@ def test_a_run_with_its_faults_repeats(config: MakeConfig) -> None:
 def test_a_restarted_writer_continues_its_serials_in_a_new_epoch(config: MakeConfig) -> None:
     with Rack(faulty(config(), kill("wave", 100))) as rack:
         rack.run(1.0)
-        rows = WrittenMessages.on(rack.segment).messages["wave.status"]
+        rows = Written.on(rack.segment).messages["wave.status"]
     assert rows["serial"].tolist() == list(range(1, len(rows) + 1))
     assert rows["tick"].tolist() == [*range(100), *range(300, 400)]
     assert sorted(set((rows["epoch"] & 0xFFFFFFFF).tolist())) == [1, 2]

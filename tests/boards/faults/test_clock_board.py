@@ -52,11 +52,11 @@ def test_no_fault_begins_or_ends_during_a_cycle(make_bus: MakeBus) -> None:
     stage = FaultStage(segment, driver)
 
     class Controller:
-        def begin(self, tick: int) -> None:
+        def begin_tick(self, tick: int) -> None:
             if tick >= stage.next_tick or segment.words[System.INJECTED] != stage.injected:
                 stage.advance_faults(tick)
 
-        def released(self, tick: int) -> None:
+        def finish_release(self, tick: int) -> None:
             stage.act_within_tick(tick)
 
     driver.controller = Controller()

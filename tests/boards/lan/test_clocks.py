@@ -183,7 +183,7 @@ class Answers:
     def __init__(self) -> None:
         self.sent: list[ReceivedMessage] = []
 
-    def on(self, key: str, callback: Any) -> None:
+    def call_on_arrival(self, key: str, callback: Any) -> None:
         """Bring nothing: the tests do."""
 
     def publish(self, key: str) -> Any:
@@ -256,7 +256,7 @@ class Wire:
         self.clocks.open(self, self.sealer)  # type: ignore[arg-type]
         self.peers["b"].add_token(OTHER, 0)
 
-    def on(self, key: str, callback: Any) -> None:
+    def call_on_arrival(self, key: str, callback: Any) -> None:
         self._heard[key] = callback
 
     def publish(self, key: str) -> Any:

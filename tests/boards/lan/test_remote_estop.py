@@ -26,7 +26,7 @@ LAUNCH, SESSION = 77, 5
 ASKERS = {"operator": 1, "second": 2}
 
 
-class InputMailbox:
+class Line:
     """A link whose requests a test sends; answers are opened as an operator does."""
 
     def __init__(self, rack: str) -> None:
@@ -36,7 +36,7 @@ class InputMailbox:
         self._waiting: list[Question] = []
         self._number = 0
 
-    def answer(self, key: str, unread: int) -> Callable[[], Iterator[Question]]:
+    def open_questions(self, key: str, unread: int) -> Callable[[], Iterator[Question]]:
         assert key == estop_key("*", self.rack)
         self.most = unread
 
@@ -74,13 +74,13 @@ class InputMailbox:
         )
 
 
-class BenchMessage:
+class Bench:
     """A desk at the segment of a rack that is not running."""
 
     def __init__(self, segment: Segment) -> None:
         self.segment, self.findings, self.tick = segment, list[Finding](), 40
         self.desk = EstopResponder(segment, OwnGrid(segment, 8), ASKERS, self.findings)
-        self.line = InputMailbox(segment.rack)
+        self.line = Line(segment.rack)
         self.open()
 
     def open(self) -> None:
@@ -104,7 +104,7 @@ class BenchMessage:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Iterator[BenchMessage]:
+def bench(tmp_path: Path) -> Iterator[Bench]:
     name = f"test-desk-{os.getpid()}"
     path = tmp_path / "rack.toml"
     path.write_text(COMMANDED)
@@ -114,14 +114,14 @@ def bench(tmp_path: Path) -> Iterator[BenchMessage]:
     try:
         # A rack's clock has set these before the first cycle of a board.
         segment.words[System.PERIOD_NS] = 2_500_000
-        yield BenchMessage(segment)
+        yield Bench(segment)
     finally:
         segment.close()
         unlink_segment(name)
 
 
 def test_a_stop_is_set_reported_once_and_answered_for_its_request_and_launch(
-    bench: BenchMessage,
+    bench: Bench,
 ) -> None:
     for asker in ("second", "operator"):
         bench.line.ask(asker)
@@ -137,14 +137,14 @@ def test_a_stop_is_set_reported_once_and_answered_for_its_request_and_launch(
     assert bench.counts == (2, 0, 0)
 
 
-def test_a_check_is_answered_and_sets_nothing(bench: BenchMessage) -> None:
+def test_a_check_is_answered_and_sets_nothing(bench: Bench) -> None:
     bench.line.ask(flags=CHECK_FLAG)
     assert len(bench.cycle()) == 1
     assert not bench.is_stopped
     assert not bench.findings
 
 
-def test_forbidden_malformed_and_unsigned_requests_get_no_answer(bench: BenchMessage) -> None:
+def test_forbidden_malformed_and_unsigned_requests_get_no_answer(bench: Bench) -> None:
     line = bench.line
     line.ask("nobody")
     line.ask(payload=b"x")
@@ -158,7 +158,7 @@ def test_forbidden_malformed_and_unsigned_requests_get_no_answer(bench: BenchMes
     assert bench.counts == (0, 1, 6)
 
 
-def test_nobody_can_request_a_stop_under_another_name(bench: BenchMessage, tmp_path: Path) -> None:
+def test_nobody_can_request_a_stop_under_another_name(bench: Bench, tmp_path: Path) -> None:
     names = (bench.segment.rack, *ASKERS)
     make_credentials(tmp_path, dict.fromkeys(names, ()), 1)
     rack, operator, second = (Sealer(Credentials(tmp_path, name)) for name in names)
@@ -176,7 +176,7 @@ def test_nobody_can_request_a_stop_under_another_name(bench: BenchMessage, tmp_p
 
 
 def test_counters_continue_after_a_restart_and_are_empty_in_lockstep(
-    bench: BenchMessage,
+    bench: Bench,
 ) -> None:
     group = np.zeros((), [("answered", "u4"), ("refused", "u4"), ("dropped", "u4")])
     bench.line.ask()

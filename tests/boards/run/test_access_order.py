@@ -157,26 +157,26 @@ FENCE = "self.fence()\n"
 PYTHON_MUTANTS: dict[str, tuple[type, str, str, str]] = {
     "head before slot": (
         Slots,
-        "publish",
+        "publish_message",
         f"{FENCE}    self.places[at][SIGNED_FROM:]",
         f"{FENCE}    box[0] = serial\n    self.places[at][SIGNED_FROM:]",
     ),
     "relaxed store of the head": (
         Slots,
-        "publish",
+        "publish_message",
         f"{FENCE}    box[0] = serial",
         "box[0] = serial",
     ),
     "no fence before a slot is filled": (
         Slots,
-        "publish",
+        "publish_message",
         f"{FENCE}    self.places[at][SIGNED_FROM:]",
         "self.places[at][SIGNED_FROM:]",
     ),
-    "signature before message": (Slots, "publish", "[SIGNED_FROM:]", "[:SIGNED_FROM]"),
+    "signature before message": (Slots, "publish_message", "[SIGNED_FROM:]", "[:SIGNED_FROM]"),
     "relaxed load of the head": (Reader, "read", "slots.fence()\n", "pass\n"),
-    "signature loaded after the message": (Slots, "load", FENCE, "pass\n"),
-    "no fence before a copy is judged": (Slots, "keeps", FENCE, "pass\n"),
+    "signature loaded after the message": (Slots, "load_slot", FENCE, "pass\n"),
+    "no fence before a copy is judged": (Slots, "is_kept", FENCE, "pass\n"),
     "slots of a dead writer left filled": (
         Slots,
         "clear_unpublished",
@@ -185,7 +185,7 @@ PYTHON_MUTANTS: dict[str, tuple[type, str, str, str]] = {
     ),
     "claim after publication": (
         Writer,
-        "claim",
+        "claim_mailbox",
         "box[Box.CLAIMANT] = self",
         "self",
     ),

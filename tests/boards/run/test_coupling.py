@@ -9,7 +9,7 @@ import pytest
 from rack.backplane.words import Block
 from rack.boards import Rack
 from tests.boards.conftest import LOOSE, MakeConfig
-from tests.boards.messages import WrittenMessages
+from tests.boards.messages import Written
 from tests.boards.runs import stop
 from tests.machine import needs_fifo
 from tests.processes import wait_until
@@ -48,7 +48,7 @@ def test_executor_and_planner_are_two_processes(
 def test_a_plan_takes_effect_at_the_end_of_its_slice(config: MakeConfig) -> None:
     with Rack(config()) as rack:
         rack.run(SECONDS)
-        found = WrittenMessages.on(rack.segment)
+        found = Written.on(rack.segment)
     plans, wave = found.messages["wave.plan"], found.messages["wave.status"]
     # A plan is wanted in every cycle: the next one begins where a slice ends.
     assert plans["tick"].tolist() == list(range(0, TICKS, 4))
@@ -64,7 +64,7 @@ def test_a_plan_takes_effect_at_the_end_of_its_slice(config: MakeConfig) -> None
 def test_a_planner_is_asked_again_as_soon_as_it_may_plan(config: MakeConfig, every: int) -> None:
     with Rack(config(f"board.wave.params.plan_every={every}")) as rack:
         rack.run(SECONDS)
-        found = WrittenMessages.on(rack.segment).messages["wave.plan"]["tick"].tolist()
+        found = Written.on(rack.segment).messages["wave.plan"]["tick"].tolist()
     expected = [0]
     # Asked at every tick that no plan is being made in, four ticks each.
     while (following := next(t for t in range(expected[-1] + 4, 10_000) if t % every == 0)) < TICKS:

@@ -15,7 +15,7 @@ from rack.boards.errors import ConfigError
 from rack.boards.exchange import PortAge
 from rack.tools.monitor.snapshot import RackMonitor
 from tests.boards.conftest import CLOCK, MakeConfig
-from tests.boards.messages import WrittenMessages
+from tests.boards.messages import Written
 from tests.boards.runs import faulty, kill
 
 WAVE, NOTES = (2, 1), (3, 2)
@@ -44,10 +44,10 @@ TICKS = 100
 SECONDS = 0.25
 
 
-def written(rack: Rack, seconds: float = SECONDS) -> WrittenMessages:
+def written(rack: Rack, seconds: float = SECONDS) -> Written:
     with rack:
         rack.run(seconds)
-        return WrittenMessages.on(rack.segment)
+        return Written.on(rack.segment)
 
 
 def newest(tick: int, delay: int) -> int:
@@ -82,7 +82,7 @@ def test_ages_and_arrivals_follow_the_configured_exchange_and_runs_repeat(
 ) -> None:
     with Rack(config(text=TEXT)) as rack:
         digest = rack.run(SECONDS).digest
-        found = WrittenMessages.on(rack.segment).messages
+        found = Written.on(rack.segment).messages
         looked = RackMonitor(rack.segment).take_snapshot()
     seen, record = found["notes.status"], found["notes.exchange"]
     for at, port in enumerate(("plain", "sparse", "early")):
@@ -124,7 +124,7 @@ def test_a_queue_is_emptied_at_every_exchange_without_refused_messages(
     with Rack(config(*QUEUE, text=NO_TABLE)) as rack:
         rack.run(1.5)
         assert [event for event in rack.events if event.kind == "detection"] == []
-        found = WrittenMessages.on(rack.segment).messages
+        found = Written.on(rack.segment).messages
     (every, phase), (cycles, first) = NOTES, SPARSE
     taken, sent = found["wave.status_taken"], found["wave.status"]
     assert taken["tick"].tolist() == list(range(phase + every * first, 600, every * cycles))
@@ -177,6 +177,6 @@ def test_a_level_that_writes_a_mailbox_of_that_name_cannot_have_an_exchange(
 ) -> None:
     with pytest.raises(
         ConfigError,
-        match=r"^board.notes.exchange: the executor writes a mailbox of that name itself; ",
+        match=r"^board.notes.exchange: the executor itself writes a mailbox of this name; ",
     ):
         resolve(config("board.notes.executor='exchange_levels:Exchanging'", text=TEXT))

@@ -13,7 +13,7 @@ from rack.boards import Rack
 from rack.boards.faults.config import FaultConfig
 from tests.boards.conftest import MakeConfig
 from tests.boards.interrupt_levels import BOARDS
-from tests.boards.messages import WrittenMessages
+from tests.boards.messages import Written
 
 pytestmark = pytest.mark.slow
 
@@ -65,14 +65,14 @@ class Heard(NamedTuple):
     counts: tuple[int, int, int]
     full: list[str]
     service_ns: int
-    written: WrittenMessages
+    written: Written
 
 
 def run(config: MakeConfig, *settings: str, faults: tuple[FaultConfig, ...] = ()) -> Heard:
     found = config(*settings, text=RACK).model_copy(update={"fault": faults})
     with Rack(found) as rack:
         outcome = rack.run(SECONDS)
-        written, block = WrittenMessages.on(rack.segment), rack.segment.get_block("hub")
+        written, block = Written.on(rack.segment), rack.segment.get_block("hub")
         heard = written.messages["hub.status"]["message"]
         counts = (
             block[Block.INTERRUPTS],

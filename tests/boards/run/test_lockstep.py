@@ -12,7 +12,7 @@ from rack.backplane.trace import Flag
 from rack.backplane.words import Block, System
 from rack.boards import Rack
 from tests.boards.conftest import LOOSE, PLAIN, PLANNED, MakeConfig
-from tests.boards.messages import WrittenMessages
+from tests.boards.messages import Written
 from tests.machine import needs_two_cores
 
 SECONDS = 0.25
@@ -24,11 +24,11 @@ SLOW = ("clock.mode=realtime", "clock.speed=0.5")
 LATE = "board.wave.params={ trouble = 'late', at = 40, ticks = 9 }"
 
 
-def written(rack: Rack, seconds: float = SECONDS) -> WrittenMessages:
+def written(rack: Rack, seconds: float = SECONDS) -> Written:
     """Run a rack, and return what it wrote."""
     with rack:
         rack.run(seconds)
-        return WrittenMessages.on(rack.segment)
+        return Written.on(rack.segment)
 
 
 def digest(rack: Rack, seconds: float = SECONDS) -> str:
@@ -36,12 +36,12 @@ def digest(rack: Rack, seconds: float = SECONDS) -> str:
         return rack.run(seconds).digest
 
 
-RUNS: dict[tuple[str, ...], tuple[Rack, WrittenMessages]] = {}
+RUNS: dict[tuple[str, ...], tuple[Rack, Written]] = {}
 
 
 def first_run(
     config: MakeConfig, *settings: str, text: str = PLANNED, seconds: float = SECONDS
-) -> tuple[Rack, WrittenMessages]:
+) -> tuple[Rack, Written]:
     """Return a rack that has run, and what it wrote; all tests of this file share it."""
     key = (*settings, text)
     if key not in RUNS:
@@ -129,7 +129,7 @@ def counted(rack: Rack, *words: int) -> int:
     )
 
 
-def late_tick(found: WrittenMessages, task: str) -> int:
+def late_tick(found: Written, task: str) -> int:
     """Return the tick of the late cycle: the first from tick 40 on that was not skipped."""
     ticks = found.cycles[task]["tick"]
     return int(ticks[ticks >= 40][0])
@@ -202,5 +202,5 @@ def test_a_board_keeps_the_grid_in_real_time(config: MakeConfig, wake: Wake) -> 
         block = rack.segment.get_block("wave")
         # A board whose core was taken away during the very last cycles does not see those any more.
         assert TICKS - 8 <= block[Block.CYCLES] + block[Block.SKIPPED] <= TICKS
-        cycles = WrittenMessages.on(rack.segment).cycles["wave"]
+        cycles = Written.on(rack.segment).cycles["wave"]
     assert (cycles["start_ns"] >= cycles["release_ns"]).all()

@@ -13,7 +13,7 @@ from rack.boards.config import resolve_layout
 from rack.boards.config.timing import build_rack_timing
 from rack.boards.timing.schedule import simulate_schedule
 from tests.boards.conftest import CLOCK, MakeConfig
-from tests.boards.messages import WrittenMessages
+from tests.boards.messages import Written
 from tests.boards.runs import faulty, kill
 
 BOARD = """
@@ -48,10 +48,10 @@ def cyclic(phases: bool = True) -> str:
     return f"{CLOCK}{''.join(boards)}\n[timing]\ncontext_switch_ms = 0.0\n"
 
 
-def written(rack: Rack, seconds: float = 0.25) -> WrittenMessages:
+def written(rack: Rack, seconds: float = 0.25) -> Written:
     with rack:
         rack.run(seconds)
-        return WrittenMessages.on(rack.segment)
+        return Written.on(rack.segment)
 
 
 @pytest.mark.slow

@@ -39,7 +39,7 @@ def segment(make_bus: MakeBus) -> Segment:  # noqa: F811
 def copies_of(segment: Segment) -> tuple[ClockCopies, StubCopier]:
     copier = StubCopier()
     # No task is there to fork.
-    driver = SimpleNamespace(tasks=(), settle=lambda: None)
+    driver = SimpleNamespace(tasks=(), wait_until_settled=lambda: None)
     return ClockCopies(segment, driver, copier), copier  # type: ignore[arg-type]
 
 

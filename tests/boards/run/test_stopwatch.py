@@ -134,11 +134,11 @@ def test_a_cycle_is_late_if_it_is_the_first_follows_skipped_ones_or_begins_late(
     site.cycle(ahead)
     site.watch.start_cycle(ahead + 1, 0)
     assert not site.watch.is_late
-    site.watch.start(ahead + 1, 1)
+    site.watch.start_cycle(ahead + 1, 1)
     assert site.watch.is_late
     # Its grid point is past, by a period.
     site.segment.words[System.EPOCH_NS] -= PERIOD_NS
-    site.watch.start(0, 0)
+    site.watch.start_cycle(0, 0)
     assert site.watch.is_late
 
 

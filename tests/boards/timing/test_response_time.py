@@ -10,7 +10,7 @@ from typing import NamedTuple
 import pytest
 
 from rack.boards.timing.response_time import (
-    Demand,
+    Load,
     compute_blocking_ns,
     compute_loads,
     compute_response_time,
@@ -55,9 +55,9 @@ def seen(tasks: list[Plain], blocked: int = 0) -> list[int]:
 
 def response(
     cost: int,
-    above: Sequence[Demand],
+    above: Sequence[Load],
     blocking: int = 0,
-    sharing: Sequence[Demand] = (),
+    sharing: Sequence[Load] = (),
     horizon: int = 10**5,
 ) -> int | None:
     return compute_response_time(cost, above, blocking, sharing=sharing, horizon=horizon)
@@ -126,7 +126,7 @@ def test_response_times_agree_with_simulated_schedules(full: bool, most_blocked:
     [[(2, 4), (3, 6)], [(2, 4), (4, 6)]],
     ids=["full above", "overloaded above"],
 )
-def test_overload_has_no_bound(above: list[Demand]) -> None:
+def test_overload_has_no_bound(above: list[Load]) -> None:
     assert response(2, above) is None
 
 

@@ -21,7 +21,7 @@ BLOCK = 0
 PICK = (Verb.MOVE, Verb.APPROACH, Verb.GRASP, Verb.DEPART, Verb.MOVE)
 
 
-class BenchMessage(Lockstep):
+class Bench(Lockstep):
     """The executor with mailboxes that the test writes."""
 
     def __init__(self, **params: Any) -> None:
@@ -90,9 +90,9 @@ class BenchMessage(Lockstep):
         return [(int(s["id"]), int(s["move"])) for s in window]
 
 
-def planned_bench(**params: Any) -> BenchMessage:
+def planned_bench(**params: Any) -> Bench:
     """A bench with paths for the motions of `PICK`."""
-    bench = BenchMessage(**params)
+    bench = Bench(**params)
     bench.order()
     for move in (1, 2, 4, 5):
         bench.plan(move)
@@ -205,7 +205,7 @@ def test_a_path_that_stays_blocked_is_an_error_that_names_the_obstacle() -> None
 
 
 def test_a_deadline_is_handed_down_minus_the_time_of_the_answer() -> None:
-    bench = BenchMessage()
+    bench = Bench()
     bench.order([Verb.MOVE_JOINTS], by=20.0)
     bench.plan(1)
     bench.cycle(2)
@@ -215,7 +215,7 @@ def test_a_deadline_is_handed_down_minus_the_time_of_the_answer() -> None:
 
 
 def test_a_refusal_is_an_error_only_when_its_move_is_due() -> None:
-    bench = BenchMessage()
+    bench = Bench()
     bench.order()
     bench.plan(1)
     bench.plan(2, error=Error.UNREACHABLE)

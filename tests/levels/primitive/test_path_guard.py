@@ -81,7 +81,7 @@ def test_a_blocked_arm_continues_when_the_obstacle_has_left() -> None:
     assert rack.servo.touches == 0
 
 
-class MailboxWatcher:
+class Watched:
     """A guard of a path in the crossing cell, with its world model."""
 
     def __init__(self, waypoints: np.ndarray, held: int = -1) -> None:
@@ -118,7 +118,7 @@ class MailboxWatcher:
 
 
 def test_resting_obstacle_anywhere_on_the_path_is_found() -> None:
-    watched = MailboxWatcher(np.array([NEAR, NEAR + SWEEP]))
+    watched = Watched(np.array([NEAR, NEAR + SWEEP]))
     watched.watch()
     assert watched.clear()
     for part in (0.3, 0.6, 0.95):
@@ -127,7 +127,7 @@ def test_resting_obstacle_anywhere_on_the_path_is_found() -> None:
 
 
 def test_an_obstacle_that_moves_into_the_path_is_found_before_it_arrives() -> None:
-    watched = MailboxWatcher(np.array([NEAR, NEAR + SWEEP]))
+    watched = Watched(np.array([NEAR, NEAR + SWEEP]))
     watched.watch()
     arrival_s = 0.6 * watched.trajectory.duration
     meets = watched.tool_at(watched.path.evaluate(watched.trajectory.evaluate_at(arrival_s).s).q)
@@ -139,7 +139,7 @@ def test_an_obstacle_that_moves_into_the_path_is_found_before_it_arrives() -> No
 
 
 def test_work_of_the_guard_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    watched = MailboxWatcher(np.array([NEAR, NEAR + SWEEP, NEAR, NEAR + SWEEP, NEAR]))
+    watched = Watched(np.array([NEAR, NEAR + SWEEP, NEAR, NEAR + SWEEP, NEAR]))
     watched.watch()
     checks = []
     free = watched.guard._checker.is_free

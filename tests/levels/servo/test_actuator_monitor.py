@@ -147,7 +147,7 @@ HELD_BY_FRICTION = math.tanh(2.0) * CELL.model.dof_frictionloss[CELL.dof]
 """Torques that dry friction absorbs at rest, N m."""
 
 
-class BenchMessage:
+class Bench:
     """An arm at rest at home, with unexplained torques that the test sets."""
 
     def __init__(self) -> None:
@@ -171,7 +171,7 @@ class BenchMessage:
 
 
 def test_pressing_a_part_on_its_support_is_not_a_motor_fault() -> None:
-    bench = BenchMessage()
+    bench = Bench()
     assert bench.leave(10, j2=-20.0, j3=-3.9, j5=1.1) == []
     # The arm has turned to it: only the wrist still presses, commanded a little more in every
     # cycle.
@@ -180,7 +180,7 @@ def test_pressing_a_part_on_its_support_is_not_a_motor_fault() -> None:
 
 
 def test_a_motor_that_lacks_more_than_a_contact_explains_is_found_while_pressing() -> None:
-    bench = BenchMessage()
+    bench = Bench()
     bench.leave(10, j2=-2.5, j3=-1.4, j5=2.2)
     much = (MAX_CONTACT_FRACTION + 0.01) * CELL.bounds.torque[1]
     found = bench.leave(SURE_CYCLES, j2=much, j3=-9.8, j5=0.4)

@@ -70,7 +70,7 @@ def table(seed: int) -> Array:
 
 
 def motion_of(seed: int, following: float, rules: float) -> tuple[Any, ...]:
-    """Return the arguments of `left_over`."""
+    """Return the arguments of `compute_residuals`."""
     inertia = noise(seed + 1, 2, JOINTS, JOINTS)
     motors = np.zeros(JOINTS, actuator_monitor.MOTORS)
     motors["velocity"], motors["bias"], motors["torque"] = noise(seed, 3, JOINTS)
@@ -122,7 +122,7 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
         for ends_s in (0.01, 0.0135, np.inf)
     ],
     "check": [sample_of(seed, error) for seed in range(35) for error in (1e-6, 1e-2, np.nan)],
-    "left_over": [
+    "compute_residuals": [
         motion_of(k, following, size)
         for k in range(20)
         for following, size in ((0.02, 1), (9, 1), (9, 1e6))
@@ -133,7 +133,7 @@ CASES: dict[str, list[tuple[Any, ...]]] = {
     ],
     "servo_joints": [joints_of(k) for k in range(4)],
 }
-VERDICTS = {"check": 3, "left_over": 3, "limit_torques": 2}
+VERDICTS = {"check": 3, "compute_residuals": 3, "limit_torques": 2}
 """Kinds of verdicts that the cases reach; else: None."""
 
 

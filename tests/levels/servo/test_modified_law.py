@@ -111,7 +111,7 @@ class SetsNothing(Modification):
         pass
 
 
-class BenchMessage:
+class Bench:
     """A modified law with torque = 3 N m + 10 N m/rad times the wanted position."""
 
     def __init__(self, **modifications: Mapping[str, Any] | str) -> None:
@@ -157,7 +157,7 @@ class BenchMessage:
 def test_after_a_switch_the_torque_changes_over_smoothly_in_the_transfer_time(
     name: str, after: float
 ) -> None:
-    bench = BenchMessage(it=name)
+    bench = Bench(it=name)
     bench.run(5)
     assert bench.switch("it", True) == ""
     torque = bench.run(TRANSFER_TICKS + 3)
@@ -176,11 +176,11 @@ def test_modifications_act_at_their_hooks_in_the_order_of_the_config() -> None:
         name: {"class": HERE + kind, "on": True}
         for name, kind in (("half", "Half"), ("counts", "Counts"), ("further", "Further"))
     }
-    assert BenchMessage(**tables).run(2).tolist() == [0.5 * 13.0 + 1.0, 0.5 * 13.0 + 2.0]
+    assert Bench(**tables).run(2).tolist() == [0.5 * 13.0 + 1.0, 0.5 * 13.0 + 2.0]
 
 
 def test_a_modification_in_place_of_the_law_replaces_another() -> None:
-    bench = BenchMessage(nine="Nine", pd={"class": COMMON + "JointPd"}, huge="Huge")
+    bench = Bench(nine="Nine", pd={"class": COMMON + "JointPd"}, huge="Huge")
     bench.switch("nine", True)
     bench.run(60)
     bench.switch("pd", True)
@@ -196,7 +196,7 @@ def test_a_modification_in_place_of_the_law_replaces_another() -> None:
 
 
 def test_a_modification_that_raises_is_undone_and_switched_off_in_the_same_sample() -> None:
-    bench = BenchMessage(raises="Raises", half={"class": HERE + "Half", "on": True})
+    bench = Bench(raises="Raises", half={"class": HERE + "Half", "on": True})
     bench.run(1)
     bench.switch("raises", True)
     torque = bench.run(TRANSFER_TICKS + 5)
@@ -214,7 +214,7 @@ def test_a_modification_that_raises_is_undone_and_switched_off_in_the_same_sampl
 
 @pytest.mark.parametrize("name", ["GivesNan", "SetsNothing"])
 def test_a_modification_with_a_result_that_is_not_finite_is_switched_off(name: str) -> None:
-    bench = BenchMessage(it=name)
+    bench = Bench(it=name)
     bench.run(1)
     bench.switch("it", True)
     assert bench.run(3).tolist() == [3.0] * 3

@@ -28,7 +28,7 @@ ROBOT, SCENE = config("puma560")
 HOME = {"do": "home"}
 
 
-class BenchMessage(Lockstep):
+class Bench(Lockstep):
     """The task executor alone; the test plays its planner and the level below."""
 
     def __init__(self, *actions: Mapping[str, Any], **params: Any) -> None:
@@ -65,7 +65,7 @@ class BenchMessage(Lockstep):
 
 
 def test_the_window_moves_with_completed_moves_and_ends_with_the_plan() -> None:
-    bench, moves = BenchMessage(HOME, HOME), 2 * WINDOW_MOVES
+    bench, moves = Bench(HOME, HOME), 2 * WINDOW_MOVES
     bench.plan([0] * WINDOW_MOVES + [1] * WINDOW_MOVES)
     assert bench.window() == list(range(1, WINDOW_MOVES + 1))
     bench.cycle(done=2)
@@ -80,18 +80,18 @@ def test_the_window_moves_with_completed_moves_and_ends_with_the_plan() -> None:
 
 
 def test_no_moves_of_a_refused_plan_are_handed_down() -> None:
-    bench = BenchMessage(HOME)
+    bench = Bench(HOME)
     bench.plan([], error=Error.UNREACHABLE)
     assert bench.window() == []
     assert (bench.status.state, bench.status.reason) == (State.ERROR, "no")
     # Without a program the level is idle.
-    bench = BenchMessage()
+    bench = Bench()
     bench.cycle()
     assert bench.status.state == State.IDLE
 
 
 def test_a_late_action_is_an_error() -> None:
-    bench = BenchMessage({**HOME, "by": 5.0})
+    bench = Bench({**HOME, "by": 5.0})
     bench.plan([0])
     bench.cycle()
     bench.cycle()
@@ -121,7 +121,7 @@ HELD = {"state": State.HOLDING, "reason": "waiting for servo: brakes engaged"}
 def test_a_stalled_task_ends_with_the_reason(
     plan: list[int], below: dict[str, Any], why: str
 ) -> None:
-    bench = BenchMessage(HOME, stalled_s=5.0)
+    bench = Bench(HOME, stalled_s=5.0)
     if plan:
         bench.plan(plan)
     for k in range(4):  # the arm moves slowly

@@ -12,7 +12,7 @@ from rack.boards.config import load
 from rack.tools.monitor.interrupts import replay_inbox
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
-from tests.boards.messages import WrittenMessages
+from tests.boards.messages import Written
 from tests.boards.run.test_interrupts import BOARDS, OVERLOADED, RACK, SECONDS, SMALL, TICKS
 from tests.tools.recordings import recorded as write_recording
 
@@ -24,7 +24,7 @@ def recorded(folder: Path, name: str, *settings: str) -> Recording:
     config = load(path, [f"name={name}", *settings])
     with Rack(config) as rack:
         rack.run(SECONDS)
-        found = WrittenMessages.on(rack.segment)
+        found = Written.on(rack.segment)
     traces = {task: rows.tolist() for task, rows in found.cycles.items()}
     return write_recording(folder / "run", config, traces, messages=found.messages)
 

@@ -82,7 +82,7 @@ def test_a_running_rack_shows_peers_imports_and_exports(segment: Segment) -> Non
     assert read_entries('name = "alone"') is None
 
 
-class RecordedRun:
+class Recorded:
     """Stands in for a recording with three cycles of the adapter."""
 
     mailboxes = ("lan.status",)
@@ -90,7 +90,7 @@ class RecordedRun:
     def __init__(self, segment: Segment) -> None:
         self.config, self.layout = segment.config, segment.layout
 
-    def signal(self, mailbox: str, field: str) -> np.ndarray:
+    def read_signal(self, mailbox: str, field: str) -> np.ndarray:
         """Return a field of a mailbox."""
         port, _, name = field.partition(".")
         if mailbox == "lan.status":
@@ -105,7 +105,7 @@ class RecordedRun:
 
 
 def test_a_report_has_counts_ages_and_losses(segment: Segment) -> None:
-    recording: Any = RecordedRun(segment)
+    recording: Any = Recorded(segment)
     found = summarize_network(recording)
     assert found is not None
     (entry,) = found["imports"]

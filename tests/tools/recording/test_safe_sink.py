@@ -102,8 +102,8 @@ def test_rows_wait_for_a_sink_that_takes_long_to_open() -> None:
 @pytest.mark.parametrize(
     ("bound", "bound_s", "hurries"),
     [
-        ("HURRIED_S", 0.05, True),
-        ("OPENED_S", 0.05, False),
+        ("HURRIED_TIMEOUT_S", 0.05, True),
+        ("OPENING_TIMEOUT_S", 0.05, False),
         # The recorder does not wait if opening uses no processor time.
         pytest.param("LOOK_S", 0.02, False, marks=pytest.mark.slow),
     ],
@@ -123,7 +123,7 @@ def test_a_recorder_does_not_wait_for_ever_for_a_sink_whose_opening_hangs(
     assert opening.sink.calls == []
     (note,) = notes
     assert note.startswith("run.rrd is missing: ")
-    assert bound != "OPENED_S" or note.endswith(
+    assert bound != "OPENING_TIMEOUT_S" or note.endswith(
         "the viewer's library has not opened it; 'rack replay' makes it"
     )
 

@@ -19,13 +19,13 @@ from tests.tools.machines import (
     A,
     B,
     C,
-    MachineComparison,
+    Machine,
     S,
     recorded,
 )
 
 
-def check_place(place: RackPlace, own: MachineComparison, line: MachineComparison) -> None:
+def check_place(place: RackPlace, own: Machine, line: Machine) -> None:
     """Check that the time of each tick is right within the uncertainty."""
     ticks = np.arange(0, TICKS, 7)
     found = place.convert_ticks(ticks, 0)

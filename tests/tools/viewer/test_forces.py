@@ -32,7 +32,7 @@ def cell(tmp_path: Path) -> Cell:
     return build_cell(*pad(tmp_path), CLOCK_NS)
 
 
-class WrittenMessages:
+class Written:
     """A recording of one message type, written by a part of the view."""
 
     def __init__(self, folder: Path) -> None:
@@ -62,7 +62,7 @@ class WrittenMessages:
 def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, cell: Cell) -> None:
     force = np.zeros((ROWS, 6))
     force[:, 2] = np.arange(ROWS)
-    written = WrittenMessages(tmp_path)
+    written = Written(tmp_path)
     written.write(
         Wrench, cell, [build_contact_arrows(written.stream, cell, "wrench")], wrench=force
     )
@@ -76,7 +76,7 @@ def test_an_arrow_is_the_force_on_the_tool_in_the_worlds_frame(tmp_path: Path, c
 def test_curves_show_wanted_and_exerted_forces(tmp_path: Path, cell: Cell) -> None:
     wrench, wanted, selected = np.zeros((3, ROWS, 6))
     wrench[:, 2], wanted[:, 2], selected[:, 2] = 18.0, -20.0, 1
-    written = WrittenMessages(tmp_path)
+    written = Written(tmp_path)
     parts = build_task_force_curves(written.stream)
     written.write(ForceStatus, cell, parts, wrench=wrench, wanted=wanted, selected=selected)
     assert read_component(written.file, "/forces/task_frame/z").values[-1].tolist() == [
@@ -88,7 +88,7 @@ def test_curves_show_wanted_and_exerted_forces(tmp_path: Path, cell: Cell) -> No
 
 def test_contact_forces_are_shown_with_the_arms_limits(tmp_path: Path, cell: Cell) -> None:
     assert cell.wrist is not None
-    written = WrittenMessages(tmp_path)
+    written = Written(tmp_path)
     parts = build_contact_curves(written.stream, cell.wrist.contact_limits)
     written.write(Wrench, cell, parts, wrench=np.tile([3.0, 0.0, 4.0, 0.0, 0.6, 0.8], (ROWS, 1)))
     assert read_component(written.file, "/forces/contact/force").values[-1].tolist() == [60.0, 5.0]

@@ -111,7 +111,7 @@ class Hoist(ServoRig):
         return Claim(int(said["claim"]), bytes(said["owner"]))
 
 
-class EquationPair:
+class Pair:
     """Two racks that step together and read each other's messages one exchange, 20 ms, later;
     unless `apart`."""
 
@@ -152,8 +152,8 @@ class EquationPair:
 
 
 @pytest.fixture
-def pair(tmp_path: Path) -> Iterator[EquationPair]:
-    pair = EquationPair(tmp_path)
+def pair(tmp_path: Path) -> Iterator[Pair]:
+    pair = Pair(tmp_path)
     pair.run(0.1)
     yield pair
     for hoist in (pair.alpha, pair.beta):
@@ -163,7 +163,7 @@ def pair(tmp_path: Path) -> Iterator[EquationPair]:
 
 
 @pytest.mark.slow
-def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: EquationPair) -> None:
+def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: Pair) -> None:
     assert pair.alpha.claim == pair.beta.claim == Claim(), "nobody has touched it yet"
     np.testing.assert_array_equal(pair.alpha.part, pair.beta.part)
     for number, (hoist, other) in enumerate(
@@ -183,7 +183,7 @@ def test_a_hand_over_and_back_has_one_owner_at_a_time(pair: EquationPair) -> Non
     )
 
 
-def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: EquationPair) -> None:
+def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: Pair) -> None:
     hoists = pair.alpha, pair.beta
     for hoist in hoists:
         hoist.go(0.0)
@@ -200,7 +200,7 @@ def test_the_name_decides_between_two_arms_that_take_the_part_at_once(pair: Equa
     "restarted", [lambda pair: pair.alpha, lambda pair: pair.beta], ids=["owner", "other"]
 )
 def test_the_part_stays_in_place_during_a_restart_of_a_servo_board(
-    pair: EquationPair, restarted: Callable[[EquationPair], Hoist]
+    pair: Pair, restarted: Callable[[Pair], Hoist]
 ) -> None:
     pair.lift(pair.alpha)
     hoist = restarted(pair)

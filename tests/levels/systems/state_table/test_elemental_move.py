@@ -28,7 +28,7 @@ LAST = {"words": "pick block1", "in_state": "reaching", "sent": 7, "reached": 1,
 
 
 @dataclass
-class BenchMessage:
+class Bench:
     """Segment of the rack without any process, and the plan from which its level starts."""
 
     segment: Segment
@@ -55,16 +55,16 @@ class BenchMessage:
 
 
 @pytest.fixture
-def bench(rack_name: str) -> Iterator[BenchMessage]:
+def bench(rack_name: str) -> Iterator[Bench]:
     plan = resolve(load("nist-state-table", [f"name={rack_name}", "clock.mode=lockstep"]))
     segment = Segment.create(plan.layout, "")
-    yield BenchMessage(segment, plan)
+    yield Bench(segment, plan)
     unlink_segment(segment.rack)
     segment.close()
 
 
 def test_a_restarted_level_continues_with_its_last_command_to_the_level_below(
-    bench: BenchMessage,
+    bench: Bench,
 ) -> None:
     joints = np.linspace(0.1, 0.6, 6)
     bench.write("status", **LAST)
@@ -86,7 +86,7 @@ def test_a_restarted_level_continues_with_its_last_command_to_the_level_below(
     np.testing.assert_array_equal(command.aim, (1.0, 2.0, 3.0))
 
 
-def test_a_restarted_level_without_a_last_command_starts_at_home(bench: BenchMessage) -> None:
+def test_a_restarted_level_without_a_last_command_starts_at_home(bench: Bench) -> None:
     bench.write("status", **LAST)
     level, command = bench.restart()
     home = level._cell.home
@@ -96,7 +96,7 @@ def test_a_restarted_level_without_a_last_command_starts_at_home(bench: BenchMes
     np.testing.assert_array_equal(command.joints, home)
 
 
-def test_a_board_that_starts_for_the_first_time_restores_nothing(bench: BenchMessage) -> None:
+def test_a_board_that_starts_for_the_first_time_restores_nothing(bench: Bench) -> None:
     level, command = bench.restart()
     assert (level.state, level.words, command.id, command.words) == ("idle", [], 0, "")
 
@@ -104,7 +104,7 @@ def test_a_board_that_starts_for_the_first_time_restores_nothing(bench: BenchMes
 class Arm:
     """The level, whose inputs from the arm and the world are set by the test."""
 
-    def __init__(self, bench: BenchMessage) -> None:
+    def __init__(self, bench: Bench) -> None:
         wiring = next(wiring for wiring in bench.plan.tasks if wiring.task == LEVEL)
         level = find_class(wiring.target, Executor)(wiring.context)
         assert isinstance(level, MoveTable)
@@ -126,7 +126,7 @@ class Arm:
 
 
 @pytest.fixture
-def arm(bench: BenchMessage) -> Arm:
+def arm(bench: Bench) -> Arm:
     return Arm(bench)
 
 

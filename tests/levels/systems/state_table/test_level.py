@@ -52,7 +52,7 @@ class Door(StateTableExecutor):
         self.drives.append(speed)
 
 
-class BenchMessage:
+class Bench:
     """A door and its mailboxes, without a bus."""
 
     def __init__(self, folder: Path) -> None:
@@ -125,8 +125,8 @@ class BenchMessage:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> BenchMessage:
-    return BenchMessage(tmp_path)
+def bench(tmp_path: Path) -> Bench:
+    return Bench(tmp_path)
 
 
 def brief(status: Message) -> tuple[str, int, str, str, int]:
@@ -134,7 +134,7 @@ def brief(status: Message) -> tuple[str, int, str, str, int]:
     return status.in_state, status.row, status.fired, status.words, State(status.state)
 
 
-def test_a_command_from_above_is_taken_done_and_answered(bench: BenchMessage) -> None:
+def test_a_command_from_above_is_taken_done_and_answered(bench: Bench) -> None:
     assert brief(bench.cycle()) == ("shut", 3, "stay shut", "", State.IDLE)
     assert bench.status.operator == 0
     bench.command(4, "open")
@@ -154,7 +154,7 @@ def test_a_command_from_above_is_taken_done_and_answered(bench: BenchMessage) ->
     assert (status.fired, status.echo, status.done) == ("open it", 5, 4)
 
 
-def test_a_command_that_no_row_takes_is_not_in_force(bench: BenchMessage) -> None:
+def test_a_command_that_no_row_takes_is_not_in_force(bench: Bench) -> None:
     bench.door.lock = "locked"
     bench.command(1, "open")
     status = bench.cycle()
@@ -170,7 +170,7 @@ def test_a_command_that_no_row_takes_is_not_in_force(bench: BenchMessage) -> Non
 
 
 @pytest.mark.parametrize("place", ["between", "open"])
-def test_a_state_is_late_after_more_than_its_patience(bench: BenchMessage, place: str) -> None:
+def test_a_state_is_late_after_more_than_its_patience(bench: Bench, place: str) -> None:
     bench.command(1, "open")
     bench.cycle()
     bench.door.place = "between"
@@ -184,7 +184,7 @@ def test_a_state_is_late_after_more_than_its_patience(bench: BenchMessage, place
         assert status.done == 0
 
 
-def test_the_level_above_holds_this_one_while_it_executes(bench: BenchMessage) -> None:
+def test_the_level_above_holds_this_one_while_it_executes(bench: Bench) -> None:
     bench.command(1, "open", hold=True, operator=9)
     status = bench.cycle()
     assert (status.state, bench.door.is_held, status.operator) == (State.HOLDING, True, 9)
@@ -197,7 +197,7 @@ def test_the_level_above_holds_this_one_while_it_executes(bench: BenchMessage) -
     assert (bench.cycle().state, bench.door.is_held) == (State.HOLDING, True)
 
 
-def test_an_operators_hold_is_done_when_all_is_at_rest(bench: BenchMessage) -> None:
+def test_an_operators_hold_is_done_when_all_is_at_rest(bench: Bench) -> None:
     bench.command(1, "open")
     bench.cycle()
     bench.door.place = "between"
@@ -215,7 +215,7 @@ def test_an_operators_hold_is_done_when_all_is_at_rest(bench: BenchMessage) -> N
     assert status.reason.startswith("no row of 'moving' takes lock = free, place = nowhere")
 
 
-def test_an_operators_command_takes_precedence_over_the_level_above(bench: BenchMessage) -> None:
+def test_an_operators_command_takes_precedence_over_the_level_above(bench: Bench) -> None:
     bench.command(7, "paint red")
     status = bench.order(3, Operation.DO, "open")
     assert brief(status) == ("moving", 1, "open it", "open", State.EXECUTING)
@@ -229,7 +229,7 @@ def test_an_operators_command_takes_precedence_over_the_level_above(bench: Bench
     assert not bench.door.is_held
 
 
-def test_a_refusal_names_the_invalid_word_and_the_valid_tables(bench: BenchMessage) -> None:
+def test_a_refusal_names_the_invalid_word_and_the_valid_tables(bench: Bench) -> None:
     status = bench.order(1, Operation.DO, "paint blue")
     assert (status.answer, status.standing, status.words) == (Answer.REFUSED, Operation.NONE, "")
     assert "blue" in status.objection
@@ -239,7 +239,7 @@ def test_a_refusal_names_the_invalid_word_and_the_valid_tables(bench: BenchMessa
     assert status.table == "normal"
 
 
-def test_a_restarted_board_continues_from_its_last_status(bench: BenchMessage) -> None:
+def test_a_restarted_board_continues_from_its_last_status(bench: Bench) -> None:
     bench.order(1, Operation.TABLE, "careful")
     bench.order(2, Operation.TABLE, "normal")
     bench.command(6, "open")

@@ -31,7 +31,7 @@ def context() -> LevelContext:
     return next(wiring.context for wiring in plan.tasks if wiring.task == "primitive")
 
 
-class BenchMessage:
+class Bench:
     """The level with messages that the test fills. The arm is initially where it is commanded."""
 
     def __init__(self, context: LevelContext) -> None:
@@ -83,11 +83,11 @@ class BenchMessage:
 
 
 @pytest.fixture
-def bench(context: LevelContext) -> BenchMessage:
-    return BenchMessage(context)
+def bench(context: LevelContext) -> Bench:
+    return Bench(context)
 
 
-def test_a_motion_leads_straight_from_rest_to_rest(bench: BenchMessage) -> None:
+def test_a_motion_leads_straight_from_rest_to_rest(bench: Bench) -> None:
     bench.follow()
     # A motion to the present position never begins.
     bench.command(bench.home)
@@ -119,7 +119,7 @@ def test_a_motion_leads_straight_from_rest_to_rest(bench: BenchMessage) -> None:
     np.testing.assert_array_equal(bench.level.status.end, goal)
 
 
-def test_half_the_speed_takes_longer_and_a_speed_is_at_most_the_limit(bench: BenchMessage) -> None:
+def test_half_the_speed_takes_longer_and_a_speed_is_at_most_the_limit(bench: Bench) -> None:
     bench.follow()
     ends = {}
     for speed in (0.0, 0.01, 0.5, 1.0, 3.0):
@@ -139,7 +139,7 @@ def test_half_the_speed_takes_longer_and_a_speed_is_at_most_the_limit(bench: Ben
 
 
 @pytest.mark.parametrize("action", ["do_halt", "do_begin"])
-def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: BenchMessage, action: str) -> None:
+def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: Bench, action: str) -> None:
     bench.follow()
     bench.command(bench.home + 0.5)
     bench.look()
@@ -163,7 +163,7 @@ def test_a_motion_that_is_halted_comes_to_rest_elsewhere(bench: BenchMessage, ac
     assert bench.level._curve is None
 
 
-def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: BenchMessage) -> None:
+def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: Bench) -> None:
     bench.follow()
     bench.below[1].stopped = 1
     bench.below[1].reason = "brakes"
@@ -198,7 +198,7 @@ def test_the_arm_is_away_while_a_board_below_is_stopped_or_lost(bench: BenchMess
     ],
 )
 def test_a_gripper_that_cannot_close_completely_holds_something(
-    bench: BenchMessage, is_closed: bool, off: float, speed: float, expected: str
+    bench: Bench, is_closed: bool, off: float, speed: float, expected: str
 ) -> None:
     gripper = bench.level._gripper
     bench.level._closed = is_closed
@@ -207,7 +207,7 @@ def test_a_gripper_that_cannot_close_completely_holds_something(
     assert bench.look()["gripper"] == expected
 
 
-def test_a_restarted_board_restores_its_gripper_and_its_set_point(bench: BenchMessage) -> None:
+def test_a_restarted_board_restores_its_gripper_and_its_set_point(bench: Bench) -> None:
     last = bench.message(JointMoveStatus)
     last.closed = 1
     last.held = 1

@@ -38,7 +38,7 @@ def crate() -> Iterator[WarmCrate]:
         yield crate
 
 
-class BenchMessage:
+class Bench:
     """One rack's trials, whole or from its faultless run."""
 
     def __init__(self, config: RackConfig, name: str, crate: WarmCrate) -> None:
@@ -90,7 +90,7 @@ def test_every_kind_of_fault_has_the_verdict_of_a_whole_trial(
     assert others == {"tendon-torn"}
     if not EXHAUSTIVE:
         kinds = random.Random(43).sample(kinds, SAMPLE)
-    bench = BenchMessage(config, rack_name, crate)
+    bench = Bench(config, rack_name, crate)
     idle = set[str]()
     cut = 0
     for plan in one_of_each(config, kinds):
@@ -112,16 +112,14 @@ def test_every_kind_of_fault_has_the_verdict_of_a_whole_trial(
 
 
 @pytest.fixture
-def bench(
-    small: Path, rack_name: str, crate: WarmCrate, monkeypatch: pytest.MonkeyPatch
-) -> BenchMessage:
+def bench(small: Path, rack_name: str, crate: WarmCrate, monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.setattr(base_rack, "EVERY_S", 0.25)
-    return BenchMessage(load(small), rack_name, crate)
+    return Bench(load(small), rack_name, crate)
 
 
 @pytest.mark.slow
 def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
-    bench: BenchMessage,
+    bench: Bench,
 ) -> None:
     plan = Plan(1, "faults", True, (MUTE, {**MUTE, "tick": 520}))
     for _ in range(2):
@@ -140,7 +138,7 @@ def test_a_trial_continues_from_a_snapshot_and_ends_once_its_verdict_is_certain(
 
 
 @pytest.mark.slow
-def test_trials_with_kills_from_outside_run_to_the_end(bench: BenchMessage) -> None:
+def test_trials_with_kills_from_outside_run_to_the_end(bench: Bench) -> None:
     plan = Plan(1, "kills", True, (), (Kill("lower", 600, 0.5),))
     found = bench.run(plan)
     assert not found.is_cut
@@ -148,7 +146,7 @@ def test_trials_with_kills_from_outside_run_to_the_end(bench: BenchMessage) -> N
 
 
 @pytest.mark.slow
-def test_a_trial_that_cannot_continue_from_a_snapshot_says_why(bench: BenchMessage) -> None:
+def test_a_trial_that_cannot_continue_from_a_snapshot_says_why(bench: Bench) -> None:
     soon = Plan(1, "faults", True, (MUTE,))
     early = Plan(1, "faults", True, ({"kind": "self-test", "board": "lower"},))
     assert bench.base.find_start(replace(soon, lockstep=False), None, SECONDS) == Start(
@@ -168,6 +166,6 @@ def test_a_rack_without_snapshots_runs_whole_trials(
     )
     text = small.read_text().replace('two_levels:Lower"\nplanner', 'holding_levels:Lower"\nplanner')
     small.write_text(text.replace("python_path = [", f'python_path = ["{tmp_path}", '))
-    trial = BenchMessage(load(small), rack_name, crate).run(Plan(1, "faults", True, (MUTE,)))
+    trial = Bench(load(small), rack_name, crate).run(Plan(1, "faults", True, (MUTE,)))
     assert trial.start.whole.startswith("no snapshots: lower: it holds socket:")
     assert judge_trial(trial).shortfalls == ()

@@ -53,7 +53,7 @@ TRIALS = [
 ]
 
 
-class CredentialFiles:
+class Made:
     """The part of a campaign that its report reads."""
 
     layout = LAYOUT
@@ -63,7 +63,7 @@ class CredentialFiles:
 
 def report_of(results: Results) -> CampaignReport:
     """Return the report of these results."""
-    campaign = CredentialFiles()
+    campaign = Made()
     campaign.order = cast(Order, Ordered())
     return CampaignReport(cast(Campaign, campaign), results, 61.26)
 

@@ -56,7 +56,7 @@ def test_cyclictest_is_absent_without_the_program_or_the_permission(
     (absent,) = find_missing_cyclictest()
     assert "apt-get install rt-tests" in absent.message
     peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
-    monkeypatch.setattr("rack.tools.lab.benches.cyclictest.permits_fifo", lambda: False)
+    monkeypatch.setattr("rack.tools.lab.benches.cyclictest.is_fifo_permitted", lambda: False)
     (absent,) = find_missing_cyclictest()
     assert "SCHED_FIFO is refused" in absent.message
 

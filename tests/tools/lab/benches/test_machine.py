@@ -112,7 +112,7 @@ def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
     waves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     peers.program(tmp_path, "cyclictest", peers.CYCLICTEST)
-    monkeypatch.setattr("rack.tools.lab.benches.cyclictest.permits_fifo", lambda: True)
+    monkeypatch.setattr("rack.tools.lab.benches.cyclictest.is_fifo_permitted", lambda: True)
     device = tmp_path / "cpu_dma_latency"
     device.touch()
     monkeypatch.setattr("rack.backplane.process.LATENCY_REQUEST", device)

@@ -23,7 +23,7 @@ from rack.tools.lab.reproduction.experiments.experiment import (
 
 
 @dataclass(frozen=True)
-class LegTimes:
+class Times:
     """Number of times that an experiment was made."""
 
     times: int
@@ -35,12 +35,12 @@ class Counted:
     def __init__(self) -> None:
         self.times = 0
 
-    def make(self, workshop: Workshop) -> LegTimes:
+    def make(self, workshop: Workshop) -> Times:
         self.times += 1
-        return LegTimes(self.times)
+        return Times(self.times)
 
-    def experiment(self) -> Experiment[LegTimes]:
-        return Experiment("counted", "counting", 1.0, LegTimes, self.make)
+    def experiment(self) -> Experiment[Times]:
+        return Experiment("counted", "counting", 1.0, Times, self.make)
 
 
 @pytest.fixture
@@ -77,13 +77,13 @@ def test_an_experiment_with_an_invalid_result_is_made_again(rest: str, workshop:
 def test_a_missing_requirement_is_stored_as_a_reason_and_a_failure_is_not(
     workshop: Workshop,
 ) -> None:
-    def lack(workshop: Workshop) -> LegTimes:
+    def lack(workshop: Workshop) -> Times:
         raise RequirementMissing("no second processor")
 
-    def fail(workshop: Workshop) -> LegTimes:
+    def fail(workshop: Workshop) -> Times:
         raise Failure("the rack did not run")
 
-    lacking, failing = (Experiment(make.__name__, "", 1.0, LegTimes, make) for make in (lack, fail))
+    lacking, failing = (Experiment(make.__name__, "", 1.0, Times, make) for make in (lack, fail))
     make_and_store(lacking, workshop)
     found = load_result(lacking, workshop.folder)
     assert found is not None
