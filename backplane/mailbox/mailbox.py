@@ -262,7 +262,6 @@ class Reader:
         # The last good message has a separate buffer, which a corrupt copy never reaches.
         state = memoryview(bytearray(GOOD_OFFSET + len(slots.record)))
         good = Slots(segment, self.spec, state[GOOD_OFFSET:])
-        """Last good message, with the head of its slot."""
         self.good = good.record
         """The last good message, with the head of its slot."""
         self.message = good.message

@@ -103,12 +103,11 @@ class ReadTable(PortTable):
                 else:
                     reading = watched.reader.get_reading(bool(result & NEW_RESULT))
                     if isinstance(watched, WatchedReader):
-                        is_odd, is_silent = (
-                            bool(result & JUDGE_MESSAGES),
-                            bool(result & JUDGE_SILENCE),
-                        )
                         reading = watched.judge_reading(
-                            tick, reading, is_odd=is_odd, is_silent=is_silent
+                            tick,
+                            reading,
+                            is_odd=bool(result & JUDGE_MESSAGES),
+                            is_silent=bool(result & JUDGE_SILENCE),
                         )
                 line.values[line.key] = reading
         for line in self._others:
@@ -144,8 +143,7 @@ class WriteTable(PortTable):
 
         Args:
             writers: At most `MAX_PORTS` writers, for which `can_write` is true, each with the
-                readers on whose
-            messages its message depends.
+                readers on whose messages its message depends.
         """
         self._writers = [writer for writer, _ in writers]
         self._sources = [

@@ -89,7 +89,6 @@ class InputPorts:
                     if rule is None
                     else GridReader(watched_reader, rule.grid).read
                 )
-                """Read every mailbox as of `tick`."""
                 values[key] = Reading(watched_reader.reader.message, Verdict.NONE)
                 line = InputMailbox(values, key, read, watched_reader)
                 (plans if mailbox == plan else self._rest).append(line)
