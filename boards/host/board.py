@@ -66,7 +66,7 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
             return _report_failure(wiring.board, end)
     except Exception as error:
         return _report_failure(wiring.board, error)
-    bus.declare_done()
+    bus.finish()
     return 0
 
 

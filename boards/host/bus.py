@@ -175,7 +175,7 @@ class HostBus:
         """Names of the crate's tasks."""
         return [task.name for task in self._segment.layout.tasks]
 
-    def find_address(self, name: str) -> int:
+    def address(self, name: str) -> int:
         """Return the bus address of a mailbox, or of the control block of a task.
 
         Raises:
@@ -187,7 +187,7 @@ class HostBus:
             raise LookupError(f"nothing on the bus is called '{name}'; known: {', '.join(known)}")
         return known[name]
 
-    def read_words(self, address: int, count: int = 1) -> list[int]:
+    def words(self, address: int, count: int = 1) -> list[int]:
         """Read words of the crate's memory.
 
         Args:
@@ -206,7 +206,7 @@ class HostBus:
             )
         return list(self._words[address // WORD : last // WORD])
 
-    def declare_done(self) -> None:
+    def finish(self) -> None:
         """Record that the program is finished, as its return does."""
         self.block[Block.STATE] = TaskState.ENDED
         if self._is_paced:

@@ -45,9 +45,9 @@ class AdapterEntry(Message, version=1):
     )
     waiting: int = declare_counter("messages that wait for the next cycles")
     arrived: int = field(
-        unit="tick", doc="tick at which the newest message reached the other side; -1: none yet"
+        unit="tick", doc="tick at which the newest message reached the other side (-1: none yet)"
     )
-    age: int = field(unit="tick", doc="time since that message was written; -1: none yet")
+    age: int = field(unit="tick", doc="time since that message was written (-1: none yet)")
 
 
 _COUNTED = ("passed", "refused", "superseded", "full", "waiting", "arrived")

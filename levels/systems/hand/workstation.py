@@ -302,8 +302,8 @@ class Workstation(HostProgram):
     def read_counts(self, bus: Bus) -> dict[str, dict[str, int]]:
         """Return the cycle counts of every task, read from its control block."""
         counts = {"cycles": Block.CYCLES, "missed": Block.MISSED, "skipped": Block.SKIPPED}
-        blocks = {task: bus.find_address(task) for task in bus.tasks}
+        blocks = {task: bus.address(task) for task in bus.tasks}
         return {
-            task: {name: bus.read_words(address + WORD * word)[0] for name, word in counts.items()}
+            task: {name: bus.words(address + WORD * word)[0] for name, word in counts.items()}
             for task, address in blocks.items()
         }

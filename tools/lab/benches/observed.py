@@ -21,7 +21,7 @@ The peers are not measured at their start either.
 """
 
 
-class RecordedRun(NamedTuple):
+class ObservedRun(NamedTuple):
     """Result of a run, and its recording."""
 
     result: RunResult
@@ -44,7 +44,7 @@ def record_rack(
     seconds: float | None,
     folder: Path,
     share: bool = True,
-) -> RecordedRun:
+) -> ObservedRun:
     """Run a rack as `run_rack` does, without display, and record it.
 
     Args:
@@ -54,7 +54,7 @@ def record_rack(
         share: Whether to run even on cores that another rack holds.
     """
     result = run_rack(config, seconds, folder, Display(), share=share)
-    return RecordedRun(result, Recording(folder))
+    return ObservedRun(result, Recording(folder))
 
 
 def remove_run_end(config: RackConfig) -> RackConfig:

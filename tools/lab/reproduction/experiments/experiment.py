@@ -31,7 +31,7 @@ from rack.boards.crate.clean import remove_dead_rack
 from rack.tools.console.answer import Failure, write_json
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.lab.benches.cyclictest import is_fifo_permitted
-from rack.tools.lab.benches.observed import UNVIEWED_SETTINGS, RecordedRun, record_rack
+from rack.tools.lab.benches.observed import UNVIEWED_SETTINGS, ObservedRun, record_rack
 
 # Subfolders for the results of experiments and for the recordings of their runs.
 RESULTS_FOLDER = "parts"
@@ -108,7 +108,7 @@ class Workshop:
         """
         return name
 
-    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> RecordedRun:
+    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> ObservedRun:
         """Run a rack and record it in the folder.
 
         A recording of an earlier run with this label is replaced.

@@ -19,7 +19,7 @@ from rack.boards.timing.trace_times import compute_gaps_ns, count_misses_and_ski
 from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Failure
 from rack.tools.faults.judge import Judgement, report_faults
-from rack.tools.lab.benches.observed import RecordedRun
+from rack.tools.lab.benches.observed import ObservedRun
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 from rack.tools.lab.reproduction.experiments.tasks import TaskRun, summarize_task
 from rack.tools.recording.cycles import Cycles
@@ -172,11 +172,11 @@ DETERMINISM = Experiment(
 )
 
 
-def _record_run(workshop: Workshop, label: str, mode: str) -> RecordedRun:
+def _record_run(workshop: Workshop, label: str, mode: str) -> ObservedRun:
     return workshop.run(label, workshop.load_config(NAME, [f"clock.mode={mode}"]), COMPARED_S)
 
 
-def _compare_run(run: RecordedRun, reference: Recording | None) -> ComparedRun:
+def _compare_run(run: ObservedRun, reference: Recording | None) -> ComparedRun:
     """Return the digest of a run, and its first difference from a reference."""
     result, recording = run
     return ComparedRun(

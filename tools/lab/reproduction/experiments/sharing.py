@@ -15,7 +15,7 @@ from rack.backplane.layout import Wake
 from rack.boards.config import load_text
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.chain import Chain
-from rack.tools.lab.benches.observed import RecordedRun, compute_lateness_us, count_cycles
+from rack.tools.lab.benches.observed import ObservedRun, compute_lateness_us, count_cycles
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 LEVELS = 5
@@ -75,7 +75,7 @@ def _measure_chain(label: str, workshop: Workshop, chain: Chain, protocol: str =
     return ChainRun(chain.boards, due, missed, dict(sorted(took.items())))
 
 
-def _run_chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> RecordedRun:
+def _run_chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> ObservedRun:
     config = load_text(workshop.find_source(chain.format_config() + protocol))
     return workshop.run(label, config.model_copy(update={"name": workshop.rack}), SECONDS)
 
