@@ -42,7 +42,7 @@ class SensedMotion:
 
 
 class Curve:
-    """A motion of all joints over time, which may change to rest at `ends_s`."""
+    """A motion of all joints over time. From `ends_s` on, the joints are at rest."""
 
     def __init__(self, *coefficients: Array, duration_s: float, rest: Array | None = None) -> None:
         """Take polynomial coefficients.
@@ -136,9 +136,12 @@ class Bridge(Curve):
         )
 
     def is_within(self, acceleration: Array) -> bool:
-        """Return True if no joint exceeds its `acceleration`, (joints,), rad/s2.
+        """Return True if no joint exceeds its acceleration limit on this curve.
 
         The acceleration of a cubic is greatest at one of its ends.
+
+        Args:
+            acceleration: Acceleration limits, (joints,), rad/s2.
         """
         begin = 2.0 * self.table[2] / self.duration_s**2
         end = (2.0 * self.table[2] + 6.0 * self.table[3]) / self.duration_s**2
