@@ -90,11 +90,11 @@ class PlanStore:
             self._by_move[message.move] = message
 
     def find_plan(self, move: int) -> MovePlan | None:
-        """Return the plan of a move, which may be a refusal, or None."""
+        """Return the stored plan of a move, which may be a refusal. None if there is none."""
         return self._by_move.get(move)
 
     def find_answer(self, request: int) -> MovePlan | None:
-        """Return the answer to a request for another path, or None."""
+        """Return the answer to a request for another path, or None if it has not been received."""
         return self._answer if self._answer is not None and self._answer.replan == request else None
 
     def find_last_planned_move(self, window: Any, handed_down: int) -> int:
@@ -204,7 +204,7 @@ class SegmentWindow:
         self._write_path(segment, plan)
 
     def replace_first(self, plan: MovePlan) -> None:
-        """Withdraw all segments, and hand down the oldest one again with another path."""
+        """Withdraw all segments, then hand down the oldest move again with another path."""
         self._command.count = 1
         self._clear_unused()
         self._command.id = self.first["id"] = self._command.id + 1

@@ -210,8 +210,8 @@ class ElementalMovePlanner(Planner):
         """Return a job for the first move without a path, or None."""
         status = self.status.message
         primitive = self.primitive.message
-        # The end of a path that the executor reports is exact, but the executor may not have
-        # received the newest path yet.
+        # Prefer the end of a path that the executor reports, because it is exact. But the executor
+        # may not have received the newest path yet.
         unseen = [p for p in self._published[-1:] if p.move.id > status.planned]
         move = find_next_motion(self._window, unseen[0].move.id if unseen else status.planned)
         if move is None:
@@ -292,7 +292,7 @@ def find_next_motion(window: Sequence[Move], newest: int) -> Move | None:
 
 
 def compute_grip(row: int, tool: Pose, seen: Scene | WorldState) -> Pose:
-    """Return the pose of an object in the frame of the tool.
+    """Return the pose of an object relative to the tool.
 
     Args:
         row: Row of the object.

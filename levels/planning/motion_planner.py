@@ -1,6 +1,6 @@
 """The path of one elemental move: inverse kinematics, then a straight line or a search.
 
-A straight line is one of the tool, a search is in joint space.
+The tool follows the straight line; the search is in joint space.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ class MotionPlanner:
         situation.apply_to(self.checker, touched)
 
     def find_goal(self, move: Move, start: Array) -> Array:
-        """Return the configuration at the end of a free motion, in the present situation.
+        """Return the configuration at the end of a free motion, in the situation set last.
 
         Raises:
             Refused: No configuration can be reached, or all are blocked.

@@ -1,8 +1,8 @@
 """Collision-free paths between two configurations, with rounded corners.
 
-A path is straight where that is free. Otherwise OMPL's RRTConnect searches one and shortens it. The
-search ends after a number of checks, never by time, and every call seeds the random numbers. So
-equal arguments give equal paths in every process.
+A path is a straight line if that is free of collisions. Otherwise OMPL's RRTConnect searches for a
+path, which is then shortened. A search is limited by its number of checks, not by time, and every
+call seeds the random numbers, so equal arguments give equal paths in every process.
 """
 
 from __future__ import annotations
@@ -99,7 +99,12 @@ class PathPlanner:
         return min(paths, key=self.compute_duration, default=None)
 
     def round_corners(self, waypoints: Array, first_blocked: FirstBlocked) -> Path:
-        """Return the path along `waypoints`, with each corner rounded as far as it stays free."""
+        """Return the path along `waypoints`, with corners rounded as far as collisions permit.
+
+        Args:
+            waypoints: Waypoints, (n, joints), rad.
+            first_blocked: Finds the first configuration that is not free.
+        """
         # Blends must not overlap: they use up to half of an inner line, and most of the first and
         # the last line.
         lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
@@ -211,7 +216,12 @@ class PathPlanner:
         return polyline, count
 
     def _build_space(self, ends: Array, free: Free) -> base.SpaceInformation:
-        """Build the scaled space of OMPL around `ends`, (2, joints), with its collision check."""
+        """Build the scaled space of OMPL around start and goal, with its collision check.
+
+        Args:
+            ends: Start and goal, (2, joints), rad.
+            free: Checks scaled configurations.
+        """
         least = ends.min(axis=0)
         most = ends.max(axis=0)
         low, high = self._limits.position.T
@@ -275,14 +285,14 @@ class MotionCheck(base.MotionValidator):  # type: ignore[misc]  # untyped
 
 @compiled_for("f8[:,::1], i8")
 def list_bisection_points(ends: Array, count: int) -> Array:
-    """Return the points at which a line is checked: its end, its middle, and so on by halves.
+    """Return the points of a line in the order of checking: its end, then repeated bisection.
 
     Args:
         ends: Ends of the line, (2, joints).
         count: Number of parts of the line.
 
     Returns:
-        Points, (count, joints), in the order of checking.
+        Points, (count, joints).
     """
     places = np.empty((count, ends.shape[1]))
     places[0] = ends[1]

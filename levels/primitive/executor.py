@@ -281,8 +281,8 @@ class PrimitiveExecutor(Executor):
         """Find the segment that needs a trajectory next.
 
         Returns:
-            Its serial, or 0 for none, and the path parameter at which the trajectory must begin,
-            rad.
+            Serial of the segment, or 0 for none, and the path parameter, rad, at which its
+            trajectory must begin.
         """
         work = self._work
         kinds = self.above.message.segments["kind"].tolist()

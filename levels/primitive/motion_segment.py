@@ -32,7 +32,7 @@ class MotionSegment(MoveSegment):
     """A copy of one segment of a `MoveCommand`."""
 
     def path(self) -> BlendedPath:
-        """Return the path of the segment.
+        """Build the path of the segment.
 
         Raises:
             ValueError: The path is invalid.
@@ -56,10 +56,14 @@ def window(command: MoveCommand) -> list[int]:
 
 
 def read_segment(command: MoveCommand, serial: int) -> MotionSegment:
-    """Return a copy of a segment, which must be in the window.
+    """Return a copy of a segment.
+
+    Args:
+        command: Command with the window.
+        serial: Serial of a segment in the window.
 
     Raises:
-        ValueError: Its kind is unknown, or a number is not finite.
+        ValueError: The kind of the segment is unknown, or a number is not finite.
     """
     record = command.segments[window(command).index(serial)]
     segment = MotionSegment(record.dtype)

@@ -195,7 +195,7 @@ class SceneWatch:
         Args:
             guard: Guard to tell about a held object.
             blind_ticks: Age from which a scene is stale.
-            has_bodies: False for a scene without bodies, which never is stale.
+            has_bodies: False for a scene without bodies, which is never stale.
         """
         self._guard = guard
         self._blind_ticks = blind_ticks

@@ -60,7 +60,7 @@ class PathMotion:
 
     @property
     def is_finished(self) -> bool:
-        """True if the set point rests at the end of the path."""
+        """True if the set point is at rest at the end of the path."""
         return (
             self.is_resting and self.s >= self.path.length and self._bridged_s >= self._bridging_s
         )

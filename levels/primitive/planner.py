@@ -76,7 +76,7 @@ class PrimitivePlanner(Planner):
         plan.error, plan.reason, plan.earliest = fault or (Error.NONE, "", plan.earliest)
 
     def _build_path(self, segment: MotionSegment) -> BlendedPath:
-        """Return the path of a segment.
+        """Build the path of a segment, and check that the arm can follow it.
 
         Raises:
             ValueError: The path is invalid or leaves the range of a joint.

@@ -1,7 +1,8 @@
 """Execution of segments.
 
-A path starts when it is planned and clear, holds on command or for the guard, and is done when the
-arm has settled. A gripper segment is done when the gripper is at rest.
+Motion along a path starts when the path is planned and clear. It holds on command, and when the
+guard finds an obstacle. The segment is done when the arm has settled. A gripper segment is done when
+the gripper is at rest.
 """
 
 from __future__ import annotations
@@ -209,7 +210,7 @@ class PathWork:
         motion.advance_by(cycle.passed_s)
 
     def check_done(self, status: DrivenArm) -> bool:
-        """Return True if the set point and the arm rest at the end of the path.
+        """Return True if set point and arm are at rest at the end of the path.
 
         Call this once for each new status. It sets `fault` if the arm does not settle in time.
         """

@@ -100,8 +100,9 @@ class DeviationMonitor:
 
         Args:
             joints: Names of the joints.
-            permitted_rad: Distance that does not count.
-            permitted_cycles: Number of consecutive cycles with a larger distance that is no fault.
+            permitted_rad: Distance up to which a cycle does not count.
+            permitted_cycles: Number of consecutive cycles with a larger distance that are
+                tolerated.
         """
         self._joints = joints
         self._permitted_rad = permitted_rad

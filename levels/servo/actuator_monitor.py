@@ -1,4 +1,4 @@
-"""Judges from the motion of the arm whether its motors give the commanded torques."""
+"""Detects from the motion of the arm when a motor does not give its commanded torque."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ class ActuatorMonitor:
         self._alone = True  # it is the only motor that lacks torque
 
     def begin_cycle(self) -> None:
-        """Begin a cycle with the commanded `torque`, in the state passed to `judge_cycle` last."""
+        """Begin a cycle in which the motors are commanded `torque`, in the state judged last."""
         self._begun = True
 
     def drop_cycle(self) -> None:

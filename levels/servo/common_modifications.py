@@ -53,7 +53,7 @@ class JointPdParams(Table):
 
 
 class JointPd(Modification):
-    """Controls every joint by itself with PD on its error.
+    """Controls each joint separately by proportional-derivative (PD) control.
 
     It ignores the wanted acceleration, coupling between joints and friction.
     """
@@ -69,7 +69,7 @@ class JointPd(Modification):
         self._load = float(params.load)
 
     def modify(self, sample: LawSample) -> None:
-        """Set the torques by PD, scaled by each joint's inertia."""
+        """Set the torques by PD control, scaled by the inertia of each joint."""
         error = sample.wanted_position - sample.position
         slip = sample.wanted_velocity - sample.velocity
         pull = sample.inertia * (self._stiffness * error + self._damping * slip)

@@ -83,7 +83,12 @@ class ComputedTorque:
     """
 
     def __init__(self, friction: Array, gains: LoopGains) -> None:
-        """Compensate the dry friction `friction`, (joints,), N m."""
+        """Create the law.
+
+        Args:
+            friction: Dry friction to compensate, (joints,), N m.
+            gains: Gains of the joint loop.
+        """
         table = np.zeros((4, len(friction)))  # in the rows of `set_torque`
         self._constants = table
         self.set_gains(gains)
@@ -162,9 +167,9 @@ def limit_torques(torque: Array, limits: Array) -> bool:
 class SetPointLaw:
     """Computes set points for drives that close a position or velocity loop.
 
-    A set point is the motion wanted at the end of the cycle. Velocity drives do not know the
-    position, so their set point also corrects the position error, as fast as `ComputedTorque`
-    would.
+    A set point is the motion wanted at the end of the cycle. Velocity drives do not control the
+    position, so their set point also contains a term that corrects the position error, as fast as
+    `ComputedTorque` would.
     """
 
     def __init__(self, cell: Cell, params: LoopGains, period_s: float) -> None:
@@ -182,7 +187,7 @@ class SetPointLaw:
         Args:
             wanted: Motion to follow.
             position: Sensed positions, (joints,), rad.
-            torque: Predicted torques, (joints,), N m, which are passed on.
+            torque: Predicted torques, (joints,), N m, which are passed on to the drives.
         """
         gained = self._period_s * wanted.acceleration
         return JointTarget(

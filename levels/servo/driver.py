@@ -1,4 +1,4 @@
-"""The part of a level that drives an arm, whatever motion it is driven to follow.
+"""The part of a level that drives an arm, independent of the motion that the arm follows.
 
 A cycle has three phases:
 
@@ -173,7 +173,7 @@ class ArmDriver(Executor):
         """
 
     def find_terms(self) -> Terms:
-        """Return the equation of motion at the sensed state, with the payload."""
+        """Return the equation of motion at the sensed state, including the payload."""
         return self.arm.dynamics.terms(self.sensors.position, self.sensors.velocity, self.payload)
 
     @abstractmethod
@@ -202,7 +202,7 @@ class ArmDriver(Executor):
 
     @abstractmethod
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return how the level follows its set points, for the status."""
+        """Return how the level follows its set points. The status reports it."""
 
     @cached_property
     def _report(self) -> ArmReport:
@@ -336,7 +336,7 @@ class ArmDriver(Executor):
             target = self.set_point_law.compute_target(wanted, self.sensors.position, torque)
             refused = self._link.follow(target, grip_force)
         if refused is not None:
-            # The arm has engaged its brakes by itself.
+            # The arm has engaged its brakes itself when it refused the command.
             self.stopping.register_refusal(refused, tick)
             return self.brake_arm()
         self._wanted = wanted.table

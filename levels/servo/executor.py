@@ -1,4 +1,4 @@
-"""The servo level of NASREM: computed torque, or set points for drives that close a loop."""
+"""The servo level of NASREM: computed torque, or set points for closed-loop drives."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ class ServoLaw(ArmDriver):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield control modifications that do not suit the law, and what `ArmDriver` yields."""
+        """Yield control modifications that do not suit the law, and mismatches of `ArmDriver`."""
         yield from super().find_mismatches(context, above, below)
         yield from find_misfits(context)
         interface = context.robot.interface
@@ -168,7 +168,15 @@ class ServoLaw(ArmDriver):
             self._grip.keep_force(self.arm.grip_force)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion:
-        """Return the wanted motion. After braking it begins where the arm is."""
+        """Return the motion wanted in this cycle, from the operator or from the level above.
+
+        After braking it begins where the arm is. With a reaction it ramps to rest.
+
+        Args:
+            reaction: Reaction of this cycle.
+            missed: Cycles before this one were missed.
+            tick: Tick of the cycle.
+        """
         sensors = self.sensors
         reference = self.reference
         if self.abandoned:
@@ -238,7 +246,7 @@ class ServoLaw(ArmDriver):
         return self._holds
 
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return how the level follows its set points, for the status."""
+        """Return how the level follows its set points. The status reports it."""
         operator = self.operator_control
         stands = operator.stands
         cut = self.reference.refused + self._cut

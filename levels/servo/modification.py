@@ -148,7 +148,7 @@ class ModificationConfig(Table):
 
     @model_validator(mode="after")
     def _check_params(self) -> ModificationConfig:
-        """Check the params against the table that the class declares."""
+        """Check the params against the table of parameters that the class declares."""
         kind = self.kind.params
         if kind is None:
             if self.params:
@@ -162,7 +162,7 @@ class ModificationConfig(Table):
 
     @property
     def kind(self) -> type[Modification]:
-        """The class of the modification."""
+        """Class of the modification."""
         return validate_class(self.cls, Modification)
 
 

@@ -1,12 +1,12 @@
 """A servo law with control modifications, which are switched without a step in the torque.
 
 In the first sample after a switch the torque does not change. The difference from the torque of the
-newly modified law decays to zero, with zero slope at both ends, while the new law is already in
-force. A switch therefore adds only this difference, whatever the modifications compute. Torque
+newly modified law decays to zero, with zero slope at both ends, while the new law is already
+active. A switch therefore adds only this difference, whatever the modifications compute. Torque
 limits apply to the sum.
 
 Two alternatives were rejected. Evaluating the old and the new law in one sample would run a
-modification with state twice. A ramp of gains would have to know the inside of the law.
+modification with state twice. A ramp of gains would need to know the internals of the law.
 
 A modification that raises an exception, or whose result is not finite, is undone and switched off
 in the same sample, with the same smooth change of the torque.

@@ -1,7 +1,7 @@
 """Interpolates the set points of the level above for every servo cycle.
 
 A set point is to be reached at its `due` tick, and the next one should arrive before that. In
-between, the motion is the cubic Hermite curve through positions and velocities, so it is C1. If no
+between, the motion is the cubic Hermite curve through positions and velocities. If no
 set point arrives in time, the motion ramps to rest; when set points resume, it joins them smoothly.
 """
 
@@ -227,12 +227,12 @@ class Reference:
         self._begin_decay(now.position, now.velocity, tick)
 
     def _begin_decay(self, position: Array, velocity: Array, tick: int) -> None:
-        """Let the difference between a motion at `tick` and the curve decay smoothly.
+        """Blend a motion into the curve: let their difference at `tick` decay smoothly.
 
         Args:
-            position: (joints,), rad.
-            velocity: (joints,), rad/s.
-            tick: Tick of that motion.
+            position: Position of the motion at `tick`, (joints,), rad.
+            velocity: Velocity of the motion at `tick`, (joints,), rad/s.
+            tick: Tick at which the blend begins.
         """
         curve = self._curve.compute_motion((tick - self._from) * self._tick_s)
         fastest = JOINING_SPEED_PART * self.speed_scale * self._limits.velocity

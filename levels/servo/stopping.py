@@ -110,7 +110,7 @@ class Stopping:
 
     @property
     def is_retrying(self) -> bool:
-        """True while a motor is at fault, or has not yet proved to work again."""
+        """True while a motor is at fault, or has not worked long enough since its retry."""
         return self._retry_at is not None
 
     def register_motor_failure(self, joint: int, lacking: float, tick: int) -> Reaction:

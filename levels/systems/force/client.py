@@ -1,4 +1,4 @@
-"""A client of a server of force and motion, on the host side.
+"""A client of the force and motion server, for programs on a host board.
 
 It offers these calls in addition to the calls of `Motions`. Task frames and contacts have names in
 `[task]`, which is checked before the launch.
@@ -9,9 +9,9 @@ It offers these calls in addition to the calls of `Motions`. Task frames and con
     free()                         motion alone, without guards
     wrench(), mode()               wrench of the tool, N, N m, by axis; mode of the server
 
-A guard that ends a request is used up: `end_of(request)` is GUARDED. Calls that wait give the
-server its sign of life. A program that makes no call for longer than `silence` is lost to the
-server.
+A guard that has ended a request is removed; `end_of(request)` is then GUARDED. Calls that wait also
+send signs of life to the server. If a program makes no call for longer than `silence`, the server
+treats it as lost.
 """
 
 from __future__ import annotations
@@ -219,7 +219,7 @@ class ForceMotions(Motions):
         }
 
     def mode(self) -> Mode:
-        """Return the mode of the server."""
+        """Return the present mode of the server."""
         return Mode(self._status.mode)
 
     def where(self) -> list[float]:

@@ -51,7 +51,12 @@ class ComplianceWatch:
     """
 
     def __init__(self, most: tuple[float, float], every: int) -> None:
-        """Limit contacts to `most`, N and N m. A cycle takes `every` ticks."""
+        """Watch the contact of an arm.
+
+        Args:
+            most: Limits on a contact, N and N m.
+            every: Ticks from cycle to cycle.
+        """
         self._most = most
         self._oldest = MAX_WRENCH_AGE_CYCLES * every
         self.task: ForceTask | None = None
@@ -139,7 +144,7 @@ class ComplianceWatch:
             self.task = ForceTask(rotation, selected, wanted, exerted, compliance.speed)
 
     def _limit_wrench(self, wanted: Array) -> Array:
-        """Return the wanted wrench, reduced to the arm's limits on contacts."""
+        """Return the wanted wrench, reduced to the arm's limits. If reduced, set `reason`."""
         for (half, name, unit), limit in zip(HALVES, self._most, strict=True):
             size = norm(wanted[half])
             if size > limit:
@@ -152,7 +157,7 @@ class ComplianceWatch:
         return wanted
 
     def _check_guards(self, compliance: Compliance) -> None:
-        """End the motion if a guard is struck, once for each command."""
+        """End the motion if the wrench exceeds a guard, once for each command."""
         beyond: Mask = (compliance.guard > 0.0) & (np.abs(self.felt) > compliance.guard)
         if beyond.any() and self.struck != compliance.id:
             self.struck = compliance.id
@@ -287,7 +292,7 @@ class HybridExecutor(WristLevel):
             self._begin_at_rest(self._target, tick)
 
     def _write_status(self, status: JointStatus) -> None:
-        """Report the boards below as one, with this level's set points."""
+        """Report the boards below as one board, with the set points of this level."""
         values = [reading.message for reading in self.statuses.values()]
         status.position = values[0].position
         status.torque[:] = sum(v.torque for v in values)

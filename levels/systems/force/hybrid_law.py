@@ -143,7 +143,7 @@ class HybridLaw:
 
         Args:
             motion: Motion of the level above.
-            task: Axes of force, or None if all axes are of motion.
+            task: Axes of force, or None if all axes are axes of motion.
             passed_s: Time since the last cycle.
             payload: Payload at the tool.
         """

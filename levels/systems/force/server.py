@@ -1,4 +1,4 @@
-"""The executor of a server of force and motion.
+"""The executor of a force and motion server.
 
 It carries out the requests of a client: motions, as a trajectory level does, COMPLY and GUARD. When
 the client is lost, it brings the arm to a safe state.
@@ -118,7 +118,7 @@ class ServerWork(RequestWork):
         self.motion.ramp_to_rest()
 
     def end_compliance(self) -> None:
-        """End compliance and guards."""
+        """End compliance, remove all guards, and restart the motion if there was compliance."""
         complied = self.contact.is_compliant
         self.contact.release_axes()
         if complied:
@@ -200,7 +200,7 @@ class ServerWork(RequestWork):
             super()._start_at_rest(request)
 
     def _is_done(self, current: MotionRequest) -> bool:
-        """Return True if the current request is done. A COMPLY needs settled forces and rest."""
+        """Return True if the current request is done. COMPLY requires settled forces and rest."""
         if current.kind != MotionKind.COMPLY:
             return super()._is_done(current)
         return self.motion.is_settled and (
@@ -282,7 +282,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         for below in self.boards.values():
             if below.has_message:
                 self._sensed = below.message.position
-        # Use the newest status of the contact. A guard that was struck ends the present request.
+        # Use the force status that answers the present contact. A struck guard ends the request.
         status = self.force.message
         work = self._work
         answers = (
@@ -331,7 +331,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         return (self._now - tick) * self.context.tick_s
 
     def _write_server_status(self, status: ServerStatus) -> None:
-        """Fill the fields that a server's status has in addition to a trajectory level's."""
+        """Fill the fields of the status that a trajectory level's status does not have."""
         work = self._work
         force = work.force
         status.mode = self.mode

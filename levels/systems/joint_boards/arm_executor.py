@@ -219,7 +219,7 @@ class ArmExecutor(ArmDriver):
         return self.payload.mass > 0.0
 
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return how the arm follows the torques from above, for the status."""
+        """Return how the arm follows the torques from above. The status reports it."""
         is_held = self.orders.is_holding
         reason = self.stopping.reason or self._waiting
         if is_held and not reason:

@@ -144,7 +144,7 @@ class JointGateway(Executor):
 
 
 def deliver_arrived(link: Link, message: Message, tick: int) -> None:
-    """Copy the newest message that has arrived by `tick` to `message`, if any.
+    """Copy the newest message that has arrived by `tick`. Without one, `message` is unchanged.
 
     Args:
         link: Link, from which arrived messages are removed.
@@ -208,7 +208,7 @@ class NetworkGateway(JointGateway):
         self._follow_clock(peer.ahead)
         super().process(tick)
         if peer.presence != Presence.THERE or peer.uncertainty < 0.0:
-            # Its references could not be followed, so its motion must not begin.
+            # The references could not be followed, so the other rack must not begin to move.
             self.status.stopped = True
             self.status.reason = LOST if peer.presence == Presence.LOST else NOT_COMPARED
         elif self._refused:
@@ -237,11 +237,18 @@ class NetworkGateway(JointGateway):
             self._their_s += step_s if apart_s > 0.0 else -step_s
 
     def _take_reference(self, command: Reading[JointReference], tick: int) -> None:
-        """Pass a new reference on when the boards below need it, with due ticks of this rack."""
+        """Pass a new reference on when the boards below need it, with its due tick on this clock.
+
+        A reference that is due too far away is refused.
+
+        Args:
+            command: Newest reference and its verdict.
+            tick: Tick of the cycle.
+        """
         if command.is_new:
             arrived = self._arrived
             arrived.copy_from(command.message)
-            arrived.operator = 0  # serials of the other rack's operators have no meaning here
+            arrived.operator = 0  # serials of the other rack's operators are unknown here
             self._refused = ""
             if arrived.due:
                 due_s = arrived.due * self._tick_s - self._their_s

@@ -47,7 +47,7 @@ class JointLoads:
         self._computed_at = np.full(joints, np.nan)
 
     def find_misfit(self, command: JointReference) -> str:
-        """Return the first field of a reference that is beyond the arm's limits, or an empty text."""
+        """Return the first field of a reference that exceeds the arm's limits, or an empty text."""
         # Written so that NaN is rejected.
         within = {
             "position": (self._low <= command.position) & (command.position <= self._high),
@@ -76,7 +76,7 @@ class JointLoads:
         self._computed_at[:] = np.nan
 
     def compute_passed_part(self, tick: int) -> float:
-        """Return the part of the present interval that has passed, 0 to 1."""
+        """Return the part of the present interval between references that has passed, 0 to 1."""
         return 1.0 if tick >= self._due else (tick - self._begin) / (self._due - self._begin)
 
     def compute_at_rest(self, position: Array) -> None:
@@ -142,7 +142,7 @@ def servo_joints(
         damped = acceleration + damping[j] * (target_velocity - velocity)
         needed = inertia * (damped + stiffness[j] * (target - position)) + load
         needed += dry[j] * math.tanh(target_velocity / FRICTION_SPEED)
-        needed = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # NaN stays
+        needed = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # keeps NaN
         torque[j] = needed
         torque[joints + j] = target
         torque[2 * joints + j] = target_velocity

@@ -128,7 +128,7 @@ class JointServo(Executor):
         yield from find_misfits(context)
 
     def process(self, tick: int) -> None:
-        """Interpolate, and compute the torques that act from the next cycle on."""
+        """Run one cycle: compute the torques that act from the next cycle on."""
         arm = self.below.message
         if not self._met and not self._meet_arm(self.below.has_message, arm):
             return
@@ -150,7 +150,7 @@ class JointServo(Executor):
                 if operator.stands
                 else reference.compute_motion(tick)
             )
-        # Use inertia and load of the reference that is followed. Compute them if there is none.
+        # Use the inertia and the load of the reference that is followed, else compute them.
         if stopped or operator.stands or reference.holding:
             self.loads.compute_at_rest(arm.position)
         elif self._offered is not None:
@@ -246,7 +246,7 @@ class JointServo(Executor):
             self._rests_on = command.operator
             self._refused = ""
             if misfit := self.loads.find_misfit(command):
-                # Before the first set point all fields are zero, which is no mistake.
+                # Before the first set point all fields are zero, which is not an error.
                 if command.due:
                     self._refused = f"rejected: a reference whose {misfit} is out of range"
                 return
