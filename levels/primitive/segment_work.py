@@ -1,8 +1,8 @@
 """Execution of segments.
 
 Motion along a path starts when the path is planned and clear. It holds on command, and when the
-guard finds an obstacle. The segment is done when the arm has settled. A gripper segment is done when
-the gripper is at rest.
+guard finds an obstacle. The segment is done when the arm has settled. A gripper segment is done
+when the gripper is at rest.
 """
 
 from __future__ import annotations
