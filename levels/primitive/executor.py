@@ -157,10 +157,10 @@ class PrimitiveExecutor(Executor):
             work.restart_wait()
 
     def _carry_object(self, row: int, tick: int) -> None:
-        """Let the guard carry an object, as soon as a new scene shows it.
+        """Tell the guard which object the tool carries, once a new scene shows it.
 
         Args:
-            row: Row of the object, or -1 to carry nothing.
+            row: Row of the object, or -1 for none.
             tick: Tick of the cycle.
         """
         self._sight.carry_object(row, tick - SEEN_CYCLES * self.context.every)

@@ -204,10 +204,10 @@ class SceneWatch:
         self._waiting: tuple[int, int] | None = None
 
     def carry_object(self, row: int, since: int) -> None:
-        """Let the guard carry an object, with its pose in a new scene.
+        """Tell the guard which object the tool carries, once a new scene shows its pose.
 
         Args:
-            row: Row of the object, or -1 to carry nothing.
+            row: Row of the object, or -1 for none.
             since: Earliest tick at which the scene may have been sensed.
         """
         self._waiting = (row, since) if row >= 0 else None

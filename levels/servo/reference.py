@@ -103,7 +103,7 @@ class Reference:
             position: Sensed positions, (joints,), rad.
             velocity: Sensed velocities, (joints,), rad/s.
             tick: Tick of the sample.
-            tolerance_rad: Distance of a joint from the wanted motion from which it is too far.
+            tolerance_rad: Distance from the motion at which a joint counts as too far away.
         """
         now = self._evaluate_motion(tick)
         if np.max(np.abs(now.position - position)) < tolerance_rad:

@@ -113,7 +113,7 @@ class SensorMonitor:
         blamed: Joint at fault, its reading, rad, and its error, rad. If there are no samples: -1,
             the age of the newest sample in ticks, and 0.
         findings: New findings, one per alarm and episode. The reader clears the list.
-        missing: Why there were no usable samples last.
+        missing: Why samples were missing the last time.
     """
 
     def __init__(self, cell: Cell, params: ArmParams, tick_s: float, every: int) -> None:

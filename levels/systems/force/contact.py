@@ -100,7 +100,7 @@ class Contact:
         self.guard[:] = guard
 
     def clear_wrench(self) -> None:
-        """Set the wanted forces to zero. The axes of force remain so."""
+        """Set the wanted forces to zero without changing the axes of force."""
         self.id += 1
         self.wrench[:] = 0.0
 

@@ -62,10 +62,10 @@ class ServerParams(TrajectoryParams):
 
 
 class ServerWork(RequestWork):
-    """Carries out requests, also COMPLY and GUARD, and checks contacts; see `ServerRequest`.
+    """Carries out requests, including COMPLY and GUARD, and checks contacts.
 
-    When the set of axes of force changes, motion restarts from where the arm is: the boards below
-    come to rest and hold, and get into step again.
+    See `ServerRequest`. When present axes of force change or end, motion restarts from where the
+    arm is: the boards below come to rest and hold, and then get into step again.
     """
 
     boards: JointBoards
