@@ -39,9 +39,9 @@ class JointGateway(Executor):
     """Passes references to the boards below after a constant delay, and extrapolates missing ones.
 
     A reference that does not arrive in time is extrapolated from the newest one at its velocity.
-    After `missing` extrapolated references it passes none down, so the boards below ramp to rest and hold;
-    when references arrive again, these boards join them. To the level above, the boards below
-    appear as one.
+    After `missing` extrapolated references it passes none down, so the boards below ramp to rest
+    and hold; when references arrive again, these boards join them. To the level above, the boards
+    below appear as one.
 
     Attributes:
         latency: Ticks that are added to the due tick of a reference.
