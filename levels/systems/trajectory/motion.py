@@ -43,7 +43,7 @@ class SampledMotion:
     Position and velocity are continuous, and every joint stays within its limits.
 
     Attributes:
-        leg: Leg under way or completed. None if the arm is stopping, or has stopped elsewhere.
+        leg: Current or completed leg. None if the arm is stopping, or has stopped elsewhere.
         time_s: Time of the present sample, s.
     """
 
@@ -68,7 +68,7 @@ class SampledMotion:
         self.rest_at(rest)
 
     def rest_at(self, position: Array) -> None:
-        """Rest at joint positions, (joints,), rad, and drop the leg."""
+        """Rest at `position`, (joints,), in rad, without a leg."""
         self.leg = None
         self._ramp = None
         self._rest = np.array(position)
@@ -107,7 +107,7 @@ class SampledMotion:
 
     @property
     def leg_s(self) -> float:
-        """Time since the leg began, s."""
+        """Time, in s, since the leg began."""
         return self.time_s - self._leg_start_s
 
     @property
@@ -131,16 +131,17 @@ class SampledMotion:
         self._ramp_to_rest_from(self.state)
 
     def _ramp_to_rest_from(self, state: JointSetPoint) -> None:
+        """Drop the leg and ramp to rest from the sample `state`."""
         self._start_ramp_to_rest(state, STOP_ACCELERATION_FRACTION)
         self.leg = None
         self._evaluate_next_sample()
 
     def begin_leg(self, make: Callable[[Array], Leg], half_blend_s: float) -> None:
-        """Begin a leg while the motion so far slows down.
+        """Begin a leg while the previous motion slows down.
 
         Args:
-            make: Builds the leg from the joint positions at which the motion so far will end.
-            half_blend_s: Half the time in which the motion so far slows down, s.
+            make: Builds the leg from the joint positions at which the previous motion will end.
+            half_blend_s: Half the time in which the previous motion slows down, s.
 
         Raises:
             InfeasibleMotion: If `make` raises it. The arm is then ramping to rest.
@@ -160,7 +161,7 @@ class SampledMotion:
     def _start_ramp_to_rest(
         self, state: JointSetPoint, fraction: float, least_s: float = 0.0
     ) -> None:
-        """Let the present motion decay to rest.
+        """Start a ramp from the current motion to rest.
 
         Args:
             state: Sample from which the ramp starts.
@@ -173,12 +174,16 @@ class SampledMotion:
         self._rest = self._ramp.end
 
     def _evaluate_next_sample(self) -> None:
-        """Evaluate the next sample, again if the motion has changed."""
+        """Evaluate the next sample. Call this again after a change of the motion."""
         before, present, _ = self._samples
         self._samples = before, present, self._compute_position(self.time_s + self._period_s)
 
     def _compute_position(self, time_s: float) -> Array:
-        """Return the joint positions at `time_s`. Raises `InfeasibleMotion`."""
+        """Return the joint positions at `time_s`: the leg and the decaying previous motion.
+
+        Raises:
+            InfeasibleMotion: If the leg has no joint positions at that time.
+        """
         position = (
             self._rest
             if self.leg is None

@@ -51,7 +51,7 @@ def record_rack(
         config: Rack to run.
         seconds: Time of the run, s. None to run until a board ends it.
         folder: Folder of the run.
-        share: Whether to run even on cores that another rack holds.
+        share: Whether to run even on cores that another rack uses.
     """
     result = run_rack(config, seconds, folder, Display(), share=share)
     return RecordedRun(result, Recording(folder))
@@ -71,7 +71,7 @@ def add_commands(config: RackConfig, commands: Sequence[CommandConfig]) -> RackC
 
 
 def compute_lateness_us(recording: Recording, task: str) -> np.ndarray:
-    """Return how late each cycle started, us, shape (n,), without the start of the run.
+    """Return the lateness of each cycle, (n,), in us, without the start of the run.
 
     After skipped releases the lateness counts from the first skipped one, as for any program that
     oversleeps grid points.

@@ -20,7 +20,7 @@ MAX_CYCLES = 2000
 
 @dataclass(frozen=True)
 class WindowOptions:
-    """Window for which the user asks, ns. None for an end that is not given."""
+    """Window that the user asked for, in ns. None for a limit that is not given."""
 
     from_ns: int | None = None
     to_ns: int | None = None
@@ -28,7 +28,7 @@ class WindowOptions:
     def choose_window(
         self, task: TimedTask, extent_ns: int | None, start_ns: int, length_ns: int | None = None
     ) -> tuple[int, int]:
-        """Return the start and end of the window, ns.
+        """Return the start and the end of the window, in ns.
 
         Args:
             task: Task whose cycles count. The default window shows two of its plans.

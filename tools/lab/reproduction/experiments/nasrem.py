@@ -1,7 +1,7 @@
 """Experiments with NASREM.
 
-They are its whole task in real time with every equation applied to the run, the same messages in
-lockstep and in real time, losses and the times to recover from them, and moves by a promised time.
+They apply every equation to a run of its whole task in real time, compare messages in lockstep and
+in real time, measure the recovery from losses, and test moves that have a deadline.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ MAX_ATTEMPTS = 3
 HEIGHT_ABOVE_M = 0.12
 """Height of A above the place to which the rack's program takes its first object, m."""
 TOO_EARLY_FRACTION = 0.5
-"""Fraction of the time in soft time that is demanded first."""
+"""First deadline of GOTO A, as a fraction of the time that it takes without a deadline."""
 GOTO_S = 32.0
 
 
@@ -92,6 +92,7 @@ class NasremRun(TaskRun):
 
 
 def _measure_task(workshop: Workshop) -> NasremRun:
+    """Run the whole task in real time and apply every equation to the run."""
     result, recording = workshop.run(NAME, workshop.load_config(NAME))
     analysis = Analysis.from_recording(recording)
     failing = {pair.measured.key for pair in analysis.mostly if pair.measured and pair.is_failed}
@@ -173,6 +174,7 @@ DETERMINISM = Experiment(
 
 
 def _record_run(workshop: Workshop, label: str, mode: str) -> RecordedRun:
+    """Run and record the rack for `COMPARED_S` in a clock mode."""
     return workshop.run(label, workshop.load_config(NAME, [f"clock.mode={mode}"]), COMPARED_S)
 
 
@@ -235,14 +237,14 @@ class GotoRun:
 
 @dataclass(frozen=True)
 class GotoRuns:
-    """Runs of A by a time that is too early, and by one that can be met."""
+    """Runs of GOTO A with a deadline that is too early, and with one that can be met."""
 
     early: GotoRun
     met: GotoRun
 
 
 def _measure_goto(workshop: Workshop) -> GotoRuns:
-    """Run GOTO A in soft time, by a time that is too early, and by a possible time."""
+    """Run GOTO A without a deadline, with one that is too early, and with a possible one."""
     soft = _run_goto(workshop, "goto", None)
     if soft.done_s is None:
         raise Failure("goto without a time was not done")

@@ -22,6 +22,7 @@ class Storage:
 
     @cached_property
     def _file(self) -> IO[bytes]:
+        """The file, which is created at the first use."""
         return tempfile.TemporaryFile()
 
     def store_block(self) -> None:

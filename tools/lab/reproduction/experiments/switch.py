@@ -55,6 +55,7 @@ class SwitchRun:
 
 
 def _measure_and_compare(workshop: Workshop) -> SwitchRun:
+    """Measure the context switch, and return it with the time that the config assumes."""
     return SwitchRun(measure_switch(), 1e3 * workshop.load_config(NAME).timing.context_switch_ms)
 
 
@@ -161,7 +162,7 @@ def _run_planner(semaphore: Semaphore, shared: _Shared) -> None:
 
 
 def compute_switch_times_us(gaps: np.ndarray, awake: np.ndarray) -> Distribution:
-    """Return the time of a switch for the wake-ups that interrupted the planner, us.
+    """Return the switch times, in us, of the wake-ups that interrupted the planner.
 
     Args:
         gaps: Begin and end of the planner's longest gap at each wake-up, ns, shape (n, 2).
