@@ -75,7 +75,7 @@ class FigureLoop(Executor):
 
 
 class FigureExecutor(FigureLoop):
-    """Executor that also reports which plan is in use."""
+    """Executor that consumes the processor time X in every cycle and reports the plan in use."""
 
     plan = Input(FigurePlan, "own.plan")
 

@@ -78,7 +78,7 @@ class AnsweredCommand:
 
 @dataclass(frozen=True)
 class OperatorResponse:
-    """The response of a run.
+    """The response of a run to its operator commands.
 
     Attributes:
         tick_ms: Simulated time of a tick, ms.
@@ -122,7 +122,7 @@ class OperatorResponse:
     def mispredicted_commands(self) -> list[AnsweredCommand]:
         """Commands that took effect at another tick than predicted.
 
-        Only exact paths are compared.
+        Only paths with an exact prediction are compared.
         """
         exact = [c for c in self.measured_commands if self.paths[c.level].is_exact]
         return [command for command in exact if command.acts != command.predicted]

@@ -173,7 +173,7 @@ def _list_priorities(rack: JudgedConfig, board: str) -> Iterator[Settings]:
 def _find_changes_of_others(rack: JudgedConfig, board: str) -> Iterator[Change]:
     """Yield the cheapest change of each board that shares a core with this one.
 
-    It is another core, for the board or only for its loose planner, or a longer cycle.
+    The change is another core, for the board or only for its loose planner, or a longer cycle.
     """
     timing = rack.timing
     cores = timing.find_cores(board)
@@ -279,7 +279,10 @@ def _list_other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
 def _try_change(
     rack: JudgedConfig, board: str, settings: Settings, cures: str | None
 ) -> Change | None:
-    """Return the change of a board if it removes the failures of that board, or of `cures`."""
+    """Return the change of a board if it removes the failures of the board `cures`.
+
+    If `cures` is None, it must remove the failures of the changed board itself.
+    """
     change = rack.try_change(board, settings)
     return change if change is not None and change.after.cures_board(cures or board, rack) else None
 

@@ -49,8 +49,7 @@ class GraspExecutor(Executor):
     fingers keep their targets and forces in the meantime. A step that fails or is suspended for too
     long ends the program with an error, and the fingers stay as they are. With a planner above, the
     newest plan defines the posture before a CLOSE step, the target points of that step, and the
-    grip force after it. After a
-    restart the level continues from its own last messages.
+    grip force after it. After a restart the level continues from its own last messages.
     """
 
     fingers = Inputs(FingerStatus, "below.status")
@@ -195,6 +194,7 @@ class GraspExecutor(Executor):
 
     @staticmethod
     def _find_newest_plan(plans: Mapping[str, Reading[GraspPlan]]) -> GraspPlan:
+        """Return the plan with the highest id."""
         return max((reading.message for reading in plans.values()), key=lambda plan: plan.id)
 
     def _needs_plan(self) -> bool:

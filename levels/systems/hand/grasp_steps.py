@@ -120,7 +120,7 @@ class Grasp:
 
     @property
     def object_position(self) -> Array:
-        """Position of the object, (3,), m."""
+        """Position of the object, (3,), in m: as sensed, or its anchor if it is not sensed."""
         return self.anchor if self.object is None else self.object.position
 
     @property
@@ -172,7 +172,7 @@ class StepWork(ABC):
 
 
 def minimum_jerk(time: float) -> tuple[float, float]:
-    """Return position, 0 to 1, and rate of a minimum-jerk motion at `time`, 0 to 1.
+    """Return position, 0 to 1, and rate of a minimum-jerk motion that lasts from time 0 to 1.
 
     See Flash and Hogan, 1985.
     """
@@ -325,7 +325,8 @@ class GrippingWork(StepWork):
 class SqueezeWork(GrippingWork):
     """Raises the grip force.
 
-    The object settles between the fingers, and its anchor is its position at the end.
+    The object settles between the fingers. Its position at the end becomes its anchor, which is its
+    target position from then on.
     """
 
     step: SqueezeStep
@@ -396,7 +397,7 @@ class ReleaseWork(StepWork):
         self._out = grasp.grip.find_outward_directions(grasp.fingers.tip)
 
     def run(self, elapsed_s: float) -> bool:
-        """Reduce the forces, or withdraw the tips."""
+        """Reduce the forces in the first half of the time, and withdraw the tips in the second."""
         grasp = self.grasp
         target = grasp.target
         half = 0.5 * self.step.seconds

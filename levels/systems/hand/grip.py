@@ -95,6 +95,8 @@ class HandGrip:
     def follow_creep(self, points: Array, tips: Array) -> None:
         """Move the points of the springs towards the tips, all by the same displacement.
 
+        The load is adjusted so that the total force stays the same.
+
         Args:
             points: Points of the springs, (fingers, 3), m; modified in place.
             tips: Positions of the tips, (fingers, 3), m.

@@ -101,7 +101,7 @@ class FingertipLaw:
         self._tips = np.zeros((len(kinematics.joints), 3))  # (fingers, 3), m: sensed
 
     def start(self, position: Array) -> None:
-        """Set targets and posture to `position`, (joints,), rad."""
+        """Set targets and posture to `position`, (joints,), in rad."""
         self.wanted[:] = self._rest[:] = position
 
     def find_tips(self, position: Array) -> Array:
@@ -376,8 +376,8 @@ def set_tensions(
         numbers: Mean tension, N; lead; response of a valve in a cycle, 0 to 1; largest trim, N.
         shares: Responses of a valve and of the trim since the last sample, 0 to 1.
         constants: Lever arm, least and largest tension, and mask of the joints, (4, joints).
-        valves: Modelled tensions now and at the sample, and trim, (3, 2, joints), N;
-            modified in place.
+        valves: Modelled tensions now and at the sample, and trim, (3, 2, joints), N; modified in
+            place.
         sensed: Sensed, then commanded tensions, flexors first, (4 * joints,), N.
         torque: Torques, (joints,), N m.
         tension: Tensions, (2, joints), N; filled, with 0 for joints of other boards.

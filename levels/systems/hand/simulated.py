@@ -73,7 +73,7 @@ class SimulatedHand(Simulation):
         self._acts = acts if (acts >= 0).all() else None
 
     def _set_initial_tensions(self, tension: Array) -> None:
-        """Set controls, valve states and delay lines to steady tensions, (2, joints), N."""
+        """Set controls, valve states and delay lines to steady tensions, (2, joints), in N."""
         model = self.cell.model
         d = self._data
         for actuator, pull in zip(
@@ -156,7 +156,7 @@ class SimulatedHand(Simulation):
 
 
 def _find_carrying_tensions(cell: Cell, data: mujoco.MjData) -> Array:
-    """Return the tensions, (2, joints), N, that carry the hand's weight in its initial position."""
+    """Return the tensions, (2, joints), in N, that carry the hand's weight initially."""
     hand = cell.hand
     assert hand is not None, "it is a hand"
     turn = (data.qfrc_bias - data.qfrc_passive)[cell.dof] / (2.0 * hand.arms)

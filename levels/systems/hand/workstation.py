@@ -209,7 +209,7 @@ class GraspPlanner:
         return None
 
     def _has_contact(self, position: Array) -> bool:
-        """Return True if the hand touches anything, including itself, at joint positions."""
+        """Return True if the hand touches itself or another body at the given joint positions."""
         model = self._cell.model
         data = self._data
         data.qpos[self._cell.qpos] = position

@@ -223,7 +223,7 @@ class MoveTable(StateTableExecutor):
                 command.yaw = compute_yaw(self._world.quaternion[row])
         tool_now = self._ik.compute_tool_pose(command.joints)
         # The gripper must be aligned with the object's faces. Of the four possible turns, take the
-        # one nearest to the present orientation.
+        # one nearest to the current orientation.
         turns = [
             build_pointing_quaternion(DOWN, -(command.yaw + quarter * 0.5 * math.pi))
             for quarter in range(4)
@@ -234,7 +234,7 @@ class MoveTable(StateTableExecutor):
     def _solve_joints(self, goal: Pose) -> Array | None:
         """Return joint positions, in rad, that reach a pose, or None if none are found.
 
-        Positions near the arm's present configuration are preferred. At most three searches are
+        Positions near the arm's current configuration are preferred. At most three searches are
         made.
         """
         joints = self._ik.find_nearby(goal, self._command.joints)

@@ -29,7 +29,7 @@ class JointBoards:
     Attributes:
         in_step: Whether the boards follow this level's set points.
         position: Joint positions at which the boards hold the joints, (joints,), rad.
-        wait_reason: Reason for which a level out of step is waiting.
+        wait_reason: Why the level waits while the boards are out of step.
     """
 
     def __init__(
@@ -69,9 +69,9 @@ class JointBoards:
         return True
 
     def leave_step(self, reason: str) -> None:
-        """Mark the boards as out of step, for the reason `reason`.
+        """Mark the boards as out of step. `reason` becomes `wait_reason`.
 
-        The boards then bring the joints to rest. Motion later continues from those positions.
+        The boards then bring the joints to rest, and motion later continues from those positions.
         """
         self.in_step = False
         self.wait_reason = reason

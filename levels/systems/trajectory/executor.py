@@ -159,8 +159,8 @@ class TrajectoryExecutor(Executor):
         """
         current = self._agenda.current
         leg = self._motion.leg
-        # Friction changes the torques while the arm breaks away from rest. At half its speed this
-        # is long past.
+        # Friction changes the torques while the arm breaks away from rest. This has decayed once
+        # the arm has reached half its speed.
         is_steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
         if current is None or current.kind != MotionKind.POSE or not current.touch or not is_steady:
             self._guard.clear_window()

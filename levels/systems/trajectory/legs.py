@@ -67,7 +67,7 @@ class WorldView:
         self._model: WorldState | None = None
 
     def update_model(self, world: Reading[WorldState]) -> None:
-        """Take over the newest world model, if it has been sensed."""
+        """Store the newest world model, if it has been sensed."""
         if world.has_message and world.message.revision:
             self._model = world.message
 
@@ -246,7 +246,7 @@ class TimeLaw:
 def _compute_ramp_distance(time_s: float, half_s: float) -> float:
     """Return the distance covered `time_s` after the start of a smooth rise of speed.
 
-    The speed rises from 0 to 1 during twice `half_s`.
+    The speed rises from 0 to 1 within 2 * `half_s`.
     """
     h = time_s / (2.0 * half_s)
     return 2.0 * half_s * h * h * h * (1.0 - 0.5 * h)
@@ -382,7 +382,7 @@ def build_time_law(times: LegTimes, speed: Array, curvature: Array, limits: Limi
 
 
 class RampToRest:
-    """Independent ramp of every joint to rest.
+    """A ramp of every joint to rest, independent of the other joints.
 
     It starts with the given position, velocity and acceleration.
 

@@ -38,13 +38,13 @@ MAX_REST_RAD = 1e-7
 
 
 class SampledMotion:
-    """Begins, blends and stops legs.
+    """Begins, blends and stops legs, which are motions from rest to rest.
 
     Position and velocity are continuous, and every joint stays within its limits.
 
     Attributes:
         leg: Current or completed leg. None if the arm is stopping, or has stopped elsewhere.
-        time_s: Time of the present sample, s.
+        time_s: Time of the current sample, s.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class SampledMotion:
 
     @property
     def state(self) -> JointSetPoint:
-        """Position, velocity and acceleration of the present sample."""
+        """Position, velocity and acceleration of the current sample."""
         before, present, after = self._samples
         h = self._period_s
         return JointSetPoint(
@@ -119,7 +119,7 @@ class SampledMotion:
 
     @property
     def is_resting(self) -> bool:
-        """Whether the present sample is at rest."""
+        """Whether the current sample is at rest."""
         before, present, after = self._samples
         return bool(
             (np.abs(after - before) < MAX_REST_RAD).all()
@@ -127,7 +127,7 @@ class SampledMotion:
         )
 
     def ramp_to_rest(self) -> None:
-        """Ramp to rest from the present sample."""
+        """Ramp to rest from the current sample."""
         self._ramp_to_rest_from(self.state)
 
     def _ramp_to_rest_from(self, state: JointSetPoint) -> None:
@@ -197,7 +197,7 @@ class SampledMotion:
         )
 
     def _check_limits(self) -> None:
-        """Raise `InfeasibleMotion` if the present sample exceeds a limit.
+        """Raise `InfeasibleMotion` if the current sample exceeds a limit.
 
         This happens, for example, when a live goal is too fast for the arm.
         """

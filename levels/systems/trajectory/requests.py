@@ -73,12 +73,12 @@ class Agenda:
     """Accepted requests that have not ended, and the outcomes of the last ones that have.
 
     After an error all requests are dropped, and new ones are refused until a CANCEL. While a
-    request of the sequence is missing, later ones are ignored. The sender sees in `taken` where to
-    continue, or sends a CANCEL.
+    request of the sequence is missing, later ones are ignored. The sender continues after
+    `taken`, or sends a CANCEL.
 
     Attributes:
         held: Requests that have not ended, oldest first.
-        goal: Request at whose goal the arm is, or to which it moves. None if there is none.
+        goal: Request whose goal the arm has reached or is moving to. None if there is none.
         taken: Newest request taken.
         rests_on: Serial of the newest operator command on which a request depends.
         error: Error that stopped the requests.

@@ -47,7 +47,7 @@ class WakeGrid(NamedTuple):
 
 
 def find_missing_cyclictest() -> tuple[Absent, ...]:
-    """Return the reason why `cyclictest` cannot run, or an empty tuple if it can."""
+    """Return `cyclictest` as `Absent` if it cannot run here, or an empty tuple if it can."""
     if shutil.which(CYCLICTEST) is None:
         return (Absent(CYCLICTEST, f"no program '{CYCLICTEST}'", "apt-get install rt-tests"),)
     if not is_fifo_permitted():

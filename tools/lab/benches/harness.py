@@ -106,7 +106,7 @@ class Absent:
 
 
 def find_missing_package(who: str, module: str) -> tuple[Absent, ...]:
-    """Return a contestant whose Python module cannot be imported, or an empty tuple."""
+    """Return a contestant as `Absent` if its module cannot be imported, else an empty tuple."""
     try:
         import_module(module)
     except ImportError as error:

@@ -119,7 +119,7 @@ def measure_launch_s(rack: RackCommand, config: str, folder: Path, share: bool) 
 
 
 def make_brief_run(rack: RackCommand, config: str, out: Path, share: bool) -> Path:
-    """Make a run of which only the launch is used, and return its folder.
+    """Record a short run of which only the launch is used, and return its folder.
 
     Args:
         rack: Command to run.
@@ -163,7 +163,7 @@ def _measure_command_s(rack: RackCommand, arguments: tuple[object, ...]) -> floa
 
 
 def measure_kills(name: str, count: int, share: bool = True) -> list[Sample]:
-    """Kill the board that drives the arm repeatedly, at random phases of its cycle.
+    """Repeatedly kill the board that drives the arm, at random phases of its cycle.
 
     Args:
         name: Config of the rack, by name or path.
@@ -174,7 +174,7 @@ def measure_kills(name: str, count: int, share: bool = True) -> list[Sample]:
         Times to detection and to engaged brakes, ms.
 
     Raises:
-        Failure: If the rack has no arm, or no kill had a reaction.
+        Failure: If the rack has no arm, or did not react to any kill.
     """
     config = load(name, [f"name=bench-kill-{os.getpid()}", "supervision.restarts=10000"])
     if config.robot is None:

@@ -101,6 +101,9 @@ def change_rate(config: RackConfig, rate_hz: float) -> RackConfig:
 class RateFigures:
     """Results of all runs at one rate.
 
+    The rate is held if no run failed, and if neither the late wakes of the machine nor the further
+    missed cycles of the rack exceed `MAX_LATE_SHARE`.
+
     Attributes:
         rate_hz: The rate.
         cycles: Number of cycles of the rack's fastest board that were due.
@@ -321,9 +324,9 @@ def compare_idle_cores(samples: Sequence[Sample], who: str) -> str:
     """Return which value of `clock.idle_cores` suits this machine, with the figures.
 
     A wake-up is lost if it is late by a period or more. The setting with fewer lost wake-ups wins
-    if the difference exceeds two standard deviations of such a count. Otherwise the setting with
-    the smaller worst lateness wins, because the worst lateness is the first sign that a host takes
-    the core away.
+    if the difference exceeds two standard deviations of chance. Otherwise the setting with the
+    smaller worst lateness wins, because the worst lateness is the first sign that a host takes the
+    core away.
 
     Args:
         samples: Lateness of all contestants.

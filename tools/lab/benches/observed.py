@@ -58,7 +58,7 @@ def record_rack(
 
 
 def remove_run_end(config: RackConfig) -> RackConfig:
-    """Return a rack in which no board ends the run."""
+    """Return a config in which no board ends the run."""
     boards = {
         name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()
     }
@@ -66,7 +66,7 @@ def remove_run_end(config: RackConfig) -> RackConfig:
 
 
 def add_commands(config: RackConfig, commands: Sequence[CommandConfig]) -> RackConfig:
-    """Return a rack with additional operator commands, which follow the existing ones."""
+    """Return a config with additional operator commands, which follow the existing ones."""
     return config.model_copy(update={"command": (*config.command, *commands)})
 
 

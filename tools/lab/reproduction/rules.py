@@ -124,7 +124,7 @@ def judge_pipeline(chains: Chains) -> ClaimVerdict:
     early = sum(count for took, count in realtime_counts.items() if took < LEVELS)
     late = arrived - early - realtime_counts.get(LEVELS, 0)
     lockstep_off = sent - lockstep_counts.get(LEVELS, 0)
-    # Each level may miss a stray share of its cycles.
+    # Each level may miss a small share of its cycles.
     share = compare_value(
         "realtime_messages_late_share", late / max(arrived, 1), "<=", LEVELS * MAX_STRAY_SHARE
     )
@@ -283,7 +283,7 @@ def judge_waits(waits: Waits) -> ClaimVerdict:
 
 
 def judge_update(run: FigureRun) -> ClaimVerdict:
-    """Count the plan updates that were preempted, of those in which the executor was released."""
+    """Count the preempted plan updates among those during which the executor was released."""
     return rule_on_strays("updates_preempted", run.preempted, run.met)
 
 
@@ -343,7 +343,7 @@ def check_planning(process_ms: float) -> tuple[Check, Check]:
     The planner runs at least `MIN_PLAN_MS` in each cycle, and plans within the permitted cycles.
 
     Args:
-        process_ms: X, ms.
+        process_ms: X, the processor time of the executor in a cycle, ms.
     """
     config = load(FIG2.config, build_settings(FIG2.config, process_ms))
     level = build_rack_timing(config, resolve_layout(config)).build_level(LEVEL)
@@ -487,7 +487,7 @@ def judge_links(
     Args:
         rates_hz: Rate of each mailbox, Hz. 1 requires at least one message.
         run: Whole task of the system.
-        ideal: Further comparisons for the claim to hold. Without them it holds within bounds.
+        ideal: Further comparisons. If one fails, the claim holds only within bounds.
     """
     min_counts = {
         box: (1.0 - MAX_STRAY_SHARE) * rate_hz * run.lasted_s if rate_hz > 1 else 1

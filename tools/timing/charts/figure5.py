@@ -115,7 +115,7 @@ def place_levels(config: RackConfig) -> list[PlacedLevel]:
 
 
 def merge_levels(levels: Sequence[PlacedLevel]) -> list[PlacedLevel]:
-    """Merge levels at the same place in the figure, because boards per joint need only one line."""
+    """Merge levels at the same place in the figure, such as boards of joints, into one line."""
     return [PlacedLevel(**row) for row in merge_rows(map(vars, levels), "level")]
 
 

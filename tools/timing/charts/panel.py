@@ -35,8 +35,8 @@ class JobCount:
         Args:
             chart: Chart that contains the jobs.
             task: Task to count.
-            start_ns: Start of the time, ns.
-            end_ns: End of the time, ns, not included.
+            start_ns: Start of the interval, ns.
+            end_ns: End of the interval, ns, not included.
         """
         releases = [job.release_ns for job in chart.jobs if job.task == task]
         late = [job for job in chart.list_late_jobs(task) if start_ns <= job.release_ns < end_ns]

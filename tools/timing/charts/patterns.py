@@ -142,7 +142,7 @@ class PatternDetail:
 
     @classmethod
     def from_medians(cls, lane: Lane, median_ns: Mapping[Unit, int]) -> PatternDetail:
-        """Derive the limits for measured patterns from the medians, in ns, of a lane's units."""
+        """Derive the limits for measured patterns from the median times of the unit functions."""
         longest = round(MAX_REMNANT_CYCLE_FRACTION * lane.cycle_ns)
         short = {
             unit: min(longest, round(MAX_REMNANT_MEDIAN_FRACTION * median))

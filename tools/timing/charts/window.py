@@ -31,7 +31,7 @@ class WindowOptions:
         """Return the start and the end of the window, in ns.
 
         Args:
-            task: Task whose cycles count. The default window shows two of its plans.
+            task: Task whose cycles limit the window. The default window shows two of its plans.
             extent_ns: Length of the run, ns. None for a schedule, which has no end.
             start_ns: Default start, ns.
             length_ns: Default length, ns. None for two plans of the task.

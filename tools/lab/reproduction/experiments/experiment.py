@@ -215,7 +215,7 @@ def make_and_store(experiment: Experiment[Any], workshop: Workshop) -> StoredRes
     except RequirementMissing as reason:
         missing = str(reason)
     if INTERRUPT.number:
-        # After a signal the run has ended in order, but too early.
+        # A signal ends the run in good order, but too early for a result.
         INTERRUPT.end_process()
     took_s = round(time.monotonic() - start_s, 1)
     result = StoredResult(data, took_s, time.strftime("%Y-%m-%d %H:%M:%S"), missing, dependencies)

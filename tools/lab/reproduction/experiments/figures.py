@@ -62,7 +62,7 @@ class FigureRack:
 
     @property
     def experiment(self) -> Experiment[FigureRun]:
-        """Experiment that runs the figure by real processes."""
+        """Experiment that runs the figure with real processes."""
         return Experiment(
             self.label,
             f"{self.label} by real processes",
@@ -94,7 +94,7 @@ def build_settings(name: str, process_ms: float) -> tuple[str, ...]:
 
     Args:
         name: Name of the config.
-        process_ms: X, ms.
+        process_ms: X, the processor time of the executor in a cycle, ms.
     """
     board = load(name).board[LEVEL]
     assert board.budget is not None, "every figure has a budget"

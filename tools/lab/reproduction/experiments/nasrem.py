@@ -223,7 +223,7 @@ class GotoRun:
     """A run of GOTO A, GOTO B.
 
     Attributes:
-        by_s: Time by which A was demanded, s. None for soft time.
+        by_s: Deadline of A, s. None for no deadline.
         done_s: End of the cycle in which the task level reported A done, s. None if it never did.
         earliest_s: Earliest possible time that a refusal named, s. None without a refusal.
         moved: Whether the arm made a move.
@@ -249,7 +249,7 @@ def _measure_goto(workshop: Workshop) -> GotoRuns:
     if soft.done_s is None:
         raise Failure("goto without a time was not done")
     early = _run_goto(workshop, "goto-too-early", round(TOO_EARLY_FRACTION * soft.done_s, 2))
-    # Without a refusal, demand the time of the first run.
+    # Without a refusal, use the time of the first run as the deadline.
     by_s = ceil((early.earliest_s or soft.done_s) * 10) / 10
     return GotoRuns(early, _run_goto(workshop, "goto-by", by_s))
 
@@ -260,12 +260,12 @@ DEADLINE = Experiment("goto", "goto in soft time, and by a time", GOTO_S, GotoRu
 def _run_goto(workshop: Workshop, label: str, by_s: float | None) -> GotoRun:
     """Run GOTO A, GOTO B.
 
-    A is above the goal of the first object that the program moves. B is the start.
+    A is above the goal of the first object that the program moves. B is the start position.
 
     Args:
         workshop: Folder and settings of the run.
         label: Name of the recording.
-        by_s: Time by which A is demanded, s. None for soft time.
+        by_s: Deadline of A, s. None for no deadline.
     """
     x, y, z = next(action["to"] for action in load(NAME).task["action"] if "to" in action)
     by = "" if by_s is None else f", by = {by_s!r}"

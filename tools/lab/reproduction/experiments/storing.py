@@ -32,7 +32,7 @@ class Storage:
 
 
 class StoringPlanner(FigurePlanner):
-    """Planner that stores a block as each plan, in the background, where it can be preempted."""
+    """Planner that stores a block with each plan, in the background, where it can be preempted."""
 
     storage = Storage()
 
