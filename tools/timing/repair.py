@@ -277,31 +277,33 @@ def _list_other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
 
 
 def _try_change(
-    rack: JudgedConfig, board: str, settings: Settings, cures: str | None
+    rack: JudgedConfig, board: str, settings: Settings, target: str | None
 ) -> Change | None:
-    """Return the change of a board if it removes the failures of the board `cures`.
+    """Return the change of a board if it removes the failures of the board `target`.
 
-    If `cures` is None, it must remove the failures of the changed board itself.
+    If `target` is None, it must remove the failures of the changed board itself.
     """
     change = rack.try_change(board, settings)
-    return change if change is not None and change.after.cures_board(cures or board, rack) else None
+    return (
+        change if change is not None and change.after.cures_board(target or board, rack) else None
+    )
 
 
 def _try_each(
-    rack: JudgedConfig, board: str, tried: Iterable[Settings], cures: str | None = None
+    rack: JudgedConfig, board: str, tried: Iterable[Settings], target: str | None = None
 ) -> Change | None:
-    """Return the first change that works, trying all of them in order."""
+    """Return the first change that works, as `_try_change` decides."""
     return next(
-        (c for settings in tried if (c := _try_change(rack, board, settings, cures)) is not None),
+        (c for settings in tried if (c := _try_change(rack, board, settings, target)) is not None),
         None,
     )
 
 
 def _search_first(
-    rack: JudgedConfig, board: str, tried: Sequence[Settings], cures: str | None = None
+    rack: JudgedConfig, board: str, tried: Sequence[Settings], target: str | None = None
 ) -> Change | None:
-    """Return the first change that works; see `search_first`."""
-    return search_first(tried, lambda settings: _try_change(rack, board, settings, cures))
+    """Return the first change that works, as `_try_change` decides; see `search_first`."""
+    return search_first(tried, lambda settings: _try_change(rack, board, settings, target))
 
 
 def search_first(items: Sequence[T], attempt: Callable[[T], R | None]) -> R | None:

@@ -205,7 +205,7 @@ def compute_costs(
 def compute_parts(cycles: Cycles) -> dict[str, np.ndarray]:
     """Return the processor time of each part of the judged cycles, (n,), in us.
 
-    The first cycle is left out.
+    Cycles of the start-up and stalled cycles are not judged. The first cycle is left out.
     """
     rows = cycles.rows
     rest_ns = (rows["processor_ns"] - cycles.used_ns)[1:]
