@@ -13,8 +13,8 @@ rack needs the other names:
   (`MailboxSpec`, `TaskSpec`).
 - `open_writer` and `open_reader` open a mailbox under its protocol. `open_observer` never takes its
   lock.
-- `SystemClock` reads the clock, `Alarm` lists the kinds of alarms, and `Demand` is what the safety
-  functions demand of the arm.
+- `SystemClock` reads the clock, `Alarm` lists the kinds of alarms, and `Demand` lists the stops
+  that the safety functions can impose on the arm.
 - `BackplaneError` is the root of all errors of this package.
 
 Names are imported on first use, because importing numpy takes a tenth of a second, which commands

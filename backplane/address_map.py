@@ -41,7 +41,7 @@ ALARM_SIZE = CACHE_LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
 
 @dataclass(frozen=True)
 class Window:
-    """Part of the segment that belongs to one board, with its address and size in bytes."""
+    """Part of the segment that belongs to one board. Address and size are in bytes."""
 
     board: str
     address: int
@@ -52,7 +52,8 @@ class AddressMap:
     """Bus addresses of everything on one backplane.
 
     Attributes:
-        size: Total size in bytes, without the texts that follow in the segment.
+        size: Total size in bytes, without the texts (layout, config, published facts) that follow
+            it in the segment.
     """
 
     def __init__(self, layout: Layout) -> None:
@@ -80,13 +81,19 @@ class AddressMap:
         self.size = round_up_to_pages(self._end)
 
     def _reserve(self, size: int) -> int:
-        """Reserve `size` bytes in separate cache lines and return their address."""
+        """Reserve `size` bytes, starting on a new cache line, and return their address."""
         address = self._end
         self._end = _round_up(address + size, CACHE_LINE)
         return address
 
     def _end_window(self, board: str, writers: set[str], layout: Layout) -> None:
-        """Place the mailboxes of a board's tasks and pad its window to a whole page."""
+        """Add the mailboxes that a board writes, and end the board's window on a page boundary.
+
+        Args:
+            board: Board that owns the window.
+            writers: Names of the board's tasks.
+            layout: Layout of the backplane.
+        """
         for mailbox in layout.mailboxes:
             if mailbox.writer in writers:
                 self.mailboxes[mailbox.name] = self._reserve(compute_mailbox_size(mailbox))
@@ -96,7 +103,7 @@ class AddressMap:
 
 
 def round_up_to_pages(size: int) -> int:
-    """Return `size` bytes rounded up to whole pages."""
+    """Return a size in bytes, rounded up to whole pages."""
     return _round_up(size, PAGE)
 
 
@@ -116,11 +123,15 @@ def compute_mailbox_size(mailbox: MailboxSpec) -> int:
 
 
 def compute_oldest_kept(head: int, depth: int) -> int:
-    """Return the number of the oldest record in a ring that cannot be partly overwritten.
+    """Return the number of the oldest record in a ring that the writer cannot be overwriting.
 
-    The writer is at most one record ahead of its `head`. A concurrent reader copies a record first
-    and compares its number with the result for the current head afterwards. The copy of an older
-    record may be half overwritten and proves nothing.
+    The writer works at most one record ahead of `head`. A concurrent reader therefore copies a
+    record first, loads `head` afterwards, and discards the copy if the record's number is lower
+    than the result, because part of the copy may come from a newer record.
+
+    Args:
+        head: Number of records written.
+        depth: Number of records in the ring.
     """
     return head + 2 - depth
 

@@ -27,8 +27,8 @@ _KEYS = re.compile(r"[\w\-. \t]++")
 def load_toml(text: str) -> dict[str, Any]:
     """Parse TOML text into tables.
 
-    Only Python itself limits the depth of tables and lists and the length of integers.
-    `rack.boards.config.toml.parse` applies the limits of a config.
+    The limits of a config on nesting and on the size of integers are not applied here, but in
+    `rack.boards.config.toml.parse`.
 
     Raises:
         tomllib.TOMLDecodeError: The text is not TOML.

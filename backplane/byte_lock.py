@@ -35,7 +35,7 @@ class ByteLock:
         self._unlock = _pack_lock_request(fcntl.F_UNLCK, address)
 
     def reopen(self, fd: int) -> None:
-        """Switch to another segment, open as `fd`. The lock is not taken in the new segment."""
+        """Use the same byte of another segment, open as `fd`, without taking the lock there."""
         self._fd = os.open(f"/proc/self/fd/{fd}", os.O_RDWR | os.O_CLOEXEC)
 
     def take(self) -> bool:
@@ -58,7 +58,8 @@ class ByteLock:
     def close_file(self) -> None:
         """Close the descriptor until `reopen` is called.
 
-        If a parent process forked this one, the parent keeps the lock.
+        The lock is released unless another process, such as the parent of a fork, also has the file
+        description open.
         """
         if self._fd >= 0:
             os.close(self._fd)
@@ -67,9 +68,9 @@ class ByteLock:
 
 @contextmanager
 def hold_lock(fd: int, address: int) -> Iterator[None]:
-    """Hold a lock while an entry of a shared table is filled.
+    """Hold the lock on a byte inside a `with` block, for example to fill a shared table's entry.
 
-    A process that needs the lock at the same time spins until the entry is complete.
+    If another process holds the lock, the calling process spins until it is released.
     """
     lock = ByteLock(fd, address)
     try:
@@ -94,8 +95,8 @@ class ProcessLock(ByteLock):
 
 
 def _close_inherited() -> None:
-    # The parent keeps its lock, which belongs to the file description that both have open.
-    """Close the locks that a forked child must not keep."""
+    """Close the process locks in a forked child. The parent still holds them."""
+    # The kernel keeps a lock while any process has its file description open.
     for lock in [*_HELD]:
         lock.close()
 
@@ -116,12 +117,17 @@ def reopen_all(fd: int) -> None:
 
 
 def is_locked(fd: int, address: int) -> bool:
-    """Check whether the byte at a bus address is locked, without taking the lock."""
+    """Check whether any process holds the lock on a byte, without taking the lock.
+
+    Args:
+        fd: Descriptor of the segment.
+        address: Bus address of the byte.
+    """
     asked = _pack_lock_request(fcntl.F_RDLCK, address)
     kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, asked))[0]
     return kind != fcntl.F_UNLCK
 
 
 def _pack_lock_request(kind: int, address: int) -> bytes:
-    """Pack a `struct flock` that concerns one byte."""
+    """Pack a `struct flock` for one byte. `kind` is a lock type such as `fcntl.F_WRLCK`."""
     return _FLOCK.pack(kind, os.SEEK_SET, address, 1, 0)

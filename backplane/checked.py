@@ -29,7 +29,7 @@ def to_enum(kind: type[E], number: float) -> E:
 
 
 def to_integer(number: float) -> int:
-    """Convert a number to an integer.
+    """Convert a number to an integer, discarding its fraction.
 
     Raises:
         DamageError: The number is NaN or infinite.
@@ -40,10 +40,10 @@ def to_integer(number: float) -> int:
 
 
 def select_item(items: Sequence[T], index: int, noun: str) -> T:
-    """Return the item that an index from shared memory selects.
+    """Return `items[index]` for an index that was read from shared memory.
 
     Args:
-        items: The items.
+        items: Sequence to select from.
         index: Index read from shared memory.
         noun: Noun for an item in the error message, such as "mailbox".
 

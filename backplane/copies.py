@@ -44,7 +44,10 @@ LAUNCH_WORDS = (
 
 
 def copy_memory(segment: Segment) -> int:
-    """Copy the memory of an idle segment to an anonymous file, and return its descriptor."""
+    """Copy the memory of a segment to an anonymous file, and return the file's descriptor.
+
+    No process may write to the segment during the copy.
+    """
     fd = os.memfd_create("snapshot", os.MFD_CLOEXEC)
     written = 0
     while written < segment.map.size:
@@ -55,8 +58,8 @@ def copy_memory(segment: Segment) -> int:
 def restore_memory(segment: Segment, fd: int, tick: int) -> None:
     """Restore a copy into the segment of a rack that is being launched.
 
-    The rack continues before `tick`, and none of its tasks may have started yet. A recorder sees
-    only what this rack writes from now on.
+    Call this before any of the rack's tasks has started. Records and messages from before the copy
+    count as read, so a recorder gets only those that the new rack writes.
 
     Args:
         segment: Segment of the new rack.
@@ -77,7 +80,7 @@ def restore_memory(segment: Segment, fd: int, tick: int) -> None:
     for mailbox in segment.layout.mailboxes:
         box = segment.get_box(mailbox.name)
         box[Box.FIRST] = box[Box.HEAD]
-    # Posts that were not taken have no meaning between two ticks.
+    # A post that was pending at the time of the copy has no meaning between two ticks.
     segment.initialize_semaphores()
 
 
@@ -99,9 +102,9 @@ def detach_segment(segment: Segment) -> None:
 
 
 def switch_segment(segment: Segment, rack: str) -> None:
-    """Redirect the views of `segment` to the segment of another rack with the same layout.
+    """Make the views of `segment` show the segment of another rack with the same layout.
 
-    No lock is taken and no mailbox is claimed.
+    The caller must take its locks and claim its mailboxes again.
     """
     fd = os.open(get_shm_path(rack), os.O_RDWR)
     segment.rack = rack

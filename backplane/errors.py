@@ -3,9 +3,9 @@
 `BackplaneError` is the root. Catching it catches every error that this package raises on purpose.
 
 - `SegmentError`: a rack name that is in use, a segment of another layout or owner, a full /dev/shm.
-- `DamageError`: shared memory with a content that no process of the rack writes.
+- `DamageError`: values in shared memory that no correct process of the rack writes.
 - `MailboxError`: an unknown mailbox, a second writer, a message that does not fit its type.
-- `ClockError`: a rate that does not divide the clock, or is not a rate.
+- `ClockError`: a rate that is not positive or does not divide the clock's rate.
 - `FaultTableError`: more faults than one run can have.
 - `OperatorTableError`: more commands waiting for their ticks than the table holds.
 - `EmergencyStopError`: a reset of the emergency stop while an input is bad.
@@ -27,7 +27,7 @@ class RackInUseError(SegmentError):
 
 
 class DamageError(SegmentError):
-    """Raised if shared memory has a content that no process of the rack writes."""
+    """Raised if shared memory contains a value that no correct process of the rack writes."""
 
     def __init__(self, detail: str) -> None:
         super().__init__(f"the rack's shared memory is damaged: {detail}")
@@ -38,7 +38,7 @@ class MailboxError(BackplaneError):
 
 
 class ClockError(BackplaneError):
-    """Raised for a rate or a period that the system clock cannot keep."""
+    """Raised for a rate that is not the system clock's rate divided by a whole number."""
 
 
 class FaultTableError(BackplaneError):
@@ -46,7 +46,7 @@ class FaultTableError(BackplaneError):
 
 
 class OperatorTableError(BackplaneError):
-    """Raised if a command cannot be handed over."""
+    """Raised if an operator's command cannot be entered into the operator table."""
 
 
 class EmergencyStopError(BackplaneError):

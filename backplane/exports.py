@@ -15,13 +15,14 @@ def build_lazy_getattr(package: str, places: Mapping[str, Sequence[str]]) -> Cal
 
     Args:
         package: Name of the package, for error messages.
-        places: Exported names by the module that defines them.
+        places: For each module, the exported names that it defines.
     """
     module_of = {name: module for module, names in places.items() for name in names}
 
-    def exported(name: str) -> Any:
+    def import_name(name: str) -> Any:
+        """Import the module that defines an exported name, and return the object."""
         if name not in module_of:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         return getattr(import_module(module_of[name]), name)
 
-    return exported
+    return import_name

@@ -38,7 +38,8 @@ class Stage(IntEnum):
 class Injection:
     """Description of one fault before it is entered into the table.
 
-    See `FaultEntry` for the fields. `when` is a condition (mailbox index, field index, value).
+    The fields are those of `FaultEntry`. `when` is a condition: mailbox index, field index, and the
+    value that the field must have for the fault to begin.
     """
 
     kind: int
@@ -55,8 +56,9 @@ class Injection:
 class FaultEntry:
     """Entry of the fault table. `words` and `parameters` are views of shared memory.
 
-    Once the fault is waiting, the clock writes `stage`, `tick` and `until`. The process that
-    applies the fault writes the words from `struck_tick` on.
+    The process that injects the fault fills the entry. After that, the clock writes `stage`, `tick`
+    and `until`, and the process in which the fault acts writes `struck_tick` and the words after
+    it.
     """
 
     stage = Word(0)  # Stage
@@ -69,15 +71,15 @@ class FaultEntry:
     until = Word(5)  # first tick after the fault, known once it has begun
     # Duration, 0 for until the end of the run, or once, depending on the kind.
     ticks = Word(6)
-    phase = Word(7)  # part of its first tick after which it acts, in 1/1000
+    phase = Word(7)  # fraction of its first tick after which it acts, in 1/1000
     seed = Word(8)
     when_box = Word(9)  # condition: index of a mailbox, -1 for none
     when_field = Word(10)  # condition: index of a field of the mailbox
     when_value = Word(11)  # condition: number that the field must equal
-    struck_tick = Word(12)  # tick at which it first had any effect, -1 before
-    struck_ns = Word(13)  # CLOCK_MONOTONIC of that effect
-    count = Word(14)  # number of effects that a detector is required to notice
-    hidden = Word(15)  # ticks from `struck_tick` to the first effect that counts
+    struck_tick = Word(12)  # tick of its first action, -1 before
+    struck_ns = Word(13)  # time of that action on CLOCK_MONOTONIC
+    count = Word(14)  # number of actions that a detector is required to notice
+    hidden = Word(15)  # ticks from `struck_tick` to the first action that is counted
 
     def __init__(self, segment: Segment, index: int) -> None:
         address = segment.map.faults + index * FAULT_ENTRY_SIZE
@@ -86,12 +88,12 @@ class FaultEntry:
         self.parameters = segment.get_bytes(address + 8 * FAULT_WORDS, 8 * PARAMETERS).cast("d")
 
     def record_action(self, tick: int, must_be_found: bool = True) -> None:
-        """Record one action of the fault.
+        """Record that the fault has acted once, for example has damaged one message.
 
         Args:
             tick: Tick of the action. The first action also sets `struck_tick` and `struck_ns`.
             must_be_found: True if a detector is required to notice this action. Only such actions
-                are counted.
+                increase `count`.
         """
         if self.struck_tick < 0:
             self.struck_ns = monotonic_ns()
@@ -111,14 +113,16 @@ class FaultTable:
 
     @property
     def generation(self) -> int:
-        """Number that rises when a fault begins or ends.
+        """Counter that the clock increases whenever a fault begins or ends.
 
-        A task reads the table only when this number has changed.
+        Tasks read the table only when it has changed.
         """
         return self._words[System.FAULTS]
 
     def add_fault(self, injection: Injection) -> FaultEntry:
-        """Fill a free entry. The fault begins when the clock finds it due.
+        """Enter a fault into the table and return its entry.
+
+        The clock begins the fault once its tick has come and its condition holds.
 
         Raises:
             FaultTableError: The table is full.
@@ -136,20 +140,27 @@ class FaultTable:
             entry.struck_tick = -1
             for place, parameter in enumerate(injection.parameters):
                 entry.parameters[place] = parameter
-            # This is stored last, because from now on the clock may begin the fault.
+            # Store the stage last, because the clock may begin the fault from then on.
             entry.stage = Stage.WAITING
             self._words[System.INJECTED] += 1
         return entry
 
     def disarm_fault(self, entry: FaultEntry) -> None:
-        """Keep a waiting fault from beginning. `free_entry` may be called after the next tick."""
+        """Prevent a waiting fault from beginning.
+
+        Call `free_entry` after the next tick, when the clock is certain to have read the change.
+        """
         # The order matters: without a condition and with a tick in the past, the fault would begin
         # at once.
         entry.tick = NEVER
         entry.when_box = -1
 
     def free_entry(self, entry: FaultEntry) -> bool:
-        """Free the entry of a disarmed fault. Returns False if the clock has already begun it."""
+        """Free the entry of a disarmed fault.
+
+        Returns:
+            False if the fault had already begun. Its entry is then left as it is.
+        """
         if entry.stage != Stage.WAITING:
             return False
         entry.stage = Stage.FREE

@@ -11,7 +11,7 @@ from typing import Any
 
 
 def encode_json(document: Any, indent: int | None = None) -> str:
-    """Encode plain data as JSON, with null for every number that is not finite."""
+    """Encode plain data as JSON. NaN and infinite numbers become null."""
     try:
         return json.dumps(document, indent=indent, allow_nan=False)
     except ValueError:

@@ -1,8 +1,8 @@
 """Layout of a backplane: its mailboxes and tasks, as plain data.
 
-The Rack computes the layout from its config. The segment is arranged by it and contains it as text,
-so a tool that attaches by name knows every mailbox and every task without importing the config's
-classes.
+The Rack computes the layout from its config. The layout determines how the segment is divided, and
+the segment contains it as text, so a tool that attaches by name knows every mailbox and every task
+without importing the config's classes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TICK_PROTOCOLS: tuple[Protocol, ...] = ("time-slice", "queue", "interrupt")
 """Protocols under which messages become visible at ticks fixed in advance."""
 
 Role = Literal["executor", "planner", "host"]
-"""Kind of task. A "host" is a host board: it has no rate, and the clock does not release it."""
+"""Kind of task. "host" stands for a host board, which has no rate and is not released."""
 
 KIND_PATTERN = re.compile(r"[<>|]?[biufcSUV]\d+")
 """Pattern of numpy type strings that a field may have.
@@ -46,13 +46,13 @@ class TickGrid(NamedTuple):
 
 @dataclass(frozen=True)
 class ExchangeSpec:
-    """Rule of a config for how an executor reads a mailbox.
+    """Rule from a config for when an executor reads a mailbox.
 
     Attributes:
-        task: The executor.
+        task: Name of the executor.
         every: Period of its reads, in ticks.
         phase: Tick of its first read.
-        asynchronous: True if it reads the newest message as soon as that is complete, under any
+        asynchronous: True if it reads each message as soon as the message is complete, under any
             protocol.
     """
 
@@ -71,14 +71,15 @@ class ExchangeSpec:
 class InterruptSpec:
     """Sending and service times of a mailbox's messages under protocol interrupt.
 
-    Times refer to the clock of this rack.
+    All times are counted by the clock of this rack.
 
     Attributes:
-        sent_ns: Time from the release that writes a message until it is sent.
-        service_ns: Time for which an interrupt handler serves a message.
+        sent_ns: Time from the release of the writing cycle until its message is sent.
+        service_ns: Time that an interrupt handler takes to serve one message.
         depth: Maximum number of messages that wait for a handler.
-        due: Ticks after the release before which the message must be in memory.
-        ahead: Ticks between the writing release and the next multiple of the mailbox's period.
+        due: Number of ticks after the release within which the message must be in memory.
+        ahead: Number of ticks from the release of a writing cycle to the end of its period, which
+            is a tick of the mailbox's grid. This is the delay that time-slice would have.
         slots: Slots of the boards that a message interrupts.
     """
 
@@ -102,8 +103,9 @@ class FieldSpec:
         unit: Unit as text.
         meaning: Meaning of the value.
         fields: Fields of a group, which is a nested message.
-        values: Names in lower case and numbers of an enum.
-        length: Least and greatest length of a vector, or magnitude of a number.
+        values: Members of an enum, each as its name in lower case and its number.
+        length: Smallest and largest permitted norm of a vector, or magnitude of a number. None if
+            there is no such limit.
     """
 
     name: str
@@ -129,24 +131,24 @@ class MailboxSpec:
         name: Name of the mailbox.
         writer: Task that writes it.
         readers: Tasks that read it.
-        protocol: When its messages become visible.
-        every: Period of the messages. They become visible at multiples of it, counted from
-            `phase`.
-        delay: Ticks from a release until its message is visible; the least under protocol
-            interrupt.
+        protocol: Protocol, which determines when messages become visible.
+        every: Period of the messages. With `phase` it defines the mailbox's grid, the ticks at
+            which messages normally become visible.
+        delay: Ticks from the release of the writing cycle until its message is visible. Under
+            protocol interrupt, the smallest number of such ticks.
         depth: Number of slots, a power of two.
         message: Name of the message type.
         version: Version of the message type.
         size: Size of a message in bytes.
         fields: Fields of the message.
-        rests_on: Mailboxes on whose information its messages depend, without queues. Its writer
-            reads all of them.
+        rests_on: Mailboxes from whose content its messages are computed, except queues. Its
+            writer reads all of them.
         capacity: Maximum number of unread messages of a queue. 0 for other protocols.
         phase: First tick at which a message can become visible.
-        exchanges: Readers that do not simply read it in every cycle.
-        max_age: Age of the information from which readers treat the writer as lost, for a
-            mailbox written on demand. 0 for a mailbox written in every period.
-        interrupt: How messages are sent under protocol interrupt, otherwise None.
+        exchanges: Rules of the executors that read it at a different rate or asynchronously.
+        max_age: For a mailbox written on demand, age of its information in ticks beyond which
+            readers treat the writer as lost. 0 for a mailbox written in every period.
+        interrupt: Times of sending and service under protocol interrupt, otherwise None.
     """
 
     name: str
@@ -169,17 +171,20 @@ class MailboxSpec:
 
     @property
     def ahead(self) -> int:
-        """Ticks from the release of the writing cycle to the next multiple of the period."""
+        """Ticks by which the release of a writing cycle precedes a tick of the mailbox's grid.
+
+        A cycle writes the mailbox if its release tick plus this number is on the grid.
+        """
         return self.delay if self.interrupt is None else self.interrupt.ahead
 
     @property
     def is_by_ticks(self) -> bool:
-        """True if ticks alone decide when its messages become visible."""
+        """True if the tick at which a message becomes visible depends on ticks alone."""
         return self.protocol in TICK_PROTOCOLS
 
     @property
     def is_repeatable(self) -> bool:
-        """True if ticks alone decide which message each reader gets."""
+        """True if ticks alone determine which message each reader gets at each read."""
         return self.is_by_ticks and not any(exchange.asynchronous for exchange in self.exchanges)
 
 
@@ -195,9 +200,9 @@ class TaskSpec:
         core: Processor core to which the task is pinned.
         priority: SCHED_FIFO priority, 0 for ordinary scheduling.
         every: Period in ticks.
-        within_cycles: Number of cycles that one plan may take.
+        within_cycles: Number of cycles that one plan may take. 1 for an executor.
         depth: Number of records in its trace ring, a power of two.
-        wake: How it waits for its next cycle in real time.
+        wake: Method by which it waits for its next cycle in real time.
         phase: Tick of its first release.
         is_external: True for a host board that the rack does not start.
     """
@@ -222,21 +227,26 @@ class TaskSpec:
 
     @property
     def slice(self) -> int:
-        """Time for one cycle or one plan, in ticks."""
+        """Time slice of one cycle of an executor or one plan of a planner, in ticks."""
         return self.every * self.within_cycles
 
     def count_unfinished(self, done: int, tick: int) -> int:
-        """Count the releases after `done` that should have been finished by `tick`."""
+        """Return the number of releases that should have been finished by `tick` but were not.
+
+        Args:
+            done: Newest release that was finished, -1 before the first.
+            tick: Current tick.
+        """
         return max(0, (tick - self.slice - self.grid.find_tick(done + 1)) // self.every + 1)
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Everything on one backplane.
+    """Description of everything on one backplane.
 
     Attributes:
         rack: Name of the rack.
-        clock_ns: Period of the system clock.
+        clock_ns: Length of a tick of the system clock.
         tasks: Tasks that the clock releases.
         mailboxes: All mailboxes.
         hosts: Host boards, which the clock does not release.
@@ -255,14 +265,15 @@ class Layout:
 
     @property
     def timed(self) -> tuple[MailboxSpec, ...]:
-        """Mailboxes that tasks and the clock write at ticks."""
+        """Mailboxes written by tasks and by the clock. Host boards write theirs at any time."""
         hosts = {host.name for host in self.hosts}
         return tuple(mailbox for mailbox in self.mailboxes if mailbox.writer not in hosts)
 
     def find_pacers(self, host: TaskSpec) -> set[str]:
-        """Return the bus adapters that pace a host board's program in lockstep.
+        """Return the bus adapters that share a mailbox with a host board.
 
-        The set is empty for an external host board.
+        In lockstep their cycles determine when the host board's program runs. The set is empty for
+        an external host board, which runs at its own speed.
         """
         return {
             task.name
@@ -296,7 +307,10 @@ class Layout:
         return {t.name: t for t in self.processes}[name]
 
     def compute_due_ticks(self, task: TaskSpec) -> int:
-        """Return the ticks from a release until the task's first message is required."""
+        """Return the number of ticks after a release within which a task must write.
+
+        This is its period, or less if one of its messages must be sent earlier by interrupt.
+        """
         sent = [
             m.interrupt.due
             for m in self.mailboxes
@@ -305,17 +319,14 @@ class Layout:
         return min([task.every, *sent])
 
     def list_interrupting_mailboxes(self, slot: int) -> list[MailboxSpec]:
-        """Return the mailboxes that interrupt the board in a slot.
-
-        They are ordered by the slot of their sender.
-        """
+        """Return the mailboxes that interrupt the board in a slot, by the slot of their writer."""
         mailboxes = [
             m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots
         ]
         return sorted(mailboxes, key=lambda mailbox: self.find_task(mailbox.writer).slot)
 
     def find_interrupt_task(self, slot: int) -> str:
-        """Return the task that serves the interrupts of the board in a slot, its first task.
+        """Return the task that serves a board's interrupts: the first task in the board's slot.
 
         Raises:
             StopIteration: There is no task in this slot.
@@ -323,7 +334,9 @@ class Layout:
         return next(task.name for task in self.tasks if task.slot == slot)
 
     def find_read_grid(self, mailbox: MailboxSpec, reader: str) -> TickGrid:
-        """Return the ticks at which a task reads a mailbox. A planner reads at its releases.
+        """Return the ticks at which a task reads a mailbox.
+
+        These are its releases, unless the mailbox has an exchange rule for the task.
 
         Raises:
             KeyError: There is no such task.
@@ -333,18 +346,18 @@ class Layout:
 
 
 SPARE_SLOTS = 2
-"""Slots of a host board's mailbox in addition to the messages that may wait.
+"""Number of slots of a host board's mailbox in addition to those for waiting messages.
 
-One is being written, and one is being copied by the bus adapter.
+One is for the message being written, and one for the message that the bus adapter is copying.
 """
 
 
 def compute_depth(span_ticks: int, every: int) -> int:
-    """Return the number of slots that hold the messages of `span_ticks` ticks.
+    """Return the number of slots that a mailbox needs to hold the messages of a time span.
 
     Args:
-        span_ticks: Length of the time span.
-        every: Period of the writer, in ticks.
+        span_ticks: Length of the time span, in ticks.
+        every: Period of the messages, in ticks.
 
     Returns:
         A power of two, at least 4.

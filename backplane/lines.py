@@ -25,7 +25,7 @@ class UtilityLines:
 
     @property
     def sysfail(self) -> list[int]:
-        """Slots that assert SYSFAIL."""
+        """Slots for which SYSFAIL is asserted."""
         return [slot for slot in self._slots if self._words[System.SYSFAIL + slot]]
 
     @property
@@ -45,7 +45,7 @@ class UtilityLines:
 
     @property
     def reset_obstacles(self) -> list[str]:
-        """Reasons why the latch must not be reset: asserted utility lines and lost boards."""
+        """Reasons why the emergency stop must not be reset: asserted lines and lost boards."""
         reasons = [f"SYSFAIL of slot {slot}" for slot in self.sysfail]
         reasons += ["ACFAIL"] if self.acfail else []
         return reasons + [
@@ -53,15 +53,15 @@ class UtilityLines:
         ]
 
     def latch_emergency_stop(self) -> None:
-        """Set the latch. The arm brakes and stays braked until the latch is reset."""
+        """Set the emergency-stop latch. The arm brakes until `reset_emergency_stop` clears it."""
         self._words[System.EMERGENCY_STOP] = 1
 
     def reset_emergency_stop(self) -> None:
         """Clear the emergency-stop latch.
 
         Raises:
-            EmergencyStopError: An input is bad, so the latch stays set. The error lists all bad
-                inputs.
+            EmergencyStopError: There are `reset_obstacles`, which the error lists. The latch stays
+                set.
         """
         if bad := self.reset_obstacles:
             raise EmergencyStopError(f"the emergency stop stays latched: {', '.join(bad)}")

@@ -5,10 +5,10 @@ page copies it, the first access to each page of the segment or of a library map
 library returns freed memory to the kernel only to request it again. That is a page fault in every
 second cycle for the first seconds, and in rare code paths at any later time.
 
-`mlockall` without MCL_ONFAULT would do it in one call, but it also fills memory that was reserved
-and never used, twice what a board needs, and later mappings at once. So pages are locked as they
-are touched. This module touches them by kind: memory of the process where it is in use, files where
-the crate has used them, and the whole segment.
+`mlockall` without MCL_ONFAULT would do all this in one call, but it would also fill memory that is
+reserved and never used, which is twice the memory that a board needs. So pages are locked when they
+are first touched. This module touches the pages of the process that are in use, the pages of files
+that the crate has used, and the whole segment.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ _libc.madvise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 _MCL_CURRENT = 1
 _MCL_FUTURE = 2
 _MCL_ONFAULT = 4
-# MADV_*, since Linux 5.14; without them pages are touched by the first cycles.
+# MADV_* flags since Linux 5.14. On older kernels the first cycles touch the pages.
 _POPULATE_READ = 22
 _POPULATE_WRITE = 23
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_MAX = -4
 HEAP_RESERVE = 4 << 20
-"""Heap kept in addition to the heap in use, in bytes."""
+"""Free heap that the C library holds in reserve, in bytes."""
 MAX_GAP_PAGES = 16
-"""Number of unused pages between used ones that are touched too.
+"""Longest gap of unused pages that is touched together with the used pages around it.
 
-One call takes as long as touching some pages.
+A separate call for each stretch would take longer.
 """
 _USER_END = 1 << 63
 """First address of the kernel, which owns mappings such as [vsyscall]."""
@@ -46,10 +46,10 @@ _PRESENT = 63
 
 
 def hold_memory(lockstep: bool = False) -> None:
-    """Disable the garbage collector, and lock present and future memory as it is touched.
+    """Disable the garbage collector, and have the kernel lock each page when it is touched.
 
-    In lockstep nothing is locked. Locking takes a sixth of a launch, and a page fault has no effect
-    on the result.
+    In lockstep no memory is locked: locking takes a sixth of the launch time, and page faults do
+    not affect the result.
     """
     if not lockstep:
         _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT)
@@ -58,13 +58,14 @@ def hold_memory(lockstep: bool = False) -> None:
 
 
 _FILES: list[tuple[int, int]] = []
-"""First and last address of every stretch of a library that the crate has used."""
+"""Start and end addresses of the parts of mapped files that the crate has used."""
 
 
 def note_used_files() -> None:
-    """Record the pages of files that this process uses, for `touch_memory` in its forks.
+    """Record which pages of mapped files this process has in memory.
 
-    A fork does not inherit the mapping of these pages.
+    A fork does not inherit the page table entries of mapped files, so `touch_memory` uses this
+    record to map the pages again in a forked board.
     """
     _FILES[:] = [
         stretch
@@ -75,7 +76,7 @@ def note_used_files() -> None:
 
 
 def touch_memory() -> None:
-    """Touch every page that a cycle may need, and let the C library keep its memory.
+    """Touch every page that a cycle may need, and stop the C library from returning memory.
 
     This takes about a tenth of a second, mostly to copy pages that are shared with the crate.
     """
@@ -85,7 +86,7 @@ def touch_memory() -> None:
     del reserve
     for span, rights, stretches in _iterate_mappings():
         if rights == "rw-s":
-            stretches = [span]  # the segment: all of it
+            stretches = [span]  # all of the segment
         elif rights[1] != "w":
             continue
         for first, last in stretches:
@@ -95,7 +96,7 @@ def touch_memory() -> None:
 
 
 def _iterate_mappings() -> Iterator[tuple[tuple[int, int], str, list[tuple[int, int]]]]:
-    """Yield span, access rights and resident stretches of every readable mapping."""
+    """Yield address range, access rights and resident ranges of every readable mapping."""
     with Path("/proc/self/pagemap").open("rb", buffering=0) as pagemap:
         for line in Path("/proc/self/maps").read_text().splitlines():
             addresses, rights, *_ = line.split(maxsplit=2)
@@ -105,7 +106,13 @@ def _iterate_mappings() -> Iterator[tuple[tuple[int, int], str, list[tuple[int, 
 
 
 def _iterate_resident(pagemap: int, start: int, end: int) -> Iterator[tuple[int, int]]:
-    """Yield the resident stretches of a mapping as pairs of addresses."""
+    """Yield start and end address of each part of a mapping that is in memory.
+
+    Args:
+        pagemap: Descriptor of /proc/self/pagemap.
+        start: First address of the mapping.
+        end: First address after the mapping.
+    """
     page = mmap.PAGESIZE
     entries = np.frombuffer(os.pread(pagemap, (end - start) // page * 8, start // page * 8), "u8")
     pages = np.flatnonzero(entries >> _PRESENT)

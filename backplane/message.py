@@ -53,7 +53,7 @@ class State(IntEnum):
     EXECUTING = 1
     DONE = 2
     ERROR = 3
-    HOLDING = 4  # has work but must wait; `reason` says for what, and what ends the wait
+    HOLDING = 4  # has work but must wait; `reason` states for what, and what ends the wait
 
 
 def field(
@@ -68,16 +68,17 @@ def field(
     """Declare a field of a message class.
 
     Args:
-        kind: numpy type, if it is not the default of the annotation (`f8` for a float or an
-            array, `i8` for an int, `u1` for a bool or an `IntEnum`, `S120` for a str). A
-            message class declares a group of fields or, with a shape, an array of groups.
+        kind: numpy type. By default it follows from the annotation: `f8` for a float or an array,
+            `i8` for an int, `u1` for a bool or an `IntEnum`, `S120` for a str. If `kind` is a
+            message class, the field is a group with the fields of that class or, with a shape, an
+            array of such groups.
         doc: Meaning of the value.
-        unit: Unit, "1" for a pure number, an `IntEnum` for an array of names. Not given for a
-            bool, a str, an enum or a group.
-        shape: Shape of an array, of integers and symbolic sizes ("joints").
-        length: Least and greatest length of a vector, or magnitude of a number, that is
-            accepted from another rack.
-        default: Value in the first message that a level writes. None for all bytes 0.
+        unit: Unit, "1" for a pure number. For an array of enum values, the `IntEnum`. Omit it for
+            a bool, a str, an enum or a group.
+        shape: Shape of an array: integers and symbolic sizes such as "joints".
+        length: Smallest and largest norm of a vector, or magnitude of a number, that is accepted
+            from another rack.
+        default: Value in the first message that a level writes. None sets all bytes to 0.
     """
     sizes = shape if isinstance(shape, tuple) else (shape,)
     stored = kind if isinstance(kind, str) else kind.message_type
@@ -85,7 +86,12 @@ def field(
 
 
 def _complete_field(declared: Field, name: str, hint: Any) -> Field:
-    """Complete a declared field with its name and its annotation.
+    """Add the name of a declared field, and the type and unit that follow from its annotation.
+
+    Args:
+        declared: Result of `field`.
+        name: Name of the field.
+        hint: Annotation of the field.
 
     Raises:
         ValueError: The type, shape, unit or default does not suit the annotation.
@@ -110,13 +116,14 @@ def _complete_field(declared: Field, name: str, hint: Any) -> Field:
 
 
 def make_message(name: str, version: int, base: type[B], fields: Mapping[str, Any]) -> type[B]:
-    """Create a message class whose fields a config defines.
+    """Create a message class whose fields are known only at run time, such as from a config.
 
     Args:
         name: Name of the message.
         version: Version of the message.
         base: Class whose fields come first.
-        fields: Results of `field` by name, for integers and groups.
+        fields: Fields to add after those of `base`, by name. Each value is what `field` returned,
+            for an integer or a group.
     """
     body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
     message_class: Any = type(name, (base,), body, version=version, message=name)
@@ -124,12 +131,12 @@ def make_message(name: str, version: int, base: type[B], fields: Mapping[str, An
 
 
 class Message:
-    """Local copy of one message, into which a mailbox reads or from which it writes.
+    """Local copy of one message: a reader fills it from its mailbox, a writer publishes it.
 
     Array fields are numpy views of `record`. Fill them in place (`m.position[:] = q`) or assign to
     them (`m.position = q`). Scalars are read and assigned as plain values, texts as `str` (see
-    `decode_text`). A number that an enum does not name is read as a plain `int`, so no reader fails
-    because another board, or another version of a rack, sent it.
+    `decode_text`). A number for which an enum has no member is read as a plain `int`, so a reader
+    does not fail because another board, or another version of a rack, sent it.
 
     Attributes:
         raw: Bytes of the message.
@@ -217,7 +224,7 @@ class Message:
             raise AttributeError(self._describe_unknown_field(name))
 
     def _describe_unknown_field(self, name: str) -> str:
-        """Describe an access to an unknown field, with the nearest field name."""
+        """Return the error text for an unknown field, which suggests the most similar name."""
         names = self.record.dtype.names or ()
         near = get_close_matches(name, names, 1)
         hint = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(names)}"
@@ -247,10 +254,10 @@ def decode_text(content: bytes | bytearray) -> str:
 
 
 def escape_text(text: str) -> str:
-    """Return a text with control characters as escapes.
+    """Replace control characters in a text by printable escape sequences.
 
-    Texts come from other racks and from users' levels and end up on terminals, which would execute
-    an escape sequence.
+    Texts from other racks and from users' levels are printed on terminals, which would execute the
+    control sequences in them.
     """
     if text.isprintable():
         return text
@@ -258,7 +265,7 @@ def escape_text(text: str) -> str:
 
 
 def get_reason(status: Message) -> str:
-    """Return the reason in a level's status. Empty if a user's status has no such field."""
+    """Return the `reason` of a status. Empty if a user-defined status has no such field."""
     return str(getattr(status, "reason", ""))
 
 
@@ -266,8 +273,9 @@ def format_state(state: int | None, otherwise: str = "") -> str:
     """Return the name of a level's state in lower case.
 
     Args:
-        state: Number of the state.
-        otherwise: Result for a state that `State` does not define. Empty for the number itself.
+        state: Number of the state. None, if there is no state, counts as undefined.
+        otherwise: Result for a state that `State` does not define. If it is empty, the result is
+            `state` itself as text.
     """
     return State(state).name.lower() if state in set(State) else otherwise or str(state)
 
@@ -280,7 +288,7 @@ def copy_message(message: B) -> B:
 
 
 def fill_counts(record: Any, counts: Iterable[float]) -> None:
-    """Fill the fields of a record with counts.
+    """Assign counts to the fields of a record, in order.
 
     A count that is too large for an integer field is stored as the largest value of the field.
     """
@@ -298,7 +306,12 @@ def _find_maximum(kind: np.dtype) -> float:
 
 @cache
 def _build_class(cls: type[B], dtype: np.dtype) -> type[B]:
-    """Return a subclass of a message class with a property for each scalar of this dtype."""
+    """Build a subclass of a message class that has a property for each scalar field.
+
+    Args:
+        cls: Message class.
+        dtype: dtype of its messages, with all sizes known.
+    """
     declared = {field.name: field for field in cls.message_type.fields}
     columns = {name: dtype[name] for name in dtype.names or ()}
     body = {
@@ -313,7 +326,7 @@ def _build_class(cls: type[B], dtype: np.dtype) -> type[B]:
 
 
 def _build_scalar_property(name: str, dtype: np.dtype, declared: Field | None) -> property:
-    """Build the property that reads a scalar field as a plain Python value."""
+    """Build a property that returns a scalar field as a `str`, `bool`, enum member or number."""
     if dtype.kind == "S":
         return property(lambda self: decode_text(self._views[name].item()))
     if declared is not None and declared.python is bool:
@@ -330,7 +343,7 @@ def _format_hint(hint: Any) -> str:
 
 
 def _can_store(kind: str, value: Any) -> bool:
-    """Check whether a numpy type stores a value without changing it."""
+    """Check whether a numpy type can store a value. Rounding of a float is permitted."""
     try:
         stored = np.array(value, kind)
     except (OverflowError, TypeError, ValueError):

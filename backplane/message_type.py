@@ -23,14 +23,14 @@ class Field:
     Attributes:
         name: Name of the field.
         kind: numpy type string or, for a group of fields, the type of the group.
-        unit: Unit as text or, for numbers that stand for names, the enum.
+        unit: Unit as text. For an enum, the enum class.
         meaning: Meaning of the value.
         shape: Integers and symbolic sizes, () for a scalar.
-        length: Least and greatest length of a vector along its last axis, or magnitude of a
-            number.
+        length: Smallest and largest permitted norm of a vector along its last axis, or magnitude
+            of a number. None if there is no such limit.
         python: `bool`, `int`, `float`, `str`, `IntEnum` or `np.ndarray`. `object` for a group
-            or a field made at run time.
-        default: Value in the first message that a level writes. None for all bytes 0.
+            of fields.
+        default: Value in the first message that a level writes. None sets all bytes to 0.
     """
 
     name: str
@@ -52,23 +52,22 @@ class MessageType:
     fields: tuple[Field, ...]
 
     def build_dtype(self, sizes: Mapping[str, int]) -> np.dtype:
-        """Return the numpy dtype with every symbolic size filled in.
+        """Return the numpy dtype of the message, with symbolic sizes replaced by numbers.
 
-        Padding is explicit in numpy's aligned layout, zeroed at creation and never written, so
-        equal messages have equal bytes.
+        Equal messages have equal bytes, because padding is zeroed at creation and never written.
 
         Args:
             sizes: Symbolic sizes by name.
 
         Raises:
-            MailboxError: `sizes` lacks a size.
+            MailboxError: `sizes` does not contain a size that a field uses.
         """
         return np.dtype([self._build_column(f, sizes) for f in self.fields], align=True)
 
     def _build_column(
         self, field: Field, sizes: Mapping[str, int]
     ) -> tuple[str, Any, tuple[int, ...]]:
-        """Return the entry of the numpy dtype for one field: name, type and shape."""
+        """Return name, numpy type and shape of one field, with symbolic sizes replaced."""
         kind = (
             field.kind.build_dtype(sizes)
             if isinstance(field.kind, MessageType)

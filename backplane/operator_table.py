@@ -1,14 +1,15 @@
 """Table of commands from outside the rack, in the system controller's shared-memory window.
 
-Any process may add a request at any time. Only the clock issues it, at the beginning of a tick: it
-publishes the message in the level's mailbox, of which it is the only writer. All tasks of a tick
-therefore see the same commands, and a lockstep run repeats with the same commands. This module
-treats a command as the bytes of a message; `levels` defines the meaning.
+Any process may add a request for a command at any time. Only the clock issues commands, at the
+beginning of a tick: it publishes the message in the level's mailbox, of which it is the only
+writer. All tasks of a tick therefore see the same commands, and a lockstep run repeats with the
+same commands. This module treats a command as the bytes of a message; `levels` defines the meaning.
 
-A request belongs to the run or to a client that waits for it. A client's request is withdrawn when
-the client's process ends, even if it is killed. To show that it is alive, the client holds a kernel
-lock, which the clock can check in a microsecond. Under a lease the client keeps the lock after its
-command was issued, and the clock notices if the client ends or is no longer `heard`.
+A request belongs either to the run or to a client, the process that added it and waits for it. A
+client's request is dropped when the client's process ends, even if it is killed. To show that it is
+alive, the client holds a kernel lock, which the clock can check in a microsecond. A client may also
+ask for a lease: it then holds the lock after its command was issued and sends heartbeats, and if
+either stops, the clock makes the level hold.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ class Client(IntEnum):
     """Values of `RequestEntry.client`."""
 
     NONE = 0  # the request belongs to the run
-    WAITS = 1  # issued only while its client lives
-    LEASES = 2  # the same, and in force only while its client lives
+    WAITS = 1  # issued only if its client is alive
+    LEASES = 2  # the same; afterwards the level holds when the client ends or falls silent
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,8 @@ class Request:
 class RequestEntry:
     """Entry of the operator table. `words` and `message` are views of shared memory.
 
-    The host fills a free entry. After that the clock writes `stage`, `serial` and `given_tick`.
+    The process that adds a request fills the entry. After that, the clock writes `stage`, `serial`
+    and `given_tick`, and a client writes `heard`.
     """
 
     stage = Word(0)  # RequestStage
@@ -80,7 +82,7 @@ class RequestEntry:
     serial = Word(4)
     given_tick = Word(5)  # tick at which it was issued, -1 before
     client = Word(6)  # Client
-    heard = Word(7)  # tick at which the client of a lease was last heard
+    heard = Word(7)  # tick of the last heartbeat from the client of a lease, -1 before
 
     def __init__(self, segment: Segment, index: int) -> None:
         size = compute_operator_entry_size(segment.layout)
@@ -95,7 +97,11 @@ class RequestEntry:
         return self.client == Client.LEASES and self.stage == RequestStage.GIVEN
 
     def can_become(self, issued: Request) -> bool:
-        """Check whether this request can become the given issued command."""
+        """Check whether issuing this request could have produced a command of a recorded run.
+
+        Args:
+            issued: The command, with the tick at which it was issued.
+        """
         return (
             self.mailbox == issued.mailbox
             and self.tick <= issued.tick
@@ -112,9 +118,9 @@ class OperatorTable:
         self.entries = [RequestEntry(segment, index) for index in range(OPERATOR_ENTRIES)]
 
     def add_request(self, request: Request) -> RequestEntry:
-        """Fill a free entry, or reuse the entry of the command that was issued longest ago.
+        """Add a request that belongs to the run. The clock issues its command when it is due.
 
-        The clock issues the command when it is due.
+        If no entry is free, the entry of the command that was issued longest ago is reused.
 
         Raises:
             OperatorTableError: All entries wait for their ticks.
@@ -126,9 +132,13 @@ class OperatorTable:
     def claim_request(
         self, request: Request, client: Client = Client.WAITS
     ) -> Iterator[RequestEntry]:
-        """Add a request on behalf of this process.
+        """Add a request whose client is this process, for the duration of a `with` block.
 
-        At the end of the `with` block the request is withdrawn unless it has been issued.
+        At the end of the block, the request is withdrawn if it has not been issued.
+
+        Args:
+            request: Command to be issued.
+            client: `Client.LEASES` to make the level hold when this process ends or is silent.
 
         Raises:
             OperatorTableError: All entries wait for their ticks.
@@ -144,21 +154,29 @@ class OperatorTable:
             yield entry
 
     def withdraw_request(self, entry: RequestEntry, ticket: int) -> bool:
-        """Withdraw a request that is still waiting. Returns False if it was issued."""
+        """Withdraw a request that is still waiting.
+
+        Args:
+            entry: Entry of the request.
+            ticket: Number of the request, in case the entry has been reused.
+
+        Returns:
+            False if the request is no longer waiting or is just being issued.
+        """
         if entry.ticket != ticket or entry.stage != RequestStage.WAITING:
             return False
         entry.stage = RequestStage.FREE
-        # The clock first marks the request as issued, then checks whether it is still wanted.
+        # The clock does this in the opposite order: it first sets `given_tick`, then reads `stage`.
         return entry.given_tick < 0
 
     def is_waiting(self, entry: RequestEntry) -> bool:
-        """Check whether a request is waiting and its client, if it has one, is alive."""
+        """Check whether a request waits for its tick. One whose client has ended does not count."""
         if entry.stage != RequestStage.WAITING:
             return False
         return not entry.client or self.is_client_alive(entry)
 
     def is_client_alive(self, entry: RequestEntry) -> bool:
-        """Check whether the client of a request is alive."""
+        """Check whether the client of a request is alive, by its kernel lock."""
         return self._segment.is_locked(_CLAIMS + entry.ticket)
 
     def list_leased(self) -> list[RequestEntry]:
@@ -166,12 +184,20 @@ class OperatorTable:
         return [entry for entry in self.entries if entry.is_leased]
 
     def record_heartbeat(self, entry: RequestEntry, ticket: int) -> bool:
-        """Record that the client of a lease is alive. Returns False if the lease was released."""
+        """Record a heartbeat from the client of a lease.
+
+        Args:
+            entry: Entry of the request.
+            ticket: Number of the request, in case the entry has been reused.
+
+        Returns:
+            False if the lease has been released.
+        """
         entry.heard = self._words[System.TICK]
         return entry.ticket == ticket and entry.client == Client.LEASES
 
     def release_lease(self, entry: RequestEntry) -> None:
-        """Release the lease of a request. The end of its client then has no effect."""
+        """Release the lease of a request. Its client may end from now on without any effect."""
         entry.client = Client.WAITS
 
     def list_waiting(self) -> list[RequestEntry]:
@@ -180,11 +206,11 @@ class OperatorTable:
         return sorted(entries, key=lambda entry: entry.ticket)
 
     def find_missing(self, requests: Sequence[Request]) -> list[Request]:
-        """Return the commands of a run that are not waiting in the table.
+        """Return the commands of a recorded run for which no request waits in the table.
 
         Args:
-            requests: Commands of the run in the order of issue, each with the tick at which it
-                was issued. A command that was added late was issued after its requested tick.
+            requests: Commands of the run in the order of issue. `tick` is the tick at which the
+                command was issued, which may be later than the requested tick.
         """
         waiting = sorted(self.list_waiting(), key=lambda entry: entry.tick)
         missing = []
@@ -197,7 +223,7 @@ class OperatorTable:
         return missing
 
     def _fill_entry(self, request: Request, client: Client) -> RequestEntry:
-        """Fill an entry. The caller holds the lock of the table.
+        """Fill a free or reusable entry with a request. The caller must hold the table's lock.
 
         Raises:
             OperatorTableError: All entries wait for their ticks.

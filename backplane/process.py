@@ -29,7 +29,7 @@ STOPPED_STATES = "Tt"
 def read_start_time(pid: int) -> int:
     """Return the start time of a process, in kernel clock ticks since boot.
 
-    The result is 0 if the process does not exist or is a zombie.
+    The result is 0 if the process does not exist or has ended.
     """
     fields = _read_stat(pid)
     return int(fields[19]) if fields and fields[0] not in ENDED_STATES else 0
@@ -38,13 +38,14 @@ def read_start_time(pid: int) -> int:
 def read_state(pid: int) -> str:
     """Return the kernel's letter for the state of a process.
 
-    It is R, S, D, T (stopped) or Z (dead, not reaped), and X if the process does not exist.
+    Common letters are R (running), S and D (waiting), T (stopped) and Z (ended, not reaped). The
+    result is X if the process does not exist.
     """
     return (_read_stat(pid) or "X")[0]
 
 
 def read_processor_ns(pid: int) -> int:
-    """Return the processor time used by a process, in ns, to about 10 ms.
+    """Return the processor time that a process has used, in ns, with a resolution of about 10 ms.
 
     The result is 0 if the process does not exist.
     """
@@ -53,7 +54,10 @@ def read_processor_ns(pid: int) -> int:
 
 
 def _read_stat(pid: int) -> list[str]:
-    """Return the fields of /proc/<pid>/stat after the command name, empty if there is none."""
+    """Return the fields of /proc/<pid>/stat after the command name.
+
+    The list is empty if the process does not exist.
+    """
     try:
         stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
     except (FileNotFoundError, ProcessLookupError):
@@ -67,20 +71,20 @@ def is_alive(pid: int, started: int = 0) -> bool:
 
     Args:
         pid: Process id.
-        started: Start time of the expected process, because pids are reused. 0 accepts any
-            process.
+        started: Start time of the expected process, to detect that the pid was reused. 0 accepts
+            any process.
     """
     start = read_start_time(pid) if pid > 0 else 0
     return bool(start) and started in (0, start)
 
 
 def wait_readable(fd: int, timeout_s: float) -> bool:
-    """Wait until a descriptor is readable, or the process of a pidfd has ended.
+    """Wait until a descriptor is readable. A pidfd becomes readable when its process ends.
 
     Unlike `select`, this accepts descriptors above 1023.
 
     Returns:
-        False if the timeout has passed.
+        False on timeout.
     """
     waiting = select.poll()
     waiting.register(fd, select.POLLIN)
@@ -88,9 +92,10 @@ def wait_readable(fd: int, timeout_s: float) -> bool:
 
 
 def compute_until(processor_time_ns: int) -> None:
-    """Busy-loop until the calling process has used this much processor time.
+    """Busy-wait until the processor time of the calling process reaches a value.
 
-    The time is measured by `process_time_ns`, which excludes preemption.
+    Args:
+        processor_time_ns: Total processor time, as returned by `time.process_time_ns`.
     """
     while process_time_ns() < processor_time_ns:
         pass
@@ -106,7 +111,10 @@ def pin_to_core(core: int) -> None:
 
 
 LATENCY_REQUEST = Path("/dev/cpu_dma_latency")
-"""Device that limits the wake-up time of cores, in us, while it is open."""
+"""Device that limits the wake-up latency of idle cores while it is open.
+
+The limit is written to it as an integer, in us.
+"""
 _PR_SET_NAME = 15
 _PR_SET_PDEATHSIG = 1
 _PR_SET_TIMERSLACK = 29
@@ -115,16 +123,13 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 DEADLINE = 100
-"""Value that stands for SCHED_DEADLINE among the priorities of SCHED_FIFO.
-
-It is above all of them, which end at 99.
-"""
+"""Number that stands for SCHED_DEADLINE where a SCHED_FIFO priority (1 to 99) is expected."""
 SCHED_DEADLINE = 6
 _RESET_ON_FORK = 1
 _RECLAIM = 2
-"""Flag that lets a process exceed its reservation with time that others leave unused.
+"""Flag that lets a process exceed its reservation while other reservations are unused.
 
-A first cycle takes longer than the later ones.
+A first cycle needs this, because it takes longer than the later ones.
 """
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 """System call number by machine, since the C library has no function for it."""
@@ -152,7 +157,8 @@ def take_core(core: int, priority: int, reservation: Reservation | None = None) 
     everywhere = os.sched_getaffinity(0)
     pin_to_core(core)
     if reservation is not None:
-        # A pinned process is admitted only if the kernel does not add up reservations.
+        # The kernel refuses a reservation to a pinned process if it checks the sum of reservations
+        # over all cores. In that case, try again unpinned.
         for cores in ({core}, everywhere):
             os.sched_setaffinity(0, cores)
             if _reserve_time(reservation):
@@ -172,22 +178,25 @@ def _reserve_time(reservation: Reservation) -> bool:
 
 
 def disable_timer_slack() -> None:
-    """Let the calling process sleep without the kernel's timer slack.
+    """Disable the kernel's timer slack for the calling process.
 
-    To save power, the kernel wakes ordinary processes up to 50 us late.
+    By default the kernel wakes ordinary processes up to 50 us late, to save power.
     """
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
 
 
 @contextmanager
 def keep_cores_awake() -> Iterator[str]:
-    """Keep idle cores from sleeping. Yields why the system refuses, or an empty text.
+    """Prevent idle cores from entering sleep states during a `with` block.
 
-    A sleeping core takes 20 us or more to wake up. A core that is kept awake spins. If a host gives
-    a virtual machine a quota of processor time, spinning counts against it, and the host takes the
-    core away for milliseconds once the quota is used up. As a rule only root may make the request.
-    It ends with the process, however the process ends:
+    A sleeping core takes 20 us or more to wake up. An idle core that may not sleep spins instead.
+    On a virtual machine with a quota of processor time, spinning uses up the quota, and the host
+    then withholds the core for milliseconds. As a rule only root may request this. The request ends
+    with the process, however the process ends:
     https://docs.kernel.org/power/pm_qos_interface.html
+
+    Yields:
+        The reason why the system refuses the request. Empty if it was granted.
     """
     refusal = ""
     with ExitStack() as stack:
@@ -201,7 +210,7 @@ def keep_cores_awake() -> Iterator[str]:
 
 
 def read_memory_sizes(pid: int) -> tuple[int, int]:
-    """Return how many bytes a process has mapped and how many are locked.
+    """Return the sizes of a process's mapped memory and of its locked memory, in bytes.
 
     Both are 0 if the process does not exist.
     """
@@ -213,7 +222,7 @@ def read_memory_sizes(pid: int) -> tuple[int, int]:
 
 
 def describe_refusal(error: OSError) -> str:
-    """Explain why the system refused a process or a file, with the limit that was reached."""
+    """Return the text of an error, with the limit on processes or open files that was reached."""
     limits = {
         errno.EAGAIN: ("processes", "u", RLIMIT_NPROC),
         errno.EMFILE: ("open files", "n", RLIMIT_NOFILE),
@@ -226,7 +235,7 @@ def describe_refusal(error: OSError) -> str:
 
 
 def set_priority(priority: int) -> bool:
-    """Switch to a SCHED_FIFO priority, or to ordinary scheduling for 0.
+    """Switch the calling process to a SCHED_FIFO priority, or to ordinary scheduling for 0.
 
     Returns:
         False if the system refuses.
@@ -257,16 +266,20 @@ def die_with_parent(parent: int) -> None:
 
 
 def adopt_orphans() -> None:
-    """Become the parent of descendants whose parents have ended, whatever their sessions."""
+    """Become the parent of all descendants whose own parents end, as a child subreaper."""
     _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 def describe_end(status: int) -> str:
-    """Describe how a process ended. A negative exit status stands for a signal."""
+    """Describe how a process ended.
+
+    Args:
+        status: Exit status, or the negative number of the signal that ended the process.
+    """
     return f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
 
 
 def list_children(parent: int) -> set[int]:
-    """Return the children of a process, including zombies that are not reaped."""
+    """Return the process ids of the children of a process, including unreaped ones."""
     pids = [int(entry.name) for entry in Path("/proc").glob("[0-9]*")]
     return {pid for pid in pids if _read_stat(pid)[1:2] == [str(parent)]}

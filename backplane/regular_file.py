@@ -32,7 +32,7 @@ class RefusedFileError(OSError):
 
 
 def read_regular_file(path: Path, limit_bytes: int) -> bytes:
-    """Return the content of a regular file, without ever waiting for a writer.
+    """Return the content of a regular file. Never blocks, even if the path leads to a FIFO.
 
     Args:
         path: File to read. Symbolic links are followed.
@@ -59,7 +59,7 @@ def read_regular_file(path: Path, limit_bytes: int) -> bytes:
 
 
 def check_regular_file(path: Path, limit_bytes: int) -> None:
-    """Check the kind and size of a file that a library opens by its path.
+    """Check the kind and size of a file before a library opens it by its path.
 
     Args:
         path: File to check. Symbolic links are followed.

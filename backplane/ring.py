@@ -14,9 +14,11 @@ MAX_COUNT = 1 << 48
 
 
 class NewRows(NamedTuple):
-    """Rows read from a ring, oldest first, and the number of rows lost.
+    """Result of reading a ring.
 
-    A lost row was overwritten before it was read.
+    Attributes:
+        rows: The new rows, oldest first.
+        lost: Number of rows that were overwritten before they could be read.
     """
 
     rows: np.ndarray
@@ -30,14 +32,14 @@ class Ring:
         memory: Memory of the records.
         dtype: Type of a record.
         head: Word with the number of records written.
-        before: Number of records written in an earlier run, which this run continues. They are
-            not read.
+        before: Number of records of the run that this run continues, which are skipped.
     """
 
     def __init__(
         self, memory: memoryview, dtype: np.dtype, head: memoryview, before: int = 0
     ) -> None:
-        # Copy plain bytes. A copy by field would skip the padding, and checksums would not match.
+        # Copy rows as plain bytes. A copy field by field would omit the padding, which checksums
+        # cover.
         self._rows = np.frombuffer(memory, dtype=f"V{dtype.itemsize}")
         self._dtype = dtype
         self._head = head
@@ -54,18 +56,18 @@ class Ring:
         """Number of records written.
 
         Raises:
-            DamageError: The number is impossible.
+            DamageError: The number is negative or impossibly large.
         """
         if not 0 <= (count := self._head[0]) < MAX_COUNT:
             raise DamageError(f"a ring cannot have {count} records")
         return count
 
     def resume_after(self, taken: int) -> None:
-        """Continue after the first `taken` records, which another reader has read."""
+        """Skip the first `taken` records, which another reader has already read."""
         self._taken = taken
 
     def read_new_rows(self) -> NewRows:
-        """Read every record written since the last call."""
+        """Read the records written since the last call, except those already overwritten."""
         head = self._written_count
         first = max(self._taken + 1, head - self._depth + 1)
         rows = self._rows[np.arange(first, head + 1) % self._depth].view(self._dtype)

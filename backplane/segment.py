@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 MAGIC = int.from_bytes(b"NASREM-1", "little")
 VERSION = 18
 TEXTS = (Head.LAYOUT_AT, Head.CONFIG_AT, Head.PUBLISHED_AT)
-"""Words with the addresses of the texts. The word after each of them contains the size."""
+"""Words that contain the addresses of the texts. The word after each contains the size."""
 PREFIX = "nasrem-rack."
 SHM_FOLDER = Path("/dev/shm")
 """Folder in which the C library's `shm_open` keeps its names."""
@@ -75,13 +75,13 @@ class Launch(NamedTuple):
 
 
 class CycleCounts(NamedTuple):
-    """Cycles of a task.
+    """Counts of a task's cycles.
 
     Attributes:
-        missed: Plans or cycles that missed their deadline.
-        skipped: Cycles skipped.
-        due: All cycles that were due.
-        plan: Cycles that one plan may take.
+        missed: Number of plans or cycles that missed their deadline.
+        skipped: Number of cycles that were skipped.
+        due: Number of cycles that were due.
+        plan: Number of cycles that one plan may take. 1 for an executor.
     """
 
     missed: int
@@ -91,9 +91,10 @@ class CycleCounts(NamedTuple):
 
     @property
     def lost(self) -> int:
-        """Number of cycles missed or skipped.
+        """Number of cycles that were missed or skipped.
 
-        It is at most `due`, because a plan may have ended after the last cycle due.
+        It is limited to `due`, because all cycles of a missed plan count, even if the plan ended
+        after the last cycle that was due.
         """
         return min(self.due, self.missed * self.plan + self.skipped)
 
@@ -109,7 +110,7 @@ class Segment:
     Attributes:
         layout: Mailboxes and tasks.
         config: The resolved config, as TOML.
-        published: Facts about the levels, as JSON.
+        published: Published facts about the levels, as JSON.
         map: Bus addresses.
         words: The memory as 64-bit integers.
         bytes: The memory as bytes.
@@ -138,7 +139,7 @@ class Segment:
         Args:
             layout: Layout of the backplane.
             config: The resolved config, as TOML.
-            published: Facts about the levels, as JSON.
+            published: Published facts about the levels, as JSON.
 
         Raises:
             SegmentError: The name is in use, memory is short, or the processor is not
@@ -201,7 +202,11 @@ class Segment:
         return segment
 
     def _fill_head(self, texts: list[bytes]) -> None:
-        """Fill the head, the texts and the initial words of a new segment."""
+        """Fill the head of a new segment, its texts, and the words that do not start at 0.
+
+        Args:
+            texts: Layout, config and published facts.
+        """
         address = self.map.size
         self.words[Head.CHECK] = crc32(b"".join(texts))
         for at, text in zip(TEXTS, texts, strict=True):
@@ -248,9 +253,9 @@ class Segment:
 
     @classmethod
     def open(cls, rack: str) -> Self:
-        """Open a rack's segment of any version without reading its layout.
+        """Open a rack's segment of any version, without reading its layout and config.
 
-        The launcher can be read from its head.
+        Of the result, only properties that need no layout can be used, such as `launcher`.
 
         Raises:
             SegmentError: There is no such segment, it belongs to another user, or it is not a
@@ -277,7 +282,7 @@ class Segment:
         return cls(rack, mmap.mmap(shm.fd, status.st_size), shm.fd)
 
     def read_head(self) -> None:
-        """Read the texts of the segment.
+        """Read layout, config and published facts from the segment.
 
         Raises:
             SegmentError: Size or version is wrong, or a text is damaged.
@@ -308,11 +313,11 @@ class Segment:
             ) from None
 
     def get_bytes(self, address: int, size: int) -> memoryview:
-        """Return the bytes at a bus address."""
+        """Return a view of `size` bytes at a bus address."""
         return self.bytes[address : address + size]
 
     def get_block(self, task: str) -> memoryview:
-        """Return a task's control block as words (`words.Block`).
+        """Return a view of a task's control block, with the words of `words.Block`.
 
         Raises:
             KeyError: There is no such task.
@@ -321,9 +326,9 @@ class Segment:
         return self.words[start : start + BLOCK_SIZE // 8]
 
     def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
-        """Count the cycles of a task by `tick`.
+        """Count the cycles of a task up to `tick`.
 
-        Releases after its last cycle count as skipped once their time is over.
+        Releases that the task has not finished count as skipped once their time slice is over.
         """
         block = self.get_block(task.name)
         skipped = block[Block.SKIPPED] + task.count_unfinished(block[Block.DONE], tick)
@@ -332,7 +337,7 @@ class Segment:
         )
 
     def get_box(self, mailbox: str) -> memoryview:
-        """Return the head of a mailbox as words (`words.Box`).
+        """Return a view of the head of a mailbox, with the words of `words.Box`.
 
         Raises:
             KeyError: There is no such mailbox.
@@ -365,7 +370,7 @@ class Segment:
 
     @property
     def launcher_text(self) -> str:
-        """Launcher for messages, such as "process 12"."""
+        """Description of the launcher for error messages, such as "process 12"."""
         return f"process {self.launcher}" if self.launcher else "a process of another PID namespace"
 
     @property
@@ -374,7 +379,7 @@ class Segment:
         return is_locked(self.fd, _LAUNCHER_LOCK)
 
     def await_launcher(self, timeout_s: float) -> bool:
-        """Wait until the launcher has ended or closed the rack. Returns False on timeout."""
+        """Wait until the launcher has ended or closed its segment. Returns False on timeout."""
         deadline = time.monotonic() + timeout_s
         while self.launcher_is_alive:
             if time.monotonic() >= deadline:
@@ -389,9 +394,9 @@ class Segment:
 
     @property
     def is_named(self) -> bool:
-        """True if the rack's name still leads to this segment.
+        """True if this is still the segment with the rack's name.
 
-        Another launch may have replaced it.
+        It is not if the segment was unlinked, or if the rack has been launched again since.
         """
         try:
             named = get_shm_path(self.rack).stat()
@@ -400,7 +405,7 @@ class Segment:
         return os.path.samestat(named, os.fstat(self.fd))
 
     def release_launcher_lock(self) -> None:
-        """Release the launcher's lock. The rack then counts as dead."""
+        """Release the launcher's lock, if this process holds it. The rack then counts as dead."""
         if self._life is not None:
             self._life.close()
 
@@ -421,9 +426,10 @@ def list_racks() -> list[str]:
 
 
 def find_foreign_kind(rack: str) -> str | None:
-    """Return the kind of a foreign entry under a rack's name, such as "directory".
+    """Return the kind of an entry in /dev/shm that has a rack's name but is not a segment.
 
-    The result is None for a regular file, or if there is no entry.
+    Returns:
+        The kind, such as "directory". None if the entry is a regular file or does not exist.
     """
     try:
         mode = get_shm_path(rack).lstat().st_mode
@@ -434,7 +440,7 @@ def find_foreign_kind(rack: str) -> str | None:
 
 
 def unlink_segment(rack: str) -> None:
-    """Remove a rack's segment by name. A segment that does not exist is no error.
+    """Remove a rack's segment by name. Does nothing if the segment does not exist.
 
     Raises:
         SegmentError: The segment belongs to another user.
@@ -450,12 +456,12 @@ def unlink_segment(rack: str) -> None:
 
 
 def get_shm_path(rack: str) -> Path:
-    """Return the path of a rack's segment."""
+    """Return the path of a rack's segment in /dev/shm."""
     return SHM_FOLDER / f"{PREFIX}{rack}"
 
 
 def _pid_namespace() -> int:
-    """Return the inode of this process's PID namespace."""
+    """Return the inode of this process's PID namespace, which identifies the namespace."""
     return Path("/proc/self/ns/pid").stat().st_ino
 
 
@@ -474,7 +480,12 @@ def restore_layout(plain: dict[str, Any]) -> Layout:
 
 
 def _restore_value(kind: Any, plain: Any) -> Any:
-    """Convert plain data to an instance of a dataclass or to a tuple, recursively."""
+    """Convert plain data recursively: dictionaries to dataclasses, and lists to tuples.
+
+    Args:
+        kind: Annotated type of the result.
+        plain: Data as parsed from JSON.
+    """
     if isinstance(plain, list):
         inner, *_ = get_args(kind)
         return tuple([_restore_value(inner, entry) for entry in plain])
@@ -488,5 +499,5 @@ def _restore_value(kind: Any, plain: Any) -> Any:
 
 @cache
 def _get_types(record: type) -> dict[str, Any]:
-    """Return the types of a dataclass's fields."""
+    """Return the types of a dataclass's fields by name."""
     return get_type_hints(record)

@@ -44,12 +44,13 @@ class MappedMemory(Protocol):
 class Semaphore:
     """Semaphore in shared memory whose waits do not depend on the wall clock.
 
-    `release()` posts it. `wait()` waits until the time set by `set_deadline` and returns 0 if it
-    has obtained the semaphore. A signal may end the wait early.
+    `release()` posts it. `wait()` waits for a post until the time set by `set_deadline`, and
+    returns 0 if it has obtained the semaphore. Otherwise the time has passed, or a signal has ended
+    the wait early.
     """
 
     def __init__(self, memory: memoryview, address: int) -> None:
-        """Use the semaphore at a bus address of a segment's memory."""
+        """Access the semaphore at a bus address of a segment's memory."""
         # This view keeps the memory mapped for as long as the semaphore is in use.
         self._place = ctypes.c_char.from_buffer(memory, address)
         at = ctypes.addressof(self._place)
@@ -62,12 +63,12 @@ class Semaphore:
         self._try = partial(_sem_trywait, at)
 
     def initialize(self, value: int) -> None:
-        """Create the semaphore with a value, for all processes that map its memory."""
+        """Create the semaphore with an initial value, shared by all processes that map it."""
         _sem_init(ctypes.addressof(self._place), 1, value)
 
     @property
     def value(self) -> int:
-        """Number of waits that the semaphore would satisfy now."""
+        """Value of the semaphore: the number of waits that would succeed at once."""
         count = ctypes.c_int()
         _sem_getvalue(ctypes.addressof(self._place), ctypes.addressof(count))
         return count.value
@@ -77,11 +78,11 @@ class Semaphore:
         self._deadline[0], self._deadline[1] = divmod(deadline_ns, 1_000_000_000)
 
     def try_acquire(self) -> bool:
-        """Obtain the semaphore without waiting. Returns False if that is impossible."""
+        """Obtain the semaphore without waiting. Returns False if its value is 0."""
         return not self._try()
 
     def acquire(self, timeout_s: float) -> bool:
-        """Obtain the semaphore within `timeout_s`. Returns False on timeout."""
+        """Wait up to `timeout_s` for the semaphore. Returns False on timeout."""
         if self.try_acquire():
             return True
         deadline_ns = time.monotonic_ns() + int(timeout_s * 1e9)
@@ -97,8 +98,8 @@ def initialize_all(memory: memoryview, wake_and_done: Iterable[int], locks: Iter
 
     Args:
         memory: Memory of the segment.
-        wake_and_done: Bus addresses of the semaphores of tasks, which start unposted.
-        locks: Bus addresses of the semaphores of locked mailboxes, which start free.
+        wake_and_done: Bus addresses of the semaphores of tasks. Their initial value is 0.
+        locks: Bus addresses of the semaphores of locked mailboxes. Their initial value is 1.
     """
     for value, addresses in ((0, wake_and_done), (1, locks)):
         for address in addresses:
@@ -111,13 +112,14 @@ def get_wake_semaphore(segment: MappedMemory, task: str) -> Semaphore:
 
 
 def get_done_semaphore(segment: MappedMemory, task: str) -> Semaphore:
-    """Return the semaphore on which lockstep waits for a task.
+    """Return the semaphore on which the clock waits for a task in lockstep.
 
-    The task posts it with each report, and the crate posts it to report the loss of the task.
+    The task posts it to report a finished release, and the crate posts it to report that the task
+    is lost.
     """
     return Semaphore(segment.bytes, segment.map.done[task])
 
 
 def get_lock_semaphore(segment: MappedMemory, mailbox: str) -> Semaphore:
-    """Return the semaphore that guards a mailbox."""
+    """Return the semaphore of a mailbox under protocol lock."""
     return Semaphore(segment.bytes, segment.map.locks[mailbox])

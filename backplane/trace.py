@@ -5,9 +5,10 @@ part) and t_residual (deadline - end) of eq. 3.5, t_executor-planner of eq. 3.9 
 the processor time of the cycle, without preemption. A reader that falls behind knows how many
 records it lost.
 
-A task traces a cycle after its last write. The trace therefore also proves facts about messages
-(`CycleRecord`): a message that is missing by then was not written, and a message that appears later
-was held back. Age alone proves nothing, because the task may have been preempted.
+A task writes the record of a cycle after the cycle's last message. The trace therefore also proves
+facts about messages (`CycleRecord`): a message that is missing when the record is there was not
+written, and a message that appears later was held back. The age of a message alone proves nothing,
+because the task may have been preempted.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ RECORD = np.dtype(
         ("state", "i8"),  # state of the level
         # Processor time of the thread since the last record: this cycle and its wake-up.
         ("processor_ns", "i8"),
-        ("closed_ns", "i8"),  # end of the bookkeeping of the previous cycle, 0 without one
+        ("closed_ns", "i8"),  # end of the bookkeeping of the previous cycle, 0 in the first
     ]
 )
 FIELDS = tuple(RECORD.names or ())
@@ -49,8 +50,8 @@ class Flag(IntFlag):
 
     MISSED = 1  # missed its deadline, or wrote a message too late
     SKIPPED = 2  # releases were skipped just before it
-    BUS_ERROR = 4  # an access was cut off by its bound
-    CORRUPT = 8  # a message failed its check
+    BUS_ERROR = 4  # an access timed out
+    CORRUPT = 8  # the checksum of a message was wrong
     PLANNED = 16  # the record of a planner's cycle that made a plan
 
 
@@ -73,7 +74,7 @@ class TraceWriter:
         self._count = self._block[Block.TRACE_HEAD]
 
     def write(self, *record: int) -> None:
-        """Append a record. Its numbers are in the order of `RECORD`."""
+        """Append a record. Its numbers are in the order of the fields of `RECORD`."""
         self._count = count = self._count + 1
         _PACK(self._ring, (count & self._mask) * TRACE_RECORD_SIZE, *record)
         self._block[Block.TRACE_HEAD] = count
@@ -93,7 +94,7 @@ def open_trace_ring(segment: Segment, task: str) -> Ring:
 
 
 class CycleRecord:
-    """Trace of one task, as used by the readers of its mailboxes."""
+    """Trace of a task, from which readers of its mailboxes learn which cycles have ended."""
 
     def __init__(self, segment: Segment, task: str) -> None:
         self._block = segment.get_block(task)
@@ -103,9 +104,10 @@ class CycleRecord:
 
     @property
     def finished_tick(self) -> int:
-        """Newest release whose cycle has ended with every access done.
+        """Release tick of the newest traced cycle.
 
-        It is -1 if there is no such cycle or it is not known.
+        It is -1 if no cycle was traced, if an access of that cycle timed out, or if its record may
+        be partly overwritten.
         """
         count = self._block[Block.TRACE_HEAD]
         at = self._get_index(count)
@@ -116,7 +118,7 @@ class CycleRecord:
     def find_end_ns(self, tick: int) -> int | None:
         """Return the end of the cycle released at `tick`, in ns of CLOCK_MONOTONIC.
 
-        The result is None if the ring has no record of the cycle.
+        The result is None if the cycle was not traced, or its record has been overwritten.
         """
         count = self._block[Block.TRACE_HEAD]
         for number in range(count, max(0, count - self._depth), -1):
@@ -130,9 +132,9 @@ class CycleRecord:
         return None
 
     def _is_kept(self, number: int) -> bool:
-        """Check whether the record with this number cannot be partly overwritten."""
+        """Check that the writer has not begun to overwrite the record with this number."""
         return number >= compute_oldest_kept(self._block[Block.TRACE_HEAD], self._depth)
 
     def _get_index(self, number: int) -> int:
-        """Return the index of the first word of the record with this number."""
+        """Return the index in the segment's words at which the record with this number starts."""
         return self._first + number % self._depth * _RECORD

@@ -12,13 +12,13 @@ from typing import Protocol
 
 
 class HasWords(Protocol):
-    """Object that consists of words of shared memory."""
+    """Object whose attributes are stored in `words`, a view of shared memory."""
 
     words: memoryview
 
 
 class Word:
-    """Descriptor of an attribute that is stored in the `words` of an object at a fixed index."""
+    """Descriptor for an attribute stored in the `words` of its object, at a fixed index."""
 
     def __init__(self, index: int) -> None:
         self._index = index
@@ -31,16 +31,21 @@ class Word:
 
 
 def encode_switch(tick: int, is_on: bool) -> int:
-    """Return the value of a word that switches on, or off, at `tick`.
+    """Encode a change of state at `tick` in one word, which `is_switched_on` evaluates.
 
-    Before that tick the opposite state holds, so all readers agree on the state by ticks alone,
-    whenever they look. Each switch must follow the opposite one. The value 0 means never on.
+    Before `tick` the word stands for the opposite state. The state therefore depends on the
+    reader's tick alone, not on the moment at which the word is read. Changes to on and to off must
+    alternate. The value 0 stands for a switch that was never on.
+
+    Args:
+        tick: First tick of the new state.
+        is_on: The new state.
     """
     return 2 * tick + is_on
 
 
 def is_switched_on(word: int, tick: int) -> bool:
-    """Check whether a switch word (see `encode_switch`) is on at `tick`."""
+    """Return the state at `tick` that a word made by `encode_switch` stands for."""
     return bool(word & 1) == (tick >= word >> 1)
 
 
@@ -73,7 +78,7 @@ class System:
     LOCKSTEP = 36
     STOP_REQUEST = 37  # written by the host
     STOP_TICK = 38  # first tick after the run, 0 if not known
-    CLOCK_SKIPPED = 39  # number of ticks skipped by the clock itself
+    CLOCK_SKIPPED = 39  # number of ticks that the clock has skipped
     FOLLOWER_PID = 40  # process of the recorder for which lockstep waits, 0 for none
     FOLLOWER_TICK = 41  # everything up to this tick is recorded
     TICK_NS = 42  # CLOCK_MONOTONIC of the newest tick
@@ -121,9 +126,9 @@ class Run(IntEnum):
 
 
 class Demand(IntEnum):
-    """Values of `System.DEMAND`, which the rack's safety functions demand of the arm.
+    """Values of `System.DEMAND`: the stop that the rack's safety functions require of the arm.
 
-    A greater demand is stronger.
+    If there are several, the largest value applies.
     """
 
     NONE = 0
@@ -171,7 +176,7 @@ class Block:
     INTERRUPTS_LOST = 23  # number of messages lost because too many waited
     INTERRUPTS_WAITING = 24  # largest number of messages that have waited
     CLOCK_SKIPPED = 25  # number of ticks skipped by the clock that this task has reported
-    # Of a host board in lockstep: tick until which its program waits, 0 if a message has come.
+    # Of a host board in lockstep: tick until which its program waits, 0 once a message has arrived.
     WAITS_UNTIL = 26
     # 1 + tick before which the task must fork a copy, 0 for none. Set by the clock.
     COPY = 27
@@ -201,7 +206,7 @@ class Box:
     HEAD = 0  # serial of the newest complete message, 0 before the first
     EPOCH = 1  # number of writers that have claimed the mailbox
     WRITER_PID = 2
-    CLAIM = 3  # has no value: the writer holds the kernel's lock on this address
+    CLAIM = 3  # unused as a number: the writer holds the kernel's lock on this address
     # Address of the kernel's lock on the critical section of protocol lock. The value is the
     # process id of the owner, 0 for none.
     OWNER = 4
@@ -215,9 +220,10 @@ class Box:
     # Of a host board's mailbox: serial of the newest message that its bus adapter has taken.
     TAKEN = 8
     # Of messages from another rack: switch (see `encode_switch`) that is on while the other rack is
-    # lost, so that the writer counts as lost.
+    # lost. Readers then treat the writer as lost.
     VOID = 9
-    # The same for racks that continue alone: the information does not grow too old while it is on.
+    # The same for a rack that continues alone: readers then use the last message, however old it
+    # is.
     KEPT = 10
     # Of a queue: serial of the newest message taken, times 3. See `queue.QueueReader`.
     POSITION = 11

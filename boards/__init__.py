@@ -11,8 +11,8 @@
 - `Event` is one occurrence in a run. `Rack(config, on_event=...)` passes each to your program as it
   happens.
 - `load` reads a config by name or path, with overrides. `RackConfig` is the result.
-- `BoardError` is the root of all errors: `ConfigError` contains every `Mistake` of a config, and
-  `LaunchError` means that a board did not start.
+- `BoardError` is the root of all errors: `ConfigError` contains every `Mistake` in a config, and
+  `LaunchError` means that a rack with a correct config could not be launched.
 
 Names are imported on first use, because the crate and its boards import parts of this package and
 must stay small.

@@ -12,5 +12,5 @@ __all__ = ["extend_path", "find_class"]
 
 
 def extend_path(folders: Sequence[Path]) -> None:
-    """Append folders to Python's import path."""
+    """Append folders to Python's import path, except those that it already contains."""
     sys.path += [str(folder) for folder in folders if str(folder) not in sys.path]

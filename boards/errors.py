@@ -2,9 +2,9 @@
 
 `BoardError` is the root. Catching it catches every error that this package raises on purpose.
 
-- `ConfigError`: a config with mistakes, all of them at once, before any process starts.
+- `ConfigError`: a config contains mistakes. It reports all of them, before any process starts.
 - `LaunchError`: a board did not start, because its self-test failed or it was not ready in time.
-- `SnapshotError`: a process that cannot be copied, or a snapshot from which a rack cannot continue.
+- `SnapshotError`: a process cannot be copied, or a rack cannot continue from a snapshot.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ MAX_VALUE_LENGTH = 80
 MAX_PLACE_LENGTH = 120
 MAX_REASON_LENGTH = 1000
 UNRECOVERABLE_STATUS = 4
-"""Exit status of a board that a restart would not help."""
+"""Exit status of a board whose failure would occur again after a restart."""
 
 NO_SNAPSHOTS_PREFIX = "no snapshots: "
 """Prefix of the note of a run that takes no snapshots. The reason follows."""
 
 
 class Failure(Exception):
-    """Raised if a command, or a call of a program, has failed.
+    """Raised if a `rack` command, or the same action called from a program, has failed.
 
     Args:
         reason: Message for the user.
@@ -56,9 +56,9 @@ class Mistake:
     """One mistake in a config.
 
     Attributes:
-        place: Key of the mistake.
-        value: Value of the key, None for no value.
-        why: The reason, or the permitted values.
+        place: Config key at which the mistake was found.
+        value: Value of the key. None if it has no value to show.
+        why: Reason why this is a mistake, or the permitted values.
     """
 
     place: str
@@ -75,7 +75,7 @@ class Mistake:
 
 
 Mistakes = Iterator[Mistake]
-"""Result type of a rule."""
+"""Result type of a function that checks one rule for configs."""
 
 
 class ConfigError(BoardError):
@@ -90,7 +90,7 @@ class ConfigError(BoardError):
 
 
 def format_value(value: Any) -> str:
-    """Format a config value as in TOML, shortened to one line."""
+    """Format a config value as in TOML, on one line and shortened if it is long."""
     value = list(value) if isinstance(value, tuple) else value
     try:
         text = str(value)
@@ -104,6 +104,6 @@ def format_value(value: Any) -> str:
 
 
 def to_one_line(text: str, longest: int) -> str:
-    """Format text as one line of at most `longest` characters, without control characters."""
+    """Return a text on one line, cut to `longest` characters, with control characters replaced."""
     text = "".join(c if c.isprintable() else "?" for c in " ".join(text[: 2 * longest].split()))
     return text if len(text) <= longest else f"{text[: longest - 3]}..."

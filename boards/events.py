@@ -1,4 +1,4 @@
-"""Events of a run as they happen, and the judgement of its end."""
+"""Events of a run as they happen, and the assessment of how the run ended."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class Event:
         tick: Tick of the system clock, -1 before the run.
         kind: Kind of event.
         board: Board that the event concerns, empty for the whole rack.
-        text: Description for people.
-        code: Code for programs: an alarm's name in lower case, "begins" or "ends" for a fault,
-            or an operator's command.
-        fault: Index of an entry of the fault table, -1 for none.
+        text: Description, to be read by a person.
+        code: Code, to be read by programs: an alarm's name in lower case, "begins" or "ends" for
+            a fault, or an operator's command.
+        fault: Index of the fault's entry in the fault table, -1 for none.
         subject: Affected mailbox, joint, task or level.
         value: Measured value, or the serial of a command.
         since: Tick at which the condition began, -1 if unknown.
@@ -68,12 +68,13 @@ class Event:
 
 DEMANDED = "a stop is demanded"
 NO_TORQUE = "no torque"
-"""Reason for brakes that engaged because no torque came in time.
+"""Reason for brakes that engaged because no torque was received in time.
 
-Brakes that engage on a demand (`DEMANDED`) have their cause in other events.
+For brakes that engaged because the safety functions required it (`DEMANDED`), other events show the
+cause.
 """
 MAX_HOLD_MS = 5e3
-"""Time without interruption for which an arm may be braked, or a level held, in ms.
+"""Longest time, in ms, for which an arm may be braked or a level may hold without interruption.
 
 A longer time without a known cause makes a run fail.
 """
@@ -83,7 +84,13 @@ MAX_BRAKED_FRACTION = 0.5
 
 @dataclass(frozen=True)
 class Braking:
-    """Engagement of the brakes for one reason, from tick `since` on."""
+    """One engagement of an arm's brakes.
+
+    Attributes:
+        why: Reason for the engagement.
+        since: Tick at which the brakes engaged.
+        lasted_ms: Time for which they were engaged.
+    """
 
     why: str
     since: int
@@ -114,10 +121,10 @@ def list_brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Br
 
 
 def format_brakings(brakings: Sequence[Braking]) -> str:
-    """Describe how often and how long brakes were engaged, and why.
+    """Describe in one line how often, how long and why brakes were engaged.
 
     Args:
-        brakings: At least one engagement.
+        brakings: Engagements of the brakes, at least one.
     """
     longest = max(brakings, key=lambda braking: braking.lasted_ms)
     total_ms = sum(braking.lasted_ms for braking in brakings)
@@ -140,11 +147,11 @@ Cause = Literal[
 ]
 """Reason why a run ended.
 
-A task is refused if it never began, which shows in a status without moves. Any other task that ends
-with an error has failed.
+"task refused" means that the task ended with an error before its first move, "task failed" that it
+ended with an error later.
 """
 SUCCESSES: tuple[Cause, ...] = ("task done", "time over")
-"""Causes of a run that may have succeeded."""
+"""Causes with which a run has succeeded if there are no faults."""
 
 
 @dataclass(frozen=True)
@@ -156,13 +163,13 @@ class Outcome:
         ticks: Length in ticks.
         state: Last state of the level that ends the run.
         reason: Reason in the last status of that level.
-        digest: Digest of everything written until the end.
-        faults: Reasons why the run failed: latched faults, lost boards, objects beyond their
+        digest: Digest of the run.
+        faults: Reasons why the run failed: latched faults, lost boards, objects too far from their
             goals although the task reports that it is done, long holds without a known cause,
             and levels that lost too many cycles.
         brakings: Engagements of the brakes after the start.
         objects: Final positions of objects with goals.
-        excused: A line for each level that lost too many cycles because of injected faults.
+        excused: A line for each level that lost too many cycles, but because of injected faults.
     """
 
     cause: Cause
@@ -179,7 +186,7 @@ class Outcome:
     def failure(self) -> str:
         """Reason why the run failed, empty if it succeeded.
 
-        A run fails by a fault, or because its task was refused, failed or cut short.
+        A run fails if there are faults, or if its cause is not one of `SUCCESSES`.
         """
         faults = "; ".join(self.faults)
         if self.cause in SUCCESSES:
@@ -193,18 +200,22 @@ class Outcome:
 
 
 def get_event_order(entry: Mapping[str, Any]) -> float:
-    """Return the sort key of an entry in an event log, its tick.
+    """Return the tick of an entry in an event log, as a sort key.
 
-    Some events are known late: a board that drives an arm reports after its return when the brakes
-    engaged. Entries without a tick, such as the outcome, come last.
+    Logs must be sorted because some events are reported late: a lost board that drives an arm
+    reports only after it has rejoined that the brakes had engaged. Entries without a tick, such as
+    the outcome, come last.
     """
     return float(entry.get("tick", math.inf))
 
 
 class Journal:
-    """List of events that calls `on_event` with each new one.
+    """List of the events of a run, which passes each new event to a function.
 
-    `segment` supplies the ticks. Events have no tick while it is None.
+    Attributes:
+        events: All events so far.
+        segment: Memory of the rack, from which events get their ticks. While it is None, events
+            get tick -1.
     """
 
     def __init__(self, on_event: Callable[[Event], None] | None) -> None:
@@ -227,8 +238,8 @@ class Journal:
         Args:
             kind: Kind of event.
             board: Board that the event concerns, empty for the whole rack.
-            text: Description for people.
-            code: Code for programs.
+            text: Description, to be read by a person.
+            code: Code, to be read by programs.
             at_ns: Time of the event on CLOCK_MONOTONIC, by default now.
             tick: Tick of the event, by default the current tick.
             subject: Affected mailbox, joint, task or level.
@@ -240,7 +251,7 @@ class Journal:
         self.record_event(Event(stamp_ns, tick, kind, board, text, code, subject=subject))
 
     def record_event(self, event: Event) -> None:
-        """Record an event and pass it on."""
+        """Append an event to the list, and pass it to `on_event`."""
         self.events.append(event)
         if self._on_event:
             self._on_event(event)
@@ -254,7 +265,10 @@ class Journal:
 
 
 def iterate_statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
-    """Yield board and last status of every level whose status has the given field."""
+    """Yield board and last status of every level whose status has a given field.
+
+    Levels that have not written a status are left out.
+    """
     for box in segment.layout.mailboxes:
         if box.name.endswith(".status") and field in (declared.name for declared in box.fields):
             status = open_observer(segment, box.name).peek()
@@ -263,14 +277,20 @@ def iterate_statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMes
 
 
 def iterate_arm_states(segment: Segment) -> Iterator[tuple[str, AnyMessage]]:
-    """Yield board and last state of every arm or hand."""
+    """Yield the board and the last state of every arm and every hand."""
     for box in segment.layout.mailboxes:
         if box.message == "arm_state":
             yield box.writer, open_observer(segment, box.name).peek().message
 
 
 class Ending:
-    """Judges the end of a run. `ends_run` and `silent` are as in `ClockWiring`."""
+    """Determines how a run has ended, from the last messages of its levels.
+
+    Args:
+        segment: Memory of the rack.
+        ends_run: Status mailbox of the level that ends the run, as in `ClockWiring`.
+        silent: Time without a status that ends the run, as in `ClockWiring`.
+    """
 
     def __init__(self, segment: Segment, ends_run: str | None, silent: int) -> None:
         self._segment = segment
@@ -279,7 +299,11 @@ class Ending:
         self._observer = None if ends_run is None else open_observer(segment, ends_run)
 
     def find_final_state(self) -> tuple[str, str]:
-        """Return the last state of the level that ends the run, and the reason."""
+        """Return the last state of the level that ends the run, and the reason for it.
+
+        Both are empty if no level ends the run. If the level was silent for too long, the reason
+        says so.
+        """
         if self._observer is None:
             return "", ""
         status = self._observer.peek().message
@@ -292,10 +316,11 @@ class Ending:
         return format_state(status.state), reason
 
     def list_latched_faults(self) -> list[str]:
-        """Describe the latched faults of levels and arms, one line each.
+        """Return one line for each level or arm with a latched fault.
 
-        A level has one if its last status reports an error, except for the level that ends the run.
-        An arm has one if it counted violations or contacts that its level does not report.
+        A level has a latched fault if its last status reports an error. The level that ends the run
+        is left out. An arm has one if it has exceeded limits or had unintended contacts; it is left
+        out if its level reports an error.
         """
         reported = {
             board: f"level '{board}': {get_reason(status) or f'error {status.error}'}"
@@ -313,11 +338,14 @@ class Ending:
     def find_long_holds(
         self, events: Sequence[Event], brakings: Sequence[Braking], ran_ms: float
     ) -> Iterator[str]:
-        """Yield a line for each reason why a hold was too long for a successful run.
+        """Yield a line for each hold that was too long.
 
-        Nothing is yielded if the cause is known: a fault was injected, an operator has commanded,
-        or a stop is demanded. Levels of a rack on a network are exempt, because they wait for other
-        racks and report for which.
+        If arms were braked for too long, this is one line about all of them. Otherwise there is one
+        line for each level that held for too long.
+
+        Nothing is yielded if the cause is known: a fault was injected, an operator has issued a
+        command, or the safety functions require a stop. Levels of a rack on a network are exempt
+        too, because they may wait for other racks.
 
         Args:
             events: Events of the run.
@@ -361,9 +389,9 @@ class Ending:
             yield from held
 
     def find_object_ends(self, goals: Mapping[int, GoalConfig]) -> tuple[ObjectEnd, ...]:
-        """Return the final positions of objects that have goals, as sensed last.
+        """Return the last sensed positions of the objects that have goals.
 
-        The result is empty if no level senses them.
+        The result is empty if no level senses objects.
 
         Args:
             goals: Goals by the row of the object in the scene message.
@@ -381,22 +409,23 @@ class Ending:
         return ()
 
     def find_cause(self) -> Cause:
-        """Return the cause of the end of a run that was not stopped."""
+        """Return why a run has ended. Call this only if no one has stopped the run."""
         if self._observer is None or self._ends_run is None:
             return "time over"
         status = self._observer.peek().message
         fields = self._segment.layout.find_mailbox(self._ends_run).fields
         if status.state != State.ERROR and not self._compute_silent_ticks():
             return "task done" if status.state == State.DONE else "time over"
-        # The field `moves` of a status counts the moves of its program. A refused one has none.
+        # The field `moves` of a status counts the moves of the task. A refused task has none.
         counts_moves = any(field.name == "moves" and not field.shape for field in fields)
         is_refused = counts_moves and not status.moves
         return "task refused" if is_refused else "task failed"
 
     def _compute_silent_ticks(self) -> int:
-        """Return the ticks since the last status of the level that ends the run.
+        """Return the number of ticks since the last status of the level that ends the run.
 
-        The result is 0 while the silence is permitted, or if the level has ended.
+        The result is 0 if the silence is not longer than permitted, or if the last status has state
+        done or error. Call this only if a level ends the run.
         """
         assert self._observer is not None, "some level ends the run"
         reading = self._observer.peek()
@@ -409,7 +438,15 @@ class Ending:
 
 @dataclass(frozen=True)
 class ObjectEnd:
-    """Goal and final position of an object, in m."""
+    """Goal and final position of an object.
+
+    Attributes:
+        object: Name of the object.
+        goal: Position of the goal in m.
+        ended: Final position in m.
+        off_mm: Distance between the two.
+        tolerance_mm: Permitted distance.
+    """
 
     object: str
     goal: Sequence[float]
@@ -419,7 +456,12 @@ class ObjectEnd:
 
     @classmethod
     def compare_with_goal(cls, goal: GoalConfig, ended: Sequence[float]) -> Self:
-        """Compare the final position of an object with its goal, in m."""
+        """Compare the final position of an object with its goal.
+
+        Args:
+            goal: Goal of the object.
+            ended: Final position in m.
+        """
         off_mm = round(1e3 * math.dist(ended, goal.position), 3)
         return cls(goal.object, goal.position, ended, off_mm, goal.tolerance_mm)
 

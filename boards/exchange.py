@@ -1,7 +1,9 @@
-"""The exchange record of a board: the message of each port in use, with its age and arrival.
+"""The exchange record of a board: the age and the arrival of the message in use at each input port.
 
-A board whose config has tables `[board.<name>.exchange.<port>]` writes the record into its mailbox
-`<name>.exchange` in every cycle, so that ages and arrivals are recorded like any other message.
+The message in use is the last one that the board has read. Its arrival is the cycle that read it
+first. A board whose config has tables `[board.<name>.exchange.<port>]` writes the record into its
+mailbox `<name>.exchange` in every cycle, so that ages and arrivals are recorded like any other
+message.
 """
 
 from __future__ import annotations
@@ -18,19 +20,21 @@ if TYPE_CHECKING:
     from rack.boards.wiring import Source
 
 EXCHANGE_PORT = "exchange"
-"""Name of the port and of the message type."""
+"""Name of the port for the exchange record, and of its message type."""
 AGE_SUFFIX = "age"
 TAKEN_SUFFIX = "taken"
-"""Suffix of the names of fields with arrivals. `AGE_SUFFIX` is the suffix for ages."""
+"""Suffix of the names of fields with arrivals. Fields with ages have `AGE_SUFFIX`."""
 _NEW = Verdict.NEW  # for the hot path
 NEVER = -1
-"""Tick of arrival before the first message."""
+"""Tick of arrival that stands for no message."""
 
 
 def build_exchange_message(reads: Mapping[str, Source]) -> type[Message]:
-    """Create the message class for a board that reads these ports.
+    """Create the message class of a board's exchange record.
 
-    It has two fields for each mailbox.
+    Args:
+        reads: Source of each input port. The message has two fields for each mailbox: age and
+            arrival.
     """
     age = (
         "from the release of the message in use to that of this cycle; negative: released later; 0"
@@ -48,14 +52,21 @@ def build_exchange_message(reads: Mapping[str, Source]) -> type[Message]:
 
 @dataclass(frozen=True)
 class PortAge:
-    """Age and arrival of the message in use, in ticks."""
+    """Age of the message in use and tick of its arrival, both in ticks."""
 
     age: int
     taken: int
 
 
 def list_port_ages(exchange: Message) -> dict[str, PortAge]:
-    """Return age and arrival of the inputs that have a message in use, by label."""
+    """Return age and arrival of each input that has received a message.
+
+    Args:
+        exchange: Exchange record of a board.
+
+    Returns:
+        Ages and arrivals by label: the port, or "<port>_<board>" for a port with several mailboxes.
+    """
     names = exchange.record.dtype.names or ()
     values = iter(exchange.raw.cast("q"))
     labels = [name.removesuffix(f"_{AGE_SUFFIX}") for name in names[::2]]
@@ -66,7 +77,7 @@ def list_port_ages(exchange: Message) -> dict[str, PortAge]:
 
 
 class MonitoredPort(NamedTuple):
-    """The last reading of one mailbox, `readings[key]`, and its reader."""
+    """Access to the last reading of one mailbox, which is `readings[key]`, and to its reader."""
 
     readings: Mapping[str, Reading[AnyMessage]]
     key: str
@@ -74,9 +85,9 @@ class MonitoredPort(NamedTuple):
 
 
 class ExchangeRecord:
-    """Fills a board's exchange message from its inputs.
+    """Fills a board's exchange record from its inputs.
 
-    The inputs are in the order of `build_exchange_message`.
+    The inputs must be in the order of the ports passed to `build_exchange_message`.
     """
 
     def __init__(self, inputs: Sequence[MonitoredPort], message: Message) -> None:
@@ -87,7 +98,7 @@ class ExchangeRecord:
             self._values[2 * at + 1] = NEVER
 
     def fill_message(self, tick: int) -> None:
-        """Record the messages in use, after the reads of the cycle released at `tick`."""
+        """Update ages and arrivals. Call this after the reads of the cycle released at `tick`."""
         values = self._values
         at = 0
         for readings, key, reader in self._inputs:

@@ -1,4 +1,4 @@
-"""Operator requests: the addressed level, the message, and the command as text."""
+"""Reading of operator requests: the addressed level, the message, and the command as text."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rack.levels.operator import Goal, Operation, OperatorCommand
 
 
 def find_level(entry: RequestEntry, layout: Layout) -> str:
-    """Return the board whose level a request addresses."""
+    """Return the name of the board whose level a request addresses."""
     return _find_mailbox(entry, layout).name.partition(".")[0]
 
 
@@ -26,10 +26,10 @@ def copy_request_message(entry: RequestEntry, layout: Layout) -> OperatorCommand
 
 
 def _find_mailbox(entry: RequestEntry, layout: Layout) -> MailboxSpec:
-    """Return the mailbox of a request.
+    """Return the mailbox into which a request's command goes.
 
     Raises:
-        DamageError: The mailbox is not an operator's.
+        DamageError: The mailbox is not for operators' commands.
     """
     mailbox = select_item(layout.mailboxes, entry.mailbox, "mailbox")
     if mailbox.message != OperatorCommand.message_type.name:
@@ -38,14 +38,14 @@ def _find_mailbox(entry: RequestEntry, layout: Layout) -> MailboxSpec:
 
 
 def build_hold_command(mailbox: MailboxSpec) -> OperatorCommand:
-    """Build the operator's hold command for the operator mailbox of a level."""
+    """Build a hold command, to be written to the operator mailbox of a level."""
     message = OperatorCommand(build_message_dtype(mailbox.fields, mailbox.size))
     message.what = Operation.HOLD
     return message
 
 
 def describe_command(message: OperatorCommand) -> str:
-    """Describe a command in one line: its verb, the name in it, and its goal."""
+    """Describe a command in one line: its operation, its goal, and a name if it has one."""
     verb = to_enum(Operation, message.what).name.lower()
     goal = message.goal
     if goal == Goal.JOINTS:
@@ -66,5 +66,5 @@ def describe_command(message: OperatorCommand) -> str:
 
 
 def _format_numbers(values: np.ndarray) -> str:
-    """Format numbers for a command line."""
+    """Format numbers as text, separated by commas."""
     return ", ".join(f"{value:g}" for value in values.tolist())

@@ -1,4 +1,4 @@
-"""Plain data that the Rack sends to the crate: everything that a process needs to run."""
+"""Plain data that the Rack sends to the crate, with everything that each process needs to run."""
 
 from __future__ import annotations
 
@@ -11,29 +11,35 @@ from rack.backplane.words import Demand
 from rack.levels.level import LevelContext
 
 Source = str | Mapping[str, str]
-"""Source of a port: a mailbox, or mailboxes by board."""
+"""Source of an input port: the name of a mailbox, or several names by board."""
 
 
 EntityRows = Sequence[tuple[int, int, bytes]]
 """Messages of a mailbox in a recorded run, oldest first.
 
-Each row has the tick at which the message was written, the tick of the information on which it
-depends, and its bytes. A mailbox whose messages repeat has only rows for changes.
+Each row has the tick at which a message was written, the tick of the oldest information on which it
+depends, and its bytes. For a mailbox that is written in every cycle, only changes have rows.
 """
 ExchangedEntries = Mapping[str, EntityRows]
 """Messages that an adapter wrote in a recorded run, by port."""
 
 
 def list_mailboxes(source: Source) -> tuple[str, ...]:
-    """Return the mailboxes of a port."""
+    """Return the names of the mailboxes of an input port."""
     return (source,) if isinstance(source, str) else tuple(source.values())
 
 
 @dataclass(frozen=True)
 class BusTimes:
-    """Minimum processor time of each kind of access in ns, to emulate a slower bus.
+    """Minimum processor time in ns of each kind of bus access, to emulate a slower bus.
 
-    See `[board.<name>.transfer]`.
+    See `[board.<name>.transfer]` in a config.
+
+    Attributes:
+        read_ns: Reading commands and statuses.
+        write_ns: Writing commands and statuses.
+        exchange_ns: Transferring the plan from the planner's processor.
+        update_ns: Writing the plan.
     """
 
     read_ns: int = 0
@@ -47,9 +53,9 @@ class SnapshotPolicy:
     """Policy for the snapshots of a rack in lockstep.
 
     Attributes:
-        part: Snapshots take at most 1 / `part` of the run's time. 0 for no snapshots by this
-            rule.
-        every: Ticks between additional snapshots, 0 for none.
+        part: Snapshots are taken as often as possible, but take at most 1 / `part` of the run's
+            time. 0 for no such snapshots.
+        every: Number of ticks between additional periodic snapshots, 0 for none.
         at: Tick before which one more snapshot is taken, None for none.
     """
 
@@ -60,16 +66,16 @@ class SnapshotPolicy:
 
 @dataclass(frozen=True)
 class Continuation:
-    """Point from which a rack in lockstep continues: its crate's last snapshot by `tick`.
+    """Point from which a rack in lockstep continues: its crate's last snapshot up to `tick`.
 
-    A task continues as it was in the snapshot, possibly with other settings. If its wiring differs,
-    it starts afresh with the content of its mailboxes.
+    A task continues in the state of the snapshot, possibly with other settings. If its wiring
+    differs, it is started anew and reads the restored mailboxes.
 
     Attributes:
         tick: Latest permitted tick of the snapshot.
-        faults: Number of faults of the config that are in the snapshot's table.
-        commands: Number of commands of the config that are in the snapshot's table.
-        losses: Boards lost in the run that it continues, with the ticks.
+        faults: Number of faults of the config that the snapshot's fault table already contains.
+        commands: Number of commands of the config that its operator table already contains.
+        losses: Boards that were lost in the continued run, each with the tick of the loss.
     """
 
     tick: int
@@ -88,16 +94,17 @@ class TaskWiring:
         inputs: Mailboxes of each input port.
         outputs: Mailbox of each output port.
         context: Context of the level.
-        critical_priority: SCHED_FIFO priority of a tightly coupled planner during its plan
-            update.
-        guards_clock: True for one of the fastest tasks, which watch the clock.
-        sent: Ports whose messages the level sends itself.
+        critical_priority: SCHED_FIFO priority of a tightly coupled planner while it writes a
+            plan. 0 to keep its ordinary priority.
+        guards_clock: True if the task checks the clock, as one of the fastest tasks.
+        sent: Output ports whose queues the level fills itself, by calling `send`. Any other
+            queue gets one message per cycle.
         fails_self_test: True if the config injects a failed self-test.
-        entries: Recorded messages for an adapter in a replay.
-        transfer: Processor time of accesses.
-        exchange: Ports that are not simply read in every cycle. If there are any, the task
-            writes its mailbox `<board>.exchange`.
-        reservation: Processor time requested instead of a priority.
+        entries: Recorded messages for an adapter in a replay, otherwise None.
+        transfer: Minimum processor time of bus accesses.
+        exchange: Rules for input ports that are read at a different rate or asynchronously. If
+            there are any, the task writes its mailbox `<board>.exchange`.
+        reservation: Processor time to reserve instead of a priority, None for none.
     """
 
     task: str
@@ -125,8 +132,9 @@ class HostWiring:
         inputs: Mailbox of each input port.
         outputs: Mailbox of each output port.
         context: Context of the program.
-        is_external: True if a prompt runs the board, not the rack.
-        computing: Simulated time for which it computes after each wait in lockstep, in ticks.
+        is_external: True if the rack does not start the board, because `rack prompt` runs it.
+        computing: In lockstep, simulated time in ticks that the program takes to compute after
+            each wait.
     """
 
     board: str
@@ -146,17 +154,18 @@ class ClockWiring:
         lockstep: True for lockstep, False for real time.
         period_ns: Wall-clock time of a tick, including the speed factor.
         stop_tick: Tick at which the run ends, 0 for never.
-        ends_run: Status mailbox whose report of done or error ends the run.
-        linger: Time from that report to the end of the run.
-        silent: Time without a message from the writer of `ends_run`, if it is not lost, that
-            ends the run.
-        history: Maximum lead of the clock over a recorder in lockstep.
+        ends_run: Status mailbox in which state done or error ends the run. None if no level ends
+            the run.
+        linger: Time from that status to the end of the run.
+        silent: The run also ends if `ends_run` has no new message for this time, unless its
+            writer is lost.
+        history: Number of ticks by which the clock may be ahead of a recorder in lockstep.
         core: Processor core.
         priority: SCHED_FIFO priority.
         keeps_awake: True if idle cores must not sleep.
-        restart_ticks: Time from the loss of a board to its rejoining in lockstep.
-        on_loss: Demand on the arm while a task is lost.
-        reservation: Processor time requested instead of a priority.
+        restart_ticks: In lockstep, time from the loss of a board until it rejoins.
+        on_loss: Stop required of the arm while a task is lost, by task.
+        reservation: Processor time to reserve instead of a priority, None for none.
     """
 
     lockstep: bool

@@ -1,13 +1,13 @@
-"""The system controller's side of the clock: makes the ticks and releases the tasks that are due.
+"""The system controller's side of the clock: advances the tick and releases the tasks that are due.
 
-In real time the clock works a little ahead of its grid if any task sleeps by itself (`wake =
-"timer"`): at tick T's grid point the tick has begun and its releases are in place. Whatever the
-clock reads as of T must therefore be final earlier. Conditions on messages are evaluated as of T -
-1, in both modes alike. Tasks that wait for a signal, or poll, are released at the grid point, by a
-second sleep of the clock within the tick.
+In real time the grid point of a tick is the time on CLOCK_MONOTONIC at which its cycles start. If
+any task sleeps by its own timer (`wake = "timer"`), the clock begins each tick a little before its
+grid point, so that the task finds its release when it wakes up. The clock therefore evaluates
+conditions on messages for tick T as of tick T - 1, in both clock modes. Tasks that wait for a
+signal, or poll, are released at the grid point, until which the clock sleeps a second time.
 
-Alternative considered: tasks that release themselves. The clock decides faults, operator commands,
-skipped ticks and the return of a restarted board before the first cycle of a tick. With
+Alternative considered: tasks that release themselves. Before the first cycle of a tick, the clock
+decides about faults, operator commands, skipped ticks and the return of restarted boards. With
 self-released tasks, all these would depend on which process is faster.
 """
 
@@ -32,39 +32,43 @@ LEAD_NS = 300_000
 It covers the clock's wake-up and its work in a tick.
 """
 LATE_DIVISOR = 2
-"""Divisor of the tick that gives the delay from which a core counts as taken away.
+"""A delay of more than one tick divided by this number shows that a core was taken away.
 
 It applies to the clock's wake-up, and to time in which nothing runs although tasks are due.
 """
 LEAD_DIVISOR = 3
-"""Divisor of the tick that limits the time by which the clock is ahead."""
+"""The clock's lead over its grid point is at most one tick divided by this number."""
 
 FindEndTick = Callable[[int], int | None]
-"""Function called before every tick. Returns the tick at which the run stops, once known."""
+"""Function called with every tick before it begins.
+
+Returns the tick before which the run stops, or None while that is not known.
+"""
 
 
 class Controller(Protocol):
-    """Work of the system controller at every tick, apart from releasing tasks."""
+    """Work that the system controller does at every tick, apart from releasing tasks."""
 
     def begin_tick(self, tick: int) -> None:
         """Do the work that is due before the tasks of `tick` are released."""
 
     def finish_release(self, tick: int) -> None:
-        """Do the work that is due after the release."""
+        """Do the work that is due after the tasks of `tick` were released."""
 
     def find_next_work_tick(self, tick: int) -> int:
-        """Return the first tick after `tick` that needs `begin_tick`, as far as is known."""
+        """Return the first tick after `tick` for which `begin_tick` has work, as far as known."""
 
 
 class ClockDriver(ABC):
     """Part common to both clock modes: ticks, releases and the end of the run.
 
     Attributes:
-        controller: Set by the clock's board, if it has one.
-        skip: Number of next ticks to skip.
+        controller: The system controller's other work, set by the clock's board. None without it.
+        skip: Number of ticks, from the next one on, that a fault makes the clock skip.
         tasks: Tasks in the order of their release.
         processes: Tasks and host boards. The clock does not release host boards.
-        is_flooded: True if a fault makes a task write more than the rings are made for.
+        is_flooded: True if a fault makes a task write more messages than its mailboxes can hold
+            for the usual time.
     """
 
     def __init__(
@@ -89,7 +93,7 @@ class ClockDriver(ABC):
         self._segment = segment
 
     def begin_tick(self, tick: int) -> bool:
-        """Publish `tick` and do the work that is due before its releases.
+        """Publish `tick` as the current tick and do the work that is due before its releases.
 
         Returns:
             False if the tick is skipped.
@@ -105,14 +109,18 @@ class ClockDriver(ABC):
     def count_skipped(self, first: int, ticks: int) -> None:
         """Publish that the clock skips `ticks` ticks from `first` on.
 
-        All are published at once, and the count is written last: a late task must see neither half
-        a skip nor a skip that began after its release.
+        The count is written last, once for all these ticks, so that a late task sees neither half a
+        skip nor a skip that began after its release.
         """
         self.words[System.SKIPPED_FROM] = first
         self.words[System.CLOCK_SKIPPED] += ticks
 
     def list_due_tasks(self, tick: int, last: int) -> list[ReleasedTask]:
-        """Return the tasks with a release in (last, tick], in the order of their releases."""
+        """Return the tasks that have a release after tick `last` and up to `tick`.
+
+        They are in the order in which the clock releases them. Tasks that are lost, or that work on
+        a plan, are left out.
+        """
         due_tasks: list[ReleasedTask] = []
         for every, phase, tasks in self._groups:
             release = tick - (tick - phase) % every
@@ -121,7 +129,7 @@ class ClockDriver(ABC):
         return due_tasks
 
     def check_tasks(self, released: list[ReleasedTask], tick: int) -> None:
-        """Do the work that is due after the release of these tasks."""
+        """Check the released tasks for missed releases, then let the controller finish the tick."""
         for task in released:
             if task.missed:
                 self.watchdog.check(task, tick)
@@ -130,32 +138,31 @@ class ClockDriver(ABC):
 
     @property
     def first_tick(self) -> int:
-        """First tick of this clock: 0, or the last tick again after a restart.
+        """First tick of this clock process: 0, or after a restart the last tick, repeated.
 
-        No task is released twice for it, because its deadline shows that it has been released.
+        Tasks already released at that tick are recognised by their deadlines and are not released
+        again.
         """
         return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
     @property
     def first_end_tick(self) -> int:
-        """First tick before which the run may end."""
+        """Earliest tick before which the run can end."""
         return 0
 
     def wait_until_settled(self) -> None:
-        """In lockstep, wait until each task has finished the work of its release, including plans.
+        """In lockstep, wait until every task has finished its last release, including plans.
 
-        Call it before a change of data that tasks read at any time rather than as of a tick. In
-        real time it does not wait, so such a change may take effect within a cycle.
+        Call this before changing data that tasks read during a cycle. In real time this function
+        does not wait, so such a change may take effect in the middle of a cycle.
         """
 
     def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
-        """In lockstep, wait until a condition on the state of a task holds.
-
-        In real time it does not wait.
+        """In lockstep, wait until a condition on a task's state holds. In real time, do not wait.
 
         Args:
-            task: Task whose reports make the condition true.
-            condition: Function that is called after each report.
+            task: Task on whose state the condition depends.
+            condition: Function that evaluates the condition, called after each report of the task.
 
         Returns:
             False if the launcher has ended.
@@ -164,18 +171,18 @@ class ClockDriver(ABC):
 
     @abstractmethod
     def run(self) -> None:
-        """Make ticks until the run is over or the launcher has ended."""
+        """Run tick after tick until the run is over or the launcher has ended."""
 
     def is_over(self, tick: int) -> bool:
-        """Check whether the run ends before `tick`."""
+        """Decide whether the run ends before `tick`, and publish its end once it is known."""
         words = self.words
         stop = words[System.STOP_TICK]
         if words[System.STOP_REQUEST] and (not stop or stop > tick):
             stop = words[System.STOP_TICK] = max(tick, 1)
         if stop and tick >= stop:
             return True
-        # Ask even if the stop is known, because a run that continues this one may end by the
-        # answer.
+        # Call this even if the end is known. It also records the end of the task, by which a run
+        # that continues this one may end.
         end_tick = self._ended(tick)
         if not stop and end_tick is not None:
             stop = words[System.STOP_TICK] = max(end_tick, self.first_end_tick, 1)
@@ -187,16 +194,16 @@ class ClockDriver(ABC):
         return self._segment.launcher_is_alive
 
     def end_run(self) -> None:
-        """End the run, and wake every task so that it notices."""
+        """Publish that the run has ended, and wake every task so that it notices."""
         self.words[System.STATE] = Run.STOPPED
         for task in self.tasks:
             task.wake()
 
 
 class RealtimeDriver(ClockDriver):
-    """Clock in real time, on an absolute grid of CLOCK_MONOTONIC.
+    """Clock in real time. Tick T has its grid point at a fixed time of CLOCK_MONOTONIC.
 
-    A late clock skips ticks and counts them.
+    A clock that wakes up too late skips the ticks that have passed, and counts them.
     """
 
     def __init__(
@@ -210,12 +217,12 @@ class RealtimeDriver(ClockDriver):
         self._lead_ns = min(LEAD_NS, self._period_ns // LEAD_DIVISOR) if leads else 0
 
     def run(self) -> None:
-        """Make ticks until the run is over or the launcher has ended."""
+        """Run tick after tick until the run is over or the launcher has ended."""
         words = self.words
         beat = max(1, int(CHECK_S * 1e9) // self._period_ns)
         for task in self.tasks:
             if task.sleeps:
-                # The task can sleep until its grid points from now on.
+                # The grid is known now, so the task can sleep until its grid points.
                 task.wake()
         last = self.first_tick - 1
         # The grid begins a little after the clock's start, so that tick 0 has a grid point too.
@@ -232,9 +239,10 @@ class RealtimeDriver(ClockDriver):
         self.end_run()
 
     def _release_tasks(self, tick: int, last: int) -> None:
-        """Give every task its release in (last, tick].
+        """Release every task that has a release after tick `last` and up to `tick`.
 
-        Tasks that sleep by themselves get it in advance, the others at the grid point.
+        Tasks that sleep by their own timer are released at once, ahead of the grid point. The
+        others are released at the grid point.
         """
         due = self.list_due_tasks(tick, last)
         point = self._compute_grid_point(tick)
@@ -244,7 +252,8 @@ class RealtimeDriver(ClockDriver):
         now = self.words[System.TICK_NS] = time.monotonic_ns()
         if now >= point or tick > last + 1:
             for task in sleeping:
-                # The task has already looked for its release, found none, and is sleeping again.
+                # At its grid point the task found no release, because the clock was late, and went
+                # back to sleep.
                 if now >= self._compute_grid_point(task.block[Block.RELEASED]):
                     task.wake()
         if len(sleeping) < len(due):
@@ -261,19 +270,19 @@ class RealtimeDriver(ClockDriver):
         return self._epoch_ns + tick * self._period_ns
 
     def _sleep_until(self, time_ns: int) -> None:
-        # Repeat the wait, because rounding may end it slightly early.
         """Sleep until a time, in ns of CLOCK_MONOTONIC."""
+        # Repeat the wait, because rounding may end it slightly early.
         while (wait := time_ns - time.monotonic_ns()) > 0:
             time.sleep(wait * 1e-9)
 
     def _sleep_until_next(self, tick: int) -> int:
-        """Sleep until a tick begins.
+        """Sleep until the tick after `tick` begins.
 
-        The clock preempts all else on its core, so if it wakes late, the core was taken away.
-        Reports recognise stalls by this.
+        The clock has the highest priority on its core. If it wakes up late, the core was taken away
+        from the rack, which an alarm reports.
 
         Returns:
-            The newest tick that is due to begin, at least `tick` + 1.
+            The newest tick that is due, at least `tick` + 1. It is greater if ticks were skipped.
         """
         due_ns = self._compute_grid_point(tick + 1)
         has_ticked = self._woke_ns

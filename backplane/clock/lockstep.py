@@ -1,16 +1,16 @@
 """The clock in lockstep: a tick begins when every task due before it has finished.
 
-Tasks on different cores run at once. Each reports through a separate semaphore. The clock waits for
-one of them at a time, beginning with the task that finished last in the tick before. The reports of
-the others have usually arrived by then, so the clock wakes up once in a tick. Alternatives
-considered: one semaphore for all (the clock wakes up for every report and takes the core from a
-task that is still working), and a word that names the awaited task (it needs a memory barrier on
-each side).
+Tasks on different cores run at the same time. Each task posts its own semaphore to report that it
+has finished a release. The clock waits for one task at a time, beginning with the task that
+finished last in the previous tick. The others have usually finished by then, so the clock wakes up
+once per tick. Alternatives considered: one semaphore for all tasks (the clock wakes up for every
+report and takes the core from a task that is still working), and a word that names the awaited task
+(it needs a memory barrier on each side).
 
-If a single executor is the only task due in the next ticks, it gets their releases as one batch.
-Separate ticks would each cost two switches and the clock's work, together a fifth of a tick of
-`k1607`. In a batch no other task is released, no message of another task becomes visible, and the
-clock has nothing to do, so the executor reads and writes the same messages.
+If an executor is the only task due in the next ticks, it gets their releases as one batch. Separate
+ticks would each cost two context switches and the clock's work, together a fifth of a tick of
+`k1607`. During a batch no other task is released, no message of another task becomes visible, and
+the clock has nothing to do, so the executor reads and writes the same messages as without it.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.words import Run, System
 
 MAX_RECORDER_WAIT_S = 30.0
-"""Maximum wait for a recorder that is stopped, or dead and not replaced.
+"""Maximum time to wait for a recorder that is stopped or dead.
 
-Its launcher replaces it much sooner.
+The launcher replaces a dead recorder much sooner.
 """
 MAX_BATCH_TICKS = 8
-"""Maximum number of ticks in a batch. Requests of the host in between take effect after it."""
+"""Maximum number of ticks in a batch. A request from the host takes effect after the batch."""
 POLL_S = 0.001
-"""Time between checks of recorder and host.
+"""Time between two checks while the clock waits for the recorder or the host.
 
-They post no semaphore, because they must not be able to disturb the clock.
+These processes must not be able to disturb the clock, so they have no semaphore to post.
 """
 
 
@@ -45,8 +45,9 @@ class LockstepDriver(ClockDriver):
     """Driver of the clock in lockstep.
 
     Attributes:
-        snapshot: Function called before every tick, or batch, to take a snapshot if one is due.
-            It returns the next tick before which it must be called. Initially it does nothing.
+        snapshot: Function called before every tick or batch, which takes a snapshot if one is
+            due. It returns the next tick before which it must be called. Initially a function
+            that does nothing.
     """
 
     def __init__(
@@ -61,13 +62,15 @@ class LockstepDriver(ClockDriver):
 
         Args:
             segment: Memory of the rack.
-            ended: Returns the tick at which the run stops, once known.
+            ended: Returns the tick before which the run stops, once known.
             one_at_a_time: True to release the tasks of a tick one after the other, including
-                planners, and to wait for each. Runs under protocols whose messages are visible
-                at once repeat only this way. A task that floods a mailbox also needs it,
-                because messages that others still read would be overwritten in the same tick.
-            history_ticks: Number of ticks that the rings hold for a recorder that is behind.
-            alarms: Alarm ring of the clock, opened if None.
+                planners, and to wait for each of them. Runs with protocols whose messages are
+                visible at once repeat exactly only in this way. While a task floods a mailbox,
+                the driver does this in any case, because the task would overwrite messages that
+                others read in the same tick.
+            history_ticks: Number of ticks by which a recorder may be behind before its rings
+                overflow.
+            alarms: Alarm ring of the clock. None to open it here.
         """
         super().__init__(segment, ended, alarms)
         self._one_at_a_time = one_at_a_time
@@ -80,13 +83,17 @@ class LockstepDriver(ClockDriver):
 
     @property
     def first_end_tick(self) -> int:
-        """The next tick. A run that continues another may begin after its end."""
+        """Earliest tick before which the run can end: the next tick.
+
+        It matters for a run that continues another: its config may set an end before its first
+        tick.
+        """
         return self._next
 
     def run(self) -> None:
-        """Make ticks until the run is over or the launcher has ended."""
+        """Run tick after tick until the run is over or the launcher has ended."""
         self.words[System.STATE] = Run.RUNNING
-        # A restarted clock does not know the end of a batch.
+        # After a restart of the clock, tasks may still be working on a batch of the old process.
         self.wait_until_settled()
         while self._wait_for_tick(tick := self._next):
             if not self.begin_tick(tick):
@@ -101,24 +108,29 @@ class LockstepDriver(ClockDriver):
         self.end_run()
 
     def _wait_for_tick(self, tick: int) -> bool:
-        """Wait for everything that `tick` must wait for. Returns False if the run ends."""
-        # Nothing has been done for this tick yet, so a run that continues from the snapshot begins
-        # with it.
+        """Take a due snapshot, then wait for single-stepping and for the recorder.
+
+        Returns:
+            False if the run ends before `tick`.
+        """
+        # Take the snapshot before any work for this tick, because a run that continues from it
+        # begins with this tick.
         self._snapshot_at = self.snapshot(tick)
         return (
             self._wait_for_step(tick) and not self.is_over(tick) and self._wait_for_follower(tick)
         )
 
     def _find_batch_end(self, due: list[ReleasedTask], tick: int) -> int:
-        """Return the tick before which nothing happens except cycles of the only executor due.
+        """Return the first tick after the batch that begins at `tick`.
 
-        The result is the next tick if there is more to do.
+        Until then nothing happens except the cycles of the one executor that is due. If there is
+        more to do, the batch consists of `tick` alone.
         """
         controller = self.controller
         if len(due) != 1 or controller is None or self._one_at_a_time:
             return tick + 1
         (alone,) = due
-        # During the cycle of a slower executor there are ticks that do not wait for it.
+        # A slower executor's cycle lasts several ticks, and these need not wait for its end.
         if alone.spec.every > 1 or alone.spec.role != "executor" or alone.is_stopped:
             return tick + 1
         words = self.words
@@ -155,7 +167,7 @@ class LockstepDriver(ClockDriver):
             if task.deadline > end:
                 continue
             if task.is_finished(end):
-                # Take its report all the same. Otherwise the semaphore would overflow.
+                # Take the post of its report, or the semaphore would overflow in the end.
                 task.done.try_acquire()
             else:
                 slowest = task
@@ -167,7 +179,7 @@ class LockstepDriver(ClockDriver):
         return True
 
     def wait_until_settled(self) -> None:
-        """Wait until every task has finished the work of its release, including plans."""
+        """Wait until every task has finished its last release, including plans."""
         for task in self.tasks:
             self.await_state(task, task.is_settled)
 
@@ -175,33 +187,41 @@ class LockstepDriver(ClockDriver):
         """Wait until a condition on the state of a task holds.
 
         Args:
-            task: Task whose reports make the condition true.
-            condition: Function that is called after each report.
+            task: Task on whose state the condition depends.
+            condition: Function that evaluates the condition, called after each report of the task.
 
         Returns:
             False if the launcher has ended.
         """
         wait = task.done.wait
         while not condition():
-            # The bound may stem from an earlier wait. A timeout that comes early only costs one
-            # extra check.
+            # The deadline may have been set for an earlier wait. A timeout that comes too early
+            # only costs one extra check.
             if wait() and not self._check_after_timeout(task):
                 return False
         return True
 
     def _check_after_timeout(self, task: ReleasedTask) -> bool:
-        """Check for a stopped task after a wait without a report. Returns False to end the run."""
+        """After a wait without a report, check whether a signal has stopped the task.
+
+        Returns:
+            False if the host requests the end of the run or the launcher has ended.
+        """
         if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
             return False
-        # A signal may have stopped the process, and lockstep must not wait for it.
+        # Lockstep does not wait for a process that a signal has stopped.
         task.check_stopped()
         task.done.set_deadline(time.monotonic_ns() + int(CHECK_S * 1e9))
         return True
 
     def _wait_for_follower(self, tick: int) -> bool:
-        """Wait for a recorder, however slow, before its rings overflow.
+        """Wait for the recorder if its rings would otherwise overflow in `tick`.
 
-        In lockstep no time passes for the rack during this wait.
+        The wait may take any time, because no simulated time passes. A recorder that is stopped or
+        dead is given up after `MAX_RECORDER_WAIT_S`.
+
+        Returns:
+            False if the host requests the end of the run or the launcher has ended.
         """
         words = self.words
         since = time.monotonic()
@@ -218,14 +238,14 @@ class LockstepDriver(ClockDriver):
     def _is_recorder_behind(self, tick: int) -> bool:
         """Check whether the recorder must catch up before `tick`.
 
-        Flooded rings hold little more than one tick.
+        While a mailbox is flooded, its ring holds the messages of little more than one tick.
         """
         if self.is_flooded and self.words[System.FOLLOWER_DRAINED] < tick - 1:
             return True
         return self.words[System.FOLLOWER_TICK] < tick - self._history_ticks
 
     def _wait_for_step(self, tick: int) -> bool:
-        """Hold before `tick` while the host single-steps the rack.
+        """While the host single-steps the rack, wait before `tick` until the host permits it.
 
         Returns:
             False if the launcher has ended.

@@ -1,9 +1,10 @@
 """A task as the clock sees it, and the watchdog for tasks that do not respond to releases.
 
-A missed release does not prove a fault, because on a busy machine any process may be preempted for
-a while. A task counts as lost only with proof: a signal has stopped its process, or it waits for
-something other than its release, or it has used so much processor time that it will not end. A task
-that gets no processor time is starved.
+A release is missed if the task has not finished the one before. That alone does not prove a fault,
+because on a busy machine any process may be preempted for a while. A task counts as hanging, and so
+as lost, only if a signal has stopped its process, if it waits although it has a release, or if it
+has used so much processor time that its cycle will not end. A task that gets no processor time
+counts as starved.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ RELEASES_MISSED = 4
 Three gave one false alarm in 24,000 cycles at 400 Hz.
 """
 MIN_HANG_NS = 1_000_000_000
-"""Minimum processor time, or waiting time, before a task counts as hanging."""
+"""Minimum time that a task must wait or compute without finishing before it counts as hanging."""
 
 
 class ReleasedTask:
@@ -31,13 +32,14 @@ class ReleasedTask:
 
     Attributes:
         index: Index of the task in the layout.
-        sleeps: True if it sleeps to its grid points by itself in real time.
+        sleeps: True if in real time it sleeps until its grid points by its own timer.
         is_posted: True if it waits for its semaphore, which `wake()` posts.
-        done: Semaphore that it posts in lockstep.
-        missed: Releases since it last finished one: 1 when it becomes late, 2 while it finishes
-            each release late, more while it finishes none.
-        deadline: Tick before which its release or plan must be finished, or its messages sent,
-            as last read. It only moves later.
+        done: Semaphore that it posts in lockstep to report a finished release.
+        missed: Number of releases in a row that it has missed. While it still finishes releases,
+            each one late, the number stays at 2.
+        deadline: Tick before which it must finish its release or plan, or send its messages if
+            that is earlier. As last read from the control block, where the task moves it to a
+            later tick when it begins a plan.
         is_stopped: True if a signal has stopped its process, so that lockstep must not wait for
             it.
     """
@@ -59,7 +61,7 @@ class ReleasedTask:
         self.done = get_done_semaphore(segment, spec.name)
 
     def can_take_release(self, release: int) -> bool:
-        """Check whether the task can take a release.
+        """Check whether the task can be released at tick `release`.
 
         It cannot while it works on a plan or is lost.
         """
@@ -67,11 +69,11 @@ class ReleasedTask:
         return block[Block.DEADLINE] <= release and not self.is_lost
 
     def release(self, tick: int, more: int = 0) -> None:
-        """Give the task its newest release.
+        """Release the task, and update `missed` and its deadline.
 
         Args:
-            tick: Current tick.
-            more: Number of releases after this one that the task gets as well, in lockstep.
+            tick: Current tick. The release tick is the task's last one up to this tick.
+            more: Number of further releases given at once, as a batch in lockstep.
         """
         block = self.block
         every = self._every
@@ -93,23 +95,23 @@ class ReleasedTask:
         block[Block.RELEASED] = newest
 
     def find_next_event(self, tick: int) -> int:
-        """Return the first tick after `tick` that must wait for the task or releases it."""
+        """Return the first tick after `tick` that waits for this task or releases it."""
         if self.deadline > tick:
             return self.deadline
         return tick + 1 + (self._phase - tick - 1) % self._every
 
     def is_settled(self) -> bool:
-        """Check whether nothing needs to wait for the task: it has finished or never will."""
+        """Check whether the task has finished its last release, or is lost or stopped."""
         block = self.block
         return block[Block.DONE] == block[Block.RELEASED] or self.is_lost or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
-        """Check whether `tick` may begin without waiting for the task."""
+        """Check whether `tick` may begin: the task is settled, or its deadline is later."""
         self.deadline = self.block[Block.DEADLINE] - self._early
         return self.deadline > tick or self.is_settled()
 
     def check_stopped(self) -> None:
-        """Check whether a signal has stopped its process."""
+        """Set `is_stopped`: whether a signal has stopped the task's process."""
         self.is_stopped = read_state(self.block[Block.PID]) in STOPPED_STATES
 
     @property
@@ -119,14 +121,14 @@ class ReleasedTask:
 
     @property
     def lost_tick(self) -> int:
-        """Tick at which a lost task was found lost."""
+        """Tick at which the loss of the task was found, -1 if it is not lost."""
         return self.block[Block.LOST] - 1
 
     @property
     def is_ready(self) -> bool:
-        """True if the new process of a lost task waits for its first release.
+        """True if a lost task has a new process that has completed its start-up.
 
-        The process of a host board may have ended already.
+        The new process of a host board may already have ended again.
         """
         return self.block[Block.STATE] in (TaskState.READY, TaskState.RUNNING, TaskState.ENDED)
 
@@ -136,12 +138,12 @@ class ReleasedTask:
         return self.block[Block.STATE] == TaskState.GIVEN_UP
 
     def mark_lost(self, tick: int) -> None:
-        """Stop releasing the task until its new process has rejoined."""
+        """Mark the task as lost at `tick`. It gets no releases until its new process rejoins."""
         self.block[Block.STATE] = TaskState.ABSENT
         self.block[Block.LOST] = tick + 1
 
     def admit_new_process(self) -> None:
-        """Admit the task's new process. The next release on the grid is its first."""
+        """Let the task's new process rejoin. Its first release is the task's next one."""
         block = self.block
         block[Block.DONE] = block[Block.RELEASED]
         block[Block.DEADLINE] = 0
@@ -159,7 +161,7 @@ def sort_by_priority(layout: Layout) -> list[TaskSpec]:
 
 
 class Watchdog:
-    """Watchdog for tasks that miss releases. `losses` counts the tasks found hanging."""
+    """Watchdog for tasks that miss releases. `losses` is the number of tasks found hanging."""
 
     def __init__(self, alarms: AlarmWriter, period_ns: int) -> None:
         self._alarms = alarms
@@ -168,7 +170,11 @@ class Watchdog:
         self._used_ns: dict[int, int] = {}  # task -> processor time when it was first checked
 
     def check(self, task: ReleasedTask, tick: int) -> None:
-        """Check a task that has missed a release by `tick`, and raise its alarms."""
+        """Check a task that has missed releases, and raise alarms about it.
+
+        An alarm reports the first missed release. After `RELEASES_MISSED` of them, the task is
+        either marked as lost, if it hangs, or reported as starved.
+        """
         missed = task.missed
         spec = task.spec
         if missed == 1:
@@ -190,7 +196,7 @@ class Watchdog:
             )
 
     def _is_hanging(self, task: ReleasedTask) -> bool:
-        """Check whether a task that has missed several releases is proved to hang."""
+        """Check for proof that a task hangs: it is stopped, waits, or has computed too long."""
         spec = task.spec
         pid = task.block[Block.PID]
         state = read_state(pid)

@@ -19,7 +19,7 @@ class SystemClock:
 
     @property
     def tick(self) -> int:
-        """Newest tick of the clock board."""
+        """Newest tick that the clock board has begun."""
         return self._words[System.TICK]
 
     @property
@@ -30,8 +30,8 @@ class SystemClock:
     def compute_tick(self) -> int:
         """Return the current tick.
 
-        In real time it is computed from the grid, because the clock board may be late. In lockstep
-        it is the newest tick.
+        In real time it is computed from CLOCK_MONOTONIC, because the clock board may be late. In
+        lockstep it is the newest tick that the clock board has begun.
         """
         if self.is_lockstep:
             return self._words[System.TICK]
@@ -39,7 +39,7 @@ class SystemClock:
 
     @property
     def period_ns(self) -> int:
-        """Time from tick to tick, in ns of the wall clock."""
+        """Length of a tick in real time, in ns. It depends on the speed factor of the run."""
         return self._words[System.PERIOD_NS]
 
     def compute_time_ns(self, tick: int) -> int:
@@ -59,12 +59,13 @@ def compute_period_ticks(
     Args:
         rate_hz: Rate, rounded to four digits or more, such as 57.14 Hz for 400 Hz / 7.
         clock_ns: Length of a tick.
-        subject: Name of the thing that has the rate, for the error message.
-        of: Words of the error message for the grid and for one step of it.
+        subject: Name of what has the rate, for the error message.
+        of: Words of the error message for what is divided and for one of its periods.
         fastest_hz: Highest rate that the error message may suggest.
 
     Raises:
-        ClockError: The rate is off the grid. The error names the nearest rates.
+        ClockError: The rate does not divide the clock's rate. The error names the nearest rates
+            that do.
     """
     clock_hz = 1e9 / clock_ns
     grid, step = of

@@ -1,11 +1,14 @@
 """Waiting for the next cycle: `waituntil(next-cycle)` of the paper's pseudo-code.
 
-"timer": the task sleeps until its next grid point and finds its release in place, because the clock
+The grid point of a tick is its time on CLOCK_MONOTONIC.
+
+"timer": the task sleeps until its next grid point, at which it finds its release, because the clock
 works a little ahead of the grid (`rack.backplane.clock.driver`). Its lateness is then the lateness
-of one wake-up, not of two in a row (clock, then task). If the release is missing, the clock is
-late, stopped, or has skipped a tick. The task sleeps until its next grid point, and the late clock
-wakes it with a post. A sleep of more than `MAX_SLEEP_NS` is a wait for the task's semaphore until
-the grid point, so that the end of a run ends it. A shorter sleep takes less processor time.
+of one wake-up, not of two in a row (clock, then task). If there is no release, the clock is late,
+stopped, or has skipped a tick. The task then sleeps until its next grid point, unless the late
+clock posts its semaphore earlier. A wait of more than `MAX_SLEEP_NS` is a wait for the semaphore
+with the grid point as its deadline, so that the end of a run interrupts it. Shorter waits are plain
+sleeps, which take less processor time.
 
 "signal": the task blocks on its semaphore until the clock posts it at the grid point.
 
@@ -31,23 +34,23 @@ from rack.backplane.words import Block, Run, System
 # Plain integers for the hot path.
 _STOPPED = int(Run.STOPPED)
 CHECK_S = 0.25
-"""Time after which a wait checks whether the launcher is still alive."""
+"""Time after which a waiting task checks whether the launcher is still alive."""
 MAX_SLEEP_NS = 25_000_000
 """Longest sleep that cannot be interrupted."""
 POLLS_PER_CHECK = 100_000
-"""Number of polls between two checks of the launcher, which take some milliseconds."""
+"""Number of polls between two checks of the launcher. This many take some milliseconds."""
 
 
 class NextCycle:
-    """Releases of one task on the grid. A late task skips the releases that passed.
+    """Waits for the releases of one task. A late task skips releases that have expired.
 
-    An executor's release has passed at the next release, except that releases given at once in
-    lockstep are taken one after the other. A planner's release has passed at the end of its plan's
-    time slice. Until then it is taken late, as of its tick, because its result depends on ticks
-    alone.
+    An executor's release expires at the task's next release, except that the releases of a batch in
+    lockstep are all taken, one after the other. A planner's release expires at the end of the
+    plan's time slice. Until then the planner takes it late, but reads as of its tick, so that its
+    plan depends on ticks alone.
 
     Attributes:
-        skipped: Number of releases that passed before the last one taken.
+        skipped: Number of releases skipped just before the last one taken.
     """
 
     def __init__(
@@ -58,8 +61,8 @@ class NextCycle:
         Args:
             segment: Memory of the rack.
             task: Name of the task.
-            clock_alarms: Ring for the alarm about a silent clock. None to leave the clock
-                unchecked.
+            clock_alarms: Alarm ring of the task, to report a clock that has stopped. None if this
+                task does not check the clock.
         """
         self._spec = spec = segment.layout.find_task(task)
         self._words = segment.words
@@ -81,15 +84,15 @@ class NextCycle:
         self._silent_clock = (
             None if is_lockstep or clock_alarms is None else SilentClock(segment, clock_alarms)
         )
-        # A restarted task skips the releases before its start. The clock does not write this word
-        # until the task has rejoined.
+        # A restarted task skips the releases before its start. This process may write RELEASED
+        # here, because the clock does not until the task has rejoined.
         self._block[Block.RELEASED] = self._block[Block.DONE]
         self._due = self._block[Block.DONE] + 1
         self.skip_until(self._due)
         self._slack = 0
         self.skipped = 0
         self.copy: Callable[[], None] | None = None
-        """Function called between two cycles when the clock wants a copy of the task."""
+        """Function called between two cycles to fork a copy of the task for a snapshot."""
 
     def wait(self) -> int | None:
         """Wait for the next release, and set `skipped`.
@@ -101,20 +104,20 @@ class NextCycle:
         block = self._block
         is_posted = self._is_posted
         while True:
-            # Read this first. A task that is late for the run's last release then still takes it,
-            # so that the miss is noticed.
+            # Read this before RELEASED, so that a task that is late for the run's last release
+            # still takes it and the miss is noticed.
             is_over = words[System.STATE] == _STOPPED
             # Read the task's release, not the clock's tick, because in lockstep the task may be
             # released later in a tick.
             newest = block[Block.RELEASED]
             if self._sleeps and newest >= self._due and self._is_before_grid_point(newest):
-                # A task woken late may find that the next release has been given too. The previous
-                # one must be taken first.
+                # The clock gives releases ahead of their grid points. Do not take this one yet, but
+                # take the previous one if that is still open.
                 newest -= self._spec.every
             if newest >= self._due:
                 if is_posted and newest != self._newest:
-                    # Take the post of this release, or of its batch, for which the task has not
-                    # waited. Otherwise the semaphore would overflow within weeks.
+                    # The task did not have to wait for this release or batch, so its post is still
+                    # pending. Take it, or the semaphore would overflow within weeks.
                     self._semaphore.try_acquire()
                 self._newest = newest
                 return self._take_release(newest)
@@ -125,7 +128,11 @@ class NextCycle:
             is_posted = False
 
     def _take_release(self, newest: int) -> int:
-        """Take the oldest release that has not passed."""
+        """Take the oldest release that has not expired, and return its tick.
+
+        Args:
+            newest: Newest release given to the task.
+        """
         every = self._spec.every
         expected = self._due
         oldest = self._block[Block.FIRST] if self._takes_batches else newest - self._slack
@@ -138,7 +145,7 @@ class NextCycle:
         return release
 
     def _is_before_grid_point(self, release: int) -> bool:
-        """Check whether the grid point of a release is still to come."""
+        """Check whether the grid point of a release is in the future."""
         return (
             monotonic_ns() < self._words[System.EPOCH_NS] + release * self._words[System.PERIOD_NS]
         )
@@ -146,13 +153,17 @@ class NextCycle:
     def _sleep_until_release(self) -> bool:
         """Sleep until the grid point of the next release.
 
-        If that has passed, sleep until the task's next grid point or a late release.
+        If that grid point has passed, sleep until the task's following one, or until the late clock
+        posts the semaphore.
+
+        Returns:
+            False if the launcher has ended.
         """
         words = self._words
         now = monotonic_ns()
         deadline = bound = now + int(CHECK_S * 1e9)
         is_due = False
-        # The clock has no grid before its start, at which it wakes every task once.
+        # The grid is unknown until the clock starts, which then wakes every task once.
         if epoch := words[System.EPOCH_NS]:
             point = epoch + self._due * words[System.PERIOD_NS]
             step = self._spec.every * words[System.PERIOD_NS]
@@ -169,9 +180,9 @@ class NextCycle:
         return self._check_after_timeout()
 
     def _await_post(self) -> bool:
-        # The bound may stem from an earlier wait. A timeout that comes early only costs one extra
-        # check.
         """Wait for the semaphore in lockstep. Returns False if the launcher has ended."""
+        # The deadline may have been set for an earlier wait. A timeout that comes too early only
+        # costs one extra check.
         if not self._semaphore.wait():
             return True
         self._semaphore.set_deadline(monotonic_ns() + int(CHECK_S * 1e9))
@@ -186,7 +197,7 @@ class NextCycle:
         return not self._semaphore.wait() or self._check_after_timeout()
 
     def _poll_release(self) -> bool:
-        """Poll for the release. Returns False if the launcher has ended."""
+        """Busy-wait for the next release. Returns False if the launcher has ended."""
         block = self._block
         due = self._due
         for _ in range(POLLS_PER_CHECK):
@@ -207,25 +218,28 @@ class NextCycle:
 
     @property
     def _has_begun(self) -> bool:
-        """True if a release has passed. Before the first one the clock may not have started."""
+        """True if the task is past its first release. Until then the clock may not have started."""
         return self._due > self._spec.phase
 
     def skip_until(self, tick: int) -> None:
-        """Take no release before `tick`. A planner keeps the time slice of its plan this way."""
+        """Take no release before `tick`. A planner calls this to reserve its plan's time slice."""
         self._due = max(self._due, self._spec.grid.find_tick(tick))
 
 
 CLOCK_PATIENCE_TICKS = 2
-"""Ticks after a missing release before the clock is checked."""
+"""Number of ticks to wait for a missing release before the clock is checked."""
 CLOCK_SILENT_S = 0.5
-"""Time without a tick after which a clock whose process waits counts as stopped.
+"""Time without a tick after which a clock whose process is blocked counts as stopped.
 
-Such a clock cannot be waiting for a tick.
+This is longer than a clock ever waits for its next tick.
 """
 
 
 class SilentClock:
-    """A task's check of a clock that makes no ticks. A late clock is not reported."""
+    """Detects, for one task, that the clock has stopped making ticks.
+
+    A silence of the clock is reported once. A clock that is only late is not reported.
+    """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
         self._words = segment.words
@@ -235,20 +249,20 @@ class SilentClock:
         self._waited_at = -1
 
     def end_silence(self) -> None:
-        """Record a release, which ends an episode of silence."""
+        """Record that a release has come, which ends a silence of the clock."""
         self._is_reported = False
 
     def compute_patience_ns(self, expected: int) -> int:
-        """Return the time to wait before the next check, in ns.
+        """Return how long to wait for a release before the clock is checked, in ns.
 
         Args:
-            expected: Tick of the next release.
+            expected: Tick of the release.
         """
         late = self._clock.compute_time_ns(expected + CLOCK_PATIENCE_TICKS) - monotonic_ns()
         return late if late > 0 else CLOCK_PATIENCE_TICKS * self._clock.period_ns
 
     def check(self) -> None:
-        """Raise one alarm if the process of the clock is stopped, dead, or silent for too long."""
+        """Raise one alarm per silence if the clock's process is stopped, dead, or blocked."""
         now = self._clock.compute_tick()
         newest = self._words[System.TICK]
         if now - newest < CLOCK_PATIENCE_TICKS:
@@ -257,14 +271,14 @@ class SilentClock:
         silent_s = (now - newest) * self._clock.period_ns * 1e-9
         clock = self._words[System.CLOCK_PID]
         state = read_state(clock)
-        # A clock that could run is only late. Check a waiting one twice, because after a pause of
-        # the whole machine it may be about to wake.
+        # A clock whose process could run is only late. If the process is blocked, check twice,
+        # because after a pause of the whole machine it may be about to wake.
         waits = silent_s > CLOCK_SILENT_S and state in WAITING_STATES
         has_stopped = state in STOPPED_STATES + ENDED_STATES or (
             waits and self._waited_at == newest
         )
         self._waited_at = newest if waits else -1
-        # A new tick, or the end of the run, proves that the clock was running.
+        # A new tick, or the end of the run, would show that the clock was running.
         if (
             has_stopped
             and not self._is_reported

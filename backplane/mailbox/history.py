@@ -1,10 +1,11 @@
-"""Messages of a mailbox for the host side: in blocks, and as the digest of a run.
+"""Access to the messages of a mailbox for recorders and tools, and the digest of a run.
 
-The digest is a hash over everything that every task wrote: ticks and values, no wall-clock time.
-Each message carries the chained checksum of its mailbox, so the digest is complete even if a
-recorder lost rows, and a restarted writer continues it. Messages that become visible after the last
-tick do not count: they are never read, and whether they are written before the run ends depends on
-timing. The mailboxes of host boards do not count either, because they are not written at ticks.
+The digest is a hash over everything that the tasks wrote: ticks and values, but no wall-clock
+times. It is computed from the newest chained checksum of each mailbox, which covers all earlier
+messages. The digest is therefore complete even if a recorder has lost messages, and a restarted
+writer continues the chain. Messages that become visible after the last tick do not count: they are
+never read, and whether they are written before the run ends depends on timing. The mailboxes of
+host boards do not count either, because they are not written at ticks.
 """
 
 from __future__ import annotations
@@ -41,9 +42,9 @@ HEAD_WORDS = {
 
 
 class MailboxRing(Ring):
-    """Messages of a mailbox as a ring of rows with the fields of `HEAD_WORDS` and `message`.
+    """Reader of a mailbox's messages in blocks, as rows with fields `HEAD_WORDS` and `message`.
 
-    It omits the messages that every reader rejects: lost, damaged or forged ones.
+    Messages that every reader rejects are omitted: lost, damaged or forged ones.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -57,7 +58,7 @@ class MailboxRing(Ring):
         self._covered = slice(CHECKED_FROM, SLOT_HEAD_SIZE + spec.size)
 
     def read_new_rows(self) -> NewRows:
-        """Read every good message written since the last call."""
+        """Read the messages written since the last call, except lost, damaged or forged ones."""
         rows, lost = super().read_new_rows()
         if not len(rows):
             return NewRows(rows, lost)
@@ -66,7 +67,8 @@ class MailboxRing(Ring):
         signatures = rows["epoch"]
         lawful = (signatures == holder) | ((signatures & EPOCH_MASK) < get_epoch(holder))
         if not lawful[-1]:
-            # This message was forged. The lawful writer will overwrite it, so read the row again.
+            # The newest message is forged. The true writer will overwrite it with its next message,
+            # which has the same serial, so read this row again at the next call.
             self._taken -= 1
         covered = rows.view(np.uint8).reshape(len(rows), self._stride)[:, self._covered]
         checks = (
@@ -84,7 +86,7 @@ class MailboxRing(Ring):
 
 
 def build_row_dtype(spec: MailboxSpec) -> np.dtype:
-    """Return the type of one row of a mailbox's ring, including padding."""
+    """Return the dtype of a row of `MailboxRing`, which spans a whole slot with its padding."""
     message = build_message_dtype(spec.fields, spec.size)
     return np.dtype(
         {
@@ -97,11 +99,14 @@ def build_row_dtype(spec: MailboxSpec) -> np.dtype:
 
 
 def find_chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
-    """Return serial and chained checksum of the newest message of every timed mailbox.
+    """Find the newest good message of every mailbox that is not written by a host board.
 
     Args:
         segment: Memory of the rack.
         until: Only messages that were visible before this tick count.
+
+    Returns:
+        Serial and chained checksum of that message by mailbox. Both are 0 without a message.
     """
     chain_by_mailbox = {}
     for spec in segment.layout.timed:
@@ -121,7 +126,7 @@ def find_chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
 
 
 def compute_digest(segment: Segment, until: int | None = None) -> str:
-    """Compute the digest of a run, 32 hexadecimal digits.
+    """Compute the digest of a run, a text of 32 hexadecimal digits.
 
     Args:
         segment: Memory of the rack.

@@ -1,6 +1,6 @@
-"""Bounded ring mailboxes from one host board to one bus adapter, not by ticks.
+"""Mailboxes from a host board to its bus adapter, as bounded rings without ticks.
 
-The host board writes at any time. If the ring is full, a write returns False and never waits, and
+The host board writes at any time and never waits. If the ring is full, the message is refused, so
 no message is overwritten that the adapter has not taken. The adapter takes any number of messages
 in its cycles and rejects messages that are damaged, forged, or contain values that their type does
 not permit. Its position in the ring is in shared memory, so a restarted adapter continues from it.
@@ -25,17 +25,20 @@ from rack.backplane.words import Box
 
 
 class HostWriter(DoubleBufferWriter):
-    """The host board's end of a ring. Opening it claims the mailbox, as for any writer."""
+    """Writing end of a ring, for the host board. Like any writer, it claims the mailbox."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._box = self.slots.box
 
     def send_message(self, tick: int) -> bool:
-        """Publish `message`, written at `tick`.
+        """Publish `message`.
+
+        Args:
+            tick: Current tick, stored with the message.
 
         Returns:
-            False if the ring is full. The message is then counted as refused.
+            False if the ring is full. The message is then refused, which is counted.
         """
         if self._box[Box.HEAD] - self._box[Box.TAKEN] >= self.spec.capacity:
             self._box[Box.REFUSED] += 1
@@ -44,16 +47,16 @@ class HostWriter(DoubleBufferWriter):
 
 
 class HostReader:
-    """The adapter's end of a ring."""
+    """Reading end of a ring, for the bus adapter."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = spec = segment.layout.find_mailbox(name)
         self._slots = Slots(segment, spec)
         self._box = self._slots.box
         self.refused = 0
-        """Number of messages rejected because they were damaged, forged or improper."""
+        """Number of messages rejected: damaged, forged, or with values that are not permitted."""
         self.superseded = 0
-        """Number of messages that were replaced by a newer one before they were taken."""
+        """Number of messages skipped because a newer one was taken or had overwritten them."""
 
     @property
     def waiting_count(self) -> int:
@@ -67,30 +70,32 @@ class HostReader:
 
     @property
     def written_tick(self) -> int:
-        """Tick at which the message taken last was written."""
+        """Tick at which the last message taken was written."""
         return self._slots.tick
 
     def take_oldest(self) -> AnyMessage | None:
-        """Take the oldest waiting message. Returns None if it is bad.
+        """Take the oldest waiting message. Call this only if a message is waiting.
 
-        The message is valid until the next call.
+        Returns:
+            The message, which is valid until the next call. None if it was rejected.
         """
         head = self._box[Box.HEAD]
         oldest = self._box[Box.TAKEN] + 1
-        # Waiting messages are overwritten only by a writer that breaks the rules.
+        # If more messages wait than the ring may hold, the writer has overwritten some against the
+        # rules.
         serial = max(oldest, head - self.spec.depth + SPARE_SLOTS)
         self.superseded += serial - oldest
         self._box[Box.TAKEN] = serial
         return self._fetch_good(serial)
 
     def take_newest(self, most: int) -> AnyMessage | None:
-        """Take all waiting messages, and return the newest good one.
+        """Take all waiting messages, and return the newest one that is not rejected.
 
         Args:
             most: Maximum number of messages to check.
 
         Returns:
-            None if none of these is good.
+            The message, which is valid until the next call. None if all checked ones were rejected.
         """
         waiting = self.waiting_count
         head = self._box[Box.HEAD]
@@ -102,7 +107,7 @@ class HostReader:
         return None
 
     def _fetch_good(self, serial: int) -> AnyMessage | None:
-        """Return the message of a serial. A bad one is counted as refused and gives None."""
+        """Return the message with a serial. If it must be rejected, count it and return None."""
         slots = self._slots
         if (
             slots.fetch_message(serial)
@@ -115,15 +120,20 @@ class HostReader:
 
 
 def is_proper(record: np.ndarray | np.void, fields: Sequence[FieldSpec]) -> bool:
-    """Check whether a message or groups of one contain only permitted values.
+    """Check whether all values of a message are permitted.
 
-    These are finite numbers, lengths within their limits, members of enums, and ASCII texts.
+    Numbers must be finite, norms of vectors within their limits, enum values members of their enum,
+    and texts ASCII.
+
+    Args:
+        record: The message, or an array of groups of one of its fields.
+        fields: Fields of the message or group.
     """
     return all(_is_permitted(record[field.name], field) for field in fields)
 
 
 def _is_permitted(values: np.ndarray, field: FieldSpec) -> bool:
-    """Check the values of one field, which may have any shape."""
+    """Check whether all values of one field are permitted. See `is_proper`."""
     kind = values.dtype.kind
     if kind == "f" and not np.isfinite(values).all():
         return False
@@ -133,14 +143,20 @@ def _is_permitted(values: np.ndarray, field: FieldSpec) -> bool:
         return False
     if field.length and not _has_length(values, field.length, bool(field.shape)):
         return False
-    # In an array of groups, groups of zeros are empty.
+    # In an array of groups, a group of zeros is an unused entry and is not checked.
     return not field.fields or is_proper(values[values != np.zeros_like(values)], field.fields)
 
 
 def _has_length(values: np.ndarray, limits: tuple[float, float], is_vector: bool) -> bool:
-    """Check the length of vectors along the last axis, or the magnitude of numbers."""
+    """Check whether the norm of each vector, or the magnitude of each number, is within limits.
+
+    Args:
+        values: Numbers, or vectors along the last axis.
+        limits: Smallest and largest permitted value.
+        is_vector: True if `values` contains vectors.
+    """
     sizes = np.abs(values)
     if is_vector:
-        # Never overflows, unlike a sum of squares.
+        # `hypot` does not overflow, unlike a sum of squares.
         sizes = np.hypot.reduce(np.minimum(sizes, 2.0 * limits[1]), axis=-1)
     return bool(((limits[0] <= sizes) & (sizes <= limits[1])).all())

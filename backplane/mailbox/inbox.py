@@ -1,8 +1,9 @@
-"""Timing of a board's inbox under protocol interrupt: messages served, and messages lost.
+"""Timing of a board's inbox under protocol interrupt: when messages are served, and which are lost.
 
-An interrupt handler serves one message at a time, in the order of arrival. `depth` messages may
-wait. A message that arrives when all places are taken is lost. All times are ns. This module does
-not use shared memory: boards, `rack check` and recordings use the same arithmetic.
+An interrupt handler serves one message at a time, in the order of arrival. At most `depth` messages
+wait. A message that arrives while `depth` messages wait is lost. All times are in ns. This module
+does not use shared memory, so that boards, `rack check` and the analysis of recordings can use the
+same arithmetic.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ from typing import NamedTuple
 
 
 class Inbox:
-    """First-in-first-out server with `depth` places to wait.
+    """First-in-first-out server with a bounded waiting room.
 
-    `lost` counts arrivals that found all places taken.
+    Attributes:
+        depth: Maximum number of waiting messages.
+        lost: Number of messages lost because they arrived while `depth` messages waited.
     """
 
     def __init__(self, depth: int) -> None:
@@ -29,14 +32,14 @@ class Inbox:
         self._starts: deque[int] = deque()
 
     def add_message(self, at_ns: int, service_ns: int) -> int | None:
-        """Let a message arrive, not before the previous one.
+        """Add the arrival of a message. Arrivals must be added in the order of their times.
 
         Args:
             at_ns: Time of arrival.
-            service_ns: Time for which the handler serves the message.
+            service_ns: Time that the handler takes to serve the message.
 
         Returns:
-            The end of the service. None if the message is lost.
+            The time at which the service ends. None if the message is lost.
         """
         starts = self._starts
         while starts and starts[0] <= at_ns:
@@ -53,27 +56,27 @@ class Inbox:
 
 
 FULL_LOAD = 0.999
-"""Load of a handler from which its inbox counts as filling up.
+"""Load of a handler from which its inbox counts as overloaded.
 
-It is below 1, so that a simulated burst stays short.
+It is below 1, so that the simulation of a burst stays short.
 """
 
 
 class InterruptSource(NamedTuple):
-    """Messages that arrive every `every_ns`, each served for `service_ns`."""
+    """Periodic messages: one arrives every `every_ns`, and serving it takes `service_ns`."""
 
     every_ns: int
     service_ns: int
 
 
 class Burst(NamedTuple):
-    """Worst case of an inbox: every source sends at once, then in each of its periods.
+    """Worst case of an inbox: all sources send at the same time, and then once in each period.
 
-    It ends when no message waits. From a load of `FULL_LOAD` on, the inbox fills up whatever its
-    depth, and `waiting` and `longest_ns` are None.
+    The burst ends when no message waits. From a load of `FULL_LOAD` on, it need not end, and
+    `waiting` and `longest_ns` are None.
 
     Attributes:
-        load: Share of the processor that the handler uses.
+        load: Share of the processor time that the handler uses.
         waiting: Largest number of waiting messages.
         longest_ns: Longest time from the arrival of a message to the end of its service.
     """
@@ -83,14 +86,15 @@ class Burst(NamedTuple):
     longest_ns: int | None
 
     def fits_depth(self, depth: int) -> bool:
-        """Check whether an inbox with `depth` places never loses a message."""
+        """Check whether an inbox in which `depth` messages can wait never loses a message."""
         return self.waiting is not None and self.waiting <= depth
 
 
 def compute_burst(sources: Sequence[InterruptSource]) -> Burst:
     """Compute the worst case of an inbox with these sources.
 
-    It is the critical instant of a first-in-first-out server.
+    The worst case is the busy period that begins when all sources send at the same time: the
+    critical instant of a first-in-first-out server.
     """
     load = sum(source.service_ns / source.every_ns for source in sources)
     if load >= FULL_LOAD:
@@ -99,8 +103,8 @@ def compute_burst(sources: Sequence[InterruptSource]) -> Burst:
     free_ns = 0
     longest_ns = 0
     for at_ns, service_ns in merge(*(_iterate_arrivals(source) for source in sources)):
-        # Arrivals of one instant belong together. The first busy period ends when an arrival finds
-        # the handler idle.
+        # All arrivals at time 0 belong to the burst. It ends when a later arrival finds the handler
+        # idle.
         if at_ns and at_ns >= free_ns:
             break
         end_ns = inbox.add_message(at_ns, service_ns)
@@ -111,7 +115,7 @@ def compute_burst(sources: Sequence[InterruptSource]) -> Burst:
 
 
 def _iterate_arrivals(source: InterruptSource) -> Iterator[tuple[int, int]]:
-    """Yield the arrivals of a source from time 0 on, each with its service time, in ns."""
+    """Yield time of arrival and service time of each message of a source, from time 0 on."""
     at_ns = 0
     while True:
         yield at_ns, source.service_ns

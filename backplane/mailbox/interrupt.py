@@ -1,28 +1,30 @@
 """Protocol interrupt: every message interrupts each board that reads it.
 
-A handler at the reading board serves one message at a time. A message is sent at a logical instant:
-the release of the cycle that writes it plus that cycle's budgeted processor time, one tick without
-a budget; a plan at the end of its time slice. At the reading board it joins the `Inbox`. A level
-sees it at its first release at or after the end of its service. When too many messages wait, it is
-lost at that board only.
+A handler at the reading board serves one message at a time. A message is sent at an instant that is
+computed, not measured: the release of the writing cycle plus the processor time budgeted for that
+cycle, or plus one tick if there is no budget. A plan is sent at the end of its time slice. At the
+reading board a message joins the `Inbox`. A level can read it at the level's first release at or
+after the end of its service. If too many messages wait at a board, the message is lost at that
+board only.
 
-Every reading task computes its board's inbox independently, from the send times in the heads of the
-slots in shared memory. The result depends on ticks alone, so all tasks of a board agree, and runs
-repeat, as long as messages are in memory at their instant. A message must therefore be written
-before the first tick at or after its instant, and lockstep waits for it. A late message counts as a
-miss of its writer, and as sent in the tick in which it is written.
+Every reading task computes its board's inbox independently, from the ticks in the heads of the
+slots in shared memory. The result depends on ticks alone, so all tasks of a board agree and runs
+repeat exactly, provided that each message is in memory when it is sent. A message must therefore be
+written before the first tick at or after its instant of sending, and in lockstep the clock waits
+for it. A late message counts as a missed deadline of its writer, and as sent in the tick in which
+it is written.
 
-A restarted reader replays the messages that are still in the slots, two seconds at least, and
-continues as the one before it, if the inbox was empty at any time within them. A restarted writer
-continues as under time-slice.
+A restarted reader computes the inbox from the messages that are still in the slots, those of the
+last two seconds or more. The result is the same as in the process before it if the inbox was empty
+at any time within that span. A restarted writer continues as under time-slice.
 
 Between tasks in one slot a message crosses no bus, so it interrupts no board and is read as under
 time-slice.
 
-Alternatives considered: the wall-clock instant of the write (runs would differ even if no deadline
-is missed), the end of the writer's cycle (time-slice with the handler's time on top, so the benefit
-of interrupts, that a message need not wait for a cycle's end, would not show), and a process per
-board that serves interrupts and keeps the inbox in shared memory (a context switch for each
+Alternatives considered: the real time of the write (runs would differ even if no deadline is
+missed), the end of the writer's cycle (this would be time-slice plus the handler's time, without
+the benefit of interrupts that a message need not wait for the end of a cycle), and a process per
+board that serves interrupts and holds the inbox in shared memory (a context switch for each
 message, and one more process that may die).
 """
 
@@ -41,15 +43,15 @@ from rack.backplane.words import Slot
 
 
 def get_interrupt_spec(spec: MailboxSpec) -> InterruptSpec:
-    """Return how the messages of a mailbox of protocol interrupt are sent."""
+    """Return the times of sending and service of a mailbox, which must have protocol interrupt."""
     assert spec.interrupt is not None, f"mailbox '{spec.name}' is of protocol {spec.protocol}"
     return spec.interrupt
 
 
 def compute_send_offset_ns(spec: MailboxSpec, clock_ns: int) -> int:
-    """Return the time from a message's earliest visibility tick to the instant of sending.
+    """Return the time from the earliest tick at which a message is visible to its sending, in ns.
 
-    The time is negative.
+    The result is negative, because a message is sent before it is visible.
     """
     return get_interrupt_spec(spec).sent_ns - spec.delay * clock_ns
 
@@ -57,7 +59,7 @@ def compute_send_offset_ns(spec: MailboxSpec, clock_ns: int) -> int:
 class InterruptWriter(Writer):
     """Writer of a mailbox under protocol interrupt.
 
-    Its messages must be written before they are sent.
+    A message must be written before the tick at which it is due (`InterruptSpec.due`).
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -65,21 +67,25 @@ class InterruptWriter(Writer):
         self._due = get_interrupt_spec(self.spec).due
 
     def compute_visible_tick(self, tick: int, now: int | None) -> int:
-        """Return the earliest tick at which the message is visible.
+        """Return the earliest tick at which a message is visible.
 
-        A late message is sent in the tick that writes it.
+        A message written too late counts as sent in the tick in which it is written.
+
+        Args:
+            tick: Release tick of the cycle that writes.
+            now: Current tick. None if the cycle is known to be on time.
         """
         released = tick if now is None else max(tick, now - self._due + 1)
         return released + self._delay
 
 
 class InterruptLine:
-    """One mailbox that interrupts a board, as seen by that board."""
+    """One of the mailboxes that interrupt a board, as one of the board's tasks sees it."""
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.service_ns = get_interrupt_spec(spec).service_ns
         self.lost = 0
-        """Number of messages lost at this board because too many waited."""
+        """Number of messages of this mailbox lost at this board because too many waited."""
         self.served: deque[int] = deque(maxlen=MAX_STEP_BACK)
         """Serials of the last few messages served."""
         self._slots = slots = Slots(segment, spec)
@@ -93,9 +99,9 @@ class InterruptLine:
 
     @property
     def newest_serial(self) -> int:
-        """Serial of the newest message that a reader must judge.
+        """Newest serial that a reader must examine.
 
-        It was served, lost on its way, or not sent by the writer.
+        It belongs to a served message, to a slot that was never filled, or to a forged message.
         """
         served = self.served
         return max(served[-1] if served else 0, self._missing, self._suspect)
@@ -103,12 +109,12 @@ class InterruptLine:
     def collect_arrivals(
         self, until_ns: int, number: int, arrivals: list[tuple[int, int, int]]
     ) -> None:
-        """Append the messages sent up to an instant to `arrivals`.
+        """Append the messages that were sent since the last call to `arrivals`.
 
         Args:
-            until_ns: The instant.
-            number: Index of this line, stored with each arrival.
-            arrivals: List of (time of arrival, index of the line, serial).
+            until_ns: Time up to which messages are collected.
+            number: Index of this line among the board's lines, stored with each arrival.
+            arrivals: List of (time of arrival, index of the line, serial) to extend.
         """
         head = self._box[0]
         heads = self._heads
@@ -125,7 +131,7 @@ class InterruptLine:
                 # The slot was never filled, so the message raises no interrupt.
                 self._missing = serial
             elif words[Slot.EPOCH] != self._signature and not self._accept_writer(serial):
-                # The true message will replace it, under the same serial.
+                # The message is forged. The true one, with the same serial, will overwrite it.
                 self._suspect = serial
                 break
             else:
@@ -138,7 +144,7 @@ class InterruptLine:
         self._passed = serial - 1
 
     def _accept_writer(self, serial: int) -> bool:
-        """Check whether a message comes from the holder of the claim, or an earlier holder."""
+        """Check whether a message is from a lawful writer, and remember its signature if so."""
         slots = self._slots
         if not slots.copy_slot(serial) or not slots.is_lawful(self._signature):
             return False
@@ -151,7 +157,7 @@ class BoardInbox:
 
     Attributes:
         lines: Mailboxes that interrupt the board, by name.
-        inbox: Timing of the inbox.
+        inbox: Model of the inbox, which computes when messages are served.
     """
 
     def __init__(self, segment: Segment, slot: int) -> None:
@@ -161,12 +167,12 @@ class BoardInbox:
         self.count = 0
         """Number of messages served."""
         self.service_ns = 0
-        """Total time for which the handler has served them."""
+        """Total time that the handler has spent on these messages."""
         self._lines = tuple(self.lines.values())
         self._clock_ns = segment.layout.clock_ns
         self._tick = -1
         self._newest_ns = 0
-        # Messages that have arrived and are not yet served: end of the service, line and serial.
+        # End of the service, line and serial of each message that waits or is being served.
         self._in_service: deque[tuple[int, InterruptLine, int]] = deque()
 
     def advance_to(self, tick: int) -> None:
@@ -190,8 +196,8 @@ class BoardInbox:
             self.service_ns += line.service_ns
 
     def _add_arrival(self, at_ns: int, line: InterruptLine, serial: int) -> None:
-        # A late message cannot be inserted before messages that have already been served.
         """Add the arrival of a message to the inbox, or count the message as lost."""
+        # A late message cannot be inserted before messages that have already been added.
         self._newest_ns = max(self._newest_ns, at_ns)
         end_ns = self.inbox.add_message(self._newest_ns, line.service_ns)
         if end_ns is None:
@@ -215,13 +221,18 @@ class InterruptReader(Reader):
         self._line = inbox.lines[name]
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message served by the release at `tick`, with its verdict."""
+        """Return the newest message whose service has ended by `tick`, with its verdict."""
         self.accesses += 1
         self._inbox.advance_to(tick)
         return self._accept(self._line.newest_serial, tick)
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Accept the newest unread good message that was served before a bad one."""
+        """Accept the newest unread good message that was served before a bad one.
+
+        Args:
+            serial: Serial of the bad message.
+            tick: Release tick of the reading cycle.
+        """
         for older in reversed(self._line.served):
             if self.serial < older < serial:
                 if self._fetch_good(older):

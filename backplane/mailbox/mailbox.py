@@ -3,12 +3,13 @@
 The writer fills `writer.message` and calls `write(tick)`. A reader calls `read(tick)` and gets a
 `Reading` with message and verdict. `tick` is the release tick of the calling cycle. A message
 written in the cycle released at tick T becomes visible at T + delay, the end of that cycle, however
-early it was written. Reads therefore depend on ticks alone.
+early it was written. The result of a read therefore depends on ticks alone. A good message is one
+that was written completely by the lawful writer and not damaged since.
 
-Alternatives considered: a sequence lock (a writer killed inside a write leaves its readers spinning
-for ever), a kernel lock (the paper's, 3 to 4 times the cost: protocol `lock`), and the newest
-complete message (not a function of ticks alone: protocol `double-buffer`). For the memory order on
-which readers rely, see `slots`.
+Alternatives considered: a sequence lock (a writer killed inside a write would leave its readers
+spinning for ever), a kernel lock (as in the paper, at 3 to 4 times the cost: protocol `lock`), and
+the newest complete message (this does not depend on ticks alone: protocol `double-buffer`). For the
+memory order on which readers rely, see `slots`.
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Word
 
 NO_MESSAGE_TICK = 1 << 62
-"""Tick of the newest message before the first one has come.
+"""Release tick that stands for the newest message while there is none yet.
 
-The resulting age is negative, so the message is never too old.
+The age computed from it is negative, so a missing first message never counts as too old.
 """
 MAX_STEP_BACK = 4
-"""Maximum number of messages that a read tries before a bad one, to bound its work."""
+"""Maximum number of older messages that a read tries in place of a bad one."""
 
 
 class Verdict(IntEnum):
     """Result of a read."""
 
-    NONE = 0  # no message has come yet
+    NONE = 0  # no message has been received yet
     OLD = 1  # the same message as in an earlier read
     NEW = 2  # a message not read before
-    BUS_ERROR = 3  # the access was cut off by its bound; the value is the last good one
+    BUS_ERROR = 3  # the access timed out; the message is the last good one
 
 
 M = TypeVar("M", bound=Message, covariant=True)
@@ -54,11 +55,10 @@ class Reading(NamedTuple, Generic[M]):
 
     Attributes:
         message: The message. All bytes are zero before the first one.
-        verdict: Whether the message is new, old or missing.
-        is_lost: True if the writer is dead, hangs, or has been silent for too long for its
-            period.
-        earlier: Unread messages before this one, oldest first, in a mailbox where every message
-            counts.
+        verdict: Whether the message is new or old, or none has been received yet.
+        is_lost: True if the writer is dead or hanging, or has not written for too long.
+        earlier: Other messages that this read received, older than `message`, oldest first. Only
+            for queues and operators' commands, of which every message must be received.
     """
 
     message: M
@@ -73,15 +73,16 @@ class Reading(NamedTuple, Generic[M]):
 
     @property
     def has_message(self) -> bool:
-        """True if any message has come yet."""
+        """True if any message has been received yet."""
         return self.verdict is not Verdict.NONE
 
 
 class Writer:
     """The only writer of a mailbox, under protocol time-slice.
 
-    Opening it claims the mailbox. A second writer is refused with `MailboxError` while the process
-    of the first one lives. A new writer continues after the last complete message, in a new epoch.
+    A writer claims the mailbox when it is created. A second writer is refused with `MailboxError`
+    while the process of the first one lives. A new writer continues after the last complete
+    message, in a new epoch.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -94,11 +95,14 @@ class Writer:
         self.held_up = 0
         """Number of accesses that timed out because a dead or stopped process held the lock."""
         self.held = 0
-        """Number of messages that injected faults hold back."""
+        """Number of messages that injected faults hold back at present."""
         self.refused = 0
-        """Number of messages that this writer of a queue has refused because it was full."""
+        """Number of messages refused because the queue was full. 0 for other protocols."""
         self.intruder = 0
-        """Process that has published since this writer's last message but one, 0 for none."""
+        """Process id of an intruder, found when a message was published. 0 for none.
+
+        An intruder is another process that has published since this writer's previous message.
+        """
         # The claim is in the segment, even if the slots publish to another head.
         self._claimed = segment.get_box(name)
         self._claim = ByteLock(segment.fd, segment.map.mailboxes[name] + 8 * Box.CLAIM)
@@ -131,19 +135,25 @@ class Writer:
 
         Args:
             tick: Release tick of the cycle that writes.
-            now: Current tick. None if the end of the cycle has not come.
+            now: Current tick. None if the cycle is known to be on time.
             basis: Tick of the oldest information on which the message depends, by default
                 `tick`.
 
         Returns:
-            False if the message is too late.
+            False if the message was published after the end of its cycle, or the access timed
+            out.
         """
         visible_at = self.compute_visible_tick(tick, now)
         is_whole = self.publish_message(tick, visible_at, tick if basis is None else basis)
         return is_whole and self.is_in_time(tick, now)
 
     def is_in_time(self, tick: int, now: int | None) -> bool:
-        """Check whether a message released at `tick` and written at `now` is in time."""
+        """Check whether a message of the cycle released at `tick` was written in time.
+
+        Args:
+            tick: Release tick of the cycle.
+            now: Current tick. None if the cycle is known to be on time.
+        """
         return now is None or now < tick + self._due
 
     def compute_visible_tick(self, tick: int, now: int | None) -> int:
@@ -151,7 +161,7 @@ class Writer:
 
         Args:
             tick: Release tick of the cycle that writes.
-            now: Current tick. None if the end of the cycle has not come.
+            now: Current tick. None if the cycle is known to be on time.
         """
         in_time = tick + self._delay
         if now is None or now < in_time:
@@ -162,7 +172,7 @@ class Writer:
     def publish_message(
         self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()
     ) -> bool:
-        """Publish `message`.
+        """Publish `message` with the given ticks in its head.
 
         Args:
             tick: Release tick of the cycle that writes.
@@ -177,11 +187,14 @@ class Writer:
         return True
 
     def lose_message(self) -> None:
-        """Publish a serial without its message, to inject a loss."""
+        """Publish the next serial without filling its slot, to inject the loss of a message."""
         self.slots.publish_gap()
 
     def iterate_outgoing(self) -> Iterator[None]:
-        """Put each message of the cycle into `message` in turn. Only queues have several."""
+        """Put each message of this cycle into `message` in turn, for the caller to publish.
+
+        Only a queue has more than one.
+        """
         yield
 
     def show_published(self) -> None:
@@ -193,7 +206,7 @@ class Writer:
         return self.slots.serial
 
     def close(self) -> None:
-        """Release the claim."""
+        """Release the claim on the mailbox."""
         _WRITERS.discard(self)
         self._claim.close()
 
@@ -203,7 +216,7 @@ _WRITERS: WeakSet[Writer] = WeakSet()
 
 
 def reclaim_mailboxes() -> None:
-    """Claim the mailboxes of this process in a segment that has replaced another."""
+    """Claim all mailboxes of this process again, after it was switched to another segment."""
     for writer in _WRITERS:
         writer.claim_mailbox()
 
@@ -212,9 +225,9 @@ def reclaim_mailboxes() -> None:
 class ReadStatistics:
     """Counts of one reader's failed reads."""
 
-    bad_reads: int = 0  # reads with any of the following
-    bus_errors: int = 0  # accesses that their bound cut off
-    corrupt: int = 0  # messages that failed their check
+    bad_reads: int = 0  # reads to which any of the following applies
+    bus_errors: int = 0  # accesses that timed out
+    corrupt: int = 0  # messages with a wrong checksum
     forged: int = 0  # messages of a process that does not hold the claim
     forger: int = 0  # process id of the last such process
     held_up: int = 0  # accesses that timed out because a dead or stopped process held the lock
@@ -224,11 +237,11 @@ class ReadStatistics:
 # A reader's state is private memory that the reader shares with compiled code. It consists of five
 # words and the last good message with its head: see `words.Slot`.
 JUDGED_SERIAL = 3
-"""Index in a reader's state of the newest serial that its `MessageWatch` has judged."""
+"""Index of a word in a reader's state: the newest serial that its `MessageWatch` has checked."""
 JUDGED_TICK = 4
-"""Index in a reader's state of that message's release tick."""
+"""Index of a word in a reader's state: the release tick of that message."""
 GOOD_OFFSET = 40
-"""Offset of the last good message in a reader's state, in bytes."""
+"""Byte offset of the last good message in a reader's state."""
 
 
 class Reader:
@@ -237,14 +250,14 @@ class Reader:
     The work of a read is bounded by the mailbox's depth.
 
     Attributes:
-        serial: Serial of the last good message, 0 without one.
+        serial: Serial of the last good message, 0 before the first.
         found: Serial of the newest message found by the last read, good or not.
         newest: Release tick of the last good message.
         visible: Tick at which the last good message became visible.
         basis: Tick of the oldest information on which the last good message depends.
         accesses: Number of reads.
         transfers: Number of messages copied.
-        words: The words of the state, which contain all of these.
+        words: The words of the reader's state, in which all these values are stored.
     """
 
     found = Word(0)
@@ -273,9 +286,9 @@ class Reader:
         self.statistics = ReadStatistics()
 
     def get_reading(self, is_new: bool) -> Reading[AnyMessage]:
-        """Return the last good message with verdict NEW or OLD.
+        """Return the last good message with verdict NEW if `is_new`, otherwise OLD.
 
-        The verdict is NONE if `is_new` is False and no message has come yet.
+        Instead of OLD, the verdict is NONE if no message has been received yet.
         """
         return self._new if is_new else self._unchanged
 
@@ -286,22 +299,30 @@ class Reader:
         serial = slots.box[0]
         if serial != self.serial:
             slots.fence()
-            # Older messages are overwritten. A serial beyond the slots fails when it is fetched.
+            # Older messages are overwritten. If no slot has a visible message, the serial at which
+            # the loop ends fails when it is fetched.
             oldest = max(self.serial, serial - slots.depth)
             while serial > oldest and slots.read_visible_tick(serial) > tick:
                 serial -= 1
         return self._accept(serial, tick)
 
     def _accept(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Accept the message found by a read, unless it is the last good one."""
+        """Return the reading for the message found by a read, or for an older one if it is bad.
+
+        Args:
+            serial: Serial of the message.
+            tick: Release tick of the cycle that reads.
+        """
         self.found = serial
         if serial == self.serial:
             return self._unchanged
         return self._new if self._fetch_good(serial) else self._accept_older(serial, tick)
 
     def _accept_older(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Judge a bad message, and accept the newest good one before it."""
-        # The reader is too late, and the slot is being overwritten.
+        """Count the fault of a bad message, and accept the newest good one before it.
+
+        If the slot of the message is being overwritten, the read counts as timed out.
+        """
         if not self.slots.is_kept(serial):
             return self._count_timeout()
         self.statistics.bad_reads += 1
@@ -309,7 +330,7 @@ class Reader:
         return self._step_back(serial, tick)
 
     def _fetch_good(self, serial: int) -> bool:
-        """Accept a message as the last good one. Returns False if it is not good."""
+        """Fetch a message, and make it the last good one. Returns False if it is bad."""
         self.transfers += 1
         slots = self.slots
         if not slots.fetch_message(serial):
@@ -322,7 +343,12 @@ class Reader:
         return True
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Accept the newest unread good message before a lost, damaged or forged one."""
+        """Accept the newest unread good message before a bad one.
+
+        Args:
+            serial: Serial of the bad message.
+            tick: Release tick of the reading cycle.
+        """
         slots = self.slots
         tries = MAX_STEP_BACK
         for older in range(serial - 1, max(self.serial, serial - slots.depth), -1):
@@ -336,9 +362,10 @@ class Reader:
         return self._unchanged
 
     def _count_bad_message(self, serial: int) -> None:
-        """Count the fault of the message fetched last.
+        """Count the last fetched message as damaged or forged.
 
-        A message whose slot contains another message is lost, which its watch counts.
+        A lost message, whose slot contains another message, is not counted here, but by the
+        `MessageWatch`.
         """
         slots = self.slots
         if not slots.is_kept(serial):
@@ -350,46 +377,46 @@ class Reader:
             self._count_forged()
 
     def _count_forged(self) -> None:
-        """Count the message fetched last as forged, and record the process that it names."""
+        """Count the last fetched message as forged, and record the process in its signature."""
         self.statistics.forged += 1
         self.statistics.forger = get_pid(self.slots.signature)
 
     def _count_timeout(self) -> Reading[AnyMessage]:
-        """Count a read that timed out, and return the last good message with BUS_ERROR."""
+        """Count a read that timed out. Returns the last good message with verdict BUS_ERROR."""
         self.statistics.bus_errors += 1
         self.statistics.bad_reads += 1
         verdict = Verdict.BUS_ERROR if self.serial else Verdict.NONE
         return self._readings[verdict]
 
     def add_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
-        """Add the good messages after serial `before` to a reading, oldest first.
+        """Add the good messages after serial `before` to `reading.earlier`, oldest first.
 
-        Messages that are no longer in the slots are missing.
+        Messages whose slots have been reused are left out.
         """
         if self.serial <= before + 1:
             return reading
         return reading._replace(earlier=tuple(self.slots.iterate_between(before, self.serial)))
 
     def peek(self) -> Reading[AnyMessage]:
-        """Return the newest complete message at once, under any protocol, for the host side."""
+        """Return the newest complete message, even if it is not visible yet."""
         head = self.slots.box[0]
         self.slots.fence()
         return self._accept(head, NO_MESSAGE_TICK)
 
 
 class DoubleBufferWriter(Writer):
-    """Writer under protocol double-buffer, whose message is visible once complete."""
+    """Writer under protocol double-buffer, whose messages are visible as soon as complete."""
 
     def compute_visible_tick(self, tick: int, now: int | None) -> int:
-        """Return the tick at which the message is written, since it is visible at once."""
+        """Return the tick at which a message is written, because it is visible at once."""
         return tick if now is None else now
 
 
 class DoubleBufferReader(Reader):
     """Reader under protocol double-buffer (section 3.3 of the paper).
 
-    It gets the newest complete message, so it reacts faster than under time-slice. In real time its
-    result no longer depends on ticks alone.
+    It gets the newest complete message, so it reacts faster than under time-slice. In real time,
+    which message it gets does not depend on ticks alone.
     """
 
     def read(self, tick: int) -> Reading[AnyMessage]:

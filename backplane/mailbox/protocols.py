@@ -1,9 +1,10 @@
 """The mailbox protocols by name, and protocol lock: the paper's `lock; read; unlock`.
 
-The lock is safe against dead holders. A semaphore whose holder was killed stays down for ever, and
-does not show its holder. So processes wait on the semaphore, within a bound, but the critical
-section belongs to the process that holds the kernel's lock on the mailbox, which ends with its
-process. An access that times out is a bus error: a verdict, never a hang.
+Protocol lock survives the death of a process inside the critical section. A semaphore whose holder
+was killed is never posted again, and does not show who held it. Processes therefore wait on the
+semaphore only for a bounded time, and the critical section belongs to the process that holds the
+kernel's lock on the mailbox, which the kernel releases when that process ends. An access that times
+out gives verdict BUS_ERROR and never hangs.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from rack.backplane.semaphores import get_lock_semaphore
 from rack.backplane.words import Box
 
 LOCK_WAIT_S = 0.002
-"""Maximum time of one wait.
+"""Maximum time to wait for the lock.
 
-An access takes a microsecond or two, an access by a preempted holder some hundred.
+A process holds it for a microsecond or two, or for some hundred if it is preempted meanwhile.
 """
 
 
@@ -51,7 +52,7 @@ class MailboxLock:
         self.held_up = 0
 
     def acquire(self) -> bool:
-        """Take the lock within its bound. Returns False if a living holder keeps it."""
+        """Take the lock. Returns False on timeout, if another live process holds it."""
         if not self._semaphore.acquire(self._wait_s):
             holder = self._box[Box.OWNER]
             # The holder may have released the lock and ended since the wait.
@@ -61,9 +62,9 @@ class MailboxLock:
                 and self._box[Box.OWNER] == holder
             ):
                 self.held_up += 1
-        # After a timeout, the kernel's lock is free if the semaphore's holder is dead, and one of
-        # several waiters gets it. After a successful wait the kernel's lock may still be taken, if
-        # such a waiter has become the owner between the two steps.
+        # After a timeout, the kernel's lock is free if the holder of the semaphore is dead. One of
+        # the waiting processes then gets it. Even after a successful wait for the semaphore, the
+        # kernel's lock may be taken by such a process.
         if not self._owner.take():
             return False
         self._box[Box.OWNER] = os.getpid()
@@ -81,7 +82,7 @@ class MailboxLock:
 
 
 class LockWriter(DoubleBufferWriter):
-    """Writer that publishes inside the critical section."""
+    """Writer under protocol lock, which publishes inside the critical section."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
@@ -118,14 +119,17 @@ class LockWriter(DoubleBufferWriter):
 
 
 class LockReader(Reader):
-    """Reader that copies inside the critical section."""
+    """Reader under protocol lock, which copies the message inside the critical section."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self.lock = MailboxLock(segment, name)
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message, or the last good one with BUS_ERROR after a timeout."""
+        """Return the newest message, with its verdict.
+
+        If the wait for the lock times out, return the last good message with verdict BUS_ERROR.
+        """
         statistics = self.statistics
         self.accesses += 1
         obtained = self.lock.acquire()
@@ -152,11 +156,11 @@ READERS: dict[Protocol, type[Reader]] = {
     "double-buffer": DoubleBufferReader,
     "lock": LockReader,
     "queue": QueueReader,
-    # This is for boards that the messages do not interrupt: the writer's board and the host side.
+    # For readers that the messages do not interrupt: tasks in the writer's slot, and the host side.
     "interrupt": Reader,
 }
 OBSERVERS: dict[Protocol, type[Reader]] = {**READERS, "lock": DoubleBufferReader, "queue": Reader}
-"""Readers that never take a lock, nor a message out of a queue."""
+"""Readers that never take a lock and never remove a message from a queue, by protocol."""
 
 
 def open_writer(segment: Segment, name: str) -> Writer:
@@ -176,7 +180,7 @@ def open_reader(
     Args:
         segment: Memory of the rack.
         name: Name of the mailbox.
-        asynchronous: True to read each message as soon as it is complete.
+        asynchronous: True to read each message of protocol time-slice as soon as it is complete.
         inbox: Inbox of the reading board. None if nothing interrupts it.
     """
     if inbox is not None and name in inbox.lines:
@@ -188,8 +192,8 @@ def open_reader(
 
 
 def open_observer(segment: Segment, name: str) -> Reader:
-    """Open a mailbox for reading its newest message, without any cost to other readers.
+    """Open a mailbox for reading its newest message without any effect on other readers.
 
-    The clock and the host side use observers.
+    The clock and processes on the host side, such as tools, use observers.
     """
     return OBSERVERS[segment.layout.find_mailbox(name).protocol](segment, name)

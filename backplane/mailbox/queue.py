@@ -1,29 +1,31 @@
 """Mailboxes under protocol queue: first in first out, with one reader.
 
 Each message is read once and in order. The writer sends any number of messages in a cycle. They are
-published together at its end, by one store, and become visible as under time-slice. A writer killed
-before that has sent none of them. The reader takes the messages that are visible at its release
-tick, oldest first, as many as it has room for.
+published together at the end of the cycle, by one store, and become visible as under time-slice. If
+the writer is killed before that store, none of them is sent. The reader takes the messages that are
+visible at its release tick, oldest first, as many as its level has room for.
 
-A queue is bounded: its `capacity` is the largest number of unread messages. When it is full, `send`
-returns False. The writer never waits, and no unread message is overwritten. The number of messages
-taken is a message too: in each of its cycles the reader writes its position into a separate
-mailbox, `<queue>_taken`, under time-slice. So fullness depends on ticks alone: a message that the
-reader takes at tick T gives the writer room from T plus the reader's cycle on.
+A queue is bounded: its `capacity` is the maximum number of unread messages. If it is full, `send`
+returns False. The writer never waits, and no unread message is overwritten. The position of the
+reader is the serial of the newest message that it has taken. In each of its cycles the reader
+writes its position into a separate mailbox, `<queue>_taken`, under time-slice. Whether the queue is
+full therefore depends on ticks alone: a place that becomes free at tick T can be used by the writer
+from T plus the reader's cycle on.
 
-The reader's position is in shared memory before its level processes, so a message is read at most
-once, whatever happens: a reader killed in a cycle has taken the messages of that cycle, and its
-successor continues after them. The opposite order would read them twice, and a message that makes
-its reader fail would make every successor fail too. A level that must know whether a message was
-acted on compares its id with the id that the reader's status echoes. A successor reads the position
-from a word in the queue's head, where it is multiplied by 3. This is an AN code: no multiple of 3
-is one bit away from another. The mailbox alone would not suffice: if its newest message is damaged,
-the previous one contains an older position. If the word is damaged, the mailbox is intact.
+The reader stores its position in shared memory before its level processes the messages, so a
+message is read at most once: if a reader is killed in a cycle, its successor continues after the
+messages of that cycle. With the opposite order the successor would read them a second time, and a
+message that makes its reader fail would make every successor fail too. A level that must know
+whether a message was acted on compares its id with the id that the reader's status echoes. The
+successor reads the position from a word in the queue's head, where it is stored multiplied by 3, as
+an AN code: no multiple of 3 differs from another in a single bit. The mailbox alone would not
+suffice, because if its newest message is damaged, the previous one contains an older position. If
+the word is damaged instead, the mailbox has the correct position.
 
-A lost, damaged or forged message is counted, and the order continues with the next one.
+A lost, damaged or forged message is counted, and the reader continues with the next one.
 
-Alternative considered: a position word in the mailbox's head, without a mailbox. It is not a
-function of ticks, so whether a queue is full would depend on which process is faster.
+Alternative considered: a position word in the mailbox's head, without a second mailbox. Its value
+does not depend on ticks alone, so whether a queue is full would depend on which process is faster.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ class QueueTaken(Message, version=1):
 # Plain integers for the hot path.
 _PUT_POSITION = Struct("@2q").pack_into
 UNLIMITED = 1 << 62
-"""Room for every message."""
+"""Number of messages to take that stands for all of them."""
 
 
 def get_position_mailbox(queue: str) -> str:
@@ -71,7 +73,7 @@ def is_position_mailbox(spec: MailboxSpec) -> bool:
 def list_queues(layout: Layout) -> list[MailboxSpec]:
     """Return the queues between tasks.
 
-    The rings of host boards are not by ticks, so they have no position and are not included.
+    The rings of host boards, which have no mailbox for a position, are not included.
     """
     names = {box.name for box in layout.mailboxes}
     return [
@@ -82,9 +84,10 @@ def list_queues(layout: Layout) -> list[MailboxSpec]:
 
 
 class QueueWriter(Writer):
-    """Writer of a queue. A level fills `message` and calls `send`.
+    """Writer of a queue.
 
-    The board calls `write` once a cycle.
+    A level fills `message` and calls `send`, any number of times in a cycle. The board calls
+    `write` once per cycle to publish these messages.
 
     Attributes:
         taken: Position of the reader as of the writer's release tick, updated by the board.
@@ -93,7 +96,8 @@ class QueueWriter(Writer):
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         slots = self.slots
-        # Messages are published to a copy of the mailbox's head and then shown together.
+        # The messages of a cycle are published one by one in a private copy of the mailbox's head.
+        # `show_published` then updates the real head.
         self._shared = slots.box
         slots.box = memoryview(bytearray(slots.box)).cast("q")
         # A predecessor may have been killed just before it stored this word.
@@ -108,7 +112,7 @@ class QueueWriter(Writer):
         return max(0, self.spec.capacity - unread)
 
     def send(self, basis: int | None = None) -> bool:
-        """Put a copy of the message into the queue. Returns False if the queue is full."""
+        """Send a copy of `message` at the end of this cycle. Returns False if the queue is full."""
         if not self.count_free_places():
             self.refused += 1
             self._shared[Box.REFUSED] += 1
@@ -121,12 +125,12 @@ class QueueWriter(Writer):
 
         Args:
             tick: Release tick of the cycle that writes.
-            now: Current tick. None if the end of the cycle has not come.
+            now: Current tick. None if the cycle is known to be on time.
             basis: Tick of the oldest information on which the messages depend, by default
                 `tick`.
 
         Returns:
-            False if the messages are too late.
+            False if messages were published after the end of their cycle.
         """
         if not self._pending:
             return True
@@ -139,12 +143,22 @@ class QueueWriter(Writer):
         return self.is_in_time(tick, now)
 
     def compute_visible_tick(self, tick: int, now: int | None) -> int:
-        """Return the tick from which messages, including lost ones, are visible."""
+        """Return the tick from which the messages of a cycle are visible.
+
+        The tick is remembered for `lose_message`.
+
+        Args:
+            tick: Release tick of the cycle that writes.
+            now: Current tick. None if the cycle is known to be on time.
+        """
         self._shown_at = super().compute_visible_tick(tick, now)
         return self._shown_at
 
     def iterate_outgoing(self) -> Iterator[None]:
-        """Put each message of the cycle into `message` in turn, then restore its content."""
+        """Put each message sent in this cycle into `message` in turn, for the caller to publish.
+
+        At the end, `message` has the same content as before.
+        """
         slots = self.slots
         present = bytes(self.message.raw)
         if self._shared[Box.HEAD] != slots.box[Box.HEAD]:
@@ -159,28 +173,31 @@ class QueueWriter(Writer):
     def publish_message(
         self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()
     ) -> bool:
-        """Publish `message`, without showing it to readers before `show_published` is called.
+        """Write `message` to its slot. Readers find it only after `show_published` is called.
 
         Args:
             tick: Release tick of the cycle that writes.
             visible_at: Tick from which the message is visible.
             basis: Tick of the oldest information on which the message depends.
             damage: Bits to flip, see `Slots.publish_message`.
+
+        Returns:
+            True, because this access cannot time out.
         """
         self.slots.publish_message(tick, visible_at, basis, damage)
         return True
 
     def lose_message(self) -> None:
-        """Publish a serial without its message, to inject a loss.
+        """Publish the next serial without filling its slot, to inject the loss of a message.
 
-        The reader finds the gap at the tick at which the message would be visible.
+        The reader finds the gap at the tick at which the message would have become visible.
         """
         slots = self.slots
         slots.heads[(self.serial + 1) & slots.mask][Slot.VISIBLE_AT] = self._shown_at
         slots.publish_gap()
 
     def show_published(self) -> None:
-        """Make all published messages visible, by one store each to observers and the reader."""
+        """Publish the messages in the slots: one store for observers, and one for the reader."""
         self._shared[Box.HEAD] = serial = self.serial
         self._shared[Box.SENT] = serial
 
@@ -201,7 +218,7 @@ class QueueReader(Reader):
         taken, rest = divmod(self.slots.box[Box.POSITION], 3)
         self.taken = written if rest else max(written, taken)
         self._farthest = self.spec.delay + self.spec.every
-        # Until a new message comes, readings contain the last message taken.
+        # Until a message is taken, readings contain the last message that the predecessor took.
         if self.taken and self._fetch_good(self.taken):
             self.transfers = 0
 
@@ -214,11 +231,12 @@ class QueueReader(Reader):
 
         Args:
             tick: Release tick of the reading cycle.
-            most: Maximum number of messages to take.
+            most: Maximum number of good messages to take.
             now: Current tick, as in `Writer.write`.
 
         Returns:
-            The newest message taken, with the others in `earlier`.
+            The newest message taken, with the others of this read in `earlier`. If none was taken,
+                the last message again with verdict OLD or NONE.
         """
         self.accesses += 1
         slots = self.slots
@@ -229,14 +247,14 @@ class QueueReader(Reader):
         last = min(box[Box.SENT], self.taken + slots.depth)
         slots.fence()
         if head > last and slots.fetch_message(head) and not slots.is_lawful(self._signature):
-            # Count a forged message without taking it, since the writer's next message will replace
-            # it.
+            # The newest message is forged. Count it without taking it, because the writer's next
+            # message will overwrite it.
             self.statistics.bad_reads += 1
             self._count_forged()
         while count < most and self._can_take(self.taken + 1, last, tick):
             before = copy_message(self.message) if count else None
             if not self._fetch_good(self.taken + 1):
-                # Count the fault of the message fetched last, which is not good.
+                # The message is lost, damaged or forged. Count it and continue with the next.
                 statistics = self.statistics
                 statistics.bad_reads += 1
                 if slots.serial != self.taken + 1:
@@ -262,9 +280,14 @@ class QueueReader(Reader):
         return self._new._replace(earlier=tuple(earlier)) if earlier else self._new
 
     def _can_take(self, serial: int, last: int, tick: int) -> bool:
-        """Check whether a serial can be taken or skipped now.
+        """Check whether the message with a serial can be taken, or skipped as bad, at `tick`.
 
-        A message that is visible too far ahead cannot be good, so it is not waited for.
+        A bad message that claims to become visible later than a good one could is not waited for.
+
+        Args:
+            serial: Serial of the message.
+            last: Newest serial that the writer has published.
+            tick: Release tick of the reading cycle.
         """
         if serial > last:
             return False
@@ -274,5 +297,5 @@ class QueueReader(Reader):
         )
 
     def close(self) -> None:
-        """Release the claim of the reader's position."""
+        """Release the claim on the mailbox with the reader's position."""
         self._position.close()

@@ -1,4 +1,4 @@
-"""Slots of one mailbox, through which complete messages get into shared memory and out again.
+"""Slots of one mailbox, the places in shared memory into which its messages are copied.
 
 A message is built in a local record, copied into the slot after the newest one, and published by
 storing its serial in the mailbox's head. A writer killed at any instruction leaves every published
@@ -8,10 +8,10 @@ Memory order: the only writer fills a slot and then stores the head's serial wit
 loads the serial with acquire before it copies the slot, so it sees all of the slot. A copy may
 still be torn by a writer that laps the reader, which the checksum detects. The checksum does not
 cover the signature. The signature is stored after the message and loaded before it, so that a
-forged message that is being overwritten never carries the signature of the true writer. Before a
-reader concludes from a head that a slot has not been reused (`is_kept`), its copy is complete. In
-turn the writer fills no slot before the previous head is stored. Words are aligned to 8 bytes, so
-they are never torn.
+forged message that is being overwritten never carries the signature of the true writer. A reader
+completes its copy before it loads the head to check that the slot has not been reused (`is_kept`),
+and the writer fills no slot before it has stored the head for the previous one. Words are aligned
+to 8 bytes, so they are never torn.
 
 On x86-64 plain loads and stores of aligned words have this order, and Python uses such loads and
 stores. Boards get the order from machine code (`rack.boards.run.compiled_mailbox`), which also
@@ -19,11 +19,11 @@ provides a `fence` for the rare paths in this folder. tests/backplane/mailbox/mo
 protocol exhaustively.
 
 The checksum is XXH3 with 64 bits, seeded with the checksum of the previous message. One pass over a
-message tells a reader whether its copy is complete and undamaged. The newest checksum covers all
-that was ever written, so one comparison shows whether two runs are equal
-(`history.compute_digest`). Alternatives considered: CRC32 and a chained hash, two passes that took
-half of a write; and a seeded CRC32 alone, whose 32 bits are few for a digest and which takes five
-times as long on 200 bytes.
+message shows a reader whether its copy is complete and undamaged. The newest checksum covers all
+messages that were ever written, so a comparison of these checksums shows whether two runs are equal
+(`history.compute_digest`). Alternatives considered: CRC32 and a chained hash (the two passes took
+half of the time of a write), and a seeded CRC32 alone (32 bits are few for a digest, and it takes
+five times as long on 200 bytes).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from rack.backplane.words import Box, Slot, Word
 
 CHECKED_FROM = Slot.BASIS * 8
 SIGNED_FROM = Slot.CHAIN * 8
-"""Offset in a slot of the words after time stamp and signature, in bytes."""
+"""Byte offset in a slot of the words after time stamp and signature."""
 # Module constants are faster than class attributes.
 _STAMP, _EPOCH, _CHAIN, _CHECK, _BASIS, _SERIAL, _TICK, _VISIBLE = range(8)
 _PUT_CONTENT = Struct("@4Q").pack_into  # BASIS to VISIBLE_AT, each stored whole
@@ -78,7 +78,12 @@ def get_pid(signature: int) -> int:
 
 
 def build_message_dtype(fields: tuple[FieldSpec, ...], size: int) -> np.dtype:
-    """Return the numpy dtype of a mailbox's message, from its layout."""
+    """Return the numpy dtype of a message.
+
+    Args:
+        fields: Fields of the message.
+        size: Size of the message in bytes.
+    """
     return np.dtype(
         {
             "names": [f.name for f in fields],
@@ -101,13 +106,16 @@ class Slots:
     """One process's access to the slots of a mailbox.
 
     Attributes:
-        record: Local copy of one slot: the eight words of its head (`words.Slot`) and the
-            message.
-        message: The message in the local record.
-        words: Head of the local record.
+        box: Head of the mailbox, with the words of `words.Box`.
+        depth: Number of slots.
+        mask: Serial & `mask` is the index of the slot of a serial.
+        record: The local record, a copy of one slot: the eight words of its head (`words.Slot`)
+            and the message.
+        message: The message in the local record, also called the local message.
+        words: The eight words of the local record.
         covered: Part of the local record that the checksum covers.
-        places: The slots in shared memory.
-        heads: Heads of the slots in shared memory.
+        places: The slots in shared memory, as bytes.
+        heads: The eight words of each slot in shared memory.
     """
 
     # Words of the local record: time of publication (CLOCK_MONOTONIC), signature of the writer
@@ -144,17 +152,23 @@ class Slots:
 
     @staticmethod
     def fence() -> None:
-        """Separate memory accesses before this call from those after it.
+        """Prevent memory accesses from being reordered across this call.
 
-        Python needs no instruction for this on x86-64. Boards replace it with a compiled fence.
+        Python needs no instruction for this on x86-64. Boards replace this function with a compiled
+        memory fence.
         """
 
     def resume_writing(self, signature: int) -> None:
-        """Prepare a writer to continue after the newest published message."""
+        """Set the local record so that a writer continues after the newest published message.
+
+        Args:
+            signature: Signature of the writer.
+        """
         # Ignore the sign, so that a flipped sign bit does not make a writer fail.
         self.serial = head = self.box[Box.HEAD] & (UNSIGNED >> 1)
         self.signature = signature
-        # A serial may be lost. The chain continues from the newest message that is in its slot.
+        # The newest serial may have no message. The chain of checksums continues from the newest
+        # message that is in its slot.
         self.chain = 0
         for serial in range(head, max(0, head - self.depth - 1), -1):
             if self.has_message(serial):
@@ -162,9 +176,9 @@ class Slots:
                 break
 
     def clear_unpublished(self) -> None:
-        """Empty the slots that a dead writer has filled but not published.
+        """Clear the serials of slots that a dead writer has filled but not published.
 
-        Otherwise readers could take them for lost messages of this writer.
+        Otherwise readers could mistake them for lost messages of the new writer.
         """
         head = self.box[Box.HEAD] & (UNSIGNED >> 1)
         for words in self.heads:
@@ -212,7 +226,7 @@ class Slots:
         return intruder
 
     def publish_gap(self) -> None:
-        """Publish a serial without filling its slot."""
+        """Publish the next serial without filling its slot."""
         self.serial += 1
         self.fence()
         self.box[0] = self.serial
@@ -222,9 +236,9 @@ class Slots:
         return self.heads[serial & self.mask][_SERIAL] == serial
 
     def is_kept(self, serial: int) -> bool:
-        """Check whether the slot of a serial has not been reused.
+        """Check that the slot of a serial has not been reused for a newer message.
 
-        If so, a copy made before this call is a copy of that message.
+        If this returns True, a copy of the slot made before the call contains no newer message.
         """
         self.fence()
         return serial >= compute_oldest_kept(self.box[0], self.depth)
@@ -236,18 +250,26 @@ class Slots:
     def load_slot(self, serial: int) -> None:
         """Copy the slot of a serial into the local record, without any check."""
         place = self.places[serial & self.mask]
-        # If this is the signature of the wanted message, the slot contains all of the message.
+        # Load the signature first. If it is the one of the wanted message, the slot already
+        # contains all of the message.
         self.record[:SIGNED_FROM] = place[:SIGNED_FROM]
         self.fence()
         self.record[SIGNED_FROM:] = place[SIGNED_FROM:]
 
     def fetch_message(self, serial: int) -> bool:
-        """Copy a message into the local record. Returns False if it is torn or another message."""
+        """Copy the message with a serial into the local record.
+
+        Returns:
+            False if the copy is damaged or incomplete, or the slot contains another message.
+        """
         self.load_slot(serial)
         return self.serial == serial and self.passes_check
 
     def iterate_between(self, before: int, newest: int) -> Iterator[AnyMessage]:
-        """Yield a copy of each good message between two serials that is still in its slot."""
+        """Yield a copy of each good message between two serials, both excluded.
+
+        Messages whose slots have been reused are left out.
+        """
         for serial in range(max(before + 1, newest - self.mask), newest):
             if self.fetch_message(serial) and self.is_lawful(0):
                 yield copy_message(self.message)
@@ -263,14 +285,15 @@ class Slots:
 
     @property
     def passes_check(self) -> bool:
-        """True if the message in the local record passes its check."""
+        """True if the checksum of the message in the local record is correct."""
         return self.chain == xxh3(self.covered, self.words[_CHAIN])
 
     def is_lawful(self, known: int) -> bool:
-        """Check whether the local message comes from the holder of the claim, or an earlier holder.
+        """Check whether the local message was written by a process that claimed the mailbox.
 
         Args:
-            known: Signature of the last lawful message, 0 before the first. Epochs only rise.
+            known: Signature of the last message accepted by the caller, 0 for none. A message from
+                an earlier epoch than this one is not lawful.
         """
         signature = self.signature
         holder = self.box[Box.CLAIMANT]

@@ -1,7 +1,7 @@
 """Alarm rings, in which a task or the clock reports the faults that it has detected.
 
-One fixed record per alarm is written, without ever waiting. An alarm is raised once per episode,
-when a condition is found, not in every cycle while it lasts.
+An alarm is one record of fixed size, and raising it never waits. An alarm is raised once per
+episode, at the beginning of a condition, not in every cycle while the condition lasts.
 """
 
 from __future__ import annotations
@@ -30,21 +30,22 @@ RECORD = np.dtype(
 
 
 PEER = -2
-"""Subject of a demand on the arm that is caused by the loss of another rack."""
+"""Subject of `Alarm.DEMAND` if the loss of another rack requires the stop."""
 
 
 BRAKED_BY_DEMAND = -1
 BRAKED_WITHOUT_TORQUE = -2
 BRAKED_AT_START = -3
-"""Reasons for engaged brakes that no error describes.
+"""Reasons for engaged brakes other than an error of the level.
 
-The brakes engaged on a demand (`BRAKED_BY_DEMAND`), because no torque came in time
-(`BRAKED_WITHOUT_TORQUE`), or because no torque had come yet (`BRAKED_AT_START`).
+The brakes engaged because the safety functions required it (`BRAKED_BY_DEMAND`), because no torque
+was received in time (`BRAKED_WITHOUT_TORQUE`), or because no torque had been received since the
+start (`BRAKED_AT_START`).
 """
 
 
 class Alarm(IntEnum):
-    """Kinds of alarms. Comments give the meaning of [subject; value]."""
+    """Kinds of alarms. Comments state the meaning of [subject; value]."""
 
     # Raised by the clock: faults, losses and demands.
     FAULT_BEGINS = 1  # [entry of the fault table; -]
@@ -123,14 +124,14 @@ class Alarm(IntEnum):
 
 
 MISSES = (Alarm.LATE, Alarm.PLAN_LATE, Alarm.STARVED, Alarm.CLOCK_SKIPPED, Alarm.CLOCK_LATE)
-"""Alarms of missed cycles, which are counted without further action.
+"""Alarms about missed cycles, which are counted but do not wake the Rack.
 
-All others are faults or reactions.
+All other alarms report faults or reactions to them.
 """
 
 
 class AlarmWriter:
-    """Writing end of the alarm ring of a task, or of the clock ("clock").
+    """Writing end of the alarm ring of a task or, by the name "clock", of the clock.
 
     Args:
         segment: Memory of the rack.
@@ -164,7 +165,7 @@ class AlarmWriter:
             subject: Subject as described at `Alarm`, -1 for none.
             value: Measured value as described at `Alarm`.
             since: Tick since which the condition holds. None if it is not known.
-            text: Text of a level about its finding.
+            text: A level's description of its finding.
         """
         count = self._head[0] + 1
         since_tick = tick if since is None else since
@@ -192,13 +193,14 @@ def open_alarm_ring(segment: Segment, task: str) -> Ring:
 
 
 CLEAN_READS = 20
-"""Number of accesses, and of the writer's cycles, without a finding that end an episode."""
+"""An episode ends after this many accesses and writer's cycles without a finding."""
 
 
 class Episodes:
-    """Alarms about one mailbox, raised once per episode, however long a fault lasts.
+    """Raises the alarms about one mailbox, once per episode, however long a fault lasts.
 
-    Each finding is stored with the access and the tick at which it was last made.
+    An episode begins with the first finding of a kind, such as a damaged message, and ends after a
+    time without another one (`CLEAN_READS`).
     """
 
     def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:
@@ -216,7 +218,7 @@ class Episodes:
             code: Kind of alarm.
             access: Number of the access, counted by the caller.
             tick: Release tick of the cycle.
-            value: Measured value.
+            value: Measured value as described at `Alarm`.
             since: Tick since which the condition holds. None if it is not known.
         """
         if not self.is_open(code, access, tick):
@@ -226,11 +228,24 @@ class Episodes:
     def raise_alarm(
         self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None
     ) -> None:
-        """Raise an alarm at once, if the caller knows that an episode begins."""
+        """Raise an alarm in any case. Call this only when a new episode is known to begin.
+
+        Args:
+            code: Kind of alarm.
+            tick: Release tick of the cycle.
+            value: Measured value as described at `Alarm`.
+            since: Tick since which the condition holds. None if it is not known.
+        """
         self._alarms.raise_alarm(tick, code, self._subject, value, since)
 
     def is_open(self, code: Alarm, access: int, tick: int) -> bool:
-        """Check whether an episode is still open."""
+        """Check whether an episode has begun and not ended.
+
+        Args:
+            code: Kind of alarm.
+            access: Number of the current access, counted by the caller.
+            tick: Release tick of the cycle.
+        """
         if code not in self._last:
             return False
         last_access, last_tick = self._last[code]

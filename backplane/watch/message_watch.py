@@ -1,10 +1,10 @@
 """Checks on the messages of a mailbox that have become visible since the last read.
 
-Messages are judged in serial order. A fault is reported only on evidence that a slow machine cannot
-produce: a serial whose slot was never filled, a later serial with an earlier tick, two messages for
-one release, or a message stamped after the end of the cycle that made it. The reader may be delayed
-too. Therefore a message is copied first, its slot is checked for reuse (`Slots.is_kept`), and only
-then is the copy judged.
+Messages are checked in the order of their serials. A fault is reported only on evidence that a slow
+machine cannot produce: a serial whose slot was never filled, a later serial with an earlier tick,
+two messages for one release, or a message published after the end of the cycle that made it. The
+reader may be delayed too. Therefore a message is copied first, then its slot is checked for reuse
+(`Slots.is_kept`), and only then is the copy evaluated.
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ LONG_AGO = -(1 << 62)
 
 
 class MessageWatch:
-    """Judges the messages of one mailbox for one reader, from its first read on.
+    """Checks the messages of one mailbox for one reader, from the reader's first read on.
+
+    The message found by the first read is not checked.
 
     Attributes:
-        seen: Serial of the newest message judged, -1 before the first read.
+        seen: Serial of the newest message that was checked, -1 before the first read.
         newest: Release tick of that message. Both are words of the reader's state.
-        late_from: Delay from release to visibility from which a message is late, in ticks.
+        late_from: A message is late if it becomes visible at least this many ticks after its
+            release.
     """
 
     seen = Word(JUDGED_SERIAL)
@@ -51,7 +54,7 @@ class MessageWatch:
         self._held_up = 0
 
     def judge_messages(self, tick: int) -> None:
-        """Judge the messages found by the read at `tick`."""
+        """Check the messages that have become visible up to the read at `tick`."""
         newest_serial = self._reader.found
         if self.seen < 0:
             self._start_after(newest_serial)
@@ -65,20 +68,32 @@ class MessageWatch:
             self._record_finding(Alarm.LOCKED, tick)
 
     def _start_after(self, serial: int) -> None:
-        """Start judging after a serial. Earlier messages are not judged."""
+        """Skip the messages up to a serial. Checks continue with the message after it."""
         self.seen = serial
         if serial and self._copy_message(serial):
             self.newest = self._slots.tick
 
     def _copy_message(self, serial: int) -> bool:
-        """Copy a message into the local record. Returns False if it is missing or not trusted."""
+        """Copy the message with a serial into the local record of the slots.
+
+        Returns:
+            False if the message is missing or damaged, or may have been overwritten meanwhile.
+        """
         return self._slots.fetch_message(serial) and self._slots.is_kept(serial)
 
     def _is_babble(self, newest_serial: int, tick: int) -> bool:
-        """Check whether there are at least two messages more than releases."""
+        """Check whether the writer has sent at least two messages more than its releases allow.
+
+        If so, record the finding.
+
+        Args:
+            newest_serial: Newest serial found by the read.
+            tick: Release tick of the reading cycle.
+        """
         slots = self._slots
         if not slots.is_kept(newest_serial):
-            # The message is already overwritten. A writer of one message per cycle is slower.
+            # The message is already overwritten, which a writer of one message per cycle is too
+            # slow to do. Use the newest message instead.
             newest_serial = slots.box[0]
         if not self._copy_message(newest_serial):
             return False
@@ -90,18 +105,23 @@ class MessageWatch:
         return True
 
     def _judge_up_to(self, newest_serial: int, tick: int) -> None:
-        """Judge the messages one by one, up to the newest one found."""
+        """Check the messages one by one, up to the newest one found.
+
+        Args:
+            newest_serial: Newest serial found by the read.
+            tick: Release tick of the reading cycle.
+        """
         slots = self._slots
         mask = slots.mask
         taken = self._reader.serial
         late = self.late_from
-        # A late reader cannot judge messages that are overwritten.
+        # Messages that are already overwritten, because the reader is late, cannot be checked.
         for serial in range(
             max(self.seen + 1, compute_oldest_kept(slots.box[0], slots.depth)), newest_serial + 1
         ):
             head = slots.heads[serial & mask]
             released = head[Slot.TICK]
-            # The reader has checked only the message that it took.
+            # The reader has verified the checksum only of the message that it took.
             if (
                 head[Slot.SERIAL] == serial
                 and self.newest < released > head[Slot.VISIBLE_AT] - late
@@ -118,7 +138,11 @@ class MessageWatch:
             self.seen = serial
 
     def _judge_odd(self, serial: int, tick: int) -> bool:
-        """Judge an unusual message. Returns False if it is too early to judge."""
+        """Check a message that is lost, damaged, late or out of order, and record the finding.
+
+        Returns:
+            False if it is too early to check the message. It must then be checked again later.
+        """
         slots = self._slots
         # Copy a torn message twice, because the true message may be overwriting a forged one.
         if not slots.copy_slot(serial) or not (slots.passes_check or slots.copy_slot(serial)):
@@ -127,8 +151,8 @@ class MessageWatch:
         if slots.serial == serial and slots.passes_check:
             self._judge_time(slots.tick, slots.visible, tick)
         elif slots.serial == 0 or slots.passes_check:
-            # The slot is empty or contains another complete message, so this message is lost. It
-            # is not missing before the first tick at which it would have been visible.
+            # The slot is empty or contains another complete message, so this message is lost. That
+            # is not reported before the first tick at which the message would have been visible.
             if self._is_sliced and expected + self._spec.delay > tick:
                 return False
             self.newest = expected
@@ -141,11 +165,18 @@ class MessageWatch:
         return True
 
     def _judge_time(self, released: int, visible: int, tick: int) -> None:
-        """Judge the release and the arrival of the message in the local record."""
+        """Check whether the message in the local record is out of order or was held back.
+
+        Args:
+            released: Release tick of the message.
+            visible: Tick at which the message became visible.
+            tick: Release tick of the reading cycle.
+        """
         if released < self.newest:
             self._record_finding(Alarm.DISORDER, tick, self.newest - released, since=released)
         elif visible - released >= self.late_from:
-            # A message published after the end of its cycle was held back, not just finished late.
+            # A message published after the end of its cycle was held back. Otherwise the cycle was
+            # just late.
             ended_ns = self._cycles.find_end_ns(released)
             if ended_ns is not None and self._slots.stamp_ns > ended_ns:
                 self._record_finding(
@@ -156,14 +187,14 @@ class MessageWatch:
     def _record_finding(
         self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None
     ) -> None:
-        """Record a finding of the current read."""
+        """Record a finding made in the reader's current access. See `Episodes.record_finding`."""
         self._episodes.record_finding(code, self._reader.accesses, tick, value, since)
 
 
 class QueueWatch(MessageWatch):
-    """Judges the messages that the reader of a queue has taken.
+    """Checks the messages that the reader of a queue has taken.
 
-    A queue may contain several messages of one release.
+    Unlike other mailboxes, a queue may contain several messages of one release.
     """
 
     def __init__(self, segment: Segment, reader: QueueReader, episodes: Episodes) -> None:
@@ -173,11 +204,11 @@ class QueueWatch(MessageWatch):
         self.seen = reader.taken
 
     def judge_messages(self, tick: int) -> None:
-        """Judge the messages taken by the read at `tick`."""
+        """Check the messages taken by the read at `tick`."""
         queue = self._queue
         slots = self._slots
         for serial in range(self.seen + 1, queue.taken + 1):
-            # The writer reuses the slot only after it has learned that the message was taken.
+            # The writer does not reuse the slot before it has read that the message was taken.
             head = slots.heads[serial & slots.mask]
             if head[Slot.SERIAL] != serial:
                 continue

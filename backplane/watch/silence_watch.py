@@ -1,10 +1,11 @@
-"""Checks on a silent mailbox, whose writer is lost, mute or only late.
+"""Checks on a mailbox without new messages, whose writer may be lost, mute or only late.
 
-Executors write in every cycle, so the age of their messages has a limit. Plans have none. Silence
-alone is a reason to hold (`is_lost`) but does not prove a fault. For an alarm the writer must be
-dead or stopped, or must have finished cycles without a message. A mailbox that is written on demand
-has a limit for the age of its information. Its writer reports why no message comes, and can declare
-the mailbox void or keep it valid.
+Executors write in every cycle, so there is a limit to the age of their messages. There is none for
+plans. Silence alone is a reason for the reading level to hold (`is_lost`), but does not prove a
+fault. An alarm is raised only if the writer is dead or stopped, or is mute: it has finished cycles
+without writing its message. For a mailbox that is written on demand, there is a limit to the age of
+its information instead. Its writer can also declare the writer lost, or the last message valid at
+any age (see `words.Box`).
 """
 
 from __future__ import annotations
@@ -21,19 +22,24 @@ from rack.backplane.watch.message_watch import LONG_AGO, MessageWatch
 from rack.backplane.words import Block, Box, is_switched_on
 
 MUTE_CYCLES = 3
-"""Age, in cycles of the writer, from which silence is investigated. An age of two is normal."""
+"""Age of the newest message, in cycles of the writer, from which its silence is checked.
+
+An age of two is normal.
+"""
 STALE_CYCLES = 4
+"""Age of the newest message, in cycles of the writer, from which a dead writer is reported."""
 
 
 class ReadingTask:
-    """The reading task, as its silence watches see it.
+    """State of the reading task that its readers and watches share.
 
     After a pause of this task or of the clock, all messages are old although no writer is silent.
+    The watches must therefore know when the task has paused.
 
     Attributes:
         since: Tick since which the task has read without a pause.
         troubles: Number of reads that failed or found a bad message.
-        now: Function that returns the clock's tick, or None if no read is ever late.
+        now: Function that returns the current tick, or None if the task is never late.
         inbox: Inbox of the task's board. None if nothing interrupts it.
     """
 
@@ -46,7 +52,7 @@ class ReadingTask:
         self._step = NO_MESSAGE_TICK
 
     def record_read(self, tick: int) -> None:
-        """Record a read at `tick`, and detect pauses from the distance to the last read."""
+        """Record a read at `tick`. A longer interval than usual since the last read is a pause."""
         step = tick - self._last
         if step != self._step:
             if step > self._step:
@@ -57,9 +63,10 @@ class ReadingTask:
 
 
 class SilenceWatch(MessageWatch):
-    """Judges the messages and the silence of one mailbox for one reader.
+    """Checks the messages of one mailbox and the silence of its writer, for one reader.
 
-    Call `is_lost` once the newest message is `quiet` ticks old.
+    Attributes:
+        quiet: Age of the newest message in ticks from which `is_lost` must be called.
     """
 
     def __init__(
@@ -81,7 +88,7 @@ class SilenceWatch(MessageWatch):
     def is_lost(self, tick: int) -> bool:
         """Check whether the writer is lost or has been silent for too long.
 
-        An alarm is raised if the cause is proven.
+        An alarm is raised if the writer is proved to be dead, stopped or mute.
         """
         if max_age := self._reader.spec.max_age:
             box = self._slots.box
@@ -91,7 +98,7 @@ class SilenceWatch(MessageWatch):
         age = tick - newest
         if age >= self.quiet:
             pid = get_pid(self._slots.box[Box.CLAIMANT])
-            # The loss may already be marked, and a new process may exist that has not cycled yet.
+            # If the loss is already marked, `pid` may be a new process that has not written yet.
             if age >= self._stale_after and (
                 self._block[Block.LOST] or read_state(pid) in ENDED_STATES + STOPPED_STATES
             ):
@@ -103,13 +110,13 @@ class SilenceWatch(MessageWatch):
         return self.is_writer_lost(tick)
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Check whether the writer is lost, however old its messages are."""
-        # A loss counts from the next tick on. Within its tick the answer would depend on which
-        # process is faster.
+        """Check whether the writer has been found dead or hanging, whatever its messages' age."""
+        # A loss counts from the tick after it was found. Within that tick, the result would depend
+        # on which process is faster.
         return self._reader.newest != NO_MESSAGE_TICK and 0 < self._block[Block.LOST] <= tick
 
     def _is_mute(self, tick: int) -> bool:
-        """Check whether the writer has finished a writing release without its message."""
+        """Check whether the writer has finished a cycle without writing the message due in it."""
         accesses = self._reader.accesses
         if any(
             self._episodes.is_open(code, accesses, tick)
@@ -121,16 +128,22 @@ class SilenceWatch(MessageWatch):
         finished = self._cycles.finished_tick
         slots = self._slots
         head = slots.box[0]
-        # A serial without a message counts as written: the message was lost, not suppressed.
+        # A serial whose slot is not filled counts as written: the message was lost, not suppressed.
         spec = self._reader.spec
         due = finished - (finished + spec.ahead - spec.phase) % spec.every
-        # The writer may not have run that release: it was dead, late, or not released by the clock.
+        # There may be no such cycle, if the writer was dead, late, or not released by the clock.
         if self._cycles.find_end_ns(due) is None:
             return False
         return slots.copy_slot(head) and slots.serial == head and slots.tick < due
 
     def _report_silence(self, code: Alarm, tick: int, age: int) -> None:
-        """Raise the alarm once per last good message. The next good message ends the episode."""
+        """Raise an alarm, unless it was already raised since the last good message.
+
+        Args:
+            code: Kind of alarm.
+            tick: Release tick of the reading cycle.
+            age: Age of the last good message in ticks.
+        """
         serial = self._reader.serial
         if self._reported.get(code) != serial:
             self._reported[code] = serial

@@ -28,16 +28,18 @@ def open_watched(
     count_room: Callable[[], int] = lambda: UNLIMITED,
     asynchronous: bool = False,
 ) -> MailboxWatcher:
-    """Open a mailbox for a task, with the checks that suit its writer.
+    """Open a mailbox for a task, with checks of its messages.
 
-    Messages of the clock have no period, so their silence is not checked.
+    The silence of the writer is checked too, except for the clock, which writes operators' commands
+    without a period.
 
     Args:
         segment: Memory of the rack.
         name: Name of the mailbox.
         alarms: Alarm ring of the task.
         task: The reading task.
-        count_room: Returns the number of messages to take from a queue. Called before each read.
+        count_room: Returns the maximum number of messages to take from a queue. Called before
+            each read.
         asynchronous: True to read each message as soon as it is complete, under any protocol
             except queue.
     """
@@ -50,7 +52,7 @@ def open_watched(
 
 
 class MailboxWatcher(ABC):
-    """Base of readers that watch a mailbox for a task and raise the task's alarms about it."""
+    """Base of readers that check their mailbox and raise alarms about it in the task's ring."""
 
     def __init__(
         self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
@@ -70,7 +72,7 @@ class MailboxWatcher(ABC):
 
     @abstractmethod
     def is_writer_lost(self, tick: int) -> bool:
-        """Check whether the writer is lost, without a read."""
+        """Check whether the writer has been found lost, without reading the mailbox."""
 
     @property
     def _has_trouble(self) -> bool:
@@ -90,7 +92,10 @@ class MailboxWatcher(ABC):
 
 
 class WatchedReader(MailboxWatcher):
-    """Reader of a mailbox that is written by ticks. A clean read costs a few comparisons more."""
+    """Reader of a mailbox that a task writes.
+
+    A read without findings costs only a few comparisons more than one without checks.
+    """
 
     def __init__(
         self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
@@ -118,13 +123,16 @@ class WatchedReader(MailboxWatcher):
     def judge_reading(
         self, tick: int, reading: Reading[AnyMessage], *, is_odd: bool, is_silent: bool
     ) -> Reading[AnyMessage]:
-        """Judge the result of a read, and return the reading for the level.
+        """Make the checks that a read requires, and return the reading for the level.
 
         Args:
             tick: Release tick of the reading cycle.
             reading: Result of the reader itself.
-            is_odd: True if messages must be judged.
-            is_silent: True if the writer's silence must be judged.
+            is_odd: True if there are messages to check.
+            is_silent: True if the writer's silence must be checked.
+
+        Returns:
+            The given reading, with `is_lost` set if the writer is lost or silent for too long.
         """
         if is_odd:
             self.watch.judge_messages(tick)
@@ -135,20 +143,20 @@ class WatchedReader(MailboxWatcher):
         return reading
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Check whether the writer is lost, without a read."""
+        """Check whether the writer has been found lost, without reading the mailbox."""
         return self.watch.is_writer_lost(tick)
 
 
 class SporadicReader(MailboxWatcher):
-    """Reader of an operator's mailbox, written by the clock, whose silence proves nothing.
+    """Reader of an operator's mailbox, which the clock writes whenever a command is issued.
 
-    A command may leave part of an earlier one in force, so none is skipped: the newest comes with
-    the unread ones before it. The first read returns all messages that the slots hold, because a
-    restarted board must know them.
+    A new command need not cancel the effect of an earlier one, so none is skipped: a reading has
+    the newest command, and the unread ones before it in `earlier`. The first read returns all
+    commands that are still in the slots, because a restarted board must know them.
     """
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message visible at `tick`, with the unread ones before it."""
+        """Return the newest message visible at `tick`, and unread ones before it in `earlier`."""
         before = self.reader.serial
         reading = self.reader.read(tick)
         if self._has_trouble:
@@ -156,15 +164,15 @@ class SporadicReader(MailboxWatcher):
         return self.reader.add_earlier(reading, before)
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Return False: a lost clock releases no board, so silence proves nothing."""
+        """Return False. If the clock is lost, no board is released, so no board can notice it."""
         return False
 
 
 class WatchedQueue(MailboxWatcher):
-    """Reader of a queue, which takes as many messages as the task has room for.
+    """Reader of a queue, which takes as many messages as the level has room for.
 
-    Silence proves nothing, because a queue is written on demand. Only a writer found dead or
-    hanging counts as lost.
+    A queue is written on demand, so silence of its writer means nothing. Only a writer found dead
+    or hanging counts as lost.
     """
 
     reader: QueueReader
@@ -183,7 +191,10 @@ class WatchedQueue(MailboxWatcher):
         self._writer = segment.get_block(reader.spec.writer)
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Take the messages visible at `tick`, and check whether their writer is lost."""
+        """Take the messages visible at `tick`.
+
+        The reading also tells whether the writer is lost.
+        """
         reader = self.reader
         reading = reader.take_messages(tick, self._room(), self._task.now())
         if self._has_trouble or reader.taken != self._messages.seen:
@@ -193,17 +204,17 @@ class WatchedQueue(MailboxWatcher):
         return reading._replace(is_lost=True) if self.is_writer_lost(tick) else reading
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Check whether the writer is lost."""
-        # A loss counts from the next tick on. Within its tick the answer would depend on which
-        # process is faster.
+        """Check whether the writer has been found lost, without reading the mailbox."""
+        # A loss counts from the tick after it was found. Within that tick, the result would depend
+        # on which process is faster.
         return 0 < self._writer[Block.LOST] <= tick
 
 
 class GridReader:
     """Reads a mailbox only at the ticks of a grid, and repeats the last reading in between.
 
-    A read that falls into a skipped cycle is omitted. A restarted task therefore reads at the same
-    ticks as before.
+    A read that is due in a skipped cycle is omitted, not made up for in the next cycle. A restarted
+    task therefore reads at the same ticks as before.
     """
 
     def __init__(self, watched: MailboxWatcher, grid: TickGrid) -> None:

@@ -1,7 +1,8 @@
-"""Attributes of a level as plain data, for people.
+"""View of a level's attributes as plain data, to be shown to the user.
 
-The view contains the level's attributes and, for objects in them, the attributes that have changed
-since the level was built. Programs, configs and views of shared memory are left out.
+The view contains the level's attributes. Of an attribute that is an object, it contains only those
+attributes that have changed since the level was built. Functions, classes, configs and views of
+shared memory are left out.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from rack.backplane.segment import Segment
 from rack.boards.run.settings import has_attributes, list_attribute_names
 
 MAX_ITEMS = 24
-"""Maximum number of array elements or items that are shown. Of larger ones the size is shown."""
+"""Maximum number of array elements or items shown. Of larger collections, the size is shown."""
 MAX_DEPTH = 5
 """Maximum nesting of objects."""
 OMITTED_CLASSES = (ByteLock, Layout, Segment)
@@ -30,20 +31,23 @@ _NOTHING = object()
 
 
 class ObjectAttributes(dict[str, Any]):
-    """Attributes of an object, as distinct from the items of a mapping."""
+    """Attributes of an object by name. A separate type, to distinguish them from a mapping."""
 
 
 class AttributeView:
-    """View of a level's attributes. Create it when the level is built."""
+    """View of a level's attributes.
+
+    Create it as soon as the level is built, because changes are found by comparison with that time.
+    """
 
     def __init__(self, level: object) -> None:
         self._level = level
         self._built = _AttributeReader().read_attributes(level, MAX_DEPTH)
 
     def read_attributes(self) -> Mapping[str, Any]:
-        """Return the attributes by name, as JSON values.
+        """Return the present values of the attributes by name, as values that JSON can represent.
 
-        These are numbers, texts, lists, and dictionaries for objects.
+        Objects are represented by dictionaries of the attributes that have changed.
         """
         now = _AttributeReader().read_attributes(self._level, MAX_DEPTH)
         return _omit_missing(
@@ -55,7 +59,15 @@ class AttributeView:
 
 
 def _find_changes(now: Any, built: Any) -> Any:
-    """Return the attributes of an object that differ from the built object."""
+    """Return a value or, for an object, those of its attributes that have changed.
+
+    Args:
+        now: Present value as plain data.
+        built: Value when the level was built.
+
+    Returns:
+        `_NOTHING` if there is no change.
+    """
     if not isinstance(now, ObjectAttributes) or not isinstance(built, ObjectAttributes):
         return _NOTHING if now == built else now
     changes = (
@@ -65,18 +77,23 @@ def _find_changes(now: Any, built: Any) -> Any:
 
 
 def _omit_missing(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the items as a dictionary, without omitted values."""
+    """Return the items as a dictionary, without those whose value is `_NOTHING`."""
     return {name: value for name, value in items if value is not _NOTHING}
 
 
 class _AttributeReader:
-    """One pass over objects, each shown only at the first place that leads to it."""
+    """Reads a tree of objects once. An object found in several places is shown at the first one."""
 
     def __init__(self) -> None:
         self._seen: set[int] = set()
 
     def read_attributes(self, thing: object, depth: int) -> ObjectAttributes:
-        """Return the attributes of an object as plain data."""
+        """Return the attributes of an object as plain data.
+
+        Args:
+            thing: The object.
+            depth: Number of further levels of nested objects to show.
+        """
         self._seen.add(id(thing))
         plain = [
             (name, self._to_plain(getattr(thing, name), depth))

@@ -36,21 +36,21 @@ from rack.levels.errors import CannotGoOn, LevelError
 from rack.levels.level import Executor, Planner
 
 SELF_TEST_FAILED = 3
-"""Exit status of a board whose start-up test failed."""
+"""Exit status of a board that failed its self-test or could not set up its level."""
 REPEATS_FACTOR = 1 << 16
-"""Factor by which the word of a failure combines place and number of repeats.
+"""Factor that separates the two numbers in the word `Block.FAILED`.
 
-The word is the place, a checksum, times this factor, plus the number of repeats.
+The word is a checksum of the place in the code, times this factor, plus the number of repeats.
 """
 MAX_TOUCHED_CYCLE_NS = 10_000_000
-"""Longest cycle for which memory is touched in advance.
+"""Longest period of a task for which memory is touched in advance, in ns.
 
-Touching takes a tenth of a second, and longer cycles have time for page faults.
+Touching takes a tenth of a second, and a task with a longer period has time for page faults.
 """
 
 
 def run_board(crate: int, name: str, segment: Segment, board: Callable[[Segment], int]) -> int:
-    """Run a board in a process forked by the crate.
+    """Run a board, as the main function of a process that the crate has forked.
 
     Args:
         crate: Process id of the crate.
@@ -59,7 +59,7 @@ def run_board(crate: int, name: str, segment: Segment, board: Callable[[Segment]
         board: Function that runs the board and returns its exit status.
 
     Returns:
-        The exit status of the process.
+        The exit status of the process: that of the board, or one that stands for its error.
     """
     die_with_parent(crate)
     # Drop the crate's priority. The board takes another priority when it is ready.
@@ -76,9 +76,10 @@ def run_board(crate: int, name: str, segment: Segment, board: Callable[[Segment]
 
 
 def _describe_failure(segment: Segment, name: str, error: Exception) -> str:
-    """Describe an error by its traceback.
+    """Describe the error that ended a board, with its traceback.
 
-    If the board's previous process ended in the same place, only the number of repeats is given.
+    If the board's previous process ended in the same place in the code, the traceback is replaced
+    by the number of repeats.
     """
     if name in segment.map.blocks:
         block = segment.get_block(name)
@@ -93,13 +94,13 @@ def _describe_failure(segment: Segment, name: str, error: Exception) -> str:
 
 
 def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> int:
-    """Build a task's level, test it, take the processor, and cycle until the run is over.
+    """Build a task's level, test it, pin the process to its core, and cycle until the run is over.
 
     Args:
         segment: Memory of the rack.
         wiring: Wiring of the task.
         attention: eventfd that wakes the Rack when the board is ready or raises an alarm.
-        copies: Socket on which the crate is told of copies of the process.
+        copies: Socket for notes to the crate about copies of this process.
 
     Returns:
         The exit status of the board.
@@ -118,7 +119,7 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies:
 
 
 def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> None:
-    """Build and test the level of a task, then run its cycles."""
+    """Build and test the level of a task, then run its cycles. See `run_task_board`."""
     spec = segment.layout.find_task(wiring.task)
     copier = Copier(segment, wiring.task, copies) if wants_snapshots(segment) else None
     block = segment.get_block(wiring.task)
@@ -136,8 +137,8 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
         is_fast = spec.every * segment.layout.clock_ns <= MAX_TOUCHED_CYCLE_NS
         lockstep = bool(segment.words[System.LOCKSTEP])
         if is_fast and spec.priority and not lockstep:
-            # This is done at ordinary priority, because a restarted board must not delay another
-            # board's cycle.
+            # Touch memory while the process still has ordinary priority, because a restarted board
+            # must not delay another board's cycle.
             touch_memory()
         block[Block.PRIORITY] = take_core(spec.core, spec.priority, wiring.reservation)
         disable_timer_slack()
@@ -157,27 +158,27 @@ def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: soc
         task.stopwatch.notify_clock()
         task.run()
     finally:
-        # Continue at ordinary priority, because closing files must not delay another board's cycle.
+        # Return to ordinary priority, because closing files must not delay another board's cycle.
         set_priority(0)
         level.close()
 
 
 def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copies: socket) -> int:
-    """Take the processor and run the system clock until the run is over.
+    """Pin the process to its core and run the system clock until the run is over.
 
     Args:
         segment: Memory of the rack.
         wiring: Wiring of the clock.
-        attention: eventfd that wakes the Rack.
-        copies: Socket on which the crate is told of copies of the process.
+        attention: eventfd that wakes the Rack when the clock raises an alarm.
+        copies: Socket for notes to the crate about copies of this process.
 
     Returns:
         The exit status of the board.
     """
     copier = Copier(segment, CLOCK, copies) if wants_snapshots(segment) else None
     take_core(wiring.core, wiring.priority, wiring.reservation)
-    # The memory is not touched in advance, because every board waits for the clock's start, and its
-    # lead over the grid has room for a page fault.
+    # Memory is not touched in advance, because every board waits for the start of the clock. The
+    # clock's lead over its grid points leaves enough time for a page fault.
     hold_memory(wiring.lockstep)
     with keep_cores_awake() if wiring.keeps_awake else nullcontext():
         run_clock(segment, wiring, attention, copier)

@@ -1,9 +1,9 @@
 """Mailboxes accessed by compiled code, with one call for all ports of a step of the cycle.
 
-A call does the same as `WatchedReader.read` and `OutputPort.write` in the usual case, on the same
+In the usual case, a call does the same as `WatchedReader.read` and `OutputPort.write`, on the same
 memory: the slots, the local records, and the words of a reader's state. In rare cases (the first
-message of a writer, a damaged, lost or forged message, a silent writer) it changes nothing and
-reports the port. The Python classes, which remain the reference, handle it then.
+message of a writer, a damaged, lost or forged message, a silent writer) it reports the port, and
+the Python classes, which remain the reference implementation, handle the access.
 
 Loads and stores of heads are atomic, with acquire and release: see `rack.backplane.mailbox.slots`.
 Addresses stay valid in a fork and in a copy of a board, whose memory is at the same place.
@@ -31,7 +31,7 @@ from rack.levels.compiled import compiled, compiled_for
 
 
 def _build_dtype(*names: str) -> np.dtype:
-    """Build a numpy dtype of 64-bit words."""
+    """Build a numpy dtype with a signed 64-bit field for each name."""
     return np.dtype([(name, "i8") for name in names])
 
 
@@ -73,15 +73,15 @@ _SIGNATURE = 8 * Slot.EPOCH
 _VISIBLE = 8 * Slot.VISIBLE_AT
 _PORT_SIZE = PORT.itemsize
 OLD_RESULT, NEW_RESULT, JUDGE_MESSAGES, JUDGE_SILENCE, READ_IN_PYTHON = 0, 1, 2, 4, 8
-"""Results of a read.
+"""Results of a read, of which the last three are bits that can be combined.
 
-The last three ask Python to judge the messages, to judge the silence, or to do the read itself.
+They request that Python check the messages, check the writer's silence, or make the whole read.
 """
 MAX_PORTS = 60
-"""Maximum number of ports of a table, since each has a bit in the result of a call."""
+"""Maximum number of ports in a table, because each has a bit in the 64-bit result of a call."""
 
 
-# Functions that give compiled code the record at an address.
+# Functions that return the record at an address, for compiled code.
 port_at = instruction(to_pointer, PORT)
 state_at = instruction(to_pointer, STATE)
 slot_at = instruction(to_pointer, SLOT)
@@ -89,16 +89,21 @@ slot_at = instruction(to_pointer, SLOT)
 
 @compiled
 def slot_of(port: Any, serial: int) -> int:
-    """Return the address of the slot of a serial."""
+    """Return the address of the slot of a serial in the mailbox of a port."""
     slot: int = port.slots + (serial & (port.depth - 1)) * port.stride
     return slot
 
 
 @compiled
 def take(port: Any, serial: int) -> bool:
-    """Accept a good message of the same writer as before, as `Reader._fetch_good` does.
+    """Accept a message as `Reader._fetch_good` does, if it is good and from the same writer.
 
-    Any other message is left to Python.
+    Args:
+        port: Port to read, a record of type `PORT`.
+        serial: Serial of the message.
+
+    Returns:
+        False if Python must handle the message, because it is bad or its writer is a new one.
     """
     slot = slot_of(port, serial)
     copy(port.record, slot, SIGNED_FROM)
@@ -118,7 +123,16 @@ def take(port: Any, serial: int) -> bool:
 
 @compiled
 def read_port(port: Any, tick: int) -> int:
-    """Read one mailbox as `WatchedReader.read` does, and return the result."""
+    """Read one mailbox as `WatchedReader.read` does.
+
+    Args:
+        port: Port to read, a record of type `PORT`.
+        tick: Release tick of the cycle.
+
+    Returns:
+        `OLD_RESULT` or `NEW_RESULT`, combined with the bits that request checks, or
+            `READ_IN_PYTHON` alone.
+    """
     state = state_at(port.state)
     serial = load(port.head)
     oldest = max(state.serial, serial - port.depth)
@@ -132,7 +146,8 @@ def read_port(port: Any, tick: int) -> int:
     state.accesses += 1
     state.found = serial
     if port.is_watched:
-        # Usually nothing is new, or the next message has come in time with a later release.
+        # In the usual case there is no new message, or exactly one, which is in time and belongs to
+        # a later release.
         if 0 <= state.judged == serial - 1 and (
             state.judged_tick < state.tick > state.visible - port.late_from
         ):
@@ -147,7 +162,12 @@ def read_port(port: Any, tick: int) -> int:
 
 @compiled
 def publish(port: Any, tick: int, stamp: int) -> int:
-    """Publish the message of a port's record as `Slots.publish_message` does.
+    """Publish the message in a port's local record as `Slots.publish_message` does.
+
+    Args:
+        port: Port to write, a record of type `PORT`.
+        tick: Release tick of the cycle.
+        stamp: Time stamp of the message, in ns of CLOCK_MONOTONIC.
 
     Returns:
         Process id of an intruder, 0 for none.
@@ -184,9 +204,9 @@ def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
     """Read mailboxes as of a tick, and write the messages that are due.
 
     Args:
-        table: Address of the ports, of type `PORT`.
+        table: Address of the ports, records of type `PORT`.
         count: Number of ports.
-        tick: Release tick of the cycle, whose end has not come.
+        tick: Release tick of the cycle, which must not be late yet.
         stamp: Time stamp of written messages, in ns of CLOCK_MONOTONIC.
 
     Returns:
@@ -208,12 +228,15 @@ def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
 
 @compiled
 def order() -> None:
-    """Implement `Slots.fence` on any processor."""
+    """Execute a memory fence. Implements `Slots.fence` on any processor."""
     fence()
 
 
 def load_machine_code() -> None:
-    """Load the compiled functions of mailboxes, before a crate forks its boards."""
+    """Load the compiled functions of this module, and replace `Slots.fence` by one of them.
+
+    The crate calls this before it forks boards.
+    """
     access_ports.preload()
     Slots.fence = staticmethod(order.load_machine_code())  # type: ignore[method-assign]  # the reference needs none on x86-64
     Slots.fence()

@@ -1,9 +1,10 @@
-"""A level in execution: `procedure level()` of the paper (section 2).
+"""The cycles of a level: `procedure level()` of the paper (section 2).
 
 `VirtualControlLoop` is its executor section and `PlannerLoop` its planner. The paper's `cobegin`
-becomes two processes: on one core, by priority (tightly coupled), or on two cores (loosely
-coupled). `lock` and `unlock` are inside the mailboxes, because only protocol `lock` needs them. The
-stopwatch keeps time stamps, trace and counts. Faults take effect between cycles.
+becomes two processes: on one core with different priorities (tightly coupled), or on two cores
+(loosely coupled). `lock` and `unlock` are inside the mailboxes, because only protocol `lock` needs
+them. The stopwatch takes time stamps, writes the trace and counts. Faults begin and end between
+cycles.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _DEMANDS = tuple(Demand)
 
 
 class VirtualControlLoop(Task):
-    """The executor section of `procedure level()`, at the higher priority.
+    """The executor section of `procedure level()`, which has the higher priority.
 
         repeat
           waituntil(next-cycle); update(next-cycle)
@@ -54,7 +55,7 @@ class VirtualControlLoop(Task):
         )
         self._guard = ClockGuard(segment, self.alarms, self.block) if wiring.guards_clock else None
         self._has_cycled = False
-        self._raised: dict[int, int] = {}  # ticks of the level's own findings, by number
+        self._raised: dict[int, int] = {}  # tick of the last user-defined finding, by its number
         self._due = segment.layout.compute_due_ticks(self.spec)
         times = wiring.transfer
         self.exchange = slow_access(self.inputs.exchange_plan, times.exchange_ns)
@@ -91,9 +92,9 @@ class VirtualControlLoop(Task):
         watch.finish_cycle(in_time, deadline, done=tick)
 
     def _handle_delay(self, tick: int) -> None:
-        """Record a pause in reading, and check the clock if the cycle begins late.
+        """React to a cycle that begins late: record a pause in reading, and check the clock.
 
-        The first cycle counts as a pause too.
+        The first cycle counts as the end of a pause too.
         """
         if self.next_cycle.skipped or not self._has_cycled:
             self.inputs.task.since = tick
@@ -102,7 +103,7 @@ class VirtualControlLoop(Task):
             self._guard.check_release(tick)
 
     def process(self, tick: int) -> None:
-        """Run the level's `process`, then report its findings and the faults that acted."""
+        """Run the level's `process`, then report its findings and the faults that acted in it."""
         executor = self.executor
         executor.demand = _DEMANDS[self.words[System.DEMAND]]
         executor.process(tick)
@@ -112,7 +113,7 @@ class VirtualControlLoop(Task):
             self._report_findings(tick)
 
     def _report_findings(self, tick: int) -> None:
-        """Raise alarms for the level's findings, and update the faults that act in the cycle."""
+        """Raise alarms for the level's findings, and record the faults that acted in the cycle."""
         executor = self.executor
         for finding in executor.findings:
             # A level may raise user-defined findings in every cycle. Raise one alarm per episode.
@@ -124,23 +125,31 @@ class VirtualControlLoop(Task):
         self.faults.burn_time(tick)
 
     def _begins_episode(self, number: int, tick: int) -> bool:
-        """Record a user-defined finding. Returns True if it begins an episode."""
+        """Record a user-defined finding of a level.
+
+        Args:
+            number: Number of the kind of finding among those that the level declares.
+            tick: Release tick of the cycle.
+
+        Returns:
+            True if the finding begins an episode, because there was none of this kind for a while.
+        """
         last = self._raised.get(number)
         self._raised[number] = tick
         return last is None or tick - last > CLEAN_READS * self.spec.every
 
 
 class PlannerLoop(Task):
-    """The planner of `procedure level()`: plans in the background, within its time slice.
+    """The planner of `procedure level()`, which plans in the background within a time slice.
 
         repeat
           plan
           lock; write_plan; unlock
         until forever
 
-    In every cycle it asks the level whether it wants a plan. If it is tightly coupled under
-    protocol `lock`, writing the plan is the paper's critical section, which the executor cannot
-    preempt.
+    In every cycle it asks the level whether a plan is wanted. If planner and executor are tightly
+    coupled and the plan has protocol `lock`, writing the plan is the paper's critical section,
+    which the executor cannot preempt.
     """
 
     def __init__(
@@ -155,7 +164,7 @@ class PlannerLoop(Task):
         self._priority = self.block[Block.PRIORITY]
 
     def cycle(self, tick: int) -> None:
-        """Plan in the cycle released at `tick`, if a plan is wanted."""
+        """Run the cycle released at `tick`, in which a plan is made if the level wants one."""
         watch = self.stopwatch
         watch.start_cycle(tick, self.next_cycle.skipped)
         self.read(tick)
@@ -163,7 +172,7 @@ class PlannerLoop(Task):
         if not self.planner.wanted(tick):
             self._pass_release(tick)
             return
-        # Claim the time slice of a plan, until whose end the clock does not release this task.
+        # Reserve the time slice of a plan. Until its end the clock does not release this task.
         self.next_cycle.skip_until(tick + self.slice)
         self.block[Block.DEADLINE] = tick + self.slice
         self.stopwatch.notify_clock()
@@ -173,8 +182,8 @@ class PlannerLoop(Task):
             # At this priority the executor cannot preempt the update of the plan.
             set_priority(self._critical_priority)
         try:
-            # Take the stamps inside the section. Before it and after it, the executor may run
-            # first.
+            # Take the time stamps at this priority. Otherwise the executor could run between a
+            # stamp and the write.
             watch.process_ns = monotonic_ns()
             in_time = self.write_plan(tick, watch.find_late_tick(tick + self.slice))
             watch.end_ns = monotonic_ns()
@@ -182,14 +191,15 @@ class PlannerLoop(Task):
             if self._critical_priority:
                 set_priority(self._priority)
         self.block[Block.PLANS] += 1
-        # A plan begun late gets its whole slice, and counts for every release within it.
+        # A plan that began late may still use its whole slice. All releases within the slice count
+        # as done.
         done = max(tick, min(self.block[Block.RELEASED], tick + self.slice - self.spec.every))
         watch.finish_cycle(in_time, tick + self.slice, done, Flag.PLANNED)
 
     def _pass_release(self, tick: int) -> None:
-        """Let a release pass without a plan.
+        """Finish a cycle in which no plan is wanted.
 
-        The cycle is traced if it came too late or other cycles were skipped.
+        The cycle is traced only if it was late or releases were skipped before it.
         """
         self.outputs.flush_delayed(tick, self.clock.compute_tick())
         in_time = self.clock.compute_tick() < tick + self.slice

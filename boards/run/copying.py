@@ -1,12 +1,13 @@
-"""Copies of a process, forked between two of its cycles, that wait until a rack continues them.
+"""Copies of a process, forked between two of its cycles, from which a rack can continue later.
 
-A fork has all that the process knows. Resources that it would share with the parent are separated:
-files that are open for reading are opened again at the same position. A process with resources that
-cannot be duplicated is refused: files open for writing, sockets, threads.
+A fork has the whole state of the process. Files that it would share with its parent are separated:
+if they are open for reading, the copy opens them again at the same position. A process cannot be
+copied if it has resources that cannot be duplicated: files open for writing, sockets or threads.
 
-A copy that is to continue forks its successor, which waits as the copy did, and then continues
-itself. At that time the crate is its parent, because the board from which it was forked has ended.
-A copy waits on a pipe whose other end only the crate holds, so it ends when the crate does.
+A copy that is requested to continue first forks a successor, which waits in its place for further
+requests, and then continues itself. By that time its parent is the crate, because the board from
+which it was forked has ended. A copy waits on a pipe whose other end only the crate has open, so it
+ends when the crate ends.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from rack.boards.errors import SnapshotError
 from rack.levels.level import LevelContext
 
 MAX_NOTE_BYTES = 4096
-"""Maximum size of a board's note."""
+"""Maximum size of a `CopyNote` as JSON."""
 MAX_NOTE_FILES = 2
 """Maximum number of descriptors sent with a note."""
 _DESCRIPTORS = Path("/proc/self/fd")
@@ -43,10 +44,15 @@ _THREADS = Path("/proc/self/task")
 
 @dataclass(frozen=True)
 class CopyNote:
-    """Note of a board to the crate: process `pid` is a waiting copy of it before `tick`.
+    """Note from a board to the crate that there is a copy of it, which waits for requests.
 
-    The crate's end of the copy's pipe is sent along and, from the clock, the memory of the segment.
-    The successor of a copy that continues already has its pipe.
+    The crate's end of the copy's pipe is sent with the note and, by the clock, the file with the
+    segment's memory. No pipe is sent for the successor of a copy, which uses the copy's pipe.
+
+    Attributes:
+        tick: First tick that the copy will run.
+        name: Name of the task, or of the clock.
+        pid: Process id of the copy.
     """
 
     tick: int
@@ -56,6 +62,10 @@ class CopyNote:
     def send_note(self, line: socket, *files: int) -> None:
         """Send the note with open files.
 
+        Args:
+            line: Socket to the crate.
+            files: Descriptors to send along.
+
         Raises:
             OSError: The crate has ended.
         """
@@ -63,21 +73,22 @@ class CopyNote:
 
 
 def receive_note(line: socket) -> tuple[CopyNote, list[int]]:
-    """Return the next note, and the files sent with it."""
+    """Wait for the next note. Returns the note and the descriptors sent with it."""
     data, files, *_ = recv_fds(line, MAX_NOTE_BYTES, MAX_NOTE_FILES)
     return CopyNote(**json.loads(data)), files
 
 
 @dataclass(frozen=True)
 class ContinueRequest:
-    """The crate's request to a copy to continue in the segment of `rack`.
+    """Request from the crate to a copy, to continue in the segment of another rack.
 
-    The other request, None, is answered with the attributes of the level as JSON.
+    Instead of this request the crate may send None. The copy then answers with the attributes of
+    its level as JSON, and waits for the next request.
 
     Attributes:
         crate: Process id of the crate, which is the parent of the copy.
         rack: Name of the rack.
-        context: New context of the level, None to keep the present one.
+        context: New context of the level. None to leave it unchanged.
     """
 
     crate: int
@@ -88,7 +99,7 @@ class ContinueRequest:
 class Copier:
     """Forks copies of this process.
 
-    Create it before the level, because files that are open at that time do not belong to the level.
+    Create it before the level. Files that are already open at that time do not prevent a copy.
     """
 
     def __init__(self, segment: Segment, name: str, line: socket) -> None:
@@ -101,16 +112,15 @@ class Copier:
     def fork_copy(
         self, tick: int, *memory: int, show: Callable[[], Mapping[str, Any]] = dict
     ) -> ContinueRequest | None:
-        """Fork a copy before `tick`.
+        """Fork a copy of this process, which waits in this call until a rack continues from it.
 
         Args:
-            tick: First tick that the copy runs.
+            tick: First tick that the copy will run.
             memory: For the clock, the file with the segment's memory.
-            show: Returns the attributes of the level that the copy shows.
+            show: Returns the attributes of the level, which the copy sends on request.
 
         Returns:
-            None in this process. In the copy, the request, each time that a rack continues from
-                it.
+            None in this process. In a copy, the request to continue.
 
         Raises:
             SnapshotError: The process cannot be copied, with the reason.
@@ -131,7 +141,7 @@ class Copier:
                 raise SnapshotError(f"{self._name}: cannot be copied: {error.strerror}") from None
             if pid:
                 CopyNote(tick, self._name, pid).send_note(self._line, here.fileno(), *memory)
-                # Reap the copies that have ended, which are children of this process.
+                # Reap earlier copies that have ended, because they are children of this process.
                 self._copies = [
                     copy for copy in self._copies if not os.waitpid(copy, os.WNOHANG)[0]
                 ]
@@ -156,25 +166,25 @@ class Copier:
         seeds: Any,
         show: Callable[[], Mapping[str, Any]],
     ) -> tuple[ContinueRequest, int]:
-        """Wait in a copy until a rack continues from it. The process ends with the crate.
+        """Wait for a request to continue. The process ends if the crate ends before that.
 
         Args:
             crate: Pipe to the crate.
             offsets: Positions of the files that are open for reading, by descriptor.
-            seeds: State of Python's random generator.
+            seeds: State of Python's random number generator.
             show: Returns the attributes of the level.
 
         Returns:
-            The request, and the successor that waits from now on.
+            The request, and the process id of the successor that waits for further requests.
         """
         while True:
             for fd, offset in offsets.items():
-                # Open the file for this process alone, and read it up to `offset`.
+                # Open the file again, so that its position is not shared with other processes.
                 reopened = os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
                 os.lseek(reopened, offset, os.SEEK_SET)
                 os.dup2(reopened, fd)
                 os.close(reopened)
-            # Python reseeds its generator in a fork.
+            # Python reseeds its random number generator in a forked process.
             random.setstate(seeds)
             try:
                 # The request is trusted, because it comes from the crate.
@@ -188,10 +198,10 @@ class Copier:
                 os._exit(os.EX_OSERR)
 
     def _list_obstacles(self, memory: Collection[int]) -> list[str]:
-        """Describe the resources of the process that a copy cannot have.
+        """Describe each resource of this process that prevents a copy.
 
         Args:
-            memory: Files of the clock, which are permitted.
+            memory: Files to ignore, because they are sent to the crate with the copy.
         """
         segment = os.fstat(self._segment.fd)
         resources = [
@@ -210,7 +220,7 @@ class Copier:
 
 
 def _list_open_files() -> dict[int, str]:
-    """Return the open files of this process with their names."""
+    """Return the names of the open files of this process by descriptor."""
     name_by_descriptor = {}
     for entry in [*_DESCRIPTORS.iterdir()]:
         # The descriptor of the listing itself is closed by now.

@@ -20,10 +20,11 @@ from rack.levels.compiled import c_function, compiled
 
 
 class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
-    """Mark a function that emits LLVM instructions, for use in compiled code.
+    """Decorator that makes a function callable in compiled code by emitting LLVM instructions.
 
-    The function is called with LLVM's builder and the arguments, which are words. It returns a
-    word, the address of a record of type `record`, or None for 0.
+    The decorated function is called once, at compile time, with LLVM's builder and the arguments,
+    which are 64-bit words. It returns the result: a word or, if `record` is given, a pointer to a
+    record of that type. None stands for the word 0.
     """
 
     def __init__(self, emit: Callable[..., Any], record: np.dtype | None = None) -> None:
@@ -31,11 +32,12 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
         self._record = record
 
     def iterate_source(self) -> Iterator[bytes]:
-        """Yield this file and the type of the record, on which the code of a caller depends."""
+        """Yield this file's content and the record type, on which the code of a caller depends."""
         yield Path(__file__).read_bytes()
         yield repr(self._record).encode()
 
     def _build(self) -> Any:
+        """Build the numba intrinsic that emits the instructions."""
         from numba import from_dtype, types
         from numba.extending import intrinsic
 
@@ -43,7 +45,10 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
         kind: Any = from_dtype(self._record) if self._record else types.int64
 
         def define(context: Any, *arguments: Any) -> Any:
+            """Return the numba signature of the function and the code generator for it."""
+
             def lower(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+                """Emit the instructions, and convert the result to the declared type."""
                 result = emit(builder, *values) or context.get_constant(types.int64, 0)
                 return builder.bitcast(result, context.get_value_type(kind))
 
@@ -55,7 +60,7 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
 
 
 def to_pointer(builder: Any, address: Any) -> Any:
-    """Emit the conversion of an address to a pointer to a word."""
+    """Emit the conversion of an address to a pointer to a 64-bit word."""
     from llvmlite import ir
 
     return builder.inttoptr(address, ir.IntType(64).as_pointer())
@@ -63,19 +68,19 @@ def to_pointer(builder: Any, address: Any) -> Any:
 
 @instruction
 def load(builder: Any, address: Any) -> Any:
-    """Load the word at an address atomically. No later access is moved before it."""
+    """Load the word at an address atomically. No later access is moved before the load."""
     return builder.load_atomic(to_pointer(builder, address), "acquire", 8)
 
 
 @instruction
 def store_release(builder: Any, address: Any, value: Any) -> None:
-    """Store a word at an address atomically. No earlier access is moved after it."""
+    """Store a word at an address atomically. No earlier access is moved after the store."""
     builder.store_atomic(value, to_pointer(builder, address), "release", 8)
 
 
 @instruction
 def fence(builder: Any) -> None:
-    """Keep accesses before and after it apart, except a store before from a load after."""
+    """Prevent reordering of accesses across the fence, except of a store with a later load."""
     builder.fence("acq_rel")
 
 

@@ -1,8 +1,8 @@
-"""The mailboxes of one step of the cycle as a table for compiled code.
+"""The mailboxes of one step of the cycle, as a table for compiled code.
 
-A step is the reading of the plan, the reading of commands and statuses, or the writing. Python
-handles only the ports whose result has changed, and reads and writes the mailboxes of other
-protocols itself.
+A step is the reading of the plan, the reading of commands and statuses, or the writing. Compiled
+code accesses the mailboxes of a step in one call. Python then handles only the ports whose result
+has changed, and accesses the mailboxes whose protocol compiled code does not support.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from rack.boards.run.compiled_mailbox import (
 from rack.levels.level import Reading
 
 WORD_BYTES = 8
-"""Bytes of a word, and the alignment of all memory that is accessed by address."""
+"""Size of a word in bytes, and required alignment of memory that compiled code accesses."""
 
 
 class InputMailbox(NamedTuple):
@@ -53,7 +53,7 @@ class InputMailbox(NamedTuple):
 
 
 class PortTable:
-    """Records of mailboxes, and the compiled function that accesses all of them in one call."""
+    """Table of mailboxes, and the compiled function that accesses all of them in one call."""
 
     def __init__(self, slots: Sequence[Slots]) -> None:
         self._ports = np.zeros(len(slots), PORT)
@@ -72,7 +72,10 @@ class PortTable:
 
 
 class ReadTable(PortTable):
-    """The reads of one step. Compiled code does the reads that it supports, Python the others."""
+    """Table of the mailboxes to read in one step.
+
+    Python reads those that compiled code does not support.
+    """
 
     def __init__(self, lines: Sequence[InputMailbox]) -> None:
         self._lines = [line for line in lines if can_read(line)][:MAX_PORTS]
@@ -90,7 +93,7 @@ class ReadTable(PortTable):
                 port["quiet"] = watched.watch.quiet
 
     def read(self, tick: int) -> None:
-        """Read every mailbox as of `tick`."""
+        """Read every mailbox as of `tick`, and store the readings for the level."""
         touched = self._access(tick, 0)
         if touched:
             for at, line in enumerate(self._lines):
@@ -115,13 +118,16 @@ class ReadTable(PortTable):
 
 
 def can_read(line: InputMailbox) -> bool:
-    """Check whether compiled code can read a mailbox: at every tick, without a lock."""
+    """Check whether compiled code can read a mailbox.
+
+    It must be read in every cycle, under a protocol without a lock, queue or interrupts.
+    """
     watched = line.watched
     return line.read == watched.read and type(watched.reader) in (Reader, DoubleBufferReader)
 
 
 def get_address(memory: memoryview) -> int:
-    """Return the address of memory.
+    """Return the address at which a block of memory starts.
 
     Raises:
         MailboxError: The memory is not aligned to words.
@@ -136,14 +142,14 @@ def get_address(memory: memoryview) -> int:
 
 
 class WriteTable(PortTable):
-    """The mailboxes that compiled code writes."""
+    """Table of the mailboxes that compiled code writes."""
 
     def __init__(self, writers: Sequence[tuple[Writer, Sequence[Reader]]]) -> None:
         """Fill the table.
 
         Args:
-            writers: At most `MAX_PORTS` writers, for which `can_write` is true, each with the
-                readers on whose messages its message depends.
+            writers: At most `MAX_PORTS` writers for which `can_write` is true, each with the
+                readers on whose messages its own message depends.
         """
         self._writers = [writer for writer, _ in writers]
         self._sources = [
@@ -160,10 +166,10 @@ class WriteTable(PortTable):
             port["delay"] = writer.compute_visible_tick(0, None)
 
     def write(self, tick: int) -> bool:
-        """Write the messages that are due, in a cycle whose end has not come.
+        """Write the messages that are due. Call this only if the cycle is not late.
 
         Returns:
-            True if a writer must be checked for an intruder, which its `intruder` names.
+            True if the `intruder` of any writer may have changed.
         """
         touched = self._access(tick, monotonic_ns())
         if touched:
@@ -173,6 +179,9 @@ class WriteTable(PortTable):
 
 
 def can_write(writer: Writer) -> bool:
-    """Check whether compiled code can write a mailbox: in every due cycle, without a lock."""
+    """Check whether compiled code can write a mailbox.
+
+    It cannot if the mailbox is written on demand, or its protocol is queue or lock.
+    """
     spec = writer.spec
     return spec.protocol not in ("queue", "lock") and not spec.max_age

@@ -1,4 +1,4 @@
-"""Ports of a task on the bus: the readers and writers of its mailboxes, used once per cycle."""
+"""Ports of a task: the readers and writers of its mailboxes, each used at most once per cycle."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from rack.levels.ports import Sender
 
 
 class InputPorts:
-    """The mailboxes that a task reads and watches. The level gets the last `Reading` of each port.
+    """The mailboxes that a task reads and checks. The level gets the last `Reading` of each port.
 
     Attributes:
         task: State of the reading task.
-        readers: Reader of each mailbox.
-        taken: Every mailbox, in the order of the ports.
-        reads_plan: True if the task reads a plan.
+        readers: Reader of each mailbox, by the name of the mailbox.
+        taken: Last reading and reader of each mailbox, in the order of the ports.
+        reads_plan: True if the task reads the plan of its level.
     """
 
     def __init__(
@@ -53,16 +53,16 @@ class InputPorts:
             segment: Memory of the rack.
             level: The level that reads. It decides how many messages to take from a queue.
             sources: Mailboxes by port.
-            alarms: Ring for alarms about faults of messages.
+            alarms: Alarm ring of the task.
             plan: Mailbox with the plan of the task's level.
-            exchange: Ports that are not simply read in every cycle.
-            inbox: Inbox of the task's board.
+            exchange: Rules for ports that are read at a different rate or asynchronously.
+            inbox: Inbox of the task's board. None if nothing interrupts it.
         """
         self.task = ReadingTask(inbox)
         self.taken: list[MonitoredPort] = []
         self.readers: dict[str, Reader] = {}
-        # Readings go to the ports themselves or, for a port that reads several mailboxes, to its
-        # dictionary.
+        # A reading is stored under the name of its port. A port that reads several mailboxes has a
+        # dictionary of readings there.
         plans: list[InputMailbox] = []
         self._rest: list[InputMailbox] = []
         for port, source in sources.items():
@@ -102,20 +102,21 @@ class InputPorts:
     def read_queue_position(
         self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter
     ) -> None:
-        """Read the position of the reader of a queue that the task writes.
+        """Add the position of a queue's reader to the mailboxes that are read in every cycle.
 
-        It is read together with the mailboxes of the ports.
+        Each read updates `queue.taken`.
 
         Args:
             segment: Memory of the rack.
-            queue: Writer of the queue.
-            alarms: Ring for alarms about faults of messages.
+            queue: Writer of the queue, which this task writes.
+            alarms: Alarm ring of the task.
         """
         position_reader = open_watched(
             segment, get_position_mailbox(queue.spec.name), alarms, self.task
         )
 
         def read_and_note(tick: int) -> Reading[AnyMessage]:
+            """Read the position, and store it in the writer of the queue."""
             reading = position_reader.read(tick)
             queue.taken = reading.message.taken
             return reading
@@ -131,14 +132,11 @@ class InputPorts:
         self.read_command_and_status(tick)
 
     def exchange_plan(self, tick: int) -> None:
-        """Transfer the plan over the bus, as of `tick`."""
+        """Read the plan as of `tick`, which transfers it over the bus from the planner's core."""
         self._plan_table.read(tick)
 
     def read_command_and_status(self, tick: int) -> None:
-        """Read every mailbox except the plan as of `tick`.
-
-        These are commands, statuses and the world model.
-        """
+        """Read every mailbox except the plan as of `tick`: commands, statuses and world model."""
         self._table.read(tick)
 
     @property
@@ -153,7 +151,7 @@ class InputPorts:
 
     @property
     def traffic(self) -> tuple[int, int]:
-        """Number of accesses and number of bytes read."""
+        """Number of reads, and number of bytes copied by them."""
         accesses = sum(reader.accesses for reader in self._readers)
         return accesses, sum(reader.transfers * reader.spec.size for reader in self._readers)
 
@@ -161,10 +159,11 @@ class InputPorts:
 class OutputPort:
     """One mailbox that a task writes.
 
-    The basis of its message is the oldest basis of the messages of `sources`. A level sends the
-    messages of a queue itself if `sends` is true. Otherwise its message is sent in every cycle in
-    which it is written. A mailbox with a `max_age` is written on demand, in the cycles in which the
-    level has sent a message.
+    The basis of a message is the tick of the oldest information on which it depends: the oldest
+    basis of the messages of `sources`. A mailbox with a `max_age` is written on demand, only in
+    cycles in which the level has sent a message. Any other mailbox is written in every cycle that
+    is due. If `sends` is true, the level fills a queue by calling `send`. Otherwise its message is
+    sent once per due cycle.
     """
 
     def __init__(
@@ -184,13 +183,13 @@ class OutputPort:
         self._is_queue = isinstance(writer, QueueWriter)
         self._sends_itself = self._is_queue and not sends
         self.value: AnyMessage | Sender[AnyMessage] = writer.message
-        """Object that the level gets in its port: the message, or a `Sender`."""
+        """Object that the level gets for its port: the message, or a `Sender`."""
         if self._is_on_demand:
             self.value = Sender(writer.message, self._mark_sent, lambda: 1)
         elif isinstance(writer, QueueWriter) and sends:
             self.value = Sender(writer.message, writer.send, writer.count_free_places)
-        # A message that is not written in every cycle becomes visible at multiples of its period,
-        # counted from its phase.
+        # A cycle is due to write if its message would become visible at a tick of the mailbox's
+        # grid, so if (tick + this number) is a multiple of the mailbox's period.
         self._ahead = spec.ahead - spec.phase
         self._index = segment.layout.find_mailbox_index(spec.name)
         self._episodes = Episodes(segment, spec.name, alarms)
@@ -198,15 +197,24 @@ class OutputPort:
         self._held_up = self._refused = 0
 
     def _mark_sent(self, basis: int | None = None) -> bool:
-        """Mark the message of a port on demand to be written in this cycle."""
+        """Have the message of a port on demand written in this cycle.
+
+        Args:
+            basis: Tick of the oldest information on which the message depends. None to derive it
+                from the messages of `sources`.
+
+        Returns:
+            True, because such a message is never refused.
+        """
         self._is_sent = True
         self._basis = basis
         return True
 
     def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
-        """Apply the faults that concern the mailbox.
+        """Replace the active faults of this mailbox by those of `faults` that concern it.
 
-        Messages delayed by earlier faults are published with the next write.
+        Args:
+            faults: Message faults that are active in the task.
         """
         chosen = [
             entry
@@ -221,11 +229,19 @@ class OutputPort:
 
     @property
     def is_faulty(self) -> bool:
-        """True if faults act on the mailbox or have delayed messages."""
+        """True if faults act on the mailbox, or delayed messages are still to be published."""
         return self._faulty is not None
 
     def write(self, tick: int, now: int | None) -> bool:
-        """Write the message if it is due. Returns False if it was too late."""
+        """Write the message if it is due, and raise alarms about the mailbox.
+
+        Args:
+            tick: Release tick of the cycle.
+            now: Current tick. None if the cycle is known to be on time.
+
+        Returns:
+            False if the message was published too late.
+        """
         writer = self.writer
         if self._faulty is not None and self._faulty.is_over:
             self._faulty = None
@@ -245,12 +261,12 @@ class OutputPort:
         return in_time
 
     def flush_delayed(self, tick: int, now: int | None) -> None:
-        """Publish delayed messages that are due."""
+        """Publish messages that faults have delayed and that are due now."""
         if self._faulty is not None:
             self._faulty.flush_due(tick, now)
 
     def report_findings(self, tick: int) -> None:
-        """Raise alarms for an intruder, refused messages or a held lock."""
+        """Raise alarms about an intruder, refused messages, or a lock held by a dead process."""
         writer = self.writer
         if writer.refused != self._refused:
             refused = writer.refused - self._refused
@@ -269,9 +285,9 @@ class OutputPort:
 class OutputPorts:
     """The mailboxes that a task writes. The level gets the outgoing message of each port.
 
-    Each message carries the tick of the information on which it depends: a command the tick of the
-    command above, a status the tick of the status below (see `Output.rests_on`). The response time
-    of the system is measured from these ticks.
+    Each message carries the tick of the oldest information on which it depends: for a command, the
+    tick of the command from above, for a status, the tick of the status from below (see
+    `Output.rests_on`). The response time of the system is measured from these ticks.
     """
 
     def __init__(
@@ -289,9 +305,9 @@ class OutputPorts:
             segment: Memory of the rack.
             level: The level that writes.
             mailboxes: Mailboxes by port.
-            alarms: Ring for alarms about faults of mailboxes.
+            alarms: Alarm ring of the task.
             inputs: Input ports of the task.
-            sent: Ports whose messages the level sends itself.
+            sent: Ports whose queues the level fills itself, by calling `send`.
         """
         segment.message_classes |= {
             name: level.outputs[port].message
@@ -313,7 +329,7 @@ class OutputPorts:
         self._is_faulty = False
 
     def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
-        """Apply these faults from now on, and no others."""
+        """Replace the active faults of all mailboxes by these."""
         for port in self._ports:
             port.apply_faults(faults)
         self._is_faulty = any(port.is_faulty for port in self._ports)
@@ -328,10 +344,10 @@ class OutputPorts:
 
         Args:
             tick: Release tick of the cycle.
-            now: Current tick. None if the end of the cycle has not come.
+            now: Current tick. None if the cycle is known to be on time.
 
         Returns:
-            False if a message was too late.
+            False if a message was published too late.
         """
         ports = self._ports
         if now is None and not self._is_faulty:
@@ -348,7 +364,7 @@ class OutputPorts:
         return in_time
 
     def flush_delayed(self, tick: int, now: int | None) -> None:
-        """Publish delayed messages that are due, in a cycle that writes nothing else."""
+        """Publish delayed messages that are due. Call this in a cycle that writes nothing else."""
         for port in self._ports:
             port.flush_delayed(tick, now)
 

@@ -1,8 +1,8 @@
-"""New settings for a level that continues from a snapshot and keeps its state.
+"""Change of settings for a level that continues from a snapshot with its state.
 
 Two levels of the same class are built, one with the old settings and one with the new ones. The
-live level takes over the attributes in which they differ, except those that it has changed itself
-since it was built.
+attributes in which these two differ get their new values in the live level, unless the live level
+has changed them itself since it was built.
 """
 
 from __future__ import annotations
@@ -17,15 +17,19 @@ from pydantic import BaseModel
 from rack.levels.level import Executor, LevelContext, Planner
 
 _WHOLE = (BaseModel, LevelContext, ModuleType, memoryview, type)
-"""Classes of values that are replaced as a whole, or not at all."""
+"""Classes of objects whose attributes are never changed one by one."""
 _NUMBERS = "biufc"
 """Kinds of numpy arrays whose elements are compared one by one."""
 
 
 def change_settings(level: Executor | Planner, context: LevelContext) -> None:
-    """Give a level another context.
+    """Change the settings of a live level to those of another context.
 
-    Raises any exception of the level's constructor.
+    Exceptions of the level's constructor are passed on.
+
+    Args:
+        level: The live level.
+        context: Context with the new settings.
     """
     before, after = type(level)(level.context), type(level)(context)
     try:
@@ -37,13 +41,21 @@ def change_settings(level: Executor | Planner, context: LevelContext) -> None:
 
 
 class _SettingsChange:
-    """Differences between two objects, to be applied to a third object of their class."""
+    """Applies the differences between two objects to a third object of the same class."""
 
     def __init__(self) -> None:
         self._seen: set[int] = set()
 
     def apply_to(self, live: object, before: object, after: object) -> None:
-        """Apply the differences between `before` and `after` to `live`."""
+        """Apply the differences between `before` and `after` to the attributes of `live`.
+
+        Attributes that `live` has changed itself are left as they are.
+
+        Args:
+            live: Object to change.
+            before: Object built with the old settings.
+            after: Object built with the new settings.
+        """
         if id(live) in self._seen:
             return
         self._seen.add(id(live))
@@ -56,7 +68,13 @@ class _SettingsChange:
                     object.__setattr__(live, name, changed)
 
     def _merge_values(self, now: Any, old: Any, new: Any) -> Any:
-        """Return a value after the change from `old` to `new`. Objects are changed in place."""
+        """Return the value that an attribute gets. Objects and collections are changed in place.
+
+        Args:
+            now: Present value in the live object.
+            old: Value with the old settings.
+            new: Value with the new settings.
+        """
         if not type(now) is type(old) is type(new):
             # For example, None has become an object.
             return new if type(now) is type(old) and now == old else now
@@ -78,7 +96,10 @@ class _SettingsChange:
 
 
 def has_attributes(thing: object) -> bool:
-    """Check whether an object has Python attributes and is not a function, class or config."""
+    """Check whether the attributes of an object can be read or changed one by one.
+
+    This excludes functions, classes, configs, and objects without Python attributes.
+    """
     is_whole = callable(thing) or isinstance(thing, _WHOLE)
     return not is_whole and (hasattr(thing, "__dict__") or hasattr(type(thing), "__slots__"))
 

@@ -1,8 +1,8 @@
 """Snapshots of a rack in lockstep, taken between two ticks when every task has finished.
 
 Each task and the clock fork a copy of themselves, and the clock copies the segment. The tasks fork
-at the same time, each on its core. A snapshot that falls into the outage of a board is taken once
-the board is back, because a missing process cannot be copied.
+at the same time, each on its core. A snapshot that is due while a board is lost is taken after the
+board has rejoined, because a missing process cannot be copied.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from rack.boards.run.task import Task
 from rack.levels.level import Executor, Planner
 
 FIRST_COST_S = 0.03
-"""Assumed standstill for a snapshot before the first one is taken."""
+"""Time for which a snapshot is assumed to stop the rack, before the first one is measured."""
 COPY_REFUSED = -1
-"""Value of `Block.COPY` of a task that cannot be copied."""
+"""Value of `Block.COPY` by which a task reports that it cannot be copied."""
 
 
 def wants_snapshots(segment: Segment) -> bool:
-    """Check whether the rack wants snapshots."""
+    """Check whether snapshots of this rack are to be taken."""
     words = segment.words
     return any(
         words[word] for word in (System.SNAPSHOT_PART, System.SNAPSHOT_EVERY, System.SNAPSHOT_AT)
@@ -38,7 +38,7 @@ def wants_snapshots(segment: Segment) -> bool:
 
 
 class TaskCopies:
-    """Forks a copy of one task between two of its cycles, when the clock wants it."""
+    """Forks a copy of one task between two of its cycles, when the clock requests one."""
 
     def __init__(
         self, task: Task, level: Executor | Planner, copier: Copier, attention: int
@@ -51,7 +51,7 @@ class TaskCopies:
         self._view = AttributeView(level)
 
     def __call__(self) -> None:
-        """Fork a copy and continue. The copy continues when a rack continues from it."""
+        """Fork a copy, and return. In the copy, this returns when a rack continues from it."""
         block = self._block
         try:
             request = self._copier.fork_copy(block[Block.COPY] - 1, show=self._view.read_attributes)
@@ -73,12 +73,12 @@ class TaskCopies:
 class ClockCopies:
     """Takes the snapshots of a rack.
 
-    The standstill for them is kept to 1 / `System.SNAPSHOT_PART` of lockstep's time. Additional
-    snapshots are taken every `System.SNAPSHOT_EVERY` ticks and before the tick in
-    `System.SNAPSHOT_AT`.
+    Snapshots are taken as often as possible without stopping the rack for more than 1 /
+    `System.SNAPSHOT_PART` of the time. Additional snapshots are taken every `System.SNAPSHOT_EVERY`
+    ticks, and before the tick in `System.SNAPSHOT_AT`.
 
     Attributes:
-        cost_s: Standstill for the last snapshot.
+        cost_s: Time for which the last snapshot stopped the rack.
     """
 
     def __init__(self, segment: Segment, driver: LockstepDriver, copier: Copier) -> None:
@@ -90,10 +90,10 @@ class ClockCopies:
         self._taken_at = -sys.maxsize
 
     def __call__(self, tick: int) -> int:
-        """Take a snapshot before `tick`, if one is due and every process is present.
+        """Take a snapshot before `tick`, if one is due and no task is lost or stopped.
 
         Returns:
-            The next tick before which a snapshot is due.
+            The next tick before which a snapshot is due, as far as it is known in ticks.
         """
         words = self._segment.words
         requested_tick = words[System.SNAPSHOT_AT] - 1
@@ -106,7 +106,7 @@ class ClockCopies:
             self._driver.wait_until_settled()
             are_there = [task.is_settled() and not task.is_lost | task.is_stopped for task in tasks]
             if all(are_there) and self._take_snapshot(tick):
-                # This is the copy. Apply the snapshot policy of the rack that continues from it.
+                # This process is a copy from which a rack continues. Apply that rack's policy.
                 return self(tick)
         next_requested = requested_tick if requested_tick > tick else sys.maxsize
         return (
@@ -114,7 +114,11 @@ class ClockCopies:
         )
 
     def _take_snapshot(self, tick: int) -> bool:
-        """Take a snapshot. Returns True in a copy of the clock that continues from it."""
+        """Take a snapshot before `tick`.
+
+        Returns:
+            False in this process. True in a copy of it, once a rack continues from the snapshot.
+        """
         started_s = time.monotonic()
         tasks = self._driver.tasks
         for task in tasks:
@@ -123,7 +127,7 @@ class ClockCopies:
         for task in tasks:
             self._driver.await_state(task, partial(_is_copied, task.block))
         if any(task.block[Block.COPY] for task in tasks):
-            # A task that refuses a copy will refuse again.
+            # A task that cannot be copied now could not be copied later either. Stop trying.
             for task in tasks:
                 task.block[Block.COPY] = 0
             self._not_before_s = float("inf")
@@ -149,5 +153,9 @@ class ClockCopies:
 
 
 def _is_copied(block: memoryview) -> bool:
-    """Check whether a task has forked its copy or refused to."""
+    """Check whether a task has forked its copy, or has reported that it cannot be copied.
+
+    Args:
+        block: Control block of the task.
+    """
     return block[Block.COPY] <= 0

@@ -1,8 +1,8 @@
 """Stopwatch of a task: times and traces each cycle, and updates the task's control block.
 
 It does all bookkeeping around the paper's procedure: time stamps (R, X, W, C of eqs. 3.5 and 3.9),
-the trace record, missed deadlines, skipped releases, failed accesses, and the report to the clock
-that a release is done.
+the trace record, counts of missed deadlines, skipped releases and failed accesses, and the report
+to the clock that a release is done.
 """
 
 from __future__ import annotations
@@ -21,14 +21,23 @@ _MISS, _SKIP, _BUS_ERROR, _DAMAGED = (
     int(f) for f in (Flag.MISSED, Flag.SKIPPED, Flag.BUS_ERROR, Flag.CORRUPT)
 )
 BUS_COUNT_CYCLES = 64
-"""Cycles between updates of the bus counters."""
+"""Number of cycles between updates of the bus counters in the control block."""
 
 
 class Stopwatch:
-    """Times one task.
+    """Times the cycles of one task.
 
-    A cycle calls `start_cycle`, stamps the end of each part, and calls `finish_cycle` or
-    `finish_idle_cycle`. Stamps are times of CLOCK_MONOTONIC.
+    A cycle calls `start_cycle`, stores a time stamp at the end of each part, and calls
+    `finish_cycle` or `finish_idle_cycle`.
+
+    Attributes:
+        is_late: True if the cycle began more than half a tick late or after skipped releases, or
+            if it is the first.
+        start_ns: Start of the cycle. All times are on CLOCK_MONOTONIC.
+        plan_ns: End of the plan's transfer over the bus (C of fig. 4).
+        read_ns: End of the reading of command, status and plan (R).
+        process_ns: End of the level's `process` or `plan` (X, P).
+        end_ns: End of the writing of all outputs (W, U).
     """
 
     def __init__(
@@ -60,20 +69,15 @@ class Stopwatch:
         self._tick = self._skipped = 0
         self._late_ns = self._period_ns // 2
         self._release_ns = 0  # grid point of the tick, in lockstep the start of the cycle
-        # The cycle began more than half a tick late or after skipped ones, or it is the first.
         self.is_late = True
-        self.start_ns = 0  # start of the cycle
-        self.plan_ns = 0  # the plan has been transferred over the bus (C of fig. 4)
-        self.read_ns = 0  # command, status and plan are read (R)
-        self.process_ns = 0  # the level has processed, or planned (X, P)
-        self.end_ns = 0  # every output is written (W, U)
+        self.start_ns = self.plan_ns = self.read_ns = self.process_ns = self.end_ns = 0
 
     def start_counting(self) -> None:
-        """Start to count processor time."""
+        """Start to count processor time, which the trace record of the next cycle includes."""
         self._processor_ns = thread_time_ns()
 
     def start_cycle(self, tick: int, skipped: int) -> None:
-        """Begin the cycle released at `tick`, after `skipped` missed releases."""
+        """Begin the cycle released at `tick`, before which `skipped` releases were skipped."""
         self._tick = tick
         self._skipped = skipped
         self.start_ns = self.plan_ns = release_ns = start_ns = monotonic_ns()
@@ -83,9 +87,12 @@ class Stopwatch:
         self.is_late = skipped > 0 or start_ns - release_ns > self._late_ns or not self._closed_ns
 
     def find_late_tick(self, deadline: int) -> int | None:
-        """Return the clock's tick at the end of the level's `process`.
+        """Return the current tick if it is `deadline` or later, otherwise None.
 
-        The result is None if tick `deadline` has not come.
+        Call this at the end of the level's `process`, after setting `process_ns`.
+
+        Args:
+            deadline: Tick before which the cycle must end.
         """
         if self._lockstep_done is None and self.process_ns < self._compute_time_ns(deadline):
             return None
@@ -93,13 +100,13 @@ class Stopwatch:
         return now if now >= deadline else None
 
     def finish_cycle(self, in_time: bool, deadline: int, done: int, flags: int = 0) -> None:
-        """Close the cycle: trace it, count it, and report releases as done.
+        """Close the cycle: trace it, count it, and report its release as done.
 
         Args:
-            in_time: False if a message was too late.
+            in_time: False if a message was published too late.
             deadline: Tick before which the cycle had to end.
             done: Newest release that is done.
-            flags: Flags of the trace record.
+            flags: Additional flags for the trace record.
         """
         block = self._block
         tick = self._tick
@@ -146,11 +153,11 @@ class Stopwatch:
         self._closed_ns = monotonic_ns()
 
     def _compute_time_ns(self, tick: int) -> int:
-        """Return the time of a tick, in ns of CLOCK_MONOTONIC."""
+        """Return the grid point of a tick, in ns of CLOCK_MONOTONIC."""
         return self._release_ns + (tick - self._tick) * self._period_ns
 
     def finish_idle_cycle(self) -> None:
-        """Close a cycle in which a planner had nothing to plan. It is counted but not traced."""
+        """Close a cycle in which no plan was wanted. It is counted but not traced."""
         # Exclude its processor time from the next plan's record.
         self._processor_ns = thread_time_ns()
         self._cycles = self._block[Block.CYCLES] = self._cycles + 1
@@ -158,12 +165,16 @@ class Stopwatch:
         self.notify_clock()
 
     def notify_clock(self) -> None:
-        """In lockstep, make the clock check this task again."""
+        """In lockstep, wake the clock so that it checks the state of this task again."""
         if self._lockstep_done is not None:
             self._lockstep_done.release()
 
     def _count_troubles(self) -> int:
-        """Count failed accesses since the last cycle, and return trace flags."""
+        """Count accesses that have failed since the last call.
+
+        Returns:
+            Flags for the trace record: `Flag.BUS_ERROR` and `Flag.CORRUPT` as they apply.
+        """
         self._troubles = self._reading.troubles
         bus_errors = self._inputs.bus_errors + self._outputs.bus_errors
         corrupt = self._inputs.corrupt
@@ -176,9 +187,9 @@ class Stopwatch:
         return (new_errors > 0) * _BUS_ERROR | (new_corrupt > 0) * _DAMAGED
 
     def update_bus_counters(self) -> None:
-        """Update the bus counters of the control block.
+        """Update the counts of accesses and bytes in the control block.
 
-        An update in every cycle would cost too much.
+        This is not done in every cycle, because it takes too long.
         """
         before = self._traffic
         self._traffic = self._inputs.traffic + self._outputs.traffic

@@ -1,7 +1,7 @@
 """The board in slot 1: the system controller, which runs the clock.
 
-At every tick it releases the tasks, begins and ends faults, issues operator commands, lets
-restarted boards rejoin the grid, and demands that the arm stop or brake.
+At every tick it releases the tasks, begins and ends faults, issues operators' commands, lets
+restarted boards rejoin, and decides whether the arm must stop or brake.
 """
 
 from __future__ import annotations
@@ -35,21 +35,18 @@ from rack.boards.wiring import ClockWiring
 from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer
 
 START_DELAY_NS = 20_000_000
-"""Time from the start of the clock's board to tick 0.
-
-It keeps the board's start-up from delaying a tick.
-"""
+"""Time from the start of the clock's board to tick 0, so that the start-up delays no tick."""
 OPERATOR_TIMEOUT_NS = 1_000_000_000
-"""Time after which an operator under a lease that was not heard counts as gone.
+"""Time without a heartbeat after which the client of a lease counts as gone.
 
-It is measured in real time, at the clock's speed.
+It is converted to ticks. In lockstep, heartbeats are not checked.
 """
 
 
 class SystemController:
-    """The clock's duties at every tick besides releasing tasks.
+    """Work of the clock's board at every tick, apart from releasing tasks.
 
-    See `rack.backplane.clock.driver.Controller`.
+    Implements `rack.backplane.clock.driver.Controller`.
     """
 
     def __init__(
@@ -82,7 +79,7 @@ class SystemController:
             self._handle_losses(tick)
 
     def finish_release(self, tick: int) -> None:
-        """Do the work that is due after the release."""
+        """Do the work that is due after the tasks of `tick` were released."""
         self._faults.act_within_tick(tick)
 
     def find_next_work_tick(self, tick: int) -> int:
@@ -92,10 +89,11 @@ class SystemController:
         return min(self._faults.next_tick, self._desk.next_tick, self._end_of_run.next_tick)
 
     def _handle_losses(self, tick: int) -> None:
-        """Handle all lost boards.
+        """React to lost boards, to the emergency stop and to the loss of other racks.
 
-        Restarted boards rejoin. A board that was given up latches the emergency stop. The other
-        losses determine the demand on the arm.
+        Restarted boards rejoin. A board that will not be restarted causes the emergency stop. The
+        losses that remain determine whether the arm must stop or brake, which is published in
+        `System.DEMAND`.
         """
         words = self._words
         seen = words[System.LOSSES], self._driver.watchdog.losses
@@ -120,12 +118,13 @@ class SystemController:
             self._demand = demand
             words[System.DEMAND] = demand
             self._driver.alarms.raise_alarm(tick, Alarm.DEMAND, subject, demand)
-        # A switch in the future, or a loss that the crate is recording, must be looked at again.
+        # Call this again at the next tick while a board is lost, a switch is set for a later tick,
+        # or the crate is just recording a loss.
         is_settled = not lost and peer >> 1 <= tick and seen[0] % 2 == 0
         self._settled = (*seen, emergency, peer) if is_settled else None
 
     def _handle_loss(self, task: ReleasedTask, tick: int) -> None:
-        """Let a restarted board rejoin, or react to a board that was given up."""
+        """Let a restarted board rejoin, or react to a board that will not be restarted."""
         lockstep = self._wiring.lockstep
         if lockstep and tick < task.lost_tick + self._wiring.restart_ticks:
             return
@@ -136,11 +135,11 @@ class SystemController:
             task.admit_new_process()
             self._driver.alarms.raise_alarm(tick, Alarm.REJOINED, task.index, away)
         elif task.is_given_up and task.spec.role == "host":
-            # From this tick on the adapter of the host board reports the loss.
+            # From this tick on, the bus adapter of the host board reports the loss.
             self._driver.wait_until_settled()
             task.admit_new_process()
         elif task.is_given_up:
-            # Do this even if the latch is already set, as it is before the start.
+            # Set the latch even if it is already set, as it is before the start.
             self._words[System.EMERGENCY_STOP] = 1
             # Leave the arm time to come to rest before the run ends.
             ends = tick + self._wiring.linger
@@ -148,10 +147,13 @@ class SystemController:
 
 
 class OperatorCommandIssuer:
-    """Issues operator commands at the start of a tick, before any task is released.
+    """Issues operators' commands at the beginning of a tick, before any task is released.
 
-    Each command goes into its level's mailbox. Nothing is due before `next_tick` unless more than
-    the first `requested` commands have come.
+    A command is issued by publishing it in its level's operator mailbox.
+
+    Attributes:
+        requested: Number of requests that the operator table had when it was last read.
+        next_tick: First tick with work to do, unless there are new requests.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
@@ -178,7 +180,7 @@ class OperatorCommandIssuer:
         self._leased: list[RequestEntry] = []
         self._newest: dict[int, int] = {}
         """Serial of the newest command that replaces earlier ones, by mailbox."""
-        # A tick of lockstep has no length in real time.
+        # In lockstep a tick has no fixed length in real time, so silence is not checked.
         in_time = not self._words[System.LOCKSTEP]
         self._silent = OPERATOR_TIMEOUT_NS // segment.layout.clock_ns if in_time else sys.maxsize
 
@@ -192,8 +194,8 @@ class OperatorCommandIssuer:
             self._check_lease(entry, tick)
         for entry in [entry for entry in self._waiting if entry.tick <= tick]:
             self._waiting.remove(entry)
-            # First mark the request, then check that it is still waiting. A client that withdraws
-            # it uses the opposite order.
+            # First set the tick, then check that the request is still waiting. A client that
+            # withdraws its request uses the opposite order.
             entry.given_tick = tick
             if self._table.is_waiting(entry):
                 self._issue_command(entry, tick)
@@ -222,7 +224,15 @@ class OperatorCommandIssuer:
             self._leased.append(entry)
 
     def _check_lease(self, entry: RequestEntry, tick: int) -> None:
-        """Make a level hold if its operator has gone while the command is in force."""
+        """Release a lease that has ended, and make the level hold if its client is gone.
+
+        A lease ends without further effect when a newer command replaces the leased one, or when
+        the level refuses it.
+
+        Args:
+            entry: Entry of a command that was issued under a lease.
+            tick: Current tick.
+        """
         mailbox = entry.mailbox
         if self._is_superseded(entry):
             self._table.release_lease(entry)
@@ -230,7 +240,7 @@ class OperatorCommandIssuer:
             heard = max(entry.given_tick, entry.heard)
             if self._table.is_client_alive(entry) and tick - heard <= self._silent:
                 return
-            # Issue the hold at once, without a request, because the table may be full.
+            # Issue the hold command directly, without a request, because the table may be full.
             writer = self._writers[mailbox]
             self._words[System.COMMANDED] += 1
             writer.message.raw[:] = build_hold_command(self._boxes[mailbox]).raw
@@ -241,7 +251,7 @@ class OperatorCommandIssuer:
         self._leased.remove(entry)
 
     def _is_superseded(self, entry: RequestEntry) -> bool:
-        """Check whether the level has refused the command or accepted a newer one instead."""
+        """Check whether a level has refused a leased command or has accepted a newer one."""
         mailbox = entry.mailbox
         serial = entry.serial
         newest = self._newest.get(mailbox, 0)
@@ -258,10 +268,12 @@ class OperatorCommandIssuer:
 
 
 class EndOfRun:
-    """Decides the tick at which a run ends, by ticks alone.
+    """Decides at which tick a run ends. The decision depends on ticks alone.
 
-    The end of the task is recorded even if the run ends at a given tick, because a run that
-    continues it may end with its task.
+    A run ends at the tick that its config gives or, without one, with its task: a while after the
+    status of the level that ends the run reports done or error, or has been missing for too long.
+    The end of the task is determined even if the config gives a tick, because a run that continues
+    this one may end with the task.
     """
 
     def __init__(self, segment: Segment, wiring: ClockWiring) -> None:
@@ -271,7 +283,7 @@ class EndOfRun:
         self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
         self._silent = wiring.silent
         self._heard: int | None = None
-        # Under a protocol by ticks, messages become visible at boundaries of the writer's period.
+        # If visibility depends on ticks alone, messages become visible only at ticks of the grid.
         self._every = 1
         self._phase = 0
         if self._reader is not None:
@@ -283,15 +295,16 @@ class EndOfRun:
 
     @property
     def next_tick(self) -> int:
-        """The next tick at which the decision may change."""
+        """Next tick at which the decision may change."""
         if self._reader is None or self._task_ends is not None:
             return sys.maxsize
         return self._next + 1
 
     def __call__(self, tick: int) -> int | None:
-        """Return the tick at which the run stops, by the messages as of the previous tick.
+        """Return the tick before which the run stops, or None while that is not known.
 
-        The result is None until it is known.
+        Args:
+            tick: Tick that is about to begin. Messages are read as of the tick before it.
         """
         final = tick - 1
         if final >= self._next and self._task_ends is None and self._reader is not None:
@@ -314,8 +327,8 @@ def run_clock(
     Args:
         segment: Memory of the rack.
         wiring: Wiring of the clock.
-        attention: eventfd that wakes the Rack.
-        copier: Forks the copies of the clock for snapshots. None to take no snapshots.
+        attention: eventfd that wakes the Rack when the clock raises an alarm.
+        copier: Forks the copies of the clock for snapshots. None if no snapshots are taken.
     """
     words = segment.words
     words[System.CLOCK_PID] = os.getpid()

@@ -1,4 +1,4 @@
-"""A task on its board, with the clock guard of fast tasks and the board's interrupt handler."""
+"""A task on its board, the clock guard of the fastest tasks, and the board's interrupt handler."""
 
 from __future__ import annotations
 
@@ -21,13 +21,19 @@ from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner
 
 PUNCTUAL_TICKS = 20
-"""Number of punctual ticks that ends an episode of late ones."""
+"""Number of ticks without a late one after which the next late tick raises an alarm again."""
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 
 class Task(ABC):
-    """A task around a level's executor or planner: ports, clock, stopwatch and faults."""
+    """A task: runs a level's executor or planner with ports, clock, stopwatch and faults.
+
+    Attributes:
+        spec: Description of the task from the layout.
+        block: Control block of the task.
+        serve: Serves the interrupts of the board in each cycle, None if this task does not.
+    """
 
     def __init__(
         self,
@@ -69,7 +75,7 @@ class Task(ABC):
     def wait_until_next_cycle(self) -> int | None:
         """Wait for the next release and return its tick. Returns None if the run is over.
 
-        Faults take effect here, between cycles.
+        Faults begin and end here, between cycles.
         """
         tick = self.next_cycle.wait()
         if tick is None:
@@ -92,10 +98,10 @@ class Task(ABC):
 
 
 class ClockGuard:
-    """A fast task's check for ticks that the clock has skipped or begun late.
+    """Reports ticks that the clock has skipped or begun late, for one of the fastest tasks.
 
-    Most skips cost a task that does not cycle in every tick no release and make none of its cycles
-    late. Only the clock's count shows them.
+    Even the fastest task need not cycle in every tick. It then loses no release by most skipped
+    ticks, and none of its cycles is late, so skipped ticks are found by the clock's count.
 
     Attributes:
         reported: Number of skipped ticks that this task has reported, including earlier
@@ -112,11 +118,15 @@ class ClockGuard:
         self._quiet_from = 0
 
     def report_skipped(self, tick: int) -> None:
-        """Report the ticks skipped since the last report, in the cycle released at `tick`."""
+        """Report the ticks that the clock has skipped since the last report.
+
+        Args:
+            tick: Release tick of the cycle. Ticks skipped after it are left to the next cycle.
+        """
         words = self._words
         since = words[System.SKIPPED_FROM]
-        # A task may begin so late that the clock has skipped ticks since its release. Its next
-        # cycle reports these.
+        # A cycle may begin so late that the clock has skipped ticks after its release. The next
+        # cycle reports them.
         if tick >= since:
             counted = words[System.CLOCK_SKIPPED]
             self._alarms.raise_alarm(
@@ -125,10 +135,14 @@ class ClockGuard:
             self.reported = self._block[Block.CLOCK_SKIPPED] = counted
 
     def check_release(self, tick: int) -> None:
-        """Check whether the clock was late, in a cycle released at `tick` that begins late."""
+        """Check, in a cycle that begins late, whether this is because the clock was late.
+
+        Args:
+            tick: Release tick of the cycle.
+        """
         words = self._words
         late_ns = words[System.TICK_NS] - self._clock.compute_time_ns(tick)
-        # Check this after the read. The time belongs to this tick only if the clock has not
+        # Check this after reading the time, which belongs to this tick only if the clock has not
         # advanced since.
         if self._clock.is_lockstep or words[System.TICK] != tick:
             return
@@ -141,11 +155,12 @@ class ClockGuard:
 class InterruptHandler:
     """Interrupt handler of a board, under protocol interrupt.
 
-    It charges the time of interrupts, counts them, and reports lost ones. On the original boards it
-    ran whenever a message came. Here the first task of the board does its work just before it
-    reads, and takes as much processor time as the handler would have used since the last cycle.
-    Reading, t_comm of eq. 3.5, grows by this time, and every lower task on the same core has to
-    wait. In lockstep, where nothing waits for a processor, it takes no time.
+    It takes processor time for each interrupt, counts interrupts, and reports lost ones. On the
+    original boards the handler ran whenever a message arrived. Here the first task of the board
+    does its work just before it reads, and takes as much processor time as the handler would have
+    used since the last cycle. Reading, t_comm of eq. 3.5, takes longer by this time, and tasks of
+    lower priority on the same core have to wait. In lockstep, where no task waits for a processor,
+    the handler takes no time.
     """
 
     def __init__(self, segment: Segment, task: str, inbox: BoardInbox, alarms: AlarmWriter) -> None:
@@ -156,7 +171,7 @@ class InterruptHandler:
         self._lines = [
             (line, Episodes(segment, name, alarms)) for name, line in inbox.lines.items()
         ]
-        # Interrupts before the start of this process are neither charged nor counted.
+        # Interrupts before the start of this process are not counted and take no time.
         inbox.advance_to(clock.tick)
         inbox.inbox.most_waiting = 0
         self._served = inbox.count
@@ -165,7 +180,7 @@ class InterruptHandler:
         self._cycles = 0
 
     def serve_messages(self, tick: int) -> None:
-        """Serve all messages that have come up to the release at `tick`."""
+        """Serve all messages that have arrived up to the release at `tick`."""
         inbox = self._inbox
         begun_ns = process_time_ns()
         self._cycles += 1
@@ -188,13 +203,16 @@ class InterruptHandler:
 
 
 def chain_accesses(*accesses: Callable[[int], None] | None) -> Callable[[int], None]:
-    """Return a function that makes these accesses one after the other, leaving out None.
+    """Return a function that makes several accesses one after the other.
 
-    A single access is returned itself.
+    Args:
+        accesses: Functions to call with the release tick, or None for those to leave out. If there
+            is only one, it is returned unchanged.
     """
     present = [access for access in accesses if access is not None]
 
     def make_all(tick: int) -> None:
+        """Make all accesses as of `tick`."""
         for access in present:
             access(tick)
 
@@ -202,18 +220,19 @@ def chain_accesses(*accesses: Callable[[int], None] | None) -> Callable[[int], N
 
 
 def slow_access(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:
-    """Return `access`, extended to at least `time_ns` of processor time.
+    """Return a function that calls `access` and takes at least `time_ns` of processor time.
 
-    This emulates a slower bus: programmed transfers over VME occupied the processor. For 0,
-    `access` itself is returned.
+    This emulates a slower bus: programmed transfers over VME occupied the processor. If `time_ns`
+    is 0, `access` itself is returned.
     """
     if not time_ns:
         return access
 
-    def take(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+    def access_slowly(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        """Make the access, and busy-wait until it has taken its minimum processor time."""
         end = process_time_ns() + time_ns
         result = access(*args, **kwargs)
         compute_until(end)
         return result
 
-    return take
+    return access_slowly
