@@ -22,9 +22,9 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.protocols import LOCK_WAIT_S
 
 RACK_NS = 5_000_000
-"""Time within which the kernel tells the Rack of a process's death, by pidfd."""
+"""Time in ns within which the kernel tells the Rack of a process's death, by pidfd."""
 MEMORY_NS = 45_000_000
-"""Real time that the kernel may need to free the memory of a killed process.
+"""Real time in ns that the kernel may need to free the memory of a killed process.
 
 Up to 0.5 ms per megabyte were seen on a busy machine, and a planner with its libraries has 80 MB.
 """
@@ -38,9 +38,10 @@ def cycle_ticks(layout: Layout, board: str) -> int:
 
 
 def compute_last_read_ticks(mailboxes: tuple[str, ...], layout: Layout) -> int:
-    """Return the time until the last message in any of these mailboxes has been read, ticks.
+    """Return the longest time in ticks until every reader of a mailbox has read a message.
 
-    It is counted from the message's release to the read of the slowest reader.
+    It is counted from the release of the cycle that writes the message, and is the longest among
+    these mailboxes. 0 if nobody reads them.
     """
     boxes = [layout.find_mailbox(name) for name in mailboxes]
     return max(
@@ -59,7 +60,7 @@ def list_struck_mailboxes(layout: Layout, index: int, board: str) -> tuple[Mailb
     Args:
         layout: Layout of the rack.
         index: Index of the mailbox. -1 means all mailboxes that the task writes.
-        board: Name of the task. Mailboxes that it does not write are left out.
+        board: Name of the task. Mailboxes that the task does not write are left out.
     """
     chosen = layout.mailboxes if index < 0 else layout.mailboxes[index : index + 1]
     return tuple(mailbox for mailbox in chosen if mailbox.writer == board)
@@ -87,7 +88,7 @@ class BoundCase:
         layout: Layout of the rack.
         injection: The fault.
         parameters: Values of the fault's parameters, by name.
-        reader: Task that detects the fault. None stands for whichever task is first.
+        reader: Task that detects the fault. None for the bound of whichever task detects it first.
     """
 
     layout: Layout
@@ -115,17 +116,17 @@ class BoundCase:
 
     @property
     def cycle_ticks(self) -> int:
-        """Cycle of the affected task, ticks."""
+        """Cycle of the affected task in ticks."""
         return cycle_ticks(self.layout, self.board)
 
     @property
     def write_ticks(self) -> int:
-        """Interval between messages in the slowest affected mailbox, ticks."""
+        """Interval in ticks between messages in the slowest affected mailbox."""
         return max(mailbox.every for mailbox in self.mailboxes)
 
     @property
     def read_ticks(self) -> int:
-        """Longest interval between reads of an affected mailbox, ticks.
+        """Longest interval in ticks between reads of an affected mailbox.
 
         It applies to the reader or, if no reader is given, to the fastest reader of each mailbox.
         """
@@ -143,9 +144,12 @@ class BoundCase:
 
 @dataclass(frozen=True)
 class Bound:
-    """A detection bound, as text and in ticks.
+    """A detection bound.
 
-    `ticks` returns None if there is no bound, or if this process knows only the text.
+    Attributes:
+        text: The bound in words.
+        ticks: Computes the bound in ticks. Returns None if there is no bound, or if this process
+            knows only the text.
     """
 
     text: str
@@ -156,7 +160,7 @@ class Bound:
 
     def __add__(self, other: Bound) -> Bound:
         def add_terms(case: BoundCase) -> int | None:
-            """Add the ticks of both bounds, if both have any."""
+            """Return the sum of both bounds in ticks, or None if one of them is None."""
             terms = self.ticks(case), other.ticks(case)
             return None if None in terms else sum(term for term in terms if term is not None)
 
@@ -176,7 +180,7 @@ def cycle_bound(count: int) -> Bound:
     """
 
     def count_ticks(case: BoundCase) -> int | None:
-        """Count the ticks of these cycles."""
+        """Return the bound in ticks. None for a host board."""
         return None if case.role == "host" else count * case.cycle_ticks
 
     text = format_count(count, "cycle") if count else "the same cycle"
@@ -184,13 +188,13 @@ def cycle_bound(count: int) -> Bound:
 
 
 def cycle_and_time_bound(count: int, time_ns: int) -> Bound:
-    """Return a bound of `count` cycles of the task that is at least `time_ns` long.
+    """Return a bound of `count` cycles of the task, but at least `time_ns`.
 
-    The gains of a controller act in time, not in cycles.
+    The time matters because the gains of a controller act in time, not in cycles.
     """
 
     def count_ticks(case: BoundCase) -> int:
-        """Count the ticks of these cycles, at least of this time."""
+        """Return the bound in ticks."""
         return max(count * case.cycle_ticks, ceil(time_ns / case.layout.clock_ns))
 
     return Bound(f"{format_count(count, 'cycle')}, at least {time_ns * 1e-6:g} ms", count_ticks)
@@ -210,7 +214,7 @@ READ = Bound("1 read", lambda case: case.read_ticks)
 DELIVERY = Bound(
     "1 delivery", lambda case: max(mailbox.delay for mailbox in case.mailboxes) + case.read_ticks
 )
-"""Time from the writer's release until a reader has read the message."""
+"""Time from the release of the writer until a reader has read the message."""
 MISSING_WRITES = 2
 """Number of writing periods without a message after which a mailbox is stale."""
 MUTE = Bound(

@@ -32,7 +32,7 @@ OPEN_STAGES = (Stage.WAITING, Stage.ACTIVE)
 PHASES = 1000
 """Number of steps into which a phase divides a tick."""
 MIN_LATENESS_TICKS = 0.6
-"""Smallest delay of a late tick, in ticks. Boards report a tick as late from 0.5 on."""
+"""Smallest delay of a late tick, in ticks. Boards report a tick that is at least 0.5 late."""
 
 
 Strike = Callable[["FaultStage", FaultEntry, int], None]
@@ -78,7 +78,7 @@ def _kill_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
 
 
 def _stop_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Stop a task's process."""
+    """Stop a task's process by SIGSTOP."""
     task = stage.find_target(entry)
     if task is not None and stage.send_signal(entry, tick, task, signal.SIGSTOP):
         task.is_stopped = True
@@ -104,19 +104,19 @@ def _is_process_lost(stage: FaultStage, entry: FaultEntry) -> bool:
 
 
 def _forge_message(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Publish a forged message."""
+    """Publish a forged message in the mailbox of the fault."""
     entry.record_action(tick)
     forge_message(stage.segment, stage.segment.layout.mailboxes[entry.mailbox].name, tick)
 
 
 def _stop_clock(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Stop the clock's own process."""
+    """Stop this process, which runs the clock, by SIGSTOP."""
     entry.record_action(tick)
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
 def _skip_ticks(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Let the clock skip ticks."""
+    """Let the clock skip the number of ticks that the fault states."""
     entry.record_action(tick)
     stage.driver.skip = int(entry.parameters[0])
     stage.driver.count_skipped(tick, stage.driver.skip)
@@ -138,17 +138,17 @@ CLOCK_STOP = ClockStep(_stop_clock)
 CLOCK_SKIP = ClockStep(_skip_ticks)
 CLOCK_JITTER = ClockStep(during=_delay_tick)
 ELSEWHERE = ClockStep()
-"""Empty step of a fault that acts in another process."""
+"""Step of a fault that acts in another process: the clock's board has nothing to do."""
 
 
 def _find_step(entry: FaultEntry) -> ClockStep:
-    """Return the step of a fault on the clock's board."""
+    """Return what the clock's board does for a fault. `ELSEWHERE` if another process acts."""
     step = find_kind(entry).step
     return step if isinstance(step, ClockStep) else ELSEWHERE
 
 
 def _next_change(entry: FaultEntry, tick: int) -> int:
-    """Return the first tick after `tick` at which a fault may begin, act or end."""
+    """Return the first tick after `tick` at which a fault may begin, act or end, or `NEVER`."""
     if entry.stage == Stage.WAITING:
         return tick + 1 if entry.when_box >= 0 else max(tick + 1, entry.tick)
     if entry.stage == Stage.ACTIVE:
@@ -162,8 +162,8 @@ class FaultStage:
 
     It also reports when messages flow again after a fault. In lockstep a process is killed or
     stopped between two cycles, after it has finished its release, and the run continues once the
-    crate has recorded its end. A run with faults is therefore repeatable. In real time a fault with
-    a phase acts within its tick, after the releases.
+    crate has recorded its end. A run with faults is therefore repeatable. In real time a fault may
+    have a phase: it then acts at a fraction of its tick, after the releases.
 
     Attributes:
         injected: Number of faults injected so far.
@@ -205,7 +205,7 @@ class FaultStage:
             number: The signal.
 
         Returns:
-            False if the process does not exist.
+            True if the signal was sent, False if the process does not exist.
         """
         pid = task.block[Block.PID]
         # A host board has no process if its program has finished or was given up, or in a replay.
@@ -228,7 +228,7 @@ class FaultStage:
         over = [entry for entry in active if self._is_over(entry, tick)]
         due = [entry for entry in waiting if self._is_due(entry, tick)]
         if over or due:
-            # Let running cycles finish with the faults with which they began.
+            # Faults must not change during a cycle, so wait until the running cycles are finished.
             self.driver.wait_until_settled()
         for entry in over:
             entry.stage = Stage.OVER
@@ -252,8 +252,8 @@ class FaultStage:
                     tick, Alarm.FLOWS, box, tick - since_tick, since_tick
                 )
         # While messages flood the rings, do one tick at a time, so that the recorder keeps up.
-        must_look = self._awaited or self.driver.is_flooded
-        changes = [tick + 1] if must_look else [_next_change(entry, tick) for entry in faults]
+        must_check = self._awaited or self.driver.is_flooded
+        changes = [tick + 1] if must_check else [_next_change(entry, tick) for entry in faults]
         self.next_tick = min(changes, default=NEVER)
 
     def act_within_tick(self, tick: int) -> None:
@@ -276,8 +276,9 @@ class FaultStage:
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
         """Return True if a fault must begin at this tick.
 
-        A condition is read at every tick, so that no message is missed. It is read as of the
-        previous tick: the clock works ahead of the grid, so messages of `tick` may not exist yet.
+        A condition is evaluated at every tick, so that no message is missed. It is evaluated for
+        the previous tick, because the clock works ahead of the grid and messages of `tick` may not
+        exist yet.
         """
         if entry.when_box < 0:
             return entry.tick <= tick
@@ -292,8 +293,8 @@ class FaultStage:
         entry.tick = tick
         duration_ticks = entry.ticks
         if kind.once and not kind.is_of_task:
-            # The board has carried it out at once. A fault of a task would stay active until the
-            # task's next cycle.
+            # The clock's board carries the fault out at once, so one tick is enough. A fault that
+            # acts in its task must stay active until the task's next cycle.
             duration_ticks = 1
         entry.until = tick + duration_ticks if duration_ticks else NEVER
         entry.stage = Stage.ACTIVE

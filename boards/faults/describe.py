@@ -32,7 +32,7 @@ def find_subject(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> st
         joints: Names of the joints.
 
     Returns:
-        An empty string if the fault affects its whole task.
+        The name of the mailbox or joint. Empty if the fault affects its whole task.
     """
     if entry.mailbox >= 0:
         return select_item(layout.mailboxes, entry.mailbox, "mailbox").name

@@ -1,7 +1,7 @@
 """Distributions of the duration and the strength of random faults that can be detected.
 
-The functions here return draws, which the records of the kinds contain and which campaigns call.
-Generators in equal states draw equal faults.
+A draw is a function that draws a random value. The records of the kinds contain draws, and
+campaigns call them. Generators in equal states draw equal faults.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ MAX_SIZE_RATIO = 20.0
 
 @dataclass(frozen=True)
 class Drawing:
-    """Input of a draw.
+    """Random generator and facts about the rack from which a draw computes a value.
 
     Attributes:
         rng: Random generator.
-        cycle: Cycle of the affected task, ticks.
-        reader: Cycle of the fastest reader of its mailbox, ticks.
+        cycle: Cycle of the affected task in ticks.
+        reader: Cycle of the fastest reader of the affected mailbox in ticks.
         second: Number of ticks in a simulated second.
         joints: Number of joints.
     """
@@ -39,17 +39,17 @@ DrawTicks = Callable[[Drawing], int]
 
 
 def uniform_number(least: float, most: float) -> Draw:
-    """Return a draw that is uniform between two numbers."""
+    """Return a draw from a uniform distribution between two numbers."""
     return lambda d: _round_as_saved(d.rng.uniform(least, most))
 
 
 def uniform_integer(least: int, most: int) -> Draw:
-    """Return a draw that is uniform among the integers between two numbers, both included."""
+    """Return a draw from a uniform distribution over the integers from `least` to `most`."""
     return lambda d: d.rng.randint(least, most)
 
 
 def log_uniform_number(least: float, most: float) -> Draw:
-    """Return a draw that is log-uniform between two numbers."""
+    """Return a draw from a log-uniform distribution between two numbers."""
     return lambda d: _round_as_saved(math.exp(d.rng.uniform(math.log(least), math.log(most))))
 
 
@@ -64,32 +64,33 @@ def draw_joint_or_all(d: Drawing) -> int:
 
 
 def uniform_seconds(least: float, most: float) -> DrawTicks:
-    """Return a draw of a duration that is uniform between two simulated times in s."""
+    """Return a draw of a duration, uniform between two simulated times in s."""
     return lambda d: max(1, round(d.rng.uniform(least, most) * d.second))
 
 
 def uniform_cycles(least: int, most: int) -> DrawTicks:
-    """Return a draw of a duration that is uniform between two numbers of the task's cycles."""
+    """Return a draw of a duration, uniform between two numbers of cycles of the task."""
     return lambda d: d.rng.randint(least, most) * d.cycle
 
 
 def uniform_messages(least: int, most: int) -> DrawTicks:
-    """Return a draw of a duration that lasts for a number of messages.
+    """Return a draw of a duration in which the task writes `least` to `most` messages.
 
-    It is at least two cycles of the fastest reader, so that the reader sees the fault.
+    The duration is at least two cycles of the fastest reader, so that the reader sees the fault.
     """
     return lambda d: max(d.rng.randint(least, most) * d.cycle, 2 * d.reader)
 
 
 def longest_of(*lengths: DrawTicks) -> DrawTicks:
-    """Return a draw that takes the longest of several durations."""
+    """Return a draw of the longest of several durations."""
     return lambda d: max(draw(d) for draw in lengths)
 
 
 def uniform_silence(least: float, most: float) -> DrawTicks:
-    """Return a draw of a duration without messages.
+    """Return a draw of the time for which a mailbox is silent.
 
-    It is a multiple of the time within which the fastest reader must notice a silent mailbox.
+    `least` and `most` are multiples of the time within which the fastest reader must notice the
+    silence.
     """
     return lambda d: round((2 * d.cycle + d.reader) * d.rng.uniform(least, most))
 
@@ -108,5 +109,5 @@ def list_sweep_sizes(least: float, visible: float, count: int) -> list[float]:
 
 
 def _round_as_saved(value: float) -> float:
-    """Round a value as files show it, so that a plan that is read back is the same plan."""
+    """Round a value to 4 significant digits, so that a plan is equal when read back from a file."""
     return float(f"{value:.4g}")

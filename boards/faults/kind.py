@@ -55,7 +55,7 @@ class Parameter:
     Attributes:
         name: Name. It must differ from the keys of `rack.boards.faults.config.FaultConfig`.
         unit: Unit, or "1".
-        meaning: Meaning, for help texts.
+        meaning: What the value means, for help texts.
         default: Default value. None if the parameter is required.
         least: Smallest valid value.
         most: Largest valid value.
@@ -115,7 +115,7 @@ class Kind:
         parameters: Parameters of the kind.
         tasks: Roles that can be affected.
         consequence: Effects besides detection.
-        lasts: Draws the duration in a campaign, ticks.
+        lasts: Draws the duration in ticks for a campaign.
         realtime: Whether the fault is impossible in lockstep, where time waits for every task.
         once: Whether it acts only once. Other faults last for a time or until the run ends.
         within_tick: Whether it can act within a tick. Other faults begin with a cycle.
@@ -141,22 +141,22 @@ class Kind:
 
     @property
     def number(self) -> int:
-        """Number of the kind in the fault table, derived from its name in every process."""
+        """Number of the kind in the fault table: a checksum of its name, equal in every process."""
         return crc32(self.name.encode())
 
     @property
     def takes_mailbox(self) -> bool:
-        """Whether it affects messages, of one mailbox or of all that the task writes."""
+        """Whether the fault affects messages, in one mailbox or in all that the task writes."""
         return self.where in ("writer", "bus", "lock")
 
     @property
     def is_of_task(self) -> bool:
-        """Whether it acts in the task's own process, during its cycles."""
+        """Whether the fault acts in the task's own process, during its cycles."""
         return self.where in ("load", "writer", "lock", "arm")
 
     @property
     def is_over_when_found(self) -> bool:
-        """Whether detection ends a lasting fault, because the Rack then kills the process."""
+        """Whether the fault ends once it is detected, because the Rack then kills the process."""
         return self.consequence.ends_process and not self.once
 
     @property
@@ -190,8 +190,8 @@ class Kind:
         Args:
             injection: The fault.
             layout: Layout of the rack.
-            reader: Task that detects the fault. None stands for whichever task is first or, for a
-                death, for the Rack.
+            reader: Task that detects the fault. None for the bound of whichever task detects it
+                first or, for a death, of the Rack.
 
         Returns:
             Ticks from the fault's first effect to its detection. None if there is no bound, as for
@@ -205,13 +205,13 @@ class Kind:
         """Compute the time within which the rack must have recovered.
 
         A restarted board continues at its next release; the executor of a restarted planner
-        continues with the planner's first plan. Messages flow again with the next one of each
-        mailbox.
+        continues with the planner's first plan. Messages flow again once each mailbox has a new
+        one.
 
         Args:
             board: Name of the affected task.
             layout: Layout of the rack.
-            restart_s: Simulated time that a restart may take, s.
+            restart_s: Simulated time in s that a restart may take.
 
         Returns:
             Ticks from the end of the fault, or from its detection.

@@ -26,11 +26,11 @@ class Outgoing(NamedTuple):
     """A message on its way to the mailbox.
 
     Attributes:
-        at: Release of the cycle that publishes it, a tick.
-        released: Release of the cycle that made it, a tick.
-        visible_at: Tick at which it becomes visible.
-        basis: Tick of the information that it is based on.
-        damage: Indices of bits to flip.
+        at: Tick at which the cycle that publishes the message was released.
+        released: Tick at which the cycle that made the message was released.
+        visible_at: Tick at which the message becomes visible.
+        basis: Tick of the information on which the message is based.
+        damage: Indices of the bits to flip.
         content: Content of a delayed message. None if it is still in the writer's buffer.
     """
 
@@ -67,7 +67,7 @@ class MessageStep:
         self.onward(message)
 
     def flush_due(self, tick: int, visible_at: int) -> None:
-        """Pass on the delayed messages that are due at `tick`."""
+        """Pass on the delayed messages that are due at `tick`. Steps that delay none do nothing."""
 
     def count_action(self, message: Outgoing) -> None:
         """Record in the fault table that the fault acted, in the cycle that writes the message."""
@@ -95,7 +95,7 @@ class Drop(MessageStep):
     """Loses messages in transit: their serials are used up, but their slots are not filled."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Lose the message with the fault's probability, else pass it on."""
+        """Lose the message with the fault's probability. Otherwise pass it on."""
         if self.create_random(message).random() < self.entry.parameters[0]:
             self.count_action(message)
             self.writer.lose_message()
@@ -124,7 +124,10 @@ class Reorder(MessageStep):
     """Swaps messages with their successors."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Pass the message on before the one held back, or hold it back at random."""
+        """Swap the message with the one held back before, if there is one.
+
+        Otherwise hold it back with the fault's probability, or pass it on.
+        """
         if self.held:
             self.onward(message)
             held_message = self.held.pop()
@@ -140,7 +143,7 @@ class Corrupt(MessageStep):
     """Flips bits of messages in their slots at random."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Choose bits to flip with the fault's probability, and pass the message on."""
+        """Pass the message on. With the fault's probability, choose bits of it to flip."""
         probability, bits, *_ = self.entry.parameters
         chance = self.create_random(message)
         size = 8 * self.writer.spec.size
@@ -157,7 +160,7 @@ class Babble(MessageStep):
     """Writes each message many times."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Pass the message on as often as the fault says."""
+        """Pass the message on as many times as the fault states."""
         self.count_action(message)
         for _ in range(round(self.entry.parameters[0])):
             self.onward(message)
@@ -181,7 +184,9 @@ class HoldLock(MessageStep):
 class FaultyWriter:
     """Replaces the writer of a mailbox that has faults.
 
-    `index` is the index of the mailbox in the layout.
+    Args:
+        writer: Writer of the mailbox.
+        index: Index of the mailbox in the layout.
     """
 
     def __init__(self, writer: Writer, index: int) -> None:
@@ -216,7 +221,7 @@ class FaultyWriter:
 
     @property
     def is_over(self) -> bool:
-        """Whether neither a fault nor a delayed message is left."""
+        """Whether no fault is active and no delayed message waits to be published."""
         return not self._steps and not self._late
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:
@@ -231,7 +236,7 @@ class FaultyWriter:
             basis: Tick of the information that the message is based on. None means `tick`.
 
         Returns:
-            False if the message was written too late for its readers.
+            True if everything was published, and in time for the readers.
         """
         self.flush_due(tick, now)
         self._written = True
@@ -258,7 +263,7 @@ class FaultyWriter:
         self._writer.show_published()
 
     def _publish_message(self, message: Outgoing) -> None:
-        """Publish a message with its own content and restore the writer's buffer."""
+        """Publish a message with its stored content, if it has any, from the writer's buffer."""
         raw = self._writer.message.raw
         # Restore the buffer afterwards, because it contains the level's newest message.
         present = bytes(raw)

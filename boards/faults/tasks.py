@@ -53,7 +53,7 @@ class ExtraComputing:
             pass
 
     def cycles_ns(self, cycles: float) -> int:
-        """Return the length of `cycles` cycles of the task, ns."""
+        """Return the length of `cycles` cycles of the task in ns."""
         return int(cycles * self.spec.every * self.clock.period_ns)
 
 
@@ -70,10 +70,10 @@ def extend_cycle(load: ExtraComputing, tick: int, now_ns: int) -> int:
     Args:
         load: The extra computing; its fault has the parameters `by` and `random`.
         tick: Release of the cycle.
-        now_ns: Current CLOCK_MONOTONIC, ns.
+        now_ns: Current CLOCK_MONOTONIC in ns.
 
     Returns:
-        CLOCK_MONOTONIC at which the computing ends, ns.
+        CLOCK_MONOTONIC in ns at which the computing ends.
     """
     by, is_random, *_ = load.entry.parameters
     fraction = random.Random(load.entry.seed + tick).random() if is_random else 1.0
@@ -86,10 +86,10 @@ def extend_time_slice(load: ExtraComputing, tick: int, now_ns: int) -> int:
     Args:
         load: The extra computing; its fault has the parameter `by`.
         tick: Release of the slice.
-        now_ns: Current CLOCK_MONOTONIC, ns.
+        now_ns: Current CLOCK_MONOTONIC in ns.
 
     Returns:
-        CLOCK_MONOTONIC at which the computing ends, ns.
+        CLOCK_MONOTONIC in ns at which the computing ends.
     """
     slice_end = load.clock.compute_time_ns(tick + load.spec.slice)
     return max(now_ns, slice_end) + load.cycles_ns(load.entry.parameters[0])
@@ -105,7 +105,7 @@ class TaskFaults:
         level: Executor or planner of the task.
 
     Attributes:
-        loads: Faults of the task's computing time.
+        loads: Extra computing of the active faults.
     """
 
     def __init__(

@@ -47,8 +47,8 @@ _LAUNCH_MASK = (1 << 62) - 1
 class LanAdapter(Adapter):
     """Exchanges mailboxes with other racks.
 
-    Its status has counters for every export and import. It writes one more mailbox for each other
-    rack.
+    Besides the imported mailboxes it writes a status, with counters for every export and import,
+    and one mailbox with the presence of each other rack.
     """
 
     params = LanTable
@@ -67,7 +67,7 @@ class LanAdapter(Adapter):
 
     @classmethod
     def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
-        """Return the other racks and the operators who may set the emergency stop.
+        """Return the names of the other racks and of those who may set the emergency stop.
 
         Alarms refer to them by their index in this sequence.
         """
@@ -78,7 +78,11 @@ class LanAdapter(Adapter):
     def build_ports(
         cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
     ) -> ConfiguredPorts:
-        """Return an input for each export, an output for each import and rack, and the status."""
+        """Return the ports that the parameters configure.
+
+        These are an input for each export, an output for each import and for the presence of each
+        other rack, and the status.
+        """
         table = _read_table(params)
         if table is None:
             return ConfiguredPorts(is_whole=False)
@@ -105,7 +109,7 @@ class LanAdapter(Adapter):
 
     @classmethod
     def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return the ports that are written in a replay. Only imports are sent one by one."""
+        """Return the ports that a replay writes. Only messages of imports are sent one by one."""
         imports = read_params(LanTable, params).imports
         return {port: port in imports for port in cls.build_ports(params, {}).outputs}
 
@@ -124,8 +128,8 @@ class LanAdapter(Adapter):
         self._rack = segment.rack
         self._launch = launch
         self._grid = OwnGrid(segment, self.context.every)
-        # Within a lease and one connection attempt, every rack that is still running has shown its
-        # token.
+        # Every rack that is still running shows its token again within one lease and one attempt
+        # to connect.
         confirm_by_tick = words[System.TICK] + self._grid.ticks_in(
             (table.lease_ms + RETRY_MS[1]) * 1e6
         )
@@ -161,7 +165,7 @@ class LanAdapter(Adapter):
             self._barrier = Barrier(segment, board, table.racks, self._peers.lost_racks)
 
     def open_connections(self) -> None:
-        """Open the session. In a replay, do nothing.
+        """Open the session and start to exchange messages. Does nothing in a replay.
 
         The session's threads inherit the core and the priority of the board.
 
@@ -173,7 +177,7 @@ class LanAdapter(Adapter):
         self._link = link = LanLink(self._rack, self._table)
         link.sealer.resume_counts(self._flaws)
         barrier = self._barrier
-        # A step has one seal for everything that it contains.
+        # A step is sealed as a whole, so the messages in it need no signatures.
         sealer = Sealer(most_bytes=self._table.most_bytes) if barrier else link.sealer
         for entry in self._imports.values():
             entry.open(barrier or link, sealer)
@@ -183,7 +187,8 @@ class LanAdapter(Adapter):
         self._desk.open(link, self._launch)
         if barrier is not None:
             barrier.open(link, self._launch)
-            # The previous adapter may have died before its last step had left the machine.
+            # The previous adapter may have died before its last step had left the machine, so
+            # prepare that step again.
             if barrier.done >= 0:
                 for export in self._exports.values():
                     export.resend_last(barrier.done, self.context.every)
@@ -191,7 +196,8 @@ class LanAdapter(Adapter):
         self._peers.set_source(
             link.watch_tokens() if barrier is None else barrier.take_changes, barrier is not None
         )
-        # The token comes last: a rack that sees it also sees all subscriptions and loses nothing.
+        # Declare the token last: a rack that sees it then also sees all subscriptions and misses
+        # no message.
         link.declare_token(self._launch, 0 if barrier is None else barrier.cycle_ns)
 
     def process(self, tick: int) -> None:
@@ -220,7 +226,10 @@ class LanAdapter(Adapter):
         self._write_status(tick)
 
     def _update_presence(self, tick: int) -> None:
-        """Update which racks are present, and set or clear the stop of the arm on a lost rack."""
+        """Update which racks are present.
+
+        With `on_peer_loss = "stop"`, stop the arm while a rack is lost.
+        """
         arrivals = self._peers.arrivals
         self.findings += self._peers.update_presence(tick)
         must_stop = self._table.on_peer_loss == "stop" and bool(self._peers.lost_racks)
@@ -233,7 +242,7 @@ class LanAdapter(Adapter):
                 export.is_asked = True
 
     def _write_status(self, tick: int) -> None:
-        """Write the counters, the state of each rack and the reason for holding to the outputs."""
+        """Write the status with all counters, and the presence and clock of each other rack."""
         status = self.ports[STATUS]
         self._clocks.write_counts(status.clocks)
         for port, export in self._exports.items():

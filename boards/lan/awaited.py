@@ -1,6 +1,6 @@
-"""Encoding of the rack that an adapter waits for in lockstep, for tools that watch the rack.
+"""Encoding of the rack for which an adapter waits in lockstep, so that tools can show it.
 
-The adapter writes one word of its control block: which rack it waits for, and why.
+The adapter writes the rack and the reason into one word of its control block.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 
 GIVE_UP_S = 20.0
-"""Real time after which a rack without an adapter counts as lost, s. A restart takes less time."""
+"""Real time in s after which a rack without an adapter counts as lost. A restart takes less."""
 _PLACES = 8
 
 
@@ -48,11 +48,11 @@ def encode_wait(index: int, why: WaitReason) -> int:
 
 
 def find_waits(segment: Segment) -> Iterator[tuple[str, str]]:
-    """Yield each adapter that waits for another rack, and a text with the rack and the reason.
+    """Yield each adapter that waits for another rack, with a text that names the rack and why.
 
     Raises:
-        DamageError: The word names a board that is not an adapter, or a rack or reason that does
-            not exist.
+        DamageError: A board that waits is not an adapter, or its word contains a rack or a reason
+            that does not exist.
     """
     for task in segment.layout.tasks:
         if word := segment.get_block(task.name)[Block.AWAITS]:

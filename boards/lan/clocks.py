@@ -2,9 +2,9 @@
 
 A ping is stamped when it is sent and when it is received; its answer is stamped likewise. The true
 offset of the other CLOCK_MONOTONIC is within half the round trip of the measured one, even if the
-two directions take different times (the bound of NTP). The stamps of arrival cannot wait for the
-adapter's cycle, so a callback in a thread of zenoh takes them. It also answers pings at once, so
-that answers do not wait for a cycle either.
+two directions take different times (the bound of NTP). Arrivals must be stamped at once instead of
+in the adapter's next cycle, so a callback in a thread of zenoh stamps them. For the same reason
+this callback also answers pings.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MAX_ROUND_TRIPS = 32
 """Number of recent round trips among which the best one is used."""
 PING_NS = 500_000_000
 EAGER_NS = 20_000_000
-"""Interval between the first pings to a rack, ns.
+"""Interval in ns between the first pings to a rack.
 
 After `EAGER_ROUND_TRIPS` answers the interval is `PING_NS`.
 """
@@ -43,20 +43,20 @@ MAX_UNANSWERED = 64
 A round trip may therefore take more than a second.
 """
 ANSWER_NS = 5_000_000
-"""Shortest interval between two answers to one rack, so that a flood of pings is not answered."""
+"""Shortest interval in ns between two answers to one rack, as a defence against floods."""
 MAX_ASKERS = 1024
 """Maximum number of racks that get answers."""
 REPORT_UNKNOWN_NS = 1_000_000_000
-"""Time after which an unknown clock offset is reported."""
+"""Time in ns after which an unknown clock offset is reported."""
 MAX_UNREAD = 64
-"""Maximum number of answers that wait for a cycle. A newer answer overwrites the oldest."""
+"""Maximum number of answers that wait for the next cycle. The oldest is overwritten first."""
 _PONG = Struct("<Q4q")
 _PING_KIND = compute_kind("ping", 1, np.dtype([]))
 _PONG_KIND = compute_kind("pong", 1, np.dtype([("launch", "<u8"), ("stamps", "<i8", 4)]))
 
 
 class RoundTrip(NamedTuple):
-    """Time stamps of a ping and its answer, ns of CLOCK_MONOTONIC.
+    """Time stamps of a ping and its answer, in ns of CLOCK_MONOTONIC.
 
     `sent` and `arrived` are taken by this rack; `received` and `answered` by the other one.
     """
@@ -68,18 +68,18 @@ class RoundTrip(NamedTuple):
 
     @property
     def duration_ns(self) -> int:
-        """Time that the ping and the answer spent on the network, both together."""
+        """Total time in ns that the ping and its answer spent on the network."""
         return (self.arrived - self.sent) - (self.answered - self.received)
 
     @property
     def offset_ns(self) -> int:
-        """The other clock minus ours, assuming that both directions take equally long."""
+        """Other clock minus this rack's clock in ns, if both directions took equally long."""
         return (self.received - self.sent + self.answered - self.arrived) // 2
 
     def compute_uncertainty_ns(self, now_ns: int) -> int:
-        """Return the largest error of the offset at the time `now_ns` of our clock.
+        """Return the largest possible error of the offset when this rack's clock shows `now_ns`.
 
-        It grows with the age of the measurement, because the clocks may drift apart.
+        The error, in ns, grows with the age of the measurement, because the clocks may drift apart.
         """
         # The 1 covers the rounding of two divisions by 2, here and in the offset.
         age_ns = max(0, now_ns - self.sent)
@@ -89,13 +89,13 @@ class RoundTrip(NamedTuple):
 class ClockOffset:
     """Offset of another clock, taken from the best of the recent round trips.
 
-    A round trip that contradicts the estimate discards the earlier ones: one of the clocks has
-    stepped, as clocks do while a machine sleeps.
+    If a round trip contradicts the estimate, all earlier ones are discarded, because one of the
+    clocks has stepped, for example while its machine slept.
 
     Attributes:
         best: Round trip with the smallest uncertainty, or None. All uncertainties grow alike, so
             the choice does not depend on the time.
-        steps: How often a clock was found to have stepped.
+        steps: Number of steps of either clock that were detected.
     """
 
     def __init__(self) -> None:
@@ -107,7 +107,7 @@ class ClockOffset:
         return len(self._recent)
 
     def add_round_trip(self, trip: RoundTrip) -> bool:
-        """Add a round trip. Return False if its stamps are impossible."""
+        """Add a round trip. Return False, without adding it, if its time stamps are impossible."""
         if trip.duration_ns < 0 or trip.arrived < trip.sent or trip.answered < trip.received:
             return False
         now_ns = trip.arrived
@@ -124,7 +124,7 @@ class ClockOffset:
         return True
 
     def discard_round_trips(self) -> None:
-        """Discard all round trips."""
+        """Discard all round trips, so that the offset is unknown."""
         self._recent.clear()
         self.best = None
 
@@ -135,14 +135,15 @@ class PeerClock:
 
     Attributes:
         peer: The rack.
-        put: Sends a ping to it.
-        offset: Offset of its clock.
-        sent: Time of each unanswered ping by its serial, ns.
-        due_ns: Time of the next ping, ns.
-        met: Launch and number of losses for which the measurements hold.
-        epoch_ns: Its CLOCK_MONOTONIC at its tick 0, or 0 before that.
-        period_ns: Real length of its tick, ns.
-        clock_ns: Simulated length of its tick, ns.
+        put: Sends a ping to the rack.
+        offset: Offset of the rack's clock.
+        sent: Time in ns at which each unanswered ping was sent, by the serial of the ping.
+        due_ns: Time in ns at which the next ping is due.
+        met: Launch and number of losses of the rack when the measurements began.
+        epoch_ns: CLOCK_MONOTONIC of the rack's machine at the rack's tick 0, in ns. 0 if the rack
+            has not started or has not answered yet.
+        period_ns: Real length of the rack's tick in ns.
+        clock_ns: Simulated length of the rack's tick in ns.
     """
 
     peer: PeerRack
@@ -157,9 +158,9 @@ class PeerClock:
 
     def discard_if_outdated(self) -> None:
         """Discard measurements that were made before a new launch or a loss of the rack."""
-        met = (self.peer.launch, self.peer.losses)
-        if met != self.met:
-            self.met = met
+        launch_and_losses = (self.peer.launch, self.peer.losses)
+        if launch_and_losses != self.met:
+            self.met = launch_and_losses
             self.due_ns = 0
             self.epoch_ns = 0
             self.clock_ns = 0
@@ -167,10 +168,10 @@ class PeerClock:
             self.sent.clear()
 
     def to_simulated_ns(self, stamp_ns: int) -> int:
-        """Convert a CLOCK_MONOTONIC stamp of the other machine to the rack's simulated time, ns.
+        """Convert a CLOCK_MONOTONIC stamp of the other machine to the rack's simulated time.
 
         Returns:
-            The simulated time, 0 before tick 0 of that rack.
+            The simulated time in ns. 0 before tick 0 of that rack.
         """
         return (
             max(0, stamp_ns - self.epoch_ns) * self.clock_ns // self.period_ns
@@ -180,7 +181,7 @@ class PeerClock:
 
 
 class Clocks:
-    """Measures the clocks of all peers. Not used in lockstep, where racks share simulated time.
+    """Measures the clock offsets of all peers. Idle in lockstep, where racks share simulated time.
 
     Pings of other racks are answered from zenoh's threads, at a bounded rate for each rack.
 
@@ -208,7 +209,7 @@ class Clocks:
         self._now_ns = 0
 
     def open(self, link: LanLink, sealer: Sealer) -> None:
-        """Start to answer other racks and prepare to ping them."""
+        """Start to answer the pings of other racks, and prepare to ping them."""
         if self._grid.is_lockstep:
             return
         self._link = link
@@ -222,7 +223,10 @@ class Clocks:
             clock.put = link.publish(ping_key(self._rack, rack))
 
     def _answer_ping(self, ping: ReceivedMessage) -> None:
-        """Answer a ping, unless it is malformed or too early. Called in a thread of zenoh."""
+        """Answer a ping, unless it is malformed or exceeds the rate limit.
+
+        Called in a thread of zenoh.
+        """
         received = monotonic_ns()
         asker = ping.key.split("/")[1]
         with self._lock:
@@ -278,7 +282,7 @@ class Clocks:
         clock.put(b"", self._sealer.seal(ping_key(self._rack, rack), head, b""))
 
     def _accept_answer(self, arrived_ns: int, pong: ReceivedMessage) -> bool:
-        """Process an answer. Return False if it is damaged or answers no ping of ours."""
+        """Process an answer. Return False if it is malformed or belongs to no ping of this rack."""
         head = self._sealer.open_message(*pong)
         if isinstance(head, Flaw) or head.kind != _PONG_KIND or len(pong.payload) != _PONG.size:
             return False
@@ -302,19 +306,19 @@ class Clocks:
         return True
 
     def is_unmeasured(self, peer: PeerRack, tick: int) -> bool:
-        """Return True if the clock of a present rack has not been measured for too long.
+        """Return True if a rack has been present for a while but its clock is still not measured.
 
-        The messages of such a rack are held back, because their age is unknown.
+        Messages from such a rack are held back, because their age is unknown.
         """
         is_unknown = peer.is_present and peer.offset_ns is None and not self._grid.is_lockstep
         return is_unknown and tick - peer.since > self._grid.ticks_in(REPORT_UNKNOWN_NS)
 
     def write_counts(self, record: Any) -> None:
-        """Write the counters into the group of a status."""
+        """Write the counters into their group of the adapter's status."""
         fill_counts(record, (self.taken, self.answered, self.withheld, self.refused))
 
     def write_clock(self, out: Any, rack: str, tick: int) -> None:
-        """Write what is known of a rack's clock into its mailbox.
+        """Write offset, uncertainty and speed of a rack's clock into its presence message.
 
         Args:
             out: The message to fill, a `rack.levels.peer.PeerPresence`.

@@ -15,7 +15,7 @@ from rack.levels.tables import Positive, Table
 FASTEST_HZ = 50.0
 """Highest rate of an exchange over a network."""
 MAX_CHAIN_BYTES = 8192
-"""Maximum size of a rack's certificates in DER form, bytes. They are sent with every seal."""
+"""Maximum size in bytes of a rack's certificates in DER form. They are sent with every seal."""
 MessageKind = type[Message]
 OnPeerLoss = Literal["hold", "stop", "go on"]
 PeerName = Annotated[str, StringConstraints(pattern=f"^{RACK_NAME}$")]

@@ -120,10 +120,14 @@ class Credentials:
         return KeyPair(content, key)
 
     def identify_sender(self, chain: bytes) -> Identity | None:
-        """Return the identity in certificates that arrived with a seal.
+        """Return the sender's identity according to the certificates that came with a seal.
+
+        Args:
+            chain: Certificates in DER form, the sender's first.
 
         Returns:
-            None if the authority has not signed them or if they have expired.
+            The identity. None if the authority has not signed the certificates or if one of them
+            has expired.
 
         Raises:
             CredentialError: The authority's certificates cannot be read.
@@ -144,7 +148,7 @@ class Credentials:
 
     @property
     def expiry_time(self) -> datetime:
-        """Time at which the first of the certificates expires. Raises `CredentialError`."""
+        """Earliest time at which one of the certificates expires. Raises `CredentialError`."""
         return min(
             certificate.not_valid_after_utc
             for path in (self.authority, self.certificate)
@@ -152,7 +156,7 @@ class Credentials:
         )
 
     def find_flaws(self, addresses: Iterable[str] = ()) -> Iterator[CredentialError]:
-        """Yield what is wrong with each file at present.
+        """Yield an error for each mistake in the credential files.
 
         Args:
             addresses: Addresses at which others reach this rack. The certificate must contain all
@@ -291,11 +295,11 @@ def _list_addresses(certificate: Certificate) -> list[str]:
 
 
 def _find_trust_path(chain: list[Certificate], authorities: list[Certificate]) -> list[Certificate]:
-    """Return the certificates from the first of a chain up to an authority.
+    """Return the verified path from the first certificate of a chain up to an authority.
 
     Returns:
-        An empty list if the chain does not lead to an authority, for example if the certificate of
-        one rack has signed the certificate of another.
+        The certificates of the path. Empty if the chain does not lead to an authority, for example
+        if the certificate of one rack has signed the certificate of another.
     """
     # As in TLS, an authority must be marked as one. Other certificates may have any extensions.
     any_kind = ExtensionPolicy.permit_all()

@@ -22,7 +22,7 @@ VALID_ENDPOINTS = (
 
 
 class Endpoint(NamedTuple):
-    """Address of a session.
+    """Address at which a session listens or to which it connects.
 
     `host` is a host name, or an address without brackets. For a Unix socket it is the socket's
     name, and `port` is 0.
@@ -85,7 +85,7 @@ class Endpoint(NamedTuple):
 
 
 def list_endpoints(table: LanTable) -> list[Endpoint]:
-    """Return the endpoints of a table. Malformed ones are left out; the rules report them."""
+    """Return the endpoints of a table, without malformed ones, which the config checks report."""
     endpoints = []
     for text in (*table.listen, *table.connect):
         with suppress(ValueError):
@@ -94,5 +94,5 @@ def list_endpoints(table: LanTable) -> list[Endpoint]:
 
 
 def has_tls(table: LanTable) -> bool:
-    """Return True if an endpoint uses TLS, so that others are known by their certificates."""
+    """Return True if an endpoint uses TLS, so that certificates identify the other racks."""
     return any(endpoint.has_tls for endpoint in list_endpoints(table))

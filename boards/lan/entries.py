@@ -58,8 +58,9 @@ class SequenceTracker:
         """
         count = self.count
         if head.launch != self.launch:
-            # After a restart in lockstep, which records no launches, it is the same launch.
-            # Otherwise it is a new one, whose messages before this one do not count as missing.
+            # A new launch starts a new sequence, and its messages before this one do not count as
+            # missing. Without a launch but with a serial, the counters were resumed in lockstep,
+            # where the status contains no launch: the launch is then still the same.
             if self.launch != NO_LAUNCH or not count.serial:
                 count.number = head.number
                 count.serial = 0
@@ -87,8 +88,8 @@ class Export:
 
     Attributes:
         every: Period of the exchange in cycles of the adapter.
-        is_asked: Whether a rack has joined that needs the newest message even if it was sent
-            before.
+        is_asked: Whether a rack has joined since the last message was sent, so that the newest
+            message must be sent even if it was sent before.
         count: Counters of the export.
     """
 
@@ -134,7 +135,7 @@ class Export:
 
     def send_newest(self, tick: int) -> None:
         """Send the newest message if it is new or if a rack that joined needs it."""
-        # The reading of the port is not used, because it has no serial and no time of writing.
+        # Read the mailbox directly, because a port gives neither the serial nor the written tick.
         source = self._source
         grid = self._grid
         reading = source.read(tick)
@@ -154,16 +155,16 @@ class Export:
         self._put(payload, self._sealer.seal(self._key, head, payload))
 
     def write_counts(self, record: Any) -> None:
-        """Write the counters into the group of a status."""
+        """Write the counters into their group of the adapter's status."""
         fill_counts(record, self.count.record.item())
 
 
 class Import:
     """Receives the messages of one mailbox of another rack.
 
-    Each exchange writes the newest good message to the mailbox `lan.<port>`. While the other rack
-    is lost, and until its first message after its return, readers find the writer lost. If the
-    config lets levels keep messages, they find the last message instead, unless it is too old.
+    Each exchange writes the newest good message to the mailbox `lan.<port>`. From the loss of the
+    other rack until its first message after its return, the mailbox is marked as away: readers see
+    its writer as lost or, with `on_peer_loss = "go on"`, keep the last message, however old.
 
     Attributes:
         every: Period of the exchange in cycles of the adapter.
@@ -208,7 +209,7 @@ class Import:
         self._sealer = sealer
 
     def is_old(self, tick: int) -> bool:
-        """Return True if the newest message is older than its maximum age."""
+        """Return True if the newest message is older than the import permits."""
         return self._basis is not None and tick - self._basis > self._max_age
 
     def update_presence(self, tick: int) -> None:
@@ -219,12 +220,12 @@ class Import:
                 self._set_away(True, tick + self._delay if self._grid.is_lockstep else tick)
 
     def mark_present(self, tick: int) -> None:
-        """Let readers use the mailbox again, from the message that is written in this cycle."""
+        """Mark the mailbox as present again, from the message of this cycle on."""
         if self._is_away:
             self._set_away(False, tick + self._delay)
 
     def _set_away(self, is_away: bool, tick: int) -> None:
-        """Mark the mailbox as away, or as back, from `tick` on."""
+        """Mark the mailbox as away or as present from `tick` on."""
         self._is_away = is_away
         self._box[self._word] = encode_switch(tick, is_away)
 
@@ -279,10 +280,10 @@ class Import:
     def _is_acceptable(
         self, head: Envelope, arrived: ReceivedMessage, arrival_tick: int, tick: int
     ) -> bool:
-        """Return True if a message is of the present launch and its age is known.
+        """Return True if a message comes from the present launch and its age is known.
 
-        In lockstep that is always true: see `Barrier`. A message that may become acceptable is kept
-        for a later cycle, and replaces the one that was kept before.
+        In lockstep that is always true: see `Barrier`. A message that may become acceptable is
+        stored for a later cycle and replaces a message that was stored before.
 
         Args:
             head: Head of the message.
@@ -295,7 +296,7 @@ class Import:
         if self._peer.is_superseded(head.launch) or tick - arrival_tick > self._max_age:
             self.count.unknown_launch += 1
             return False
-        # Its age is unknown, and may be too great, until the clocks have been compared.
+        # Until the clocks have been compared, the age of the message is unknown.
         if self._is_present_launch(head) and self._peer.offset_ns is not None:
             return True
         for _, kept_message in self._early:
@@ -313,7 +314,7 @@ class Import:
         return self._peer.is_present and head.launch == self._peer.launch
 
     def _keep_if_newest(self, head: Envelope, payload: bytes) -> bool:
-        """Keep a message and return True if it is well formed and newer than all before it."""
+        """Store a message and return True if it is well formed and newer than all earlier ones."""
         message = AnyMessage(self._buffer.record.dtype, memoryview(bytearray(payload)))
         if not is_proper(message.record, self._fields):
             self.count.refused += 1
@@ -324,7 +325,7 @@ class Import:
         return True
 
     def write_counts(self, record: Any, tick: int) -> None:
-        """Write the counters and the age of the newest message into the group of a status."""
+        """Write the counters and the newest message's age into their group of the status."""
         count = self.count
         count.launch = NO_LAUNCH if self._grid.is_lockstep else self._order.launch
         count.age = NEVER if self._basis is None else tick - self._basis

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _HEAD = Struct("<4sIHQQQQqqq")
 _MAGIC = b"RLN2"
 MAX_SEAL_BYTES = 72
-"""Length of the longest seal, bytes."""
+"""Length of the longest seal in bytes."""
 MAX_ENVELOPE_BYTES = _HEAD.size + MAX_CHAIN_BYTES + MAX_SEAL_BYTES
 
 

@@ -14,11 +14,14 @@ class OwnGrid:
     """Converts ticks of this rack to times and back.
 
     In lockstep all racks share one simulated time. In real time each rack has its own epoch.
-    `every` is the length of the adapter's cycle in ticks.
+
+    Args:
+        segment: Segment of the rack.
+        every: Length of the adapter's cycle in ticks.
 
     Attributes:
         is_lockstep: Whether the rack runs in lockstep.
-        tick_s: Length of one tick in simulated time, s.
+        tick_s: Length of one tick in s of simulated time.
     """
 
     def __init__(self, segment: Segment, every: int = 1) -> None:
@@ -37,15 +40,15 @@ class OwnGrid:
         return compute_period_ticks(rate_hz, self._cycle_ns, "an exchange")
 
     def ticks_in(self, real_ns: float) -> int:
-        """Return the number of ticks after which at least `real_ns` of real time have passed."""
+        """Return the smallest number of ticks that last at least `real_ns` ns of real time."""
         return ceil(real_ns / self._clock.period_ns)
 
     def time_ns(self, tick: int) -> int:
-        """Return the simulated time of a tick, ns."""
+        """Return the simulated time of a tick in ns."""
         return tick * self._clock_ns
 
     def stamp_ns(self, tick: int) -> int:
-        """Return the CLOCK_MONOTONIC of a tick here, ns. In lockstep, its simulated time."""
+        """Return the CLOCK_MONOTONIC of a tick in ns, or its simulated time in lockstep."""
         return self.time_ns(tick) if self.is_lockstep else self._clock.compute_time_ns(tick)
 
     def to_local_tick(self, head: Envelope, peer: PeerRack, tick: int) -> int:

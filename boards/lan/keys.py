@@ -37,7 +37,7 @@ def alive_key(rack: str, launch: int, cycle_ns: int = 0) -> str:
     Args:
         rack: Name of the rack.
         launch: Number of the launch, at most 64 bits.
-        cycle_ns: Length of the adapter's cycle in lockstep, ns. 0 in real time.
+        cycle_ns: Length of the adapter's cycle in ns in lockstep. 0 in real time.
     """
     return f"rack/{rack}/alive/{launch:016x}" + (f"-{cycle_ns}" if cycle_ns else "")
 
@@ -47,7 +47,7 @@ def launch_and_cycle(alive: str) -> tuple[int, int] | None:
 
     Returns:
         The launch number and the length of the adapter's cycle in ns, which is 0 in real time. None
-        if no adapter can have declared this token.
+        if the key is malformed.
     """
     if (match := _ALIVE.fullmatch(alive)) is None:
         return None

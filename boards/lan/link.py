@@ -42,7 +42,7 @@ KEEP_ALIVES = 4
 HANDSHAKE_MS = 3000
 """Maximum time to open a connection."""
 MAX_STEP_BYTES = 65_536
-"""Maximum length of a step in lockstep, bytes."""
+"""Maximum length of a step in bytes, in lockstep."""
 ZENOH_BYTES = 1024
 """Maximum overhead that zenoh adds to a message: key expression, lengths and options."""
 SOCKET = "unixsock-stream"
@@ -66,7 +66,7 @@ class ReceivedMessage(NamedTuple):
 class Question(NamedTuple):
     """A received query. `reply` sends a payload and its envelope as an answer.
 
-    The query ends when the next question is taken, or when none is left.
+    The query stays open until the next question is taken or the channel is found empty.
     """
 
     asked: ReceivedMessage
@@ -112,8 +112,8 @@ class LanLink:
     def publish(self, key: str, reliable: bool = False) -> Callable[[bytes, bytes], None]:
         """Return a function that sends a payload and its envelope under a key expression.
 
-        It drops the message if there is no room. With `reliable`, which only lockstep uses, it
-        waits for room instead.
+        It drops the message if the send queue is full. With `reliable`, which only lockstep uses,
+        it waits for room in the queue instead.
         """
         control = zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP
         publisher = self.session.declare_publisher(
@@ -141,8 +141,8 @@ class LanLink:
         self._kept.append(channel)
 
         def take_samples() -> Iterator[Any]:
-            # Take at most one buffer's worth, so that a flood cannot prolong the cycle.
             """Yield the samples in the buffer, oldest first."""
+            # Take at most one buffer's worth, so that a flood cannot prolong the cycle.
             for _ in range(unread):
                 if (sample := channel.try_recv()) is None:
                     return

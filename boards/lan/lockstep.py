@@ -56,7 +56,7 @@ class Step(NamedTuple):
 
     Attributes:
         head: Envelope of the step.
-        cycle_ns: Length of the adapter's cycle in simulated time, ns.
+        cycle_ns: Length of the adapter's cycle in ns of simulated time.
         racks: Racks for which the sender waits.
         exports: Messages that the sender exports in this cycle.
     """
@@ -71,7 +71,7 @@ def pack_step(cycle_ns: int, racks: Iterable[str], exports: Sequence[ReceivedMes
     """Serialise a step.
 
     Args:
-        cycle_ns: Length of the adapter's cycle in simulated time, ns.
+        cycle_ns: Length of the adapter's cycle in ns of simulated time.
         racks: Racks for which the sender waits.
         exports: Messages to export.
     """
@@ -105,13 +105,13 @@ class Partner:
     Attributes:
         rack: Name of the rack.
         place: Index of the rack in `LanTable.racks`.
-        launch: Launch of its steps.
-        time_ns: Simulated time of its newest step, ns. `NEVER` if none has arrived.
-        steps: Steps that are not yet delivered.
-        is_out: Whether it no longer takes part, so that nobody waits for it.
-        is_there: Whether it was present in the last cycle.
-        gone_s: CLOCK_MONOTONIC at which its adapter was found gone, s. None if the adapter is
-            present or was never seen.
+        launch: Launch that sends its steps. `NO_LAUNCH` if none is known.
+        time_ns: Simulated time of its newest step in ns. `NEVER` if none has arrived.
+        steps: Steps whose exports are not yet delivered.
+        is_out: Whether the rack no longer takes part, so that nobody waits for it.
+        is_there: Whether the rack was present in the last cycle.
+        gone_s: CLOCK_MONOTONIC in s at which its adapter was noticed to have ended. None if the
+            adapter is present or was never seen.
     """
 
     def __init__(self, rack: str, place: int) -> None:
@@ -129,20 +129,20 @@ class Partner:
 
     @property
     def wait_word(self) -> int:
-        """Code for `Block.AWAITS` that says that this rack is awaited, and why."""
+        """Word for `Block.AWAITS` that identifies this rack and the reason for waiting."""
         why = WaitReason.UNSEEN if self.launch == NO_LAUNCH else WaitReason.SLOWER
         return encode_wait(self.place, why if self.gone_s is None else WaitReason.GONE)
 
     def is_gone_for(self, time_s: float) -> bool:
-        """Return True if its adapter has been gone for longer than `time_s`, s."""
+        """Return True if the rack's adapter has been gone for more than `time_s` seconds."""
         return self.gone_s is not None and time.monotonic() - self.gone_s > time_s
 
     def has_reached(self, now_ns: int) -> bool:
-        """Return True if no further step up to this simulated time is to be expected from it."""
+        """Return True if the step of this simulated time has arrived or the rack takes no part."""
         return self.time_ns >= now_ns or self.is_out
 
     def add_step(self, step: Step) -> None:
-        """Record a step. One that is not newer is not delivered again."""
+        """Record a received step. Only a step that is newer than all earlier ones is stored."""
         self.gone_s = None
         if step.head.time_ns > self.time_ns:
             self.time_ns = step.head.time_ns
@@ -158,11 +158,12 @@ class Partner:
 class Barrier:
     """Exchanges the steps of all racks in lockstep at the end of each cycle.
 
-    Exports and imports use it in place of `LanLink`; it has the same methods.
+    Exports and imports use it in place of `LanLink`: it has the same `publish` and `subscribe`.
 
     Attributes:
-        cycle_ns: Length of the adapter's cycle in simulated time, ns. Must be equal in all racks.
-        done: Release of the last cycle that the previous adapter finished, a tick. -1 if there was
+        cycle_ns: Length of the adapter's cycle in ns of simulated time. It must be equal in all
+            racks.
+        done: Release tick of the last cycle that the previous adapter finished. -1 if there was
             none.
     """
 
@@ -276,7 +277,7 @@ class Barrier:
             except Empty:
                 if self._is_over:
                     return False
-                # Show which rack is awaited, and give it up if its adapter is gone for too long.
+                # Show which rack is awaited. Stop waiting if its adapter has been gone too long.
                 awaited = late_partners[0]
                 self._block[Block.AWAITS] = awaited.wait_word
                 awaited.is_out |= awaited.is_gone_for(GIVE_UP_S)
@@ -335,14 +336,16 @@ class Barrier:
         if step is not None and self._is_partner_launch(partner, step.head.launch):
             self._process_step(partner, step)
 
-    def _process_token(self, partner: Partner, launch: int, cycle_ns: int, is_there: bool) -> None:
+    def _process_token(
+        self, partner: Partner, launch: int, cycle_ns: int, is_present: bool
+    ) -> None:
         """Process a change of another rack's liveliness token."""
-        if is_there and partner.launch in (NO_LAUNCH, launch):
+        if is_present and partner.launch in (NO_LAUNCH, launch):
             self._check_cycle(partner, cycle_ns)
             partner.gone_s = None
-            # It has just appeared, so it has missed the steps that were sent before.
+            # The rack has just appeared, so it has missed the steps that were sent before.
             self._resend_steps(self._first_flag)
-        elif is_there:
+        elif is_present:
             self._is_partner_launch(partner, launch)
         elif partner.launch == launch:
             partner.gone_s = time.monotonic()
@@ -350,7 +353,7 @@ class Barrier:
                 partner.reset_state()
 
     def _process_step(self, partner: Partner, step: Step) -> None:
-        """Process a step of another rack. Refuse lockstep if the racks do not fit together."""
+        """Process a step of another rack. Refuse lockstep if the racks are incompatible."""
         self._check_cycle(partner, step.cycle_ns)
         flags = step.head.flags
         if not flags & StepFlag.OVER and self._rack not in step.racks:
@@ -374,9 +377,10 @@ class Barrier:
             self._resend_steps(StepFlag(0))
 
     def _is_partner_launch(self, partner: Partner, launch: int) -> bool:
-        """Return True if a launch is the one that runs in lockstep with this rack.
+        """Return True if a launch of another rack may take part. Remember it if it is new.
 
-        Once the run has begun, a second launch of a rack takes no part, and the first one is over.
+        Once the run has begun, a second launch of a rack cannot join, and the first one counts as
+        ended.
         """
         if partner.launch != launch:
             if self._has_begun and partner.launch != NO_LAUNCH:
@@ -387,7 +391,7 @@ class Barrier:
         return True
 
     def _check_cycle(self, partner: Partner, cycle_ns: int) -> None:
-        """Refuse lockstep if the other rack runs in real time or has another cycle."""
+        """Refuse lockstep if the other rack runs in real time or has a different cycle length."""
         if not cycle_ns:
             self._refuse_lockstep(f"rack '{partner.rack}' runs in real time, this one in lockstep")
         if cycle_ns != self.cycle_ns:
@@ -404,11 +408,11 @@ class Barrier:
     def _deliver_exports(self, partner: Partner) -> None:
         """Deliver the exports of a rack up to this cycle, and record a change of its presence."""
         for step in partner.take_steps(self._now_ns):
-            # After a restart, steps arrive again that were delivered before it.
+            # After a restart of this adapter, steps that it had delivered arrive again. Skip them.
             for export in step.exports if step.head.time_ns > self._passed_ns else ():
                 if export.key.split("/")[1] == partner.rack and export.key in self._imports:
                     self._imports[export.key].append(export)
-        is_there = partner.time_ns >= self._now_ns
-        if is_there != partner.is_there or self._is_first:
-            partner.is_there = is_there
-            self._changes.append((partner.rack, partner.launch, is_there))
+        is_present = partner.time_ns >= self._now_ns
+        if is_present != partner.is_there or self._is_first:
+            partner.is_there = is_present
+            self._changes.append((partner.rack, partner.launch, is_present))

@@ -44,8 +44,9 @@ class PeerRack:
         launches: Number of different launches seen.
         losses: How often the rack was lost.
         since: Tick of the last change of presence.
-        offset_ns: Its CLOCK_MONOTONIC minus the one of this machine, ns. None if not yet measured.
-        uncertainty_ns: Largest error of `offset_ns`, ns.
+        offset_ns: CLOCK_MONOTONIC of the rack's machine minus that of this machine, in ns. None if
+            not yet measured.
+        uncertainty_ns: Largest possible error of `offset_ns` in ns.
         tokens: Launches whose tokens exist, oldest first.
         confirm_by: Tick by which the token must appear, if the rack was present when this adapter
             was restarted. -1 if nothing is to be confirmed.
@@ -114,7 +115,7 @@ class PeerRack:
             self.findings.append(Finding(Alarm.PEER_LOST, self.number))
 
     def _mark_present(self, launch: int, tick: int) -> None:
-        """Make a launch the present one and note whether the rack was restarted or has returned."""
+        """Make a launch the present one. Add a finding if the rack was restarted or is back."""
         self.mark_lost(tick)
         if launch != self.launch:
             self.offset_ns = None
@@ -177,7 +178,7 @@ class Peers:
     """The racks with which this rack works, by name. Other racks on the network are ignored.
 
     Attributes:
-        arrivals: Number of tokens that have appeared, of any rack.
+        arrivals: How often a rack has appeared, including racks that are not peers.
     """
 
     def __init__(self, racks: Iterable[str], keep_messages: bool = False) -> None:
@@ -201,14 +202,14 @@ class Peers:
 
     def update_presence(self, tick: int) -> list[Finding]:
         """Process the changes of presence since the last call and return the resulting findings."""
-        for rack, launch, is_there in self._changes():
-            self.arrivals += is_there
+        for rack, launch, has_appeared in self._changes():
+            self.arrivals += has_appeared
             peer = self._peers.get(rack)
             if peer is None:
                 continue
             if not self._is_lockstep:
-                (peer.add_token if is_there else peer.remove_token)(launch, tick)
-            elif is_there:
+                (peer.add_token if has_appeared else peer.remove_token)(launch, tick)
+            elif has_appeared:
                 peer.join_lockstep(launch, tick)
             else:
                 peer.mark_lost(tick)

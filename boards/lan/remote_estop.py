@@ -1,8 +1,8 @@
 """Emergency stop of a rack on request of other machines, carried out in the adapter's cycles.
 
 Only senders named in `adapter.lan.estop_from` may request it. Requests that are malformed, unsigned
-or from anybody else get no answer. Each cycle processes a bounded number of requests. Newer
-requests overwrite the rest, and a sender without an answer asks again.
+or from anybody else get no answer. Each cycle processes a bounded number of requests. If more
+arrive, the oldest are overwritten, and a sender that gets no answer asks again.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ REQUESTS_A_CYCLE = 16
 
 
 class EstopResponder:
-    """Sets the emergency stop of one rack and reports each one in the `findings`.
+    """Sets the emergency stop of this rack on request and adds a finding for each stop.
 
     Attributes:
         count: Counters of answered, refused and dropped requests.
@@ -57,14 +57,14 @@ class EstopResponder:
         self.count = zero_counts(LanDesk)
 
     def open(self, link: LanLink, launch: int) -> None:
-        """Start to accept requests."""
+        """Start to accept requests, if any sender is permitted."""
         self._sealer = link.sealer
         self._launch = launch
         if self._askers:
             self._requests = link.open_questions(estop_key("*", self._rack), REQUESTS_A_CYCLE)
 
     def answer_requests(self, tick: int) -> None:
-        """Answer the requests that have arrived, and latch the emergency stop if one demands it."""
+        """Answer the requests that have arrived, and latch the emergency stop if asked to."""
         for request, reply in self._requests():
             head = self._sealer.open_message(*request)
             asker = request.key.split("/")[1]
@@ -88,7 +88,7 @@ class EstopResponder:
         self.count.record[...] = record
 
     def write_counts(self, record: object) -> None:
-        """Write the counters into the group of a status.
+        """Write the counters into their group of the adapter's status.
 
         Nothing is written in lockstep, because the counters do not depend on ticks alone.
         """

@@ -20,7 +20,7 @@ from rack.levels.peer import PeerPresence, Presence, format_peer_port
 
 
 class ReplayedNetwork:
-    """Repeats what a recorded run received from the peers and imports of an adapter."""
+    """Repeats the imported messages and the changes of presence of a recorded run."""
 
     def __init__(
         self,
@@ -51,14 +51,14 @@ class ReplayedNetwork:
         self._tick = NEVER
 
     def start_cycle(self, tick: int) -> None:
-        """Start the cycle released at `tick`, up to which changes are reported."""
+        """Start the cycle released at `tick`. `take_changes` yields the changes up to this tick."""
         self._tick = tick
 
     def take_changes(self) -> Iterator[tuple[str, int, bool]]:
         """Yield the changes of presence up to this cycle, in the form of `Barrier.take_changes`."""
         while self._changes and self._changes[0][0] <= self._tick:
-            _, rack, is_there = self._changes.pop(0)
-            yield rack, NO_LAUNCH, is_there
+            _, rack, has_appeared = self._changes.pop(0)
+            yield rack, NO_LAUNCH, has_appeared
 
     def write_recorded(self, write: Mapping[str, Any], tick: int) -> None:
         """Write the messages that were recorded in this cycle.
@@ -76,7 +76,7 @@ class ReplayedNetwork:
 
 
 def _list_presence_changes(rack: str, rows: EntityRows) -> Iterator[tuple[int, str, bool]]:
-    """Yield the tick, the rack and True when it appeared, or False when it was lost."""
+    """Yield each change of presence: tick, rack, and True if it appeared or False if lost."""
     message = PeerPresence.zeros({})
     last_presence = int(Presence.AWAITED)
     for tick, _, content in rows:

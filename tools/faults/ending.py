@@ -21,11 +21,11 @@ EXTERNAL = "external kill"
 """Name, in reports, of a SIGKILL that a campaign sends directly, without the fault table."""
 
 REST_VELOCITY = 0.02
-"""Joint velocity below which an arm counts as at rest, rad/s."""
+"""Joint velocity in rad/s below which an arm counts as at rest."""
 
 
 def find_record(kind: str) -> Kind:
-    """Return the record of a kind in a report. A kill from outside is treated as a kill.
+    """Return the record of a kind in a report. External kills have the record of `kill`.
 
     Raises:
         Failure: The kind is unknown.
@@ -45,11 +45,11 @@ class Strike:
         fault: Index in the fault table.
         kind: Name of the kind.
         board: Affected task.
-        began: Tick at which it began. -1 if it did not begin.
-        ends: Tick at which it ended or would have ended, or `NEVER`.
-        tick: Tick at which it first acted, however little. -1 if it did not act.
-        time_ns: CLOCK_MONOTONIC of its first action, ns.
-        count: How often it acted strongly enough to be detectable.
+        began: Tick at which the fault began. -1 if it did not begin.
+        ends: Tick at which the fault ended or would have ended, or `NEVER`.
+        tick: Tick at which the fault first acted, however little. -1 if it did not act.
+        time_ns: CLOCK_MONOTONIC of the first action in ns.
+        count: How often the fault acted strongly enough to be detectable.
         hidden: Ticks from `tick` to the first detectable action.
         mailboxes: Affected mailboxes.
         joint: Affected joint. Empty for none or all.
@@ -127,7 +127,7 @@ def read_arm(segment: Segment) -> ArmEnd:
 
 
 def _build_strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> Strike:
-    """Convert an entry of the fault table."""
+    """Convert an entry of the fault table to a `Strike`."""
     kind = find_kind(entry)
     values = kind.read_parameters(entry)
     board = find_board(entry, layout)

@@ -36,7 +36,7 @@ COLLISION = Alarm.COLLISION.name.lower()
 UNDONE_BY: Mapping[str, str] = {BRAKES: "brakes_opened", "demand": "demand", "restart": "rejoined"}
 """Code of the recovery that undoes each reaction."""
 TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
-"""Places of faults that may keep boards from their cycles."""
+"""Places of faults that may keep boards from running their cycles."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class Detection:
         event: The event.
         delay: Ticks from the fault's first action, without ticks that the clock skipped.
         bound: Largest permitted delay in ticks. None if there is no bound.
-        delay_ms: Delay in wall-clock time, ms. None in lockstep, where it means nothing.
-        bound_ms: Bound of a death in real time, ms. It then replaces `bound`.
+        delay_ms: Delay in ms of wall-clock time. None in lockstep, where it means nothing.
+        bound_ms: Bound in ms for a death in real time, which replaces `bound`. None otherwise.
     """
 
     event: Event
@@ -144,8 +144,8 @@ class Aftermath(NamedTuple):
 
     Attributes:
         reactions: Codes of the reactions.
-        is_undone: Whether all reactions were undone and all lost messages replaced. A message is
-            replaced when a good message that was made after the fault was seen in the mailbox.
+        is_undone: Whether all reactions were undone and all lost messages replaced. Messages of a
+            mailbox count as replaced once it contains a good message from after the fault.
         recovery: Ticks from the fault's first action until the last reaction was undone.
         lacking: Codes of required reactions that did not follow. Brakes that were already closed
             are not required to close.
@@ -212,7 +212,7 @@ def _can_react(strike: Strike, reaction: Event) -> bool:
 
 
 def takes_cycles(strike: Strike) -> bool:
-    """Return True if a fault may keep tasks from their cycles."""
+    """Return True if a fault may keep tasks from running their cycles."""
     return strike.record.where in TAKE_CYCLES
 
 
@@ -224,7 +224,7 @@ def _are_engaged(tick: int, events: Sequence[Event]) -> bool:
 
 
 def _find_undone_tick(reaction: Event, events_after: Sequence[Event]) -> int | None:
-    """Return the tick at which a reaction was undone, or None."""
+    """Return the tick at which a reaction was undone, or None if it was not."""
     recoveries = (
         event.tick
         for event in events_after

@@ -31,7 +31,7 @@ Seen = Literal["detected", "missed", "not struck"]
 Report = dict[str, Any]
 
 SETTLE_S = 0.25
-"""Simulated time after a fault's bounds in which its effects may still be reported."""
+"""Simulated time in s after a fault's bounds in which its effects may still be reported."""
 
 
 @dataclass(frozen=True)
@@ -41,26 +41,26 @@ class Judgement:
     Attributes:
         kind: Name of the kind.
         board: Affected task.
-        struck: Tick at which it first acted. -1 if it did not act.
-        seen: Whether it was detected.
-        mailbox: Affected mailbox, if it is one.
-        joint: Affected joint, if it is one.
+        struck: Tick at which the fault first acted. -1 if it did not act.
+        seen: Whether the fault was detected.
+        mailbox: Affected mailbox. Empty unless there is exactly one.
+        joint: Affected joint. Empty unless there is exactly one.
         size: Size of the fault, if its kind has one.
-        began: Tick at which it began. -1 if it did not begin.
+        began: Tick at which the fault began. -1 if it did not begin.
         is_judged: False if the fault is smaller than the size from which it must be detected.
-        cycle: Cycle of the affected task, ticks.
-        found_by: Board that detected it.
+        cycle: Cycle of the affected task in ticks.
+        found_by: Board that detected the fault.
         found_as: Code of the detection.
-        delay: Ticks from its first action to its detection.
-        delay_ms: The same in wall-clock time, ms.
-        bound: Largest permitted delay, ticks. None if there is no bound.
-        bound_ms: Largest permitted delay in wall-clock time, ms.
-        is_within: Whether it was detected within its bound.
+        delay: Ticks from the fault's first action to its detection.
+        delay_ms: The delay in ms of wall-clock time.
+        bound: Largest permitted delay in ticks. None if there is no bound.
+        bound_ms: Largest permitted delay in ms of wall-clock time.
+        is_within: Whether the fault was detected within its bound.
         reactions: Codes of the reactions to it.
-        is_recovered: Whether it was recovered from within the bound.
-        recovery: Ticks from its first action until every reaction was undone and affected messages
-            flowed again. None if that was not seen or if there was no reaction.
-        recovery_bound: Largest permitted value of `recovery`.
+        is_recovered: Whether the rack recovered from the fault within the bound.
+        recovery: Ticks from the fault's first action until every reaction was undone and affected
+            messages flowed again. None if that was not seen or if there was no reaction.
+        recovery_bound: Largest permitted value of `recovery`. None if the launch was refused.
         lacking: Required reactions that did not follow.
         is_latched: Whether the fault ended the task, as its kind permits.
     """
@@ -112,9 +112,9 @@ class Circumstances:
 
     Attributes:
         layout: Layout of the rack.
-        offset_ns: Difference that converts CLOCK_MONOTONIC to the time of the events, ns.
+        offset_ns: Time of the events minus CLOCK_MONOTONIC, in ns.
         is_lockstep: Whether the run was in lockstep.
-        restart_s: Simulated time that a restart may take, s.
+        restart_s: Simulated time in s that a restart may take.
         has_failed: Whether the task ended with an error, as some kinds permit.
         moving: Obstacles that move, and may collide with an arm that a fault has stopped.
     """
@@ -132,7 +132,7 @@ def judge_faults(
 ) -> FaultVerdict:
     """Judge the faults of a run by its events.
 
-    An event detects one fault only. If it matches two, it counts for the one that acted first and
+    An event detects one fault only. If it matches two, it counts for the fault that acted first and
     is not yet detected. A fault of the arm that ended before its bound without being detected
     counts as not having acted, and so does a fault whose run ended before the bound of its
     recovery.
@@ -175,8 +175,8 @@ class Judge:
                 for detection in detections
                 if not self._is_in_time_for_later(detection, later)
             ]
-            # Reactions belong to this fault until the next one acts, or until this one is long
-            # over.
+            # Reactions belong to this fault until the next fault acts, or until the end of this
+            # fault's window.
             horizon = min([*(s.tick for s in later if s.tick > strike.tick), last + 1])
             best = min(own_detections, key=lambda detection: detection.sort_key, default=None)
             if best:
@@ -242,7 +242,7 @@ class Judge:
     def _is_periodic(self, mailbox: str) -> bool:
         """Return True if a mailbox has a message in every period of its writer.
 
-        Plans, queues, mailboxes for news, and the mailboxes of host boards do not.
+        Mailboxes of planners and host boards, queues, and mailboxes with a maximum age do not.
         """
         mailbox_spec = self._layout.find_mailbox(mailbox)
         return (
@@ -274,8 +274,8 @@ class Judge:
         reader = event.board if event.code in MAILBOX_ALARMS else None
         bound = self._compute_bound(strike, reader)
         if self._run.is_lockstep:
-            # In lockstep the clock waits for the end of a process that it has killed itself. A
-            # kill from outside is not known to the clock, which runs as fast as it can, so neither
+            # In lockstep the clock waits for the end of a process that it has killed itself. An
+            # external kill is not known to the clock, which runs as fast as it can, so neither
             # ticks nor time measure the delay.
             if event.kind == DIED and strike.kind == EXTERNAL:
                 bound = None
@@ -286,7 +286,7 @@ class Judge:
         return Detection(event, delay, bound, delay_ms, bound_ms)
 
     def _build_judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
-        """Judge a fault by its best detection and by the reactions up to `horizon`."""
+        """Judge a fault by its best detection and by the reactions before tick `horizon`."""
         visible_from = strike.record.visible_from
         owed = (
             tuple(filter(self._is_periodic, strike.affected_mailboxes)) or strike.affected_mailboxes
@@ -415,5 +415,5 @@ def _build_row(judgement: Judgement, layout: Layout) -> Report:
 
 
 def _in_cycles(ticks: int | None, cycle: int) -> float | None:
-    """Convert ticks to cycles of the affected task."""
+    """Convert ticks to cycles of the affected task. None remains None."""
     return None if ticks is None else round(ticks / cycle, 3)

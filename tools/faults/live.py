@@ -55,7 +55,7 @@ class LiveRack:
         Args:
             settings: Keys of `[[fault]]`. Values of None are ignored.
             wait: Whether to wait until the fault is over.
-            timeout_s: Maximum wall-clock time to wait for the end, s. None waits without limit.
+            timeout_s: Maximum wall-clock time in s to wait for the end. None waits without limit.
 
         Raises:
             ConfigError: The fault has mistakes. All of them are reported.
@@ -132,7 +132,11 @@ class LiveRack:
         return format_fitted_table(list(columns), rows)
 
     def _parse_fault(self, settings: Document) -> FaultConfig:
-        """Validate the keys of a fault. Raises `ConfigError`."""
+        """Return a fault from its keys. A fault without a seed gets an unused one.
+
+        Raises:
+            ConfigError: A key or a value is invalid.
+        """
         # Two faults of one run must not draw the same random numbers.
         settings.setdefault(
             "seed", (self._config.seed + self._segment.words[System.INJECTED]) % SEEDS
@@ -144,7 +148,7 @@ class LiveRack:
             raise ConfigError(convert_errors(error, FaultConfig, settings)) from None
 
     def _check_fault(self, fault: FaultConfig) -> None:
-        """Check that a running rack, and this process, can have a fault.
+        """Check that this process can inject a fault into a running rack.
 
         Raises:
             ConfigError: The fault cannot begin in a running rack, or lacks an end.
@@ -172,7 +176,7 @@ class LiveRack:
         set_priority(0)
 
     def _wait_until(self, holds: Callable[[], bool], timeout_s: float | None) -> bool:
-        """Wait until a condition holds or the run is over. Return False after `timeout_s`, s."""
+        """Wait until a condition holds or the run is over. Return False after `timeout_s` s."""
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while not holds() and not self._segment.run_is_over:
             if time.monotonic() > deadline:
@@ -184,7 +188,7 @@ class LiveRack:
         """Wait until a fault, or the run, is over.
 
         Raises:
-            Failure: `timeout_s` is over, or the run has ended before the fault began.
+            Failure: `timeout_s` has passed, or the run has ended before the fault began.
         """
         self._print_waiting(entry)
         if not self._wait_until(lambda: entry.stage == Stage.OVER, timeout_s):
@@ -192,7 +196,7 @@ class LiveRack:
         self._check_begun(entry)
 
     def _print_waiting(self, entry: FaultEntry) -> None:
-        """Print that a fault waits, if it does."""
+        """If a fault is waiting to begin, print for what it waits."""
         if entry.stage == Stage.WAITING:
             print(self._describe_state(entry), file=sys.stderr, flush=True)
 
@@ -238,5 +242,5 @@ class LiveRack:
 
 
 def _format_cell(value: str | int | None) -> str:
-    """Return a cell of the table of faults: "-" for an unknown tick."""
+    """Return a value as a cell of the table of faults. An unknown tick is shown as "-"."""
     return "-" if value is None or value == -1 else str(value)

@@ -155,7 +155,7 @@ def sign_certificate(
 
 
 def _to_general_name(text: str) -> x509.GeneralName:
-    """Return an address, or a host name, as an alternative name of a certificate."""
+    """Return an address or a host name in the form of a certificate's alternative name."""
     try:
         return x509.IPAddress(ip_address(text))
     except ValueError:
@@ -173,7 +173,7 @@ def key_to_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def write_credentials(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files by name into a folder, which is created if necessary."""
+    """Write each file into a folder. Create the folder if it does not exist."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, content in files.items():
         # Create the file with its final mode, and never follow a link that somebody has left.

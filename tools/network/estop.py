@@ -27,9 +27,9 @@ from rack.tools.console.address import Operator, RackAddress
 from rack.tools.console.answer import Failure
 
 CONNECT_S = 3.0
-"""Maximum wait for a connection and for the first rack at its other end."""
+"""Maximum wait in s for a connection and for the first rack at its other end."""
 OTHERS_S = 0.3
-"""Maximum wait for further racks at the other end once one was seen."""
+"""Maximum wait in s for further racks at the other end once one was seen."""
 ANSWER_S = 1.0
 """Maximum wait for an answer. After that the request is repeated."""
 PATIENCE_S = 4.0
@@ -76,11 +76,11 @@ class EstopSession:
         self._link.close()
 
     def _wait_until(self, condition: Callable[[], object], bound_s: float) -> None:
-        """Follow which racks are present until a condition holds or `bound_s` seconds are over."""
+        """Track which racks are present until a condition holds or `bound_s` seconds are over."""
         end_s = time.monotonic() + bound_s
         while True:
-            for rack, launch, is_there in self._changes():
-                if is_there:
+            for rack, launch, has_appeared in self._changes():
+                if has_appeared:
                     self._launches[rack] = launch
                 elif self._launches.get(rack) == launch:
                     del self._launches[rack]
@@ -124,7 +124,7 @@ class EstopSession:
         rack = self._address.rack
         rack_text = f"rack '{rack}' at {self._address.endpoint}"
         first_s = time.monotonic()
-        # Whether the rack has accepted a request, which its adapter answers in its next cycle.
+        # Whether the rack has accepted a request. Its adapter answers in its next cycle.
         was_taken = False
         while True:
             began_s = time.monotonic()
@@ -186,12 +186,13 @@ def stop_when(
     operator: Operator,
     tell: Callable[[str], None],
 ) -> int:
-    """Stay connected to a rack and set its emergency stop on demand.
+    """Stay connected to a rack and set its emergency stop when the operator asks for it.
 
-    A demand while the rack is out of reach is repeated until the stop is set.
+    If the rack is out of reach then, the request is repeated until the stop is set.
 
     Args:
-        pressed: Waits up to a time in s. Returns True once the stop is demanded.
+        pressed: Waits for at most the given time in s. Returns True if the operator asks for the
+            stop.
         address: Address of the rack.
         operator: Name and certificates of whoever sets the stop.
         tell: Called repeatedly with a text that says whether the stop can be set.
@@ -200,7 +201,7 @@ def stop_when(
         The tick at which the stop was set.
 
     Raises:
-        Failure: The stop could not be set from the beginning.
+        Failure: The first check finds that the stop cannot be set.
     """
     with EstopSession(address, operator) as session:
         checked_launch: int | None = None

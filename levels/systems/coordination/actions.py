@@ -17,7 +17,7 @@ _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
 
 
 def write_action(action: AnyAction, message: CellAction) -> None:
-    """Write an action into the `CellAction` of a message. Fields that it lacks become zero."""
+    """Write an action into the `CellAction` of a message. Fields that it lacks are set to zero."""
     for field in CellAction.message_type.fields:
         message.record[field.name] = np.zeros((), message.record.dtype[field.name])
     message.by = action.by or 0.0
@@ -74,7 +74,11 @@ def read_action(message: CellAction, context: LevelContext) -> AnyAction:
 
 
 def _to_table(message: CellAction) -> dict[str, Any]:
-    """Return the action as a table of a program, without its `by`."""
+    """Return the action of a message as a table of a program, without the key `by`.
+
+    Raises:
+        ProgramError: The action or the form of its goal is unknown.
+    """
     position = message.position.tolist()
     match message.action, message.goal:
         case OrderAction.HOME, _:

@@ -1,10 +1,10 @@
 """Agreement between a coordinator and its arms about each step of a program.
 
 The coordinator asks all arms of a step. Once every arm has answered POSSIBLE, it tells all of them
-to do the step. If one arm refuses, the program ends for all. An answer stays valid until the arm
-reports another one, so a step begins everywhere or nowhere, however long messages take. An answer
-may expire at a given time. If the order would arrive too late for one, the step is cancelled for
-all arms and asked again.
+to do the step. If one arm refuses, the program ends for all. The answer POSSIBLE is a promise: it
+stays valid until the arm reports another answer, so a step begins everywhere or nowhere, however
+long messages take. A promise may expire at a given time. If the order to do the step would arrive
+too late for one arm, the step is cancelled for all arms and asked again.
 
 The id of an order contains the step and the attempt. A coordinator that has lost its memory, after
 a new launch of its rack, therefore learns from the reports of the arms which step is active and
@@ -15,8 +15,8 @@ rules ensure that the arms begin together or not at all:
 
 - The answer to an order is final: POSSIBLE turns into DOING only by DO, and into CANCELLED only by
   CANCEL or another order.
-- An arm begins nothing that it has not answered to be possible. After a new launch of its rack,
-  which knows of no promise, it fails an order to do something.
+- An arm begins nothing that it has not promised. After a new launch of its rack, which knows of no
+  promise, it answers FAILED to an order to do something.
 """
 
 from __future__ import annotations
@@ -52,13 +52,14 @@ class Agreement:
     Attributes:
         program: Checksum of the program.
         phase: What the coordinator is doing.
-        step: Number of steps done.
-        attempt: How often the present step was asked for before.
+        step: Number of steps that are done.
+        attempt: Number of earlier attempts at the present step.
         error: Why the program ends early, or `Error.NONE`.
-        reason: The same as text.
-        begun: Simulated time at which every arm had reported, s: the origin of the program's times.
-            0 before that.
-        ending: Simulated time since when the arms are being ended, s. 0 before that.
+        reason: The error as text.
+        begun: Simulated time in s at which every arm had reported. The program's times count from
+            it. 0 before that.
+        ending: Simulated time in s at which the coordinator began to end the runs of the arms. 0
+            before that.
     """
 
     def __init__(
@@ -69,8 +70,8 @@ class Agreement:
         Args:
             program: Checksum of the program.
             steps: Arms of each step.
-            margin_s: Time that an order needs to reach its arm, s.
-            farewell_s: Time that the arms have to confirm the end, s.
+            margin_s: Time in s that an order needs to reach its arm.
+            farewell_s: Time in s that the arms have to confirm the end.
         """
         self.program = program
         self._steps = steps
@@ -119,11 +120,12 @@ class Agreement:
     def advance_program(self, answers: Mapping[str, Reading[CellReport]], now_s: float) -> None:
         """Advance the program if the answers allow it.
 
-        The program is over once every arm has confirmed the end, or was given enough time for it.
+        A program that ends is over once every arm has confirmed the end, or has had enough time to
+        confirm it.
 
         Args:
             answers: Newest report of each arm.
-            now_s: Simulated time, s.
+            now_s: Simulated time in s.
         """
         self._answers = answers
         self._now_s = now_s
@@ -156,9 +158,9 @@ class Agreement:
         return all(answer.has_message and not answer.is_lost for answer in answers)
 
     def _await_reports(self) -> None:
-        """Wait until every arm reports, then continue at the step that the reports show.
+        """Wait until every arm reports, then begin with the step that the reports show.
 
-        If a report shows that the program has ended, end it here too.
+        If a report shows that the program has already ended, end it at the coordinator as well.
         """
         answers = [reading.message for reading in self._answers.values()]
         own_answers = [answer for answer in answers if answer.program == self.program]
@@ -173,8 +175,8 @@ class Agreement:
             self.begun = self._now_s
             self._start_next_step()
         if self.phase is Phase.ASKING:
-            # Evaluate the reports in this cycle already, so that an arm that has forgotten its
-            # promise is not asked again.
+            # Evaluate the reports in the same cycle. Otherwise this cycle would ask again an arm
+            # that already carries out the step, or that has lost its promise in a restart.
             self._evaluate_answers()
 
     def _start_next_step(self) -> None:
@@ -192,7 +194,7 @@ class Agreement:
         if any(response in INTERRUPTED for response in responses.values()):
             self.phase = Phase.CANCELLING
         elif any(response in BEGUN for response in responses.values()):
-            # An earlier launch of this rack has told them to begin.
+            # An earlier launch of this rack has already told the arms to begin.
             self.phase = Phase.DOING
         elif all(
             response is Response.POSSIBLE for response in responses.values()
@@ -244,7 +246,7 @@ class Agreement:
         return False
 
     def end_program(self, error: Error, reason: str) -> None:
-        """End the program, and with it the runs of the arms."""
+        """Begin to end the program and the runs of the arms, unless this has begun already."""
         if self.phase not in (Phase.ENDING, Phase.OVER):
             self.phase = Phase.ENDING
             self.error = error
@@ -263,14 +265,16 @@ NOT_PROMISED = "told to do what it has not promised: its rack was launched anew"
 
 
 class TakenOrder:
-    """The order that an arm has taken, identified by the program's checksum and the order's id.
+    """Newest order to an arm and the arm's response to it.
+
+    The order is identified by the checksum of its program and by its id.
 
     Attributes:
         program: Checksum of the program. 0 if there is no order.
         order: Id of the order. 0 if there is none.
-        response: Present response to it.
-        error: Why it was refused or failed, or why the program ends early.
-        reason: The same as text.
+        response: Present response to the order.
+        error: Why the order was refused or failed, or why the program ends early.
+        reason: The error as text.
         stops: Whether the order is being carried out and must be interrupted.
     """
 
@@ -331,7 +335,7 @@ class TakenOrder:
             self.reason = NOT_PROMISED
 
     def fail_order(self, error: Error, reason: str) -> None:
-        """Refuse the order if it needs an answer, or let it fail if it is being carried out."""
+        """Answer REFUSED if the order still needs an answer, otherwise FAILED."""
         response = Response.REFUSED if self.is_asked else Response.FAILED
         self.set_response(response, reason, error)
 
@@ -342,8 +346,8 @@ class TakenOrder:
 
         Args:
             response: The response.
-            reason: What is wrong. Empty if nothing is.
-            error: Error code that is used if there is a reason.
+            reason: Why the order was refused or failed. Empty for other responses.
+            error: Error code. Used only if there is a reason.
         """
         self.response = response
         self.reason = reason

@@ -87,14 +87,14 @@ class CellProgram(Program):
 
     @property
     def checksum(self) -> int:
-        """Positive number that differs, almost certainly, between two programs."""
+        """Positive checksum by which orders and reports identify the program."""
         return zlib.crc32(self.model_dump_json().encode()) or 1
 
     def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
         """Yield key, value and reason of each mistake.
 
-        Mistakes are steps without actions or with two actions of one arm, times that do not rise,
-        and names or joints that do not fit into an order.
+        Mistakes are steps without actions or with two actions of one arm, times that do not
+        increase, and names or joints that do not fit into an order.
         """
         latest = 0.0
         for k, step in enumerate(self.step):
@@ -197,7 +197,7 @@ class Coordinator(Executor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield arms of the program that the parameters lack.
+        """Yield a mistake for each action whose arm is not among the parameters.
 
         Args:
             context: Context of this level.
@@ -249,7 +249,7 @@ class Coordinator(Executor):
         )
 
     def _reason_to_hold(self) -> str:
-        """Return why the arms must rest on their paths, or an empty string."""
+        """Return why the arms must stop on their paths, or an empty string."""
         if self._operated.is_holding:
             return self._operated.format_reason(self.context.board)
         if self._agreement.phase in (Phase.ENDING, Phase.OVER):

@@ -40,7 +40,7 @@ MAX_STRAY_RAD = 0.005
 
 
 class OrderedTaskParams(TaskParams):
-    """Source of the orders of a task level, and how long it keeps a promise."""
+    """Source of the orders of a task level, and the time for which its answers stay valid."""
 
     coordinator: RackName = ""
     """rack that gives the orders over the network, empty if a board of this rack does"""
@@ -53,8 +53,8 @@ class OrderedTaskParams(TaskParams):
 class OrderedTaskExecutor(TaskExecutor):
     """Answers the orders of a coordinator and carries out the ones that it has accepted.
 
-    While its orders are lost, it holds the arm on its path. It ends its run on command of the
-    coordinator, or if the coordinator is away for `stalled_s`.
+    While the coordinator is lost, it holds the arm on its path. It ends its run when ordered to, or
+    when the coordinator has been absent for `stalled_s`.
     """
 
     world = Input(WorldState, "world.model")
@@ -96,7 +96,7 @@ class OrderedTaskExecutor(TaskExecutor):
     def build_ports(
         cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
     ) -> ConfiguredPorts:
-        """Return the port for orders and, over a network, the one for the other rack's clock."""
+        """Return the port for orders and, over a network, a port for the other rack's clock."""
         try:
             table = OrderedTaskParams.model_validate(params)
         except ValidationError:
@@ -173,7 +173,7 @@ class OrderedTaskExecutor(TaskExecutor):
             self._absent = ""
 
     def _answer_order(self, request: CellRequest, tick: int) -> None:
-        """Answer an order once it is planned. Request its plan as soon as the arm rests."""
+        """Request a plan for an order as soon as the arm rests, and answer once the plan exists."""
         plan = self.plan.message
         taken = self._taken
         if (request.program, request.order) == (taken.program, taken.order):
@@ -225,7 +225,7 @@ class OrderedTaskExecutor(TaskExecutor):
         return ""
 
     def _begin_plan(self, request: CellRequest) -> None:
-        """Begin the promised plan, or request another one if the world has changed since."""
+        """Begin the promised plan. Request a new one if the arm or an object has moved since."""
         if not self._actions:
             self._take_action(request)
         has_strayed = float(np.abs(self.below.message.start - request.start).max()) > MAX_STRAY_RAD
@@ -241,12 +241,16 @@ class OrderedTaskExecutor(TaskExecutor):
             self._orders_begun += 1
 
     def _take_action(self, request: CellRequest) -> None:
-        """Take the action and the time offset of a request."""
+        """Adopt the action and the clock offset of a request."""
         self._actions = (read_action(request, self.context),)
         self._ahead_s = request.ahead
 
     def _interrupt_program(self, plan: TaskPlan, below: MoveStatus) -> int:
-        """Interrupt the order, for an operator or because it was stopped."""
+        """Interrupt the order for an operator or because the coordinator stops it.
+
+        Returns:
+            How many moves of the plan are done.
+        """
         done = super()._interrupt_program(plan, below)
         self._halted = self._halted and not self._detour.move
         self._breaking_off = None
@@ -262,7 +266,7 @@ class OrderedTaskExecutor(TaskExecutor):
         return done
 
     def _find_last_move(self, plan: TaskPlan) -> int:
-        """Return the first move that must not be shown to the level below."""
+        """Return the first move of the plan that must not begin."""
         until = super()._find_last_move(plan)
         return until if self._breaking_off is None else min(until, self._breaking_off)
 
@@ -274,15 +278,15 @@ class OrderedTaskExecutor(TaskExecutor):
         return self._absent or self._held or waits or self._waits
 
     def _check_progress(self, plan: TaskPlan, waits: str, tick: int) -> None:
-        # While the coordinator holds the arm, it decides for how long.
         """End with an error if nothing has happened for too long."""
+        # While the coordinator holds the arm, the coordinator decides for how long.
         if self._held:
             self._moved_at = tick
         else:
             super()._check_progress(plan, waits, tick)
 
     def _list_progress_values(self) -> tuple[int, ...]:
-        """Return a tuple that changes whenever the orders make progress."""
+        """Return further values whose change counts as progress."""
         return self._taken.order, self._taken.response, self._begun, not self._absent
 
     def _write_status(self, plan: TaskPlan, waits: str) -> None:
@@ -321,7 +325,8 @@ class OrderedTaskExecutor(TaskExecutor):
     def _end_order(self, plan: TaskPlan) -> None:
         """End an order that is done or has failed.
 
-        An error that ends the whole run is kept. Any other error becomes the answer to the order.
+        An error that ends the whole run stays in place. Any other error becomes the answer to the
+        order.
         """
         taken = self._taken
         if self._error and (taken.is_asked or taken.is_under_way):
@@ -353,7 +358,7 @@ class OrderedTaskExecutor(TaskExecutor):
 
 
 class OrderedTaskPlanner(TaskPlanner):
-    """Plans the action of an order as its executor requests: to begin later or at once."""
+    """Plans the action of an order for its executor, to begin at a given time or at once."""
 
     request = Input(CellRequest, "own.request")
     params = OrderedTaskParams
@@ -387,7 +392,7 @@ class OrderedTaskPlanner(TaskPlanner):
         return str(refused)
 
     def _compute_visible_s(self, tick: int) -> float:
-        """Return the earliest simulated time at which the plan can begin, s."""
+        """Return the earliest simulated time in s at which the plan can begin."""
         return max(super()._compute_visible_s(tick), self._begin_s + self.context.period_s)
 
     def _check_times(self, moves: Sequence[Rehearsed], visible_s: float) -> None:

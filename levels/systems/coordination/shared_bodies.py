@@ -101,7 +101,8 @@ class SharedBody:
         A greater claim is accepted from any rack. Otherwise only the owner's message counts.
 
         Returns:
-            The new pose of the body, (7,), m and quaternion. None if the message has nothing new.
+            The new pose of the body, (7,): position in m and quaternion. None if the message is
+            to be ignored.
         """
         for entry in message.bodies[message.bodies["name"] == self.name]:
             claim = Claim(int(entry["claim"]), bytes(entry["owner"]))
@@ -121,7 +122,12 @@ class SharedBody:
             self.is_touched = bool(entry["touched"])
 
     def write_entry(self, record: np.void, pose: Array) -> None:
-        """Write the state into a `SharedBodyEntry`. `pose` is (7,), from this rack's simulation."""
+        """Write the state into a `SharedBodyEntry`.
+
+        Args:
+            record: The entry.
+            pose: Pose in this rack's simulation, (7,): position in m and quaternion.
+        """
         record["name"] = self.name
         record["touched"] = self.is_touched
         record["claim"] = self.claim.number

@@ -20,8 +20,8 @@ MOTION = 6
 class SharingArm(SimulatedArm):
     """Simulated arm that can fix copies of objects at given poses.
 
-    The copies are moved between the ticks of MuJoCo. Within a tick they behave like other bodies.
-    Rows are rows of the world model.
+    A fixed copy is moved back to its pose after each tick. Within a tick it moves like any other
+    body. `row` is the row of an object in the world model.
     """
 
     # A sleeping object would not wake when it is moved from outside.
@@ -39,12 +39,17 @@ class SharingArm(SimulatedArm):
         return bool(self._mark_held_geoms()[self.cell.list_geoms(row)].any())
 
     def read_pose(self, row: int) -> Array:
-        """Return the simulated pose of an object, (7,), m and quaternion."""
+        """Return the simulated pose of an object, (7,): position in m and quaternion."""
         qpos_index = self.cell.object_qpos[row]
         return np.array(self._data.qpos[qpos_index : qpos_index + POSE])
 
     def place_object(self, row: int, pose: Array) -> None:
-        """Move an object to a pose, (7,), m and quaternion, and set its velocity to zero."""
+        """Move an object to a pose and set its velocity to zero.
+
+        Args:
+            row: Row of the object.
+            pose: New pose, (7,): position in m and quaternion.
+        """
         model = self._model
         qpos_index = self.cell.object_qpos[row]
         dof_index = model.body_dofadr[self.cell.bodies[row]]
@@ -61,7 +66,7 @@ class SharingArm(SimulatedArm):
             self._kept[row] = self.read_pose(row)
 
     def _simulate_tick(self) -> None:
-        """Simulate a tick, then return the fixed copies to their poses."""
+        """Simulate a tick, then move the fixed copies back to their poses."""
         super()._simulate_tick()
         for row, pose in self._kept.items():
             self.place_object(row, pose)

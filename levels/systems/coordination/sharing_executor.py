@@ -67,7 +67,7 @@ class SharingServoExecutor(ServoExecutor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield mistakes in the list of shared objects, and the ones of any servo level.
+        """Yield mistakes in the list of shared objects, and those of any servo level.
 
         Args:
             context: Context of this level.
@@ -92,7 +92,7 @@ class SharingServoExecutor(ServoExecutor):
         yield from super().find_mismatches(context, above, below)
 
     def process(self, tick: int) -> None:
-        """Do the cycle of a servo level, and write the shared objects when they are due."""
+        """Run a cycle of a servo level, and write the shared objects if they are due."""
         if not self.takeover.is_started and self.last.has_message:
             for body in self._shared.values():
                 body.restore_state(self.last.message)
@@ -103,7 +103,7 @@ class SharingServoExecutor(ServoExecutor):
                 body.write_entry(self.shared.bodies[slot], self.arm.read_pose(row))
 
     def on_restored(self) -> None:
-        """Keep the grip, and fix copies where the restored state has them."""
+        """Keep the grip, and fix the copies at their restored poses."""
         super().on_restored()
         self._fix_copies()
 

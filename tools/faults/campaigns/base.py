@@ -21,7 +21,7 @@ from rack.tools.faults.campaigns.plan import Plan
 EVERY_S = 2.0
 """Simulated time between two snapshots. On average a trial repeats half of it."""
 OF_LAUNCH = ("launch", "ready", "start")
-"""Kinds of events that every launch has again."""
+"""Kinds of events that each launch reports itself, so a trial does not take them over."""
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,9 @@ class Start:
     """Starting point of a trial.
 
     Attributes:
-        tick: Tick before which it starts.
-        whole: Why it starts at tick 0. Empty if it does not, and for the faultless run.
+        tick: Tick before which the trial starts.
+        whole: Why the trial does not continue from a snapshot. Empty if it does, and for the
+            faultless run.
         continues: The snapshot from which to continue. None for a whole run.
         events: Events of the faultless run before the start.
     """
@@ -41,7 +42,11 @@ class Start:
     events: tuple[Event, ...] = ()
 
     def resolve_snapshot(self, tick: int) -> Start:
-        """Return the start at the snapshot that was used, with the events before its tick."""
+        """Return this start with the tick of the snapshot that was used and the events before it.
+
+        Args:
+            tick: Tick at which the trial actually began.
+        """
         if self.continues is None:
             return self
         earlier_events = (
@@ -69,7 +74,7 @@ class BaseRack:
         Args:
             plan: Plan of the trial.
             crate: Crate of the worker. None if it has none.
-            seconds: Simulated time of the faultless run if no task ends it, s.
+            seconds: Simulated time in s after which the faultless run ends if no task ends it.
         """
         if not (plan.faults or plan.kills):
             return Start()

@@ -46,7 +46,7 @@ NOMINAL = Plan(0, "nominal", lockstep=True)
 
 @dataclass(frozen=True)
 class Order:
-    """Order for a campaign.
+    """Specification of a campaign.
 
     Attributes:
         name: Name of the config, for reports.
@@ -55,11 +55,11 @@ class Order:
         seed: Seed of all random choices.
         modes: Clock modes in their order, True for lockstep.
         kinds: Kinds, separated by commas. None for all.
-        kills: Number of kills from outside.
-        sizes: Number of sizes for each curve.
-        faultless_s: Simulated time without faults, s, for each load.
+        kills: Number of external kills.
+        sizes: Number of sizes for each curve of size against detection delay.
+        faultless_s: Simulated time in s without faults, for each entry of `loads`.
         loads: Whether the machine is loaded, for each stretch of faultless time.
-        seconds: Simulated time of a rack that no task ends, s.
+        seconds: Simulated time in s after which a run ends if no task ends it.
     """
 
     name: str
@@ -75,7 +75,7 @@ class Order:
     seconds: float | None = None
 
     def to_document(self) -> Document:
-        """Return the order as plain data. Equal campaigns have equal documents."""
+        """Return the specification as plain data. Equal campaigns have equal documents."""
         return {**vars(self), "config": self.config.to_toml_text()}
 
 
@@ -83,14 +83,14 @@ class Campaign:
     """Runs one campaign.
 
     Args:
-        order: What to do.
+        order: Specification of the campaign.
         folder: Folder of the campaign.
         progress: Progress display.
         whole: Whether every trial runs from tick 0 instead of continuing from a snapshot.
 
     Raises:
         ConfigError: The config has mistakes.
-        Failure: The kinds of the order do not fit the rack.
+        Failure: A kind in the specification is unknown, or the rack cannot have it.
     """
 
     def __init__(self, order: Order, folder: Path, progress: Progress, whole: bool = False) -> None:
@@ -109,7 +109,7 @@ class Campaign:
         self._whole = whole
 
     def run(self) -> Results:
-        """Do everything that is not done yet, until the end or until Ctrl-C.
+        """Run everything that has no result yet, until all is done or Ctrl-C is pressed.
 
         Raises:
             Failure: The task is not done even without faults, or another campaign uses the folder.
@@ -142,7 +142,11 @@ class Campaign:
         return results
 
     def _open_folder(self) -> None:
-        """Create the folder or continue in it. Raises `Failure` if another campaign uses it."""
+        """Create the folder, or reuse it if it belongs to the same campaign.
+
+        Raises:
+            Failure: The folder belongs to another campaign.
+        """
         path = self.folder / ORDER
         wanted = json.loads(encode_json(self.order.to_document()))
         if path.exists():
@@ -158,22 +162,22 @@ class Campaign:
         write_json(path, wanted)
 
     def _describe_rack(self, lockstep: bool) -> RackUnderTest:
-        """Describe the rack for the draws of plans."""
+        """Return what the draws of plans need to know about the rack."""
         restart = self._config.supervision.find_restart_time(lockstep)
         return RackUnderTest(self._targets, self._ticks, self._second, restart)
 
     def _run_fault_trials(self, results: Results, lockstep: bool) -> None:
-        """Run trials until every kind has acted as often as ordered."""
+        """Run trials until every kind has acted as often as specified."""
         order = self.order
         kinds = self.kinds
         if lockstep or len(order.modes) > 1:
             # In real time, run only kinds that are impossible in lockstep.
             kinds = [kind for kind in kinds if needs_real_time(kind) != lockstep]
-        # Unary plus leaves out the kinds that lack nothing.
+        # Unary plus removes the kinds of which no fault is missing.
         lacking = +Counter(dict.fromkeys(kinds, order.injections))
         rack = self._describe_rack(lockstep)
         tried = set[str]()
-        # Faults that need a whole trial each come in later rounds, which leave cores free.
+        # Faults that need a whole trial each are left to later rounds, which leave cores free.
         round_kinds = [kind for kind in lacking if find_record(kind).recoverable] or list(lacking)
         for turn in range(ROUNDS):
             seed = f"{order.seed} {turn}"
@@ -234,7 +238,7 @@ class Campaign:
         self._progress.end_run(self._estimate_s([plan]), text, result.shortfalls)
 
     def _run_faultless(self, results: Results) -> None:
-        """Run without faults for as long as ordered, without load and under load."""
+        """Run without faults for the specified time, with and without load."""
         if not self.order.faultless_s:
             return
         for stretch, is_loaded in enumerate(self.order.loads):
@@ -267,14 +271,14 @@ class Campaign:
             if (result := _load_matching_result(job)) is None:
                 return
             yield result
-            # A run without ticks has not ended, and would not end if it were repeated.
+            # A run without ticks has failed and would fail again, so do not repeat it.
             ran_s = result.ticks / self._second or left_s
             left_s -= ran_s
             run_number += 1
             self._progress.end_run(ran_s, result.ended, result.shortfalls)
 
     def _estimate_s(self, plans: Sequence[Plan]) -> float:
-        """Estimate the duration of runs, s.
+        """Estimate how long the runs of plans take, in s of real time.
 
         In lockstep a core simulates the default rack in about a third of real time.
         """
@@ -287,14 +291,14 @@ class Campaign:
 def _load_matching_result(job: TrialJob) -> TrialResult | None:
     """Return the saved result of a trial. None if it is missing or belongs to another plan.
 
-    Another version may draw another plan for the same trial number.
+    Another version of this program may have drawn another plan for the same trial number.
     """
     result = load_result(job.path)
     return result if result is not None and result.plan == job.plan else None
 
 
 def _describe_plan(plan: Plan) -> str:
-    """Describe a plan in a few words."""
+    """Describe a plan briefly: its name and the number of its faults of each kind."""
     if not plan.number:
         return plan.purpose
     kinds = Counter([*(table["kind"] for table in plan.faults), *[EXTERNAL] * len(plan.kills)])

@@ -37,7 +37,7 @@ class EarlyEnd:
         struck = list_strikes(self._rack.segment, self._joints)
         certain_at = find_certain_tick(struck, self._rack.events, self._run, tick)
         if certain_at is None:
-            # The verdict needs the whole run, so hold it no more.
+            # The verdict needs the whole run, so do not hold the rack again.
             self._words[System.HOLD_AT] = 0
         elif certain_at > tick:
             self._hold_before(certain_at)
@@ -47,7 +47,7 @@ class EarlyEnd:
             self._words[System.HOLD_AT] = 0
 
     def _hold_before(self, tick: int) -> None:
-        """Let the rack hold before a tick."""
+        """Request that the rack is held before a tick."""
         self._words[System.HOLD_AT] = tick + 1
 
 
@@ -74,7 +74,7 @@ class _ForesightedJudge(Judge):
     """Judge that also computes when its judgements become final."""
 
     def find_certain_tick(self, tick: int) -> int | None:
-        """Return the tick from which all judgements are final: see the function of this name."""
+        """Return the tick from which all judgements are final: see `find_certain_tick` above."""
         latest = tick
         for strike, judgement in zip(self._strikes, self.judge_all().faults, strict=True):
             certain_tick = self._find_fault_certain_tick(strike, judgement, tick)

@@ -17,23 +17,23 @@ from rack.tools.faults.ending import EXTERNAL, find_record
 MAX_FAULTS = 40
 """Maximum number of faults in a trial. The fault table has room for a few more."""
 LEAD_S = 0.1
-"""Minimum simulated time before the first fault."""
+"""Minimum simulated time in s before the first fault."""
 TAIL_S = 1.0
-"""Simulated time at the end of a faultless run in which no fault begins.
+"""Simulated time in s at the end of a faultless run in which no fault begins.
 
 A fault must act while the task is being executed.
 """
 SETTLE_S = 0.1
-"""Simulated time between the last possible effect of a fault and the next fault."""
+"""Simulated time in s between the last possible effect of a fault and the next fault."""
 EPISODE_READS = 25
 """Number of reads after which a reader reports another fault of the same mailbox, with a margin.
 
 See `Episodes` for the number itself.
 """
 MAX_EXTENSION_S = 0.25
-"""Maximum simulated time by which a window is extended so that its mailbox may be used again."""
+"""Maximum simulated time in s by which a window is extended to use its mailbox again."""
 ARM_STOP_S = 0.5
-"""Simulated time by which each fault that stops the arm prolongs the task, s.
+"""Simulated time in s by which each fault that stops the arm prolongs the task.
 
 For NASREM it is 0.5 to 1.6 s. Faults after the end of the task do not act and are drawn again.
 """
@@ -42,7 +42,7 @@ SHUFFLES = 20
 BATCH_FAULTS = 1000
 """Number of faults that are distributed over trials at a time."""
 KILL_GAP_S = 3.5
-"""Minimum simulated time between two kills from outside. A restart takes up to 2 s of real time."""
+"""Minimum simulated time in s between two external kills. A restart takes up to 2 s."""
 MIN_TICKS = 20
 """Minimum time in ticks that a fault without a mailbox needs to be detected and to end."""
 SEEDS = 2**31
@@ -54,9 +54,9 @@ class RackUnderTest:
 
     Attributes:
         targets: Possible targets of faults.
-        ticks: Length of a faultless run, ticks.
+        ticks: Length of a faultless run in ticks.
         second: Number of ticks in a simulated second.
-        restart_s: Simulated time that a restart may take, s.
+        restart_s: Simulated time in s that a restart may take.
     """
 
     targets: Targets
@@ -75,14 +75,14 @@ class RackUnderTest:
         return max(1, self.ticks - round(TAIL_S * self.second) - self.first_tick)
 
     def compute_window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
-        """Return the time from the beginning of a fault to the next fault.
+        """Return the minimum time from the beginning of a fault to the next fault.
 
-        In this time the fault is detected, ends and is recovered from.
+        It is long enough for the fault to be detected, to end and to be recovered from.
 
         Args:
             target: Target of the fault.
-            ticks: Duration of the fault, ticks.
-            parameters: Values of its parameters. Others have their defaults.
+            ticks: Duration of the fault in ticks.
+            parameters: Values of its parameters. Parameters that are missing have their defaults.
 
         Returns:
             The time in ticks.
@@ -105,14 +105,15 @@ class RackUnderTest:
 
 @dataclass(frozen=True)
 class FaultCard:
-    """One fault that is to be assigned to a trial.
+    """One drawn fault, to be assigned to a trial.
 
     Attributes:
         target: Target of the fault.
         ticks: Duration in ticks. 0 for a kind that acts once.
         parameters: Values of its parameters.
         window: Ticks from its beginning to the next fault.
-        room: Ticks of a faultless run that it needs, without those by which it prolongs the task.
+        room: Ticks of a faultless run that the fault takes up: its window without the ticks by
+            which it prolongs the task.
         may_repeat: Whether another fault of the same trial may affect its mailbox, because readers
             report that fault too.
         seed: Seed of the fault.
@@ -132,7 +133,7 @@ class FaultCard:
     def draw_card(
         cls, rack: RackUnderTest, kind: str, rng: Random, size: float | None = None
     ) -> FaultCard:
-        """Draw a fault as the record of its kind describes.
+        """Draw a fault from the distributions in the record of its kind.
 
         Args:
             rack: The rack.
@@ -201,7 +202,8 @@ def fault_plans(
 ) -> list[Plan]:
     """Draw plans that contain a number of faults of each kind.
 
-    The faults come in random order, as many in a trial as fit into the task one after the other.
+    The order of the faults is random. Each trial has as many as fit into the task one after the
+    other.
 
     Args:
         rack: The rack.
@@ -221,13 +223,13 @@ def fault_plans(
 def kill_plans(
     rack: RackUnderTest, count: int, seed: int, modes: Sequence[bool], first: int
 ) -> list[Plan]:
-    """Draw plans of kills from outside.
+    """Draw plans of external kills, which do not use the fault table.
 
     Args:
         rack: The rack.
         count: Number of kills.
         seed: Seed of the draws.
-        modes: Clock modes, True for lockstep, which the trials use in turn.
+        modes: Clock modes that the trials use in turn, True for lockstep.
         first: Number of the first trial.
     """
     rng = Random(f"{seed} kills")
@@ -251,7 +253,7 @@ def size_plans(
 
     Args:
         rack: The rack.
-        kinds: Names of kinds. Kinds that are always detectable are left out.
+        kinds: Names of kinds. Kinds that are detectable at any size are omitted.
         count: Number of sizes of each kind.
         seed: Seed of the draws.
         first: Number of the first trial.
@@ -264,7 +266,7 @@ def size_plans(
 
 
 def list_swept_sizes(kind: str, count: int) -> list[float]:
-    """Return the sizes for a kind's curve. Empty for a kind that is always detectable."""
+    """Return the sizes for a kind's curve. Empty for a kind that is detectable at any size."""
     record = find_record(kind)
     if record.visible_from is None or record.size is None:
         return []
@@ -276,7 +278,7 @@ class TrialShare:
 
     Attributes:
         cards: The faults.
-        room: Ticks that are left for more faults.
+        room: Number of ticks that remain for more faults.
     """
 
     def __init__(self, room_ticks: int) -> None:
@@ -286,7 +288,7 @@ class TrialShare:
         self._struck: dict[str, bool] = {}
 
     def has_room_for(self, card: FaultCard) -> bool:
-        """Return True if a fault fits into the trial. The first one always does."""
+        """Return True if a fault fits into the trial. The first fault always fits."""
         box = card.target.mailbox
         if box in self._struck and not (self._struck[box] and card.may_repeat):
             return False
@@ -335,7 +337,7 @@ def _pack_plans(
 
 
 def _distribute_cards(room_ticks: int, cards: Sequence[FaultCard]) -> list[TrialShare]:
-    """Distribute faults over trials: the longest first, each where least room is left."""
+    """Distribute faults over trials: longest first, each to the fullest trial with room for it."""
     shares: list[TrialShare] = []
     for card in sorted(cards, key=lambda card: -card.window):
         fitting = [share for share in shares if share.has_room_for(card)]
@@ -347,10 +349,10 @@ def _distribute_cards(room_ticks: int, cards: Sequence[FaultCard]) -> list[Trial
 
 
 def _choose_order(room_ticks: int, cards: Sequence[FaultCard], rng: Random) -> list[FaultCard]:
-    """Return faults in the best of some random orders.
+    """Return faults in the best of several random orders.
 
-    If possible, each begins before the end of a task that earlier faults have prolonged. Faults of
-    the arm come late, because the arm is at rest at first.
+    If possible, each fault begins before the end of the task, which earlier faults may have
+    prolonged. Faults of the arm come late, because the arm is at rest at first.
     """
     orders = [rng.sample(cards, len(cards)) for _ in range(SHUFFLES)]
 
@@ -364,7 +366,7 @@ def _choose_order(room_ticks: int, cards: Sequence[FaultCard], rng: Random) -> l
 
 
 def _draw_starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
-    """Return a start tick for each window, one after the other from a random tick on.
+    """Return start ticks for windows that follow each other from a random tick on.
 
     The first tick is late if there is room, because a trial continues from the last snapshot before
     its first fault.

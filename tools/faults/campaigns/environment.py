@@ -17,7 +17,7 @@ from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import await_ends, list_descendants
 
 BOUND_S = 2.0
-"""Time that killed processes get to end."""
+"""Maximum wait in s for killed processes to end."""
 COMM_LENGTH = 15
 """Number of characters of a process's name that the kernel keeps."""
 SPEED_FACTOR = 2.0
@@ -34,7 +34,7 @@ def list_living_descendants() -> set[int]:
 
 
 def find_leftovers(rack: str, pids_before: set[int]) -> list[str]:
-    """Return everything that is left of a rack, as readable texts.
+    """Return everything that a rack left behind, as readable texts.
 
     Args:
         rack: Name of the rack.

@@ -24,12 +24,12 @@ Purpose = Literal["faults", "kills", "sizes", "nominal", "faultless"]
 
 @dataclass(frozen=True)
 class Kill:
-    """One SIGKILL from outside.
+    """One external SIGKILL, which a campaign sends without the fault table.
 
     Attributes:
         board: Board whose process is killed.
         tick: Tick of the kill.
-        phase: Fraction of the tick that passes before it.
+        phase: Fraction of the tick that passes before the kill.
     """
 
     board: str
@@ -48,7 +48,7 @@ class Plan:
         purpose: Purpose of the run.
         lockstep: Whether it runs in lockstep.
         faults: Tables of faults as in a config.
-        kills: Kills from outside.
+        kills: External kills.
     """
 
     number: int
@@ -86,7 +86,7 @@ class Plan:
     def format_faults(self, config: str) -> str:
         """Return the faults as a file for `--faults`.
 
-        Kills from outside cannot be expressed in such a file, so they are written as comments.
+        External kills cannot be expressed in such a file, so they are written as comments.
         """
         mode = " --lockstep" if self.lockstep else ""
         faults = to_toml({"fault": [dict(table) for table in self.faults]})
@@ -114,9 +114,9 @@ class Target:
     Attributes:
         kind: Name of the kind.
         board: Affected task.
-        cycle: Period of the task, or of the mailbox's messages, ticks.
+        cycle: Period in ticks of the task or of the mailbox's messages.
         mailbox: Affected mailbox. None for a fault of the whole task.
-        reader: Period of the mailbox's fastest reader, ticks.
+        reader: Period in ticks of the mailbox's fastest reader.
     """
 
     kind: str
@@ -146,7 +146,7 @@ class Targets:
         self._roles = {task.name: task.role for task in layout.tasks}
         self._driving = {name: kind.faults for name, kind in find_executors(config).items()}
         self.by_kind = {kind.name: self._find_targets(kind) for kind in KINDS}
-        # The clock's process can be killed from outside as well.
+        # An external kill may also hit the clock's process.
         self.by_kind[EXTERNAL] = self._build_targets(EXTERNAL, [*self._roles, CLOCK])
 
     def _find_targets(self, kind: Kind) -> list[Target]:
@@ -178,7 +178,7 @@ class Targets:
 
         The mailbox needs readers, and messages often enough: plans, for example, are not periodic.
         """
-        # The clock writes only for an operator, and a host board at the will of its program.
+        # The clock writes only for an operator, and a host board whenever its program likes.
         role = self._roles.get(box.writer)
         if role is None or not box.readers:
             return False
@@ -194,7 +194,7 @@ def select_kinds(wanted: str | None, targets: Targets, realtime: bool) -> list[s
     """Return the kinds of a campaign.
 
     Args:
-        wanted: Names of kinds, separated by commas. None for all that the rack can have.
+        wanted: Names of kinds, separated by commas. None for all that are possible in the rack.
         targets: Targets in the rack.
         realtime: Whether the campaign includes real time.
 

@@ -29,7 +29,7 @@ MAX_FRACTION = 1.5
 
 
 def plot_campaign(report: CampaignReport, path: Path) -> None:
-    """Draw a campaign into a PNG file: delays against bounds, curves of size, recovery times."""
+    """Draw a campaign into an image: delays against bounds, curves of size, recovery times."""
     order = report.order
     with open_figure([path], *SIZE_IN) as figure:
         for position, draw in zip(
@@ -41,7 +41,7 @@ def plot_campaign(report: CampaignReport, path: Path) -> None:
 
 
 def _list_places(figure: Figure) -> Iterator[SubplotSpec]:
-    """Yield the places of the three charts: one on the left, two on the right."""
+    """Yield the positions of the three charts: one on the left, two on the right."""
     # Fixed margins: the numbers beside the left chart and the names of kinds always need room.
     grid = figure.add_gridspec(
         2,

@@ -1,4 +1,4 @@
-"""Report of a campaign: campaign.json, and campaign.md with the same figures for people."""
+"""Report of a campaign: campaign.json, and campaign.md with the same figures as readable text."""
 
 from __future__ import annotations
 
@@ -60,12 +60,12 @@ class CampaignSummary(FaultCounts):
         limits_violated: Number of violated limits, checked at every substep.
         touches: Number of unintended contacts.
         left_behind: Number of processes and segments that were left behind.
-        simulated_s: Simulated time of all runs, s.
+        simulated_s: Simulated time of all runs in s.
         unexplained: Detections that no fault explains.
         unexplained_per_hour: Their rate in simulated time.
         stray_misses: Deadline misses that no fault explains, in real time.
         false_trips: Unexplained detections in faultless time.
-        faultless_s: Simulated time without faults, s.
+        faultless_s: Simulated time without faults in s.
         false_trips_per_hour: Rate of false trips.
     """
 
@@ -91,9 +91,9 @@ class CampaignReport:
     """Figures of a campaign.
 
     Attributes:
-        order: Order of the campaign.
+        order: Specification of the campaign.
         results: Results of all runs.
-        clock_ms: Length of a tick, ms.
+        clock_ms: Length of a tick in ms.
         summary: Figures of all kinds together.
         by_kind: Figures of each kind.
         curves: Curve of size against delay, by kind.
@@ -168,8 +168,8 @@ class CampaignReport:
         }
 
     def _list_notes(self) -> list[str]:
-        # Leave out lockstep, where every launch notes that all boards share one core.
-        """Return the notes of launches in real time, each once."""
+        """Return the notes of launches in real time, without repetitions."""
+        # Omit lockstep, where every launch notes that all boards share one core.
         runs = [run for run in self.results.runs if not run.plan.lockstep]
         return list(dict.fromkeys(note for run in runs for note in run.notes))
 

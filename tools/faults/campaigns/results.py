@@ -30,12 +30,12 @@ class TrialResult:
         plan: Plan of the trial.
         ended: How the trial ended: with the task done, early because all verdicts were certain,
             safely stopped (arm at rest, no limit violated), not armed, or otherwise.
-        ticks: Length of the run, ticks.
+        ticks: Length of the run in ticks.
         digest: Digest of the run.
         violations: Number of violated limits.
         touches: Number of unintended contacts.
         left: Everything that the rack left behind.
-        wall_s: Duration in real time, s.
+        wall_s: Duration in s of real time.
         notes: Notes of the launch.
         misses: Number of deadline misses, by code.
         stray_misses: Number of misses that no fault explains.
@@ -43,7 +43,7 @@ class TrialResult:
         unexplained: Detections that no fault explains.
         shortfalls: What was wrong, a line each. Empty for a good trial.
         start: Tick of the snapshot from which the trial continued. 0 if it did not.
-        whole: Why it did not continue from a snapshot.
+        whole: Why the trial did not continue from a snapshot. Empty if it did.
     """
 
     plan: Plan
@@ -65,7 +65,7 @@ class TrialResult:
 
 
 def judge_trial(trial: Trial) -> TrialResult:
-    """Judge a trial."""
+    """Judge a trial and return the result that its campaign saves."""
     outcome = trial.outcome
     verdict = _judge_faults(trial)
     ended = _classify_end(trial)
@@ -121,7 +121,7 @@ class FaultlessTime:
 
     Attributes:
         load: Description of the load on the machine. Empty without load.
-        seconds: Simulated time of the runs, s.
+        seconds: Simulated time of the runs in s.
         runs: Results of the runs.
     """
 
@@ -141,7 +141,7 @@ class FaultlessTime:
 
     @property
     def misses(self) -> dict[str, int]:
-        """Number of deadline misses by code. A busy machine explains them."""
+        """Number of deadline misses by code. They do not count as false trips."""
         total: Counter[str] = Counter()
         for run in self.runs:
             total.update(run.misses)
@@ -169,7 +169,7 @@ class Results:
         trials: Trials with faults and kills.
         sizes: Trials for curves of size against delay.
         faultless: Faultless time.
-        lacking: Lines about faults that did not act although they were drawn repeatedly.
+        lacking: A line for each kind of fault that acted too rarely despite repeated draws.
         is_interrupted: Whether the campaign was interrupted.
     """
 
@@ -182,7 +182,7 @@ class Results:
 
     @property
     def runs(self) -> list[TrialResult]:
-        """All runs of any purpose."""
+        """Results of all runs, whatever their purpose."""
         faultless = [run for stretch in self.faultless for run in stretch.runs]
         return [self.nominal, *self.trials, *self.sizes, *faultless]
 
@@ -298,4 +298,7 @@ def _list_fault_shortfalls(fault: Judgement) -> Iterator[str]:
         undone = "never undone"
         if fault.recovery is not None:
             undone = f"undone only after {fault.recovery} ticks"
-        yield f"{strike}: {reaction_text} was {undone} (bound in ticks: {fault.recovery_bound})"
+        # A refused launch has no bound for its recovery.
+        has_bound = fault.recovery_bound is not None
+        bound_text = f" (bound in ticks: {fault.recovery_bound})" if has_bound else ""
+        yield f"{strike}: {reaction_text} was {undone}{bound_text}"

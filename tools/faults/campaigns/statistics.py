@@ -14,7 +14,7 @@ from rack.tools.faults.judge import Judgement
 
 @dataclass(frozen=True)
 class FaultCounts:
-    """Numbers of the faults that must be detected, by what became of them."""
+    """Numbers of faults by outcome. Only faults that must be detected are counted."""
 
     drawn: int
     injected: int
@@ -43,13 +43,13 @@ class KindFigures(FaultCounts):
         wilson: Bounds of the 95 % confidence intervals of shares of the injected faults. None if
             none were injected.
         bound: Detection bound as text.
-        cycles: Delays to detection, cycles.
-        ticks: Delays to detection, ticks.
-        bound_ticks: Least and largest bound, ticks.
-        part_of_bound: Delays as fractions of their bounds.
-        ms: Delays to detection, ms.
-        reactions: Codes of reactions.
-        recovery_ms: Times to recovery in simulated time, ms.
+        cycles: Detection delays in cycles of the task.
+        ticks: Detection delays in ticks.
+        bound_ticks: Smallest and largest bound in ticks.
+        part_of_bound: Detection delays as fractions of their bounds.
+        ms: Detection delays in ms.
+        reactions: Codes of the reactions.
+        recovery_ms: Recovery times in ms of simulated time.
     """
 
     wilson: dict[str, tuple[float, float] | None]
@@ -108,9 +108,11 @@ RULE_95 = 0.05
 
 
 def compute_wilson_interval(count: int, total: int) -> tuple[float, float] | None:
-    """Return the bounds of Wilson's 95 % interval for the share `count` / `total`.
+    """Return the bounds of Wilson's 95 % interval for a share. None if `total` is 0.
 
-    None if `total` is 0.
+    Args:
+        count: Number of cases that have the property.
+        total: Number of all cases.
     """
     if not total:
         return None
@@ -122,9 +124,9 @@ def compute_wilson_interval(count: int, total: int) -> tuple[float, float] | Non
 
 
 def compute_rate(count: int, seconds: float) -> EventRate | None:
-    """Return the rate of events. None if there was no time.
+    """Return the hourly rate of `count` events in `seconds` of time. None if `seconds` is 0.
 
-    The upper bound is the rate at which no more than `count` events have a probability of 5 %
+    The upper bound is the rate at which `count` or fewer events have a probability of 5 %
     (Poisson).
     """
     if seconds <= 0.0:
@@ -143,7 +145,7 @@ def compute_rate(count: int, seconds: float) -> EventRate | None:
 
 
 def count_faults(faults: Iterable[Judgement]) -> FaultCounts:
-    """Count how many faults acted, were detected, were detected in time and so on."""
+    """Count faults by outcome. Only faults that must be detected are counted."""
     judged = [fault for fault in faults if fault.is_judged]
     struck = [fault for fault in judged if fault.seen != "not struck"]
     return FaultCounts(
@@ -165,7 +167,7 @@ def list_size_points(faults: Iterable[Judgement], kind: str, clock_ns: int) -> l
     Args:
         faults: Judged faults of any kind.
         kind: Name of the kind.
-        clock_ns: Length of a tick, ns.
+        clock_ns: Length of a tick in ns.
     """
     struck = [fault for fault in faults if fault.kind == kind and fault.struck >= 0]
     points = [
@@ -176,7 +178,7 @@ def list_size_points(faults: Iterable[Judgement], kind: str, clock_ns: int) -> l
 
 
 def compute_spread(values: Iterable[float | None]) -> Spread | None:
-    """Return median and maximum of the values that are not None, or None if all are."""
+    """Return median and maximum of the values that are not None, or None if all are None."""
     numbers = [value for value in values if value is not None]
     return Spread(round(median(numbers), 3), round(max(numbers), 3)) if numbers else None
 
@@ -207,5 +209,5 @@ def _compute_figures(kind: str, faults: Sequence[Judgement], clock_ns: int) -> K
 
 
 def _to_ms(ticks: int | None, clock_ns: int) -> float | None:
-    """Convert ticks to ms."""
+    """Convert ticks to ms. None remains None."""
     return None if ticks is None else round(ticks * clock_ns * 1e-6, 3)

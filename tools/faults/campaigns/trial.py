@@ -36,9 +36,9 @@ GRACE_S = 60.0
 NOMINAL_S = 1800.0
 """Simulated time allowed for a run whose length is unknown."""
 STILL_S = 120.0
-"""Maximum real time without a tick. No rack plans for longer."""
+"""Maximum real time in s without a tick. No rack plans for longer."""
 STUCK_S = 20.0
-"""Maximum real time from a request to stop to the end."""
+"""Maximum real time in s that a run may take to end after a request to stop."""
 LOOK_S = 0.001
 """Interval at which the tick is checked in lockstep, which has no grid on which to sleep."""
 HELD_S = 0.004
@@ -50,7 +50,7 @@ RETRY_S = 0.02
 
 
 class Killer:
-    """Kills boards of one rack by SIGKILL at given instants, without the fault table.
+    """Kills boards of one rack by SIGKILL at given times, without the fault table.
 
     Attributes:
         done: The kills so far.
@@ -64,7 +64,7 @@ class Killer:
         self.done: list[Strike] = []
 
     def compute_wait_s(self) -> float:
-        """Return the time until the next kill, at most 0.5 s."""
+        """Return the time in s until the next kill is due, at most 0.5."""
         if not self._waiting:
             return 0.5
         if self._words[System.LOCKSTEP]:
@@ -73,7 +73,7 @@ class Killer:
         return min(0.5, max(0.0, kill_s - time.monotonic()))
 
     def kill_due_board(self) -> None:
-        """Kill the board whose instant has come. If it is not running, try again later."""
+        """Kill the next board if its kill is due. If it is not running, try again later."""
         words = self._words
         if not self._waiting or time.monotonic() < self._retry_at:
             return
@@ -91,13 +91,13 @@ class Killer:
             self._retry_at = time.monotonic() + RETRY_S
 
     def _compute_instant_ns(self) -> int:
-        """Return the CLOCK_MONOTONIC of the next kill, ns."""
+        """Return the CLOCK_MONOTONIC in ns at which the next kill is due."""
         kill = self._waiting[0]
         words = self._words
         return words[System.EPOCH_NS] + round((kill.tick + kill.phase) * words[System.PERIOD_NS])
 
     def _kill_board(self, board: str) -> bool:
-        """Kill a board and record it. Return False if it is not running."""
+        """Kill a board and record the kill. Return False if the board is not running."""
         pid = self._find_pid(board)
         if not is_alive(pid):
             return False
@@ -110,7 +110,7 @@ class Killer:
         return False
 
     def _find_pid(self, board: str) -> int:
-        """Return the process of a running board, or 0 if the board is not running."""
+        """Return the process id of a running board, or 0 if the board is not running."""
         if board == CLOCK:
             return self._words[System.CLOCK_PID]
         block = self._segment.get_block(board)
@@ -119,13 +119,13 @@ class Killer:
 
 
 def build_outside_kill(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
-    """Return the record of a kill from outside.
+    """Return the record of an external kill.
 
     Args:
         layout: Layout of the rack.
         board: Board that was killed.
         tick: Tick of the kill.
-        time_ns: CLOCK_MONOTONIC of the kill, ns.
+        time_ns: CLOCK_MONOTONIC of the kill in ns.
     """
     return Strike(
         fault=-1,
@@ -152,12 +152,12 @@ class Trial:
         strikes: Faults of the run.
         arm: State of the arm at the end.
         left: Everything that the rack left behind.
-        wall_s: Duration in real time, s.
+        wall_s: Duration in s of real time.
         levels: Last state of each level, as text.
         is_late: Whether a level gave up because it could not meet a time.
-        again: Outcome of a run without the faults right after a refused launch.
+        again: Outcome of a second run, without the faults, after a refused launch.
         start: Where the trial started.
-        is_cut: Whether it was ended early because the verdict on each fault was certain.
+        is_cut: Whether the trial was ended early because the verdict on each fault was certain.
     """
 
     plan: Plan
@@ -195,8 +195,8 @@ def run_trial(
         config: Config of the rack, without faults.
         plan: Plan of the trial.
         rack_name: Name of the rack.
-        ticks: Length of a faultless run, ticks. 0 if unknown.
-        seconds: Simulated time of a rack that no task ends, s.
+        ticks: Length of a faultless run in ticks. 0 if unknown.
+        seconds: Simulated time in s after which the run ends if no task ends it.
         base: Faultless rack. None to run the whole trial.
         crate: Crate that runs the rack and has the snapshots. None to start a new one.
 

@@ -1,6 +1,6 @@
 """Worker processes, which run trials in parallel.
 
-There are as many as cores. Each trial has its rack and leaves a file.
+There is one for each core. Each trial launches a rack and leaves a file with its result.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class TrialJob:
     Attributes:
         plan: Plan of the trial.
         path: File for the result.
-        ticks: Length of a faultless run, ticks.
-        seconds: Simulated time of a rack that no task ends, s.
+        ticks: Length of a faultless run in ticks.
+        seconds: Simulated time in s after which the run ends if no task ends it.
     """
 
     plan: Plan
@@ -78,7 +78,7 @@ class Workers:
     def run(self, jobs: Sequence[TrialJob], alone: bool) -> Iterator[TrialJob]:
         """Run trials and yield each one when its file is written.
 
-        A signal ends the trials in progress, which leave no file.
+        If a signal arrives, the trials in progress are ended and leave no file.
 
         Args:
             jobs: Trials to run.
@@ -115,7 +115,10 @@ class Workers:
 
 
 class TrialRunner:
-    """Runs the trials of one worker with its core, its crate and its faultless rack."""
+    """Runs the trials of one worker process.
+
+    Its trials in lockstep share a core, a crate and a faultless rack.
+    """
 
     def __init__(self, config: RackConfig, whole: bool, core: int) -> None:
         self._config = config
@@ -140,8 +143,8 @@ class TrialRunner:
     def _prepare_crate(self, lockstep: bool) -> WarmCrate | None:
         """Return the crate for the next trial, or None if the rack must start a new one.
 
-        Use a fresh crate for each real-time trial: a warm one has different cache and page-fault
-        behaviour.
+        Each real-time trial gets a fresh crate, because a warm one has different cache and
+        page-fault behaviour.
         """
         if self._crate is not None and (self._crate.is_over or not lockstep):
             self._crate.end_crate()
@@ -151,22 +154,22 @@ class TrialRunner:
         return self._crate
 
 
-_maker: TrialRunner
+_runner: TrialRunner
 
 
 def _prepare_worker(config: RackConfig, whole: bool, cores: SimpleQueue[int], parent: int) -> None:
     """Prepare a worker process. It ends with its parent and ignores Ctrl-C on the terminal."""
-    global _maker
+    global _runner
     os.setpgid(0, 0)
     INTERRUPT.install_handlers()
     die_with_parent(parent)
-    _maker = TrialRunner(config, whole, cores.get())
+    _runner = TrialRunner(config, whole, cores.get())
 
 
 def _run_job(job: TrialJob) -> str:
     """Run a trial in a worker. Return what went wrong, or an empty string."""
     try:
-        _maker.run_and_save(job)
+        _runner.run_and_save(job)
     except Exception as error:
         # Report any error, because the campaign would otherwise wait for the result.
         return f"{type(error).__name__}: {error}"

@@ -121,7 +121,7 @@ def test_a_self_test_that_fails_is_found_when_the_rack_does_not_arm_because_of_i
     # It is recovered from when the rack then runs without it.
     for again in (None, outcome("board lost", "board 'lower' ended")):
         assert refused("self-test", why, again).shortfalls == (
-            "self-test of lower at tick 0: not armed was never undone (bound in ticks: None)",
+            "self-test of lower at tick 0: not armed was never undone",
         )
     assert refused("self-test", why.replace("lower", "upper")).faults[0].seen == "missed"
     launched = judge_trial(trial(strikes=(strike("self-test", "lower", 0),)))
