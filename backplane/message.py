@@ -342,7 +342,7 @@ def _can_store(kind: str, value: Any) -> bool:
 class Command(Message):
     """Base class of the commands to a level."""
 
-    id: int = field("u4", unit="1", doc="serial of the command; 0: no command")
+    id: int = field("u4", unit="1", doc="serial of the command (0: no command)")
 
 
 class Status(Message):
@@ -350,5 +350,5 @@ class Status(Message):
 
     echo: int = field("u4", unit="1", doc="serial of the command that this status answers")
     state: State = field(doc="idle, executing, done, error or holding")
-    error: int = field("u2", unit="1", doc="error code of the level; 0: none")
-    reason: str = field(doc="reason for the error or the hold, readable; empty: neither")
+    error: int = field("u2", unit="1", doc="error code of the level (0: none)")
+    reason: str = field(doc="reason for the error or the hold (empty: neither)")

@@ -71,14 +71,14 @@ class Bus(Protocol):
     def tasks(self) -> list[str]:
         """Names of the tasks of the crate."""
 
-    def find_address(self, name: str) -> int:
+    def address(self, name: str) -> int:
         """Return the bus address of a mailbox, or of the control block of a task.
 
         Raises:
             LookupError: No mailbox or task has this name.
         """
 
-    def read_words(self, address: int, count: int = 1) -> list[int]:
+    def words(self, address: int, count: int = 1) -> list[int]:
         """Return 8-byte words of the crate's memory, starting at a bus address.
 
         `rack check` prints the addresses. Any word may be read without a message, whichever board
@@ -88,7 +88,7 @@ class Bus(Protocol):
             ValueError: The address is not aligned to a word, or the words extend beyond the memory.
         """
 
-    def declare_done(self) -> None:
+    def finish(self) -> None:
         """Declare that the program's work is done, as a return from `run` does."""
 
 

@@ -45,7 +45,7 @@ for n in (3, 6, 7, 12):
     for _ in range(50):
         square, tall, x = rng.normal(size=(n, n)), rng.normal(size=(6, n)), rng.normal(size=n)
         found += [algebra.mat_vec(square, x), algebra.transposed_mat_vec(tall, tall[:, 0]), algebra.gram(tall)]
-        found += [algebra.solve(algebra.gram(square), x), [algebra.norm(x)], algebra.each(math.tanh, tall)]
+        found += [algebra.solve(algebra.gram(square), x), [algebra.norm(x)], algebra.apply_elementwise(math.tanh, tall)]
         found += [tall.sum(axis=0), tall.sum(axis=1), [x.sum()], np.linalg.norm(tall, axis=1), np.sqrt(np.abs(x))]
 print(hashlib.sha256(b"".join(np.asarray(value).tobytes() for value in found)).hexdigest())
 """

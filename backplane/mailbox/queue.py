@@ -43,7 +43,8 @@ class QueueTaken(Message, version=1):
     """Position of the reader of a queue, written by that reader."""
 
     taken: int = field(
-        unit="1", doc="serial of the newest message that the reader of the queue has taken; 0: none"
+        unit="1",
+        doc="serial of the newest message that the reader of the queue has taken (0: none)",
     )
     unread: int = field(unit="1", doc="messages that this reader could see, and left in the queue")
 

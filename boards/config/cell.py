@@ -1,7 +1,7 @@
 """Data derived from the arm and its cell.
 
-MuJoCo is imported inside the functions, because that takes 0.5 s, which a rack without an arm need
-not spend.
+MuJoCo is imported inside the functions, because the import takes 0.5 s and racks without an arm do
+not need it.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ if TYPE_CHECKING:
 
 
 def compute_cell_sizes(config: RackConfig) -> dict[str, int]:
-    """Return the sizes that messages use by name, such as the number of joints.
+    """Return the sizes to which message types refer by name, such as the number of joints.
 
-    Empty for a rack without an arm. Raises `RobotError` if arm and scene do not fit the model.
+    The result is empty for a rack without an arm. Raises `RobotError` if arm and scene do not fit
+    the model.
     """
     if config.robot is None:
         return {}
@@ -28,7 +29,10 @@ def compute_cell_sizes(config: RackConfig) -> dict[str, int]:
 
 
 def find_geom_name(config: RackConfig, geom: int) -> str:
-    """Return the name of a geom of the cell from its number, which comes from shared memory."""
+    """Return the name of the geom with the given number in the cell of the rack.
+
+    Raises `DamageError` if there is no such geom, because the number comes from shared memory.
+    """
     from rack.levels.robot import lookup
 
     model = build_rack_cell(config).model

@@ -36,7 +36,7 @@ DOWN = (0.0, 0.0, -1.0)
 
 
 def describe_commands(level: PublishedLevel) -> str:
-    """Return the commands of a level as text, with valid names: "hold, resume, table saw|slow"."""
+    """Return the commands of a level as text with valid names, as in "hold, table saw|slow"."""
     words = []
     for what, goals in level.commands.items():
         names = "|".join(level.wording.get(what, ()))
@@ -82,6 +82,7 @@ def build_requests(config: RackConfig, layout: Layout) -> tuple[Request, ...]:
 
 
 def _encode_request(command: CommandConfig, layout: Layout) -> Request:
+    """Return the request that enters a checked command into the operator table."""
     name = f"{command.level}.operator"
     spec = layout.find_mailbox(name)
     message = OperatorCommand(build_message_dtype(spec.fields, spec.size))
@@ -112,7 +113,7 @@ def find_command_mistakes(
     """Return every mistake in operator commands.
 
     Args:
-        commands: The commands, with their places in a config. A live command has an empty place.
+        commands: The commands with their places in a config. The place of a live command is empty.
         config: The config of the rack.
         levels: Its levels.
         broken: Boards with known mistakes. Commands for them are not checked.
@@ -138,6 +139,7 @@ def find_command_mistakes(
 def _check_command(
     place: str, command: CommandConfig, config: RackConfig, published: Levels
 ) -> Mistakes:
+    """Yield every mistake in one operator command. `place` is empty for a live command."""
     at = partial(format_place, place)
     if command.tick is not None and command.at is not None:
         yield Mistake(at("at"), command.at, "tick is also given; give only one of tick, at")
@@ -167,7 +169,13 @@ def _check_command(
 
 
 def _check_goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Mistakes:
-    """Check that a command has exactly one goal, of a form that the level accepts."""
+    """Check that a command has exactly one goal of an accepted form, or none if it takes none.
+
+    Args:
+        at: Function that returns the place of a key of the command.
+        command: The command.
+        known: Commands that the level takes, with the accepted forms of their goals.
+    """
     accepted = known[command.operation]
     goals = command.goals
     what = f"{command.what} of '{command.level}'"
@@ -193,7 +201,7 @@ def _check_goal(at: Callable[[str], str], command: CommandConfig, known: Command
 
 
 def _find_goal_key(goal: Goal) -> str:
-    """Return the key of a `[[command]]` table that gives a goal of this form."""
+    """Return the key of a `[[command]]` table that specifies a goal of this form."""
     keys = {Goal.POSE: "quaternion", Goal.DIRECTION: "position", Goal.OFF: "on"}
     return keys.get(goal, goal.name.lower())
 
@@ -236,6 +244,7 @@ def _check_setting(place: str, command: CommandConfig, level: PublishedLevel) ->
 
 
 def _check_joints(place: str, joints: tuple[float, ...], config: RackConfig) -> Mistakes:
+    """Check that a joint goal has one value per joint, within the joint's position limits."""
     robot = config.robot
     if robot is None:
         yield Mistake(place, list(joints), "the rack has no arm")

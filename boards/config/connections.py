@@ -50,9 +50,9 @@ class TaskPorts:
         inputs: Declarations of its inputs, by port.
         outputs: Declarations of its outputs, by port.
         reads: Mailbox of each input. For a port that reads several, a dict of mailboxes by board.
-        exchange: When an executor reads its ports, by port.
-        mistakes: Reasons why declared inputs are not connected.
-        is_whole: False if mistakes hide some of the ports that the config adds.
+        exchange: Entries of the executor's `exchange` table, by port. They say when a port is read.
+        mistakes: Mistakes that prevent inputs from being connected.
+        is_whole: False if some of the ports that the config adds are unknown because of mistakes.
     """
 
     place: TaskEntry
@@ -89,7 +89,7 @@ class TaskPorts:
         return {port: f"{self.place.board}.{port}" for port in self.outputs}
 
     def find_origin_mailboxes(self, output: str) -> tuple[str, ...]:
-        """Return the mailboxes from which the information in an output comes."""
+        """Return the mailboxes with the information on which an output is based."""
         source = self.outputs[output].rests_on
         return () if source is None else list_mailboxes(self.reads.get(source.name, {}))
 
@@ -146,7 +146,7 @@ def _connect_inputs(
     inputs: Mapping[str, InputPort[Any]],
     mistakes: list[Mistake],
 ) -> Iterator[tuple[str, Source]]:
-    """Yield each input with the mailboxes that it reads.
+    """Yield each connected input with the mailbox or mailboxes that it reads.
 
     Args:
         config: The config of the rack.
@@ -176,7 +176,10 @@ def _connect_inputs(
 
 
 def _group_by_board(mailboxes: Sources) -> Source:
-    """Return mailboxes by board. If a board writes several of them, these are by mailbox name."""
+    """Return a dict of the mailboxes with the names of their boards as keys.
+
+    If a board writes several of the mailboxes, the full names of these mailboxes are the keys.
+    """
     boards = [box.partition(".")[0] for box in mailboxes]
     pairs = zip(boards, mailboxes, strict=True)
     return {board if boards.count(board) == 1 else box: box for board, box in pairs}
@@ -189,7 +192,7 @@ class Wiring:
         config: The config of the rack.
         broken: Tables that were removed from the config because of mistakes, as in "board.servo".
         ports: Ports of every task and host board whose class exists, in order.
-        missing: For all others, the reason why the class cannot be used.
+        missing: For every other task and host board, the reason why its class cannot be used.
     """
 
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
@@ -220,7 +223,7 @@ class Wiring:
 
     @property
     def broken_boards(self) -> list[str]:
-        """The boards whose tables are broken."""
+        """Names of the boards whose tables are broken."""
         return [name.removeprefix("board.") for name in self.broken if name.startswith("board.")]
 
     @property
@@ -292,12 +295,12 @@ class Wiring:
 
     @property
     def of_host(self) -> set[str]:
-        """Mailboxes of the host side. Only a bus adapter connects them with the other side."""
+        """Mailboxes of the host side. Only a bus adapter connects them with the real-time side."""
         return self.from_host | self.to_host
 
     @cached_property
     def every(self) -> dict[str, int]:
-        """Periods of the boards, ticks. Boards with an invalid rate are left out."""
+        """Periods of the boards in ticks. Boards with an invalid rate are left out."""
         periods: dict[str, int] = {}
         for name in self.config.board if "clock" not in self.broken else ():
             with suppress(ClockError):
@@ -306,7 +309,10 @@ class Wiring:
 
     @cached_property
     def unknown_boards(self) -> set[str]:
-        """Boards whose mistakes hide their mailboxes. A reader of such a mailbox is not wrong."""
+        """Boards whose mailboxes are not all known because of mistakes.
+
+        Reading a mailbox of such a board is not reported as a further mistake.
+        """
         boards = {place.board for place in self.missing}
         boards |= {ports.place.board for ports in self.ports.values() if not ports.is_whole}
         boards |= {place.removeprefix("board.").removeprefix("host.") for place in self.broken}
@@ -338,11 +344,15 @@ class Wiring:
         return tuple(dict.fromkeys(ports.task for ports, _ in self.reading.get(mailbox, ())))
 
     def is_of_network(self, name: str) -> bool:
-        """Return True for the network adapter's board and for the mailboxes that it writes."""
+        """Return True for the network adapter's board and for the mailboxes that it writes.
+
+        Args:
+            name: Name of a board or of a mailbox.
+        """
         return self.config.adapter.lan is not None and name.partition(".")[0] == LAN
 
     def find_protocol(self, mailbox: str) -> Protocol:
-        """Return the protocol of a mailbox, which depends on the config and on its writer."""
+        """Return the protocol of a mailbox, which its writer and the config determine."""
         if mailbox in self.to_host:
             # Host boards always read the newest message at once.
             return "time-slice"
@@ -354,9 +364,9 @@ class Wiring:
         if protocol == "interrupt" and (
             mailbox in self.operator_mailboxes or self.is_of_network(mailbox)
         ):
-            # No board of this rack sends these messages, so none can be interrupted by it.
+            # Messages of the clock and of the network adapter do not interrupt boards.
             return "time-slice"
-        # With a lock the clock would wait for readers.
+        # The clock writes the operator mailboxes and must not wait for a reader that holds a lock.
         return (
             "double-buffer"
             if protocol == "lock" and mailbox in self.operator_mailboxes

@@ -54,7 +54,9 @@ class Assembled:
 def assemble(
     name_or_path: str | Path, overrides: Sequence[str], faults: str | Path | None
 ) -> Assembled:
-    """Read a config's files and apply settings and a fault script. Mistakes are collected.
+    """Read the files of a config, append the faults of a script, and apply settings.
+
+    Mistakes are collected in the result instead of being raised.
 
     Args:
         name_or_path: Name of a bundled config, or path of a TOML file.
@@ -83,7 +85,10 @@ def assemble(
 
 @contextmanager
 def collect_mistakes(mistakes: list[Mistake]) -> Iterator[None]:
-    """Context in which a `ConfigError` ends the block and adds its mistakes to the list."""
+    """Return a context that collects the mistakes of a `ConfigError` in a list.
+
+    The error ends the block of the context and is not raised further.
+    """
     try:
         yield
     except ConfigError as error:
@@ -162,12 +167,13 @@ def find_file(path: Path) -> Path | None:
 
 
 def resolve_paths(tables: Tables, folder: Path) -> Tables:
-    """Return tables with absolute paths, relative ones being resolved from `folder`.
+    """Return tables in which every path is absolute. Relative paths start from `folder`.
 
     A file that does not exist there is looked up among the bundled files, in configs/.
     """
 
     def find(text: str) -> str:
+        """Return the absolute path of the file to which `text` refers, whether it exists or not."""
         return str(_find_referenced_file(text, folder) or folder / text)
 
     tables = change_texts(tables, ("robot", "model"), find)
@@ -182,7 +188,7 @@ def resolve_paths(tables: Tables, folder: Path) -> Tables:
 
 
 def change_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) -> Any:
-    """Return tables with some texts changed.
+    """Return a copy of tables in which the texts at one path of keys are changed.
 
     Args:
         value: The tables.
@@ -208,7 +214,7 @@ def _get_table(tables: Tables, key: str) -> Tables:
 
 
 def shorten_path(model: Path) -> str:
-    """Return a path as it is stored in a config. Paths of bundled files become relative."""
+    """Return a path as configs store it. The path of a bundled file is relative to configs/."""
     return model.relative_to(CONFIGS).as_posix() if model.is_relative_to(CONFIGS) else str(model)
 
 
@@ -218,7 +224,7 @@ def _locate_config(name_or_path: str | Path, place: str, *folders: Path) -> Path
     is_path = isinstance(name_or_path, Path) or "/" in text or text.endswith(".toml")
     if is_path and (file := find_file(Path(text))):
         return file
-    # Look the text up among the names only if it is no file, because that reads every config.
+    # Listing the names reads every config, so do it only if the text is not a file.
     if is_path:
         known = [folder for folder in folders if text in list_names(folder)]
     else:
@@ -236,7 +242,7 @@ def _locate_config(name_or_path: str | Path, place: str, *folders: Path) -> Path
 def _read_config(
     path: Path, chain: tuple[Path, ...], known: dict[Path, Tables], mistakes: list[Mistake]
 ) -> Tables:
-    """Read a file and merge its tables into the tables of the files that it extends.
+    """Return the merged tables of a file and of the files that it extends. Read each file once.
 
     Args:
         path: The file.
@@ -253,6 +259,10 @@ def _read_config(
 def _read_merged(
     path: Path, chain: tuple[Path, ...], known: dict[Path, Tables], mistakes: list[Mistake]
 ) -> Tables:
+    """Read a file and all files that it extends. Raises `ConfigError` if it extends itself.
+
+    The arguments are those of `_read_config`.
+    """
     if path in chain:
         loop = " -> ".join(p.name for p in (*chain[chain.index(path) :], path))
         raise ConfigError([Mistake(f"{path.name}: extends", None, f"extends itself: {loop}")])
@@ -275,6 +285,7 @@ def _merge_extension(base: Tables, top: Tables) -> Tables:
 
 
 def _read_tables(path: Path) -> Tables:
+    """Read the tables of one TOML file. Raises `ConfigError` if it cannot be read or parsed."""
     try:
         text = read_regular_file(path, MAX_FILE_BYTES).decode()
     except (OSError, UnicodeDecodeError) as error:
@@ -284,6 +295,7 @@ def _read_tables(path: Path) -> Tables:
 
 
 def _list_bases(extends: Any, path: Path, mistakes: list[Mistake]) -> list[Path]:
+    """Return the files listed under `extends`. Add a mistake for each that does not exist."""
     place = f"{path.name}: extends"
     if not isinstance(extends, list) or not all(isinstance(item, str) for item in extends):
         raise ConfigError([Mistake(place, extends, "must be a list of config names or paths")])
@@ -309,5 +321,10 @@ def _find_named_config(name: str, folder: Path = CONFIGS) -> Path | None:
 
 
 def _find_referenced_file(reference: str, folder: Path) -> Path | None:
-    """Return the file that a config in `folder` refers to, from there or from configs/."""
+    """Return the file to which a path in a config refers. None if it does not exist.
+
+    Args:
+        reference: The path, relative to `folder` or else to configs/.
+        folder: Folder of the config.
+    """
     return find_file(folder / reference) or find_file(CONFIGS / reference)

@@ -35,11 +35,11 @@ def find_fault_mistakes(
     """Return every mistake in faults.
 
     Args:
-        faults: The faults, with their places in a config. A live fault has an empty place.
+        faults: The faults with their places in a config. The place of a live fault is empty.
         config: The config of the rack.
         levels: Its levels.
         layout: Its layout. None skips the checks that need one.
-        unspecified: Boards with known mistakes. What depends on them is not checked.
+        unspecified: Boards with known mistakes. Checks that depend on them are skipped.
     """
     rules = [
         FaultCheck(place, fault, config, levels, layout, unspecified) for place, fault in faults
@@ -54,7 +54,16 @@ def find_fault_mistakes(
 
 @dataclass(frozen=True)
 class FaultCheck:
-    """Checks of one fault. The attributes are the arguments of `find_fault_mistakes`."""
+    """Checks of one fault.
+
+    Attributes:
+        place: Place of the fault in the config. Empty for a live fault.
+        fault: The fault.
+        config: The config of the rack.
+        levels: Its levels.
+        layout: Its layout. None skips the checks that need one.
+        unspecified: Boards with known mistakes. Checks that depend on them are skipped.
+    """
 
     place: str
     fault: FaultConfig
@@ -94,6 +103,7 @@ class FaultCheck:
                 yield self._build_mistake("when", str(error.args[0]))
 
     def _check_kind(self, kind: Kind) -> Mistakes:
+        """Yield a mistake for each key that does not fit the kind of fault."""
         if kind.realtime and self.config.is_lockstep:
             why = (
                 f"{kind.name} needs real time: in lockstep time waits for every task; run without"
@@ -121,6 +131,7 @@ class FaultCheck:
         yield from self._check_parameters(kind)
 
     def _check_parameters(self, kind: Kind) -> Mistakes:
+        """Yield a mistake for each unknown, invalid or missing parameter of the kind."""
         known = {parameter.name: parameter for parameter in kind.parameters}
         for name, value in self.fault.parameters.items():
             why = f"{kind.name} has no such parameter; parameters: {_format_names(known)}"
@@ -136,13 +147,19 @@ class FaultCheck:
                 )
 
     def _check_target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
+        """Yield a mistake if this kind of fault cannot affect the given task or mailbox."""
         if why := self._explain_board(kind, tasks):
             yield self._build_mistake("board", why)
         elif why := self._explain_mailbox(kind):
             yield self._build_mistake("mailbox", why)
 
     def _explain_board(self, kind: Kind, tasks: Mapping[str, Role]) -> str:
-        """Return why a fault of this kind cannot strike the task. Empty if it can."""
+        """Return the reason why this kind of fault cannot affect its task. Empty if it can.
+
+        Args:
+            kind: The kind of fault.
+            tasks: Roles of all tasks and host boards, by name.
+        """
         board = self.fault.board
         if board in self.config.host and self.config.host[board].external:
             return "the rack does not start this external board, so it has no process to strike"
@@ -171,12 +188,16 @@ class FaultCheck:
         return ""
 
     def _find_layout(self, place: str) -> Layout | None:
-        """Return the layout. None if there is none, or if it lacks the board of this place."""
+        """Return the layout. None without a layout, or if it lacks the board of `place`.
+
+        Args:
+            place: Name of a task or mailbox, or a condition that begins with one.
+        """
         is_known = place.partition(".")[0].strip() not in self.unspecified
         return self.layout if is_known else None
 
     def _explain_mailbox(self, kind: Kind) -> str:
-        """Return why a fault of this kind cannot strike the task's mailboxes. Empty if it can."""
+        """Return why this kind of fault cannot affect the task's mailboxes. Empty if it can."""
         board = self.fault.board
         mailbox = self.fault.mailbox
         layout = self._find_layout(board)
@@ -205,20 +226,22 @@ class FaultCheck:
         return ""
 
     def _forbid_keys(self, keys: Iterable[str], why: str) -> Mistakes:
-        """Yield a mistake for each of these keys that is given."""
+        """Yield a mistake with the reason `why` for each of the keys that the fault has."""
         for key in keys:
             if self._get_value(key) is not None:
                 yield self._build_mistake(key, why)
 
     def _get_value(self, key: str) -> object:
+        """Return the fault's value for a key of its `[[fault]]` table. None if it is not given."""
         return self.fault.lasts if key == "for" else getattr(self.fault, key)
 
     def _build_mistake(self, key: str, why: str) -> Mistake:
+        """Return a mistake about one key of the fault."""
         return Mistake(format_place(self.place, key), self._get_value(key), why)
 
 
 def _explain_value(parameter: Parameter, value: float, robot: RobotConfig | None) -> str:
-    """Return why a value of the parameter is not valid. Empty if it is."""
+    """Return why a value of the parameter is invalid. Empty if it is valid."""
     most = parameter.most
     if parameter.name == "joint" and robot is not None:
         most = len(robot.joints) - 1
@@ -267,6 +290,7 @@ def build_live_injection(
 def _build_injection(
     fault: FaultConfig, config: RackConfig, layout: Layout, place: str
 ) -> Injection:
+    """Return the fault table's entry for one fault of a checked config, or for a live fault."""
     kind = KINDS[fault.kind]
     names = [process.name for process in layout.processes]
     task = -1 if fault.board == CLOCK else names.index(fault.board)
@@ -275,7 +299,7 @@ def _build_injection(
         # Two faults of one config must draw different random numbers.
         seed = crc32(f"{config.seed} {place}".encode()) % SEEDS
     when = None if fault.when is None else parse_condition(fault.when, layout)
-    # Zero ticks mean until the end of the run, or that the fault strikes once.
+    # With zero ticks the fault lasts until the end of the run, or strikes only once.
     ticks = 0
     if fault.cycles is not None:
         ticks = fault.cycles * cycle_ticks(layout, fault.board)
@@ -297,7 +321,11 @@ def _build_injection(
 
 
 def _find_mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
-    """Return the index of the mailbox to strike. -1 if it is every one the task writes, or none."""
+    """Return the index of the mailbox that a fault affects.
+
+    Returns:
+        -1 if the fault affects every mailbox that its task writes, or no mailbox.
+    """
     if fault.mailbox is not None:
         return layout.find_mailbox_index(fault.mailbox)
     # A bus fault forges one message in one mailbox, by default the first that has a reader.

@@ -29,10 +29,10 @@ OPERATOR_DEPTH = 128
 RETAINED_S = 2.0
 """Simulated time that mailboxes and trace rings retain.
 
-Real-time boards may starve a recorder for 1 s, in which it must lose nothing.
+Real-time boards may keep the recorder from running for 1 s, and it must not lose data in that time.
 """
 SUSTAINED = 4
-"""Average number of messages per cycle of a queue's writer that a recorder can follow.
+"""Average number of messages per cycle of a queue's writer with which a recorder can keep up.
 
 It limits the memory of deep queues.
 """
@@ -45,7 +45,7 @@ NS_PER_MS = 1e6
 def find_core(core: int) -> int:
     """Return the core on which a task runs that requests `core`.
 
-    A core that the machine lacks is replaced by one of the available cores, in turn.
+    A core that is not available is replaced by one that is, depending on its number.
     """
     available = sorted(os.sched_getaffinity(0))
     return core if core in available else available[core % len(available)]
@@ -66,7 +66,7 @@ def list_replaced_cores(config: RackConfig) -> list[str]:
 
 
 def build_exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
-    """Return when an executor reads the ports of its `exchange` table, by port, in ticks."""
+    """Return the ticks at which an executor reads the ports of its `exchange` table, by port."""
     board = ports.place.board
     every = wiring.every[board]
     phase = wiring.config.board[board].phase
@@ -95,7 +95,7 @@ class LayoutBuilder:
         self._hosts = {ports.task: self._build_host(ports.place) for ports in wiring.hosts}
 
     def build_layout(self) -> Layout:
-        """Compute the layout."""
+        """Return the layout: all tasks, host boards and mailboxes of the segment."""
         mailboxes = [box for name in self._wiring.writers for box in self._build_written(name)]
         # The clock writes the operator's commands to the levels.
         mailboxes += [
@@ -120,7 +120,7 @@ class LayoutBuilder:
         writer = self._tasks[ports.task]
         every = writer.every * output.cycles
         delay = writer.slice
-        # A message that is visible at the start of a reader's slice must last until its end.
+        # A message that is visible at the start of a reader's slice must last until the slice ends.
         tasks_and_hosts = self._tasks | self._hosts
         readers = [tasks_and_hosts[reader] for reader in self._wiring.list_readers(name)]
         slowest = max((reader.slice for reader in readers), default=0)
@@ -152,15 +152,15 @@ class LayoutBuilder:
         """Yield a queue and the mailbox in which its reader reports its position to the writer.
 
         Args:
-            box: The queue without its size.
+            box: Record of the queue, whose capacity and depth are not set yet.
             capacity: Largest number of unread messages.
             reader: The task that reads the queue.
             writer: The task that writes it.
         """
         delay = reader.slice
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
-        # The writer learns the reader's position after both delays. In that time it can send no
-        # more messages than the capacity.
+        # The writer learns the reader's position after both delays. Until then it can send at most
+        # as many messages as the capacity.
         most = capacity * (1 + self._kept // (box.delay + delay))
         # A deep queue retains fewer messages, to limit its memory.
         slots = compute_depth(min(most, 2 * capacity + SUSTAINED * self._kept // box.every), 1)
@@ -180,7 +180,7 @@ class LayoutBuilder:
     def _add_interrupts(
         self, box: MailboxSpec, writer: TaskSpec, readers: Sequence[TaskSpec]
     ) -> MailboxSpec:
-        """Return a mailbox of protocol interrupt with the costs and times of its messages.
+        """Add the costs and times of interrupts to the record of a mailbox and return it.
 
         Messages do not interrupt tasks of the writer's slot, host boards or the network adapter,
         which read shared memory.
@@ -217,6 +217,7 @@ class LayoutBuilder:
         return replace(box, delay=delay, depth=depth, interrupt=interrupt)
 
     def _build_task(self, place: TaskEntry) -> TaskSpec:
+        """Return the record of an executor or a planner."""
         board = self._config.board[place.board]
         every = self._wiring.every[place.board]
         wake = board.wake or self._config.clock.wake

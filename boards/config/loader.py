@@ -55,7 +55,7 @@ def load_text(text: str) -> RackConfig:
 
 
 def read_stored(text: str) -> RackConfig:
-    """Read the config that a rack or a run stores as text, which may not be trusted.
+    """Read the stored config of a rack or a run, whose text need not be trusted.
 
     Nothing that the config names is imported, and the import path stays as it is.
 
@@ -109,7 +109,10 @@ def validate(assembly: Assembled) -> RackConfig:
 
 
 def _iterate_valid_tables(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
-    """Yield place and record of each valid table of a list. Invalid ones are already reported."""
+    """Yield the place and the record of each valid table in a list of tables.
+
+    Invalid tables are left out, because their mistakes are already reported.
+    """
     entries = tables.get(key)
     if not isinstance(entries, list):
         return
@@ -139,7 +142,7 @@ def _build_valid_part(tables: Tables, broken: frozenset[str]) -> RackConfig:
 
 
 def _complete_robot(config: RackConfig) -> RackConfig:
-    """Return the config with joints, tool and home of the arm taken from its model if not given.
+    """Return the config with missing joints, tool and home of the arm taken from its model.
 
     Raises:
         ConfigError: The model does not provide them.

@@ -51,11 +51,12 @@ def convert_errors(
 
 
 def _convert_error(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: str) -> Mistake:
+    """Convert one error of pydantic into a mistake. The arguments are those of `convert_errors`."""
     keys = _drop_variant_names(entry["loc"], tables, entry["type"] == "missing")
     where = (
         place + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
     ).lstrip(".")
-    # A table of several kinds, selected by the value of one key.
+    # The table can be of several kinds, and the value of one key selects the kind.
     if entry["type"].startswith("union_tag"):
         context = entry["ctx"]
         valid = context.get("expected_tags", "").replace("'", "")
@@ -123,7 +124,7 @@ def _find_declaration(
 
 
 def _may_be_of_kind(kind: type[BaseModel], table: Any) -> bool:
-    """Return True if a table may be of a kind, judged by keys with fixed values (do = "goto")."""
+    """Return True if a table has the fixed values of a model, such as do = "goto"."""
     fixed = {
         key: get_args(f.annotation)
         for key, f in kind.model_fields.items()

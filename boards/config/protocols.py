@@ -12,8 +12,9 @@ from rack.levels.tables import Table
 MailboxName = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*\.[a-z][a-z0-9_]*$")]
 Microseconds = Annotated[float, Field(ge=0, le=1e6, allow_inf_nan=False)]
 UNREAD = 32
+"""Default for the largest number of unread messages in a queue."""
 MOST_UNREAD = 4096
-"""Default and greatest depth of a queue, messages."""
+"""Upper limit for the largest number of unread messages in a queue."""
 
 
 class InterruptConfig(Table):

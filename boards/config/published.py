@@ -67,7 +67,7 @@ class PublishedLevel:
         commands: Operator commands that it takes, with the valid forms of their goals.
         wording: Valid names for each command that takes a name. A command is left out if its names
             are not known.
-        names: See `Executor.names`.
+        names: Names for the level's alarms by number. See `Executor.list_names`.
         keys: Keys of all its parameters.
         live: Its live parameters by key.
         struck_by: Fault kinds that can strike the hardware that it drives.
@@ -152,6 +152,7 @@ def gather_facts(config: RackConfig) -> PublishedRack:
 
 
 def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> PublishedLevel:
+    """Gather the facts about the level of one board."""
     commands = kind.commands if has_operator_port(kind) else {}
     params = config.board[board].params
     live: dict[str, PublishedParam] = {}
@@ -182,6 +183,7 @@ def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> Pub
 
 
 def _describe_param(declared: FieldInfo, launched: object) -> PublishedParam:
+    """Return the facts about a live parameter that had the value `launched` at the launch."""
     constraints: dict[Constraint, float | bool] = {}
     for bound in declared.metadata:
         for key in get_args(Constraint):

@@ -30,7 +30,7 @@ class RecordConfig(Table):
 
     @model_validator(mode="after")
     def _check_windows(self) -> Self:
-        """Require that rows are kept until they may be needed: faults can be detected late."""
+        """Check that `keep` covers `before` and `after`, because faults can be detected late."""
         if self.keep is not None and self.keep < self.before + self.after:
             raise ValueError(
                 f"keep = {self.keep:g} s is shorter than before + after ="

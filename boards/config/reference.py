@@ -109,7 +109,7 @@ def list_key_tables(config: RackConfig) -> list[KeyTable]:
 
 
 def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
-    """Return the table of a name, or else all tables whose names begin with it.
+    """Return the table with the given name, or else all tables whose names begin with it.
 
     Raises:
         LookupError: No table has such a name. The message lists the tables.
@@ -136,6 +136,7 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
 
 
 def _list_model_tables(model: type[BaseModel], path: str) -> Iterator[KeyTable]:
+    """Yield the tables that a model declares. `path` is the place of its own table."""
     schema = model.model_json_schema(schema_generator=DescribedSchema)
     return _walk_schema(schema, schema.get("$defs", {}), path, path, f"[{path}]")
 
@@ -143,7 +144,15 @@ def _list_model_tables(model: type[BaseModel], path: str) -> Iterator[KeyTable]:
 def _walk_schema(
     schema: Schema, known: Schema, name: str, path: str, heading: str
 ) -> Iterator[KeyTable]:
-    """Yield the table that a schema describes, followed by the tables inside it."""
+    """Yield the table that a schema describes, followed by the tables inside it.
+
+    Args:
+        schema: JSON schema of the table.
+        known: Schemas to which other schemas refer, by name.
+        name: Name of the table for look-ups.
+        path: Place of the table in the config.
+        heading: Heading of the table in TOML.
+    """
     keys = []
     inner: list[KeyTable] = []
     for key, entry in schema.get("properties", {}).items():
@@ -164,7 +173,10 @@ def _walk_schema(
 def _list_inner_tables(
     entry: Schema, known: Schema, name: str, path: str, heading: str
 ) -> Iterator[KeyTable]:
-    """Yield the tables that a value of this schema may be, or may contain."""
+    """Yield the tables that a value of this schema can be or contain.
+
+    The arguments are those of `_walk_schema`.
+    """
     if "$ref" in entry:
         yield from _walk_schema(known[entry["$ref"].rpartition("/")[2]], known, name, path, heading)
     for option in entry.get("anyOf", ()):
@@ -186,6 +198,7 @@ def _list_value_schemas(entry: Schema) -> Iterator[Schema]:
 
 
 def _describe_key(name: str, entry: Schema, is_required: bool) -> Key:
+    """Return the record of one key from its JSON schema."""
     # A description declares the unit in brackets, as in "tick period [ms]; a whole number of ns".
     before, _, rest = entry.get("description", "").partition(" [")
     unit, _, after = rest.partition("]")
@@ -248,6 +261,7 @@ def _format_limits(entry: Schema) -> str:
 
 
 def _format_number(value: float) -> str:
+    """Return a number as text without loss, in at most six digits if possible."""
     text = f"{value:g}"
     return text if float(text) == value else str(value)
 
@@ -271,7 +285,7 @@ def _build_findings_table(board: str, kinds: Mapping[str, FindingKind]) -> KeyTa
 
 
 def _list_fault_tables() -> Iterator[KeyTable]:
-    """Yield a table for each fault kind that has parameters, without the keys of all faults."""
+    """Yield a table with the parameters of each fault kind that has any."""
     for kind in KINDS:
         keys = [
             Key(

@@ -44,7 +44,7 @@ LINGER_S = 0.5
 SILENT_S = 30.0
 """Simulated time without a status after which the level that ends the run counts as dead.
 
-At least 8 cycles of that level.
+The limit is at least 8 cycles of that level.
 """
 AHEAD_S = RETAINED_S / 2
 """Simulated time by which lockstep may run ahead of a recorder: half of what the rings retain."""
@@ -65,7 +65,7 @@ def resolve(config: RackConfig) -> Resolved:
 
 
 def resolve_layout(config: RackConfig) -> Layout:
-    """Return the layout of a config, without a check of files that only its own machine has.
+    """Check a config and return its layout. Files that only its own machine has are not checked.
 
     Raises:
         ConfigError: The config has mistakes. All of them are listed.
@@ -106,8 +106,8 @@ class Resolved:
         """Return a copy for one run.
 
         Args:
-            repeats: Name of the rack that its levels see, because messages may contain it. Empty
-                for the rack's own name.
+            repeats: Name of the recorded rack whose run is repeated. Levels see this name as that
+                of their rack, because messages may contain it. Empty for the rack's own name.
             entries: For a replay, what each adapter wrote in the recorded run. A replay starts no
                 host boards and contacts no other racks. None for an ordinary run.
         """
@@ -130,7 +130,7 @@ class Resolved:
         """Return the wiring of the clock's board.
 
         Args:
-            seconds: Simulated time after which the run stops, s. None to run until the task ends.
+            seconds: Simulated time in s after which the run stops. None to run until the task ends.
         """
         config = self.config
         clock = config.clock
@@ -145,7 +145,7 @@ class Resolved:
         # faster than waking up another core. A polling board never yields its core.
         if config.is_lockstep and (yielding := [t for t in executors if t.wake != "poll"]):
             core = min(yielding, key=lambda task: (task.every, task.slot)).core
-        # Demand on the arm while a board is lost. None if the level below holds.
+        # What the arm must do while a board is lost: nothing if the level below it holds.
         demands = {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}
         return ClockWiring(
             lockstep=config.is_lockstep,
@@ -164,6 +164,7 @@ class Resolved:
         )
 
     def _to_ticks(self, seconds: float) -> int:
+        """Convert simulated time in s to ticks."""
         return round(seconds * 1e9 / self.config.clock_ns)
 
     @property
@@ -190,7 +191,7 @@ def _examine(config: RackConfig, further: Iterable[Mistake] = ()) -> Examination
 
 
 class Examination:
-    """Check of a whole config, and the records that it derives on the way.
+    """Checks a whole config and derives the records that a launch needs.
 
     Args:
         config: The config, without broken tables.
@@ -237,7 +238,7 @@ class Examination:
             self.mistakes = [network.move_to_adapter(mistake, config) for mistake in self.mistakes]
 
     def build_resolved_rack(self) -> Resolved:
-        """Return everything derived from the config, which must have no mistakes."""
+        """Return everything derived from the config. Call this only if there are no mistakes."""
         config = self._config
         layout = self._layout
         assert layout is not None, "no mistakes"
@@ -261,6 +262,7 @@ class Examination:
         )
 
     def _build_host_wiring(self, ports: TaskPorts) -> HostWiring:
+        """Return the wiring of a host board."""
         config = self._config
         name = ports.place.board
         return HostWiring(
@@ -276,6 +278,7 @@ class Examination:
     def _build_task_wiring(
         self, layout: Layout, ports: TaskPorts, fails_self_test: bool
     ) -> TaskWiring:
+        """Return the wiring of a task. `fails_self_test` makes its self-test fail."""
         board = self._config.board[ports.place.board]
         spec = layout.find_task(ports.task)
         is_executor = spec.role == "executor"
@@ -309,6 +312,7 @@ class Examination:
         )
 
     def _build_board_contexts(self, wiring: Wiring) -> dict[str, LevelContext]:
+        """Return the contexts of the levels by board."""
         every = wiring.every
         boards = wiring.config.board
         paces = {name: Pace(every[name], board.within_cycles) for name, board in boards.items()}
@@ -328,12 +332,13 @@ class Examination:
         }
 
     def _build_context(self, name: str, params: Mapping[str, Any], **times: Any) -> LevelContext:
+        """Return the context of a level or host program. `times` are its remaining fields."""
         config = self._config
         return LevelContext(
             board=name,
             clock_ns=config.clock_ns,
             seed=config.seed,
-            # None without an arm; then no level uses it.
+            # This is None without an arm, and then no level uses it.
             robot=cast(RobotConfig, config.robot),
             scene=config.scene,
             task=config.task,

@@ -75,7 +75,7 @@ FORMAT_NOTE = (
 RESTART_S = 2.0
 """Longest time of a restart in real time. A planner with its libraries needs 1.5 s."""
 LONGEST_EVERY = 1_000_000
-"""Longest cycle of a board, ticks."""
+"""Longest cycle of a board in ticks."""
 
 
 class ClockConfig(Table):
@@ -191,7 +191,7 @@ class SupervisionConfig(Table):
     limit"""
 
     def find_restart_time(self, lockstep: bool) -> float:
-        """Return the longest simulated time that a restart may take, s."""
+        """Return the longest simulated time in s that a restart may take."""
         return self.lockstep_restart_s if lockstep else max(RESTART_S, self.lockstep_restart_s)
 
 
@@ -259,7 +259,7 @@ class BoardConfig(PlacedConfig):
 
     @property
     def busy_ms(self) -> float:
-        """Processor time of one executor cycle by the budget, ms. 0 without a budget."""
+        """Processor time of one executor cycle in ms, as budgeted. 0 without a budget."""
         cost = self.budget
         if cost is None:
             return 0.0
@@ -367,12 +367,12 @@ class CommandConfig(Table):
 
     @property
     def operation(self) -> Operation:
-        """Operation that is commanded."""
+        """Operation that the command requests."""
         return Operation[self.what.upper()]
 
     @property
     def goals(self) -> list[Goal]:
-        """Forms of the goals that are given. A valid command has one or none, by its operation."""
+        """Forms of the given goals. A valid command has one goal, or none if it takes none."""
         goals = [Goal.JOINTS] if self.joints is not None else []
         if self.position is not None or self.quaternion is not None or self.direction is not None:
             goals.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
@@ -403,17 +403,17 @@ class TaskEntry(NamedTuple):
 
     @property
     def table(self) -> str:
-        """Table of the task, as in "board.servo"."""
+        """Name of the task's table in the config, as in "board.servo" or "host.program"."""
         return f"{'host' if self.role == 'host' else 'board'}.{self.board}"
 
     @property
     def class_key(self) -> str:
-        """Key of the table that names the class."""
+        """Key of the task's table that names the class of the task."""
         return "program" if self.role == "host" else self.role
 
     @property
     def reads_key(self) -> str:
-        """Key of the table that connects ports to other mailboxes."""
+        """Key of the task's table that connects its ports to other mailboxes."""
         return "planner_reads" if self.role == "planner" else "reads"
 
 
@@ -467,7 +467,7 @@ class RackConfig(Table):
 
     @property
     def format_notes(self) -> list[str]:
-        """Note on the changes since the format of this config. Empty for the newest format."""
+        """Notes on changes made after this config's format. Empty for the newest format."""
         return [FORMAT_NOTE] if self.format < FORMAT else []
 
     @property
@@ -477,12 +477,12 @@ class RackConfig(Table):
 
     @property
     def clock_ns(self) -> int:
-        """Length of a tick in simulated time, ns."""
+        """Length of a tick in ns of simulated time."""
         return round(self.clock.period_ms * 1e6)
 
     @property
     def tick_ns(self) -> int:
-        """Length of a tick in real time, ns."""
+        """Length of a tick in ns of real time."""
         return round(self.clock_ns / self.clock.speed)
 
     @property
@@ -491,7 +491,7 @@ class RackConfig(Table):
         return () if self.robot is None else self.robot.joints
 
     def find_period(self, board: str) -> int:
-        """Return the period of a board's executor, ticks.
+        """Return the period of a board's executor in ticks.
 
         Raises:
             ClockError: The rate does not divide the clock rate.
@@ -502,7 +502,10 @@ class RackConfig(Table):
         return compute_period_ticks(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
 
     def list_links(self) -> Iterator[tuple[str, str]]:
-        """Yield each pair of neighbours as upper and lower board. One of them names the other."""
+        """Yield each pair of neighbouring boards, first the upper and then the lower board.
+
+        Two boards are neighbours if at least one of them names the other.
+        """
         listed = [(name, lower) for name, board in self.board.items() for lower in board.below]
         listed += [(upper, name) for name, board in self.board.items() for upper in board.above]
         yield from (
@@ -512,12 +515,12 @@ class RackConfig(Table):
         )
 
     def find_boards_below(self, board: str) -> set[str]:
-        """Return all boards below a board, at any distance."""
+        """Return all boards below a board, directly or through other boards."""
         direct = {lower for upper, lower in self.list_links() if upper == board}
         return direct.union(*(self.find_boards_below(lower) for lower in direct))
 
     def list_tasks(self) -> Iterator[TaskEntry]:
-        """Yield the tasks of all boards: of each board the executor, then the planner."""
+        """Yield the tasks of all boards. The executor of a board comes before its planner."""
         for name, board in self.board.items():
             yield TaskEntry(
                 name, name, "executor", board.executor, board.slot, board.core, board.priority

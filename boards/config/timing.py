@@ -71,7 +71,7 @@ def build_rack_timing(
 
 
 def compute_frames(table: ScheduleConfig, clock_ns: int) -> CyclicSchedule:
-    """Return the frames of a static schedule, rounded to ticks."""
+    """Return the lengths of the frames of a static schedule, rounded to ticks."""
     return CyclicSchedule(*(round(ms * 1e6 / clock_ns) for ms in (table.minor_ms, table.major_ms)))
 
 
@@ -110,6 +110,7 @@ def subtract_interrupts(timing: RackTiming, measured: Mapping[str, Budget]) -> d
 def _build_board_timing(
     config: RackConfig, layout: Layout, name: str, budget: Budget | None
 ) -> BoardTiming:
+    """Return the timing model's record of one board."""
     board = config.board[name]
     within_ms = None if board.budget is None else board.budget.plan_within_ms
     within_ns = None if within_ms is None else round(within_ms * NS_PER_MS)
@@ -138,8 +139,8 @@ def _build_board_timing(
 def _find_read_ticks(layout: Layout, board: str) -> dict[str, TickGrid]:
     """Return the ticks at which an executor reads messages, by their writer.
 
-    Writers whose messages it reads in every cycle are left out. If there are several ports, the one
-    that is read most rarely counts.
+    Writers whose messages it reads in every cycle are left out. If it reads a writer's messages at
+    several ports, the port that is read most rarely counts.
     """
     grids: dict[str, TickGrid] = {}
     for box in layout.mailboxes:
@@ -154,8 +155,8 @@ def compute_reservation(config: RackConfig, busy_ms: float, every: int) -> Reser
 
     Args:
         config: The config of the rack.
-        busy_ms: Processor time of one cycle by the budget, ms.
-        every: Period of the task, ticks.
+        busy_ms: Budgeted processor time of one cycle in ms.
+        every: Period of the task in ticks.
 
     Returns:
         None if the task runs by its priority instead.
@@ -201,7 +202,10 @@ def read_budgets(config: RackConfig) -> dict[str, Budget]:
 
 
 def replace_budgets(config: RackConfig, measured: Mapping[str, Budget]) -> RackConfig:
-    """Return a config with exactly these budgets, by board. Each `plan_within_ms` is kept."""
+    """Return a config whose budgets are replaced by the measured ones, given by board.
+
+    A board without a measured budget has none in the result. The others keep `plan_within_ms`.
+    """
     boards = {}
     for name, board in config.board.items():
         budget = None

@@ -14,7 +14,7 @@ from rack.backplane.bounded_toml import INTEGER_BITS, MAX_DEPTH, TOO_DEEP, TOO_L
 from rack.boards.errors import ConfigError, Mistake, format_value
 
 SETTING = re.compile(r"""((?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[^"'=\n])+)=([^\0]*)""")
-"""A setting "key.sub=value". Its key is in TOML, as in `protocol.mailbox."level.plan"=lock`."""
+"""Setting "key.sub=value" with a key in TOML, as in `protocol.mailbox."level.plan"=lock`."""
 FREE_FORM = ("params", "task")
 """Tables that levels declare. An empty list in them is a value and must be written."""
 
@@ -67,6 +67,7 @@ def to_toml(tables: Mapping[str, Any]) -> str:
 
 
 def _drop_empty_values(table: Mapping[str, Any]) -> Tables:
+    """Return a table without empty values, but with all values in tables that levels declare."""
     filled = {key: value for key, value in table.items() if value not in ({}, [], ())}
     return {
         key: value if key in FREE_FORM else _drop_empty_items(value)
@@ -75,6 +76,7 @@ def _drop_empty_values(table: Mapping[str, Any]) -> Tables:
 
 
 def _drop_empty_items(value: Any) -> Any:
+    """Drop the empty values from `value` if it is a table, or from the tables in it."""
     if isinstance(value, list | tuple):
         return [_drop_empty_items(item) for item in value]
     return _drop_empty_values(value) if isinstance(value, Mapping) else value
@@ -130,12 +132,16 @@ def _split_setting(setting: str) -> tuple[list[str], str]:
 
 
 def _parse_value(text: str) -> Any:
+    """Return the value of a TOML text, or the text itself if it is not TOML.
+
+    Raises `ConfigError` if the value is out of bounds.
+    """
     try:
         load_toml(f"value = {text}")
     except tomllib.TOMLDecodeError:
         return text.strip()
     except ValueError:
-        # The text is TOML, but its value is out of bounds: `parse` reports why.
+        # The text is TOML, but its value is out of bounds: `parse_tables` reports why.
         pass
     return parse_tables(f"value = {text}")["value"]
 

@@ -338,7 +338,10 @@ class AlarmConverter:
                 return ""
 
     def _format_previous_value(self, board: str, command: OperatorCommand) -> str:
-        """Return the value of a parameter before a command that sets it, as a clause."""
+        """Return the value of a parameter before a command that sets it, as a clause.
+
+        The new value is stored as the previous value for the next such command.
+        """
         try:
             key, value = read_setting(command.name)
         except LevelError:
@@ -354,4 +357,5 @@ class AlarmConverter:
         return select_item(self._layout.processes, number, "task").name if number >= 0 else other
 
     def _format_span(self, ticks: float) -> str:
+        """Return a number of ticks as text, followed by its simulated time in ms."""
         return f"{format_count(ticks, 'tick')} ({ticks * self._layout.clock_ns * 1e-6:g} ms)"

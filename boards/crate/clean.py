@@ -64,7 +64,7 @@ def remove_own_racks(rack: str | None = None, killed: Collection[int] = ()) -> N
 
     Args:
         rack: Name of a rack. None for all of them.
-        killed: Processes that this one has killed. The racks that they launched are removed too.
+        killed: Processes that this process has killed. Racks launched by them are removed too.
     """
     for name in list_racks() if rack is None else [rack]:
         with suppress(SegmentError):

@@ -71,7 +71,7 @@ Source = Connection | socket | int
 HOST_BOARD = "rack.boards.host.board"
 """Module that runs host programs. It is imported only in the processes of host boards."""
 HOST_PROCESSES = 4
-"""Processes that are not in the layout: Rack, crate, clock, recorder."""
+"""Number of processes that are not in the layout: Rack, crate, clock and recorder."""
 OUTPUT_PAUSE_S = 0.01
 """Time between two reads of a host board's output, so that endless output delays nothing else."""
 ORPHANS_S = 1.0
@@ -107,11 +107,12 @@ class Crate:
 
     @property
     def _segment(self) -> Segment:
+        """Segment of the present rack. It exists only while a rack is open."""
         assert self._opened is not None, "a rack is open"
         return self._opened
 
     def run(self) -> None:
-        """Serve requests until the Rack is gone, then make sure that no board is left."""
+        """Serve requests until the Rack closes the line or ends, then end all boards and copies."""
         while True:
             printing = [output for output in self._outputs.values() if output not in self._resting]
             readers = [output.reader for output in printing]
@@ -171,7 +172,7 @@ class Crate:
                 self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
 
     def _open_rack(self, opening: Open) -> None:
-        """Attach to a segment, and fill it if the rack continues from a snapshot."""
+        """Attach to a segment, and restore its content if the rack continues from a snapshot."""
         self._opened = segment = Segment.attach(opening.rack)
         note_used_files()
         set_priority(opening.priority)
@@ -183,7 +184,7 @@ class Crate:
         self._line.send(Opened(-1 if snapshot is None else snapshot.tick))
 
     def _power_on(self, name: str, wiring: TaskWiring | ClockWiring) -> None:
-        """Fork a task or the clock, or let its copy in the snapshot continue."""
+        """Fork a task or the clock, or let its copy in the snapshot continue instead."""
         self._wirings[name] = wiring
         copy = self._to_go_on.pop(name, None)
         if copy is not None and copy.can_continue_as(wiring):
@@ -197,12 +198,12 @@ class Crate:
             self._fork_board(name, lambda segment: run_task_board(segment, wiring, *lines))
             return
         if copy is not None:
-            # As after the loss of a clock, the new clock continues the run.
+            # The new clock continues the run, as after the loss of a clock.
             self._segment.words[System.STATE] = Run.RUNNING
         self._fork_board(name, lambda segment: run_clock_board(segment, wiring, *lines))
 
     def _take_note(self) -> None:
-        """Receive a note of a board about its copy."""
+        """Receive the note of a board that has forked a copy, and publish the new snapshots."""
         self._shelf.receive_note(self._wirings)
         self._publish_snapshots()
 
@@ -213,7 +214,10 @@ class Crate:
         words[System.SNAPSHOT_BYTES] = self._shelf.private_bytes
 
     def _preload_levels(self, request: Preload) -> None:
-        """Import and preload what the boards share. The Rack reports mistakes of the config."""
+        """Import and preload the levels that the boards share.
+
+        The crate ignores mistakes of the config, which the Rack reports.
+        """
         sys.path[:] = request.path
         compiled.on_compile = lambda function: self._line.send(Compiling(function))
         load_machine_code()
@@ -264,7 +268,7 @@ class Crate:
         self._watch_process(name, pid)
 
     def _report_fork_failure(self, name: str, why: str) -> None:
-        """Report a board that could not be forked as ended before it began."""
+        """Report that a board could not be forked. It counts as lost."""
         end = Ended(name, 0, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
         with suppress(OSError):
             self._line.send(ForkFailed(end, f"board '{name}' cannot be forked: {why}"))
@@ -278,9 +282,9 @@ class Crate:
             self._line.send(Forked(name, pid))
 
     def _kill_orphans(self) -> None:
-        """Kill the processes that an ended host board has started, in whatever session.
+        """Kill the processes that an ended host board has left behind, whatever their session.
 
-        Its end has made them children of the crate.
+        When it ended, they became children of the crate.
         """
         deadline = time.monotonic() + ORPHANS_S
         while time.monotonic() < deadline:
@@ -323,10 +327,11 @@ class Crate:
         return tick
 
     def _is_host(self, name: str) -> bool:
+        """Return True if this is the name of a host board."""
         return any(host.name == name for host in self._segment.layout.hosts)
 
     def _kill_boards(self, board: str | None = None) -> None:
-        """Kill a board, or all of them."""
+        """Kill the named board, or all boards."""
         for pidfd, (name, _) in self._boards.items():
             if board in (None, name):
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
@@ -364,10 +369,10 @@ class Crate:
                 continue
 
     def _reap_ended(self, timeout_s: float | None, *others: Source) -> Collection[object]:
-        """Wait for something to happen, reap boards that have ended, and receive notes on copies.
+        """Wait until something is ready, reap boards that have ended, and receive notes on copies.
 
         Args:
-            timeout_s: Longest time to wait, s. None to wait without a limit.
+            timeout_s: Longest time to wait in s. None to wait without a limit.
             others: Further objects to wait for.
 
         Returns:

@@ -1,6 +1,7 @@
 """The Rack's check for processes that hang: no progress for much longer than their period.
 
-In real time it checks only the clock, whose watchdog checks the tasks. In lockstep it checks all.
+In real time it checks only the clock, whose own watchdog checks the tasks. In lockstep it checks
+the clock and all tasks.
 """
 
 from __future__ import annotations
@@ -13,7 +14,10 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
 HEARTBEATS_MISSED = 4
-"""Ticks without progress after which the clock hangs. Three gave a false alarm in 24,000 ticks."""
+"""Ticks without progress after which the clock counts as hanging.
+
+Three ticks gave a false alarm in 24,000 ticks.
+"""
 LEAST_S = 2.0
 """Shortest time limit. The launcher has no real-time priority and may itself be late."""
 LOCKSTEP_S = 60.0
@@ -37,7 +41,7 @@ class Heartbeat:
         self._waited_at = -1
 
     def find_hanging(self) -> list[str]:
-        """Return the tasks found hanging since the last call. The system clock is "clock"."""
+        """Return the tasks that were newly found to hang. The system clock is called "clock"."""
         if self._words[System.STATE] != Run.RUNNING:
             return []
         now = time.monotonic()
@@ -50,7 +54,7 @@ class Heartbeat:
             progress[name] = done, is_idle
         blocks = self._blocks.values()
         awaits = any(block[Block.AWAITS] for block in blocks)
-        # In lockstep a tick of the clock may contain several cycles, which count as its progress.
+        # In lockstep a tick of the clock may contain several cycles, which also count as progress.
         ticks = self._words[System.TICK] + sum(block[Block.DONE] for block in blocks)
         progress[CLOCK] = ticks, self._words[System.HELD] or awaits
         hanging = []
@@ -69,7 +73,10 @@ class Heartbeat:
         return hanging
 
     def _clock_is_stuck(self) -> bool:
-        """Return True if a silent clock is stopped, dead or waiting, and not merely starved."""
+        """Return True if a clock without progress is stopped, dead or waiting.
+
+        A clock that is merely starved of processor time is not stuck.
+        """
         state = read_state(self._words[System.CLOCK_PID])
         tick = self._seen[CLOCK][0]
         # A waiting clock must be seen twice: after a pause of the whole machine it is woken soon.

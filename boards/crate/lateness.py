@@ -1,4 +1,4 @@
-"""Judgement on whether the tasks of a run kept up with the clock.
+"""Check whether the tasks of a run kept up with the clock.
 
 Every release without a finished cycle counts as a skipped cycle, whatever the reason: the task was
 late, or its board was dead, restarting, or not back before the end of the run.
@@ -20,20 +20,20 @@ from rack.boards.faults.kind import find_kind
 def judge_lost_cycles(
     segment: Segment, config: RackConfig, end: int
 ) -> tuple[list[str], list[str]]:
-    """Judge the cycles that each task missed or skipped.
+    """Find the tasks that missed or skipped more cycles than the config permits.
 
-    Without a trace it is not known which cycles an injected fault cost. Every task is therefore
-    excused as many lost cycles as were due from a fault's first effect to the end of its recovery,
-    by the bound of its kind. The remaining lost cycles are compared with the remaining cycles.
+    Without a trace it is not known which cycles an injected fault cost. Every task may therefore
+    lose as many cycles as were due between the first effect of a fault and the end of its recovery,
+    which the fault's kind bounds. The other lost cycles are compared with the other cycles.
 
     Args:
-        segment: Memory of the rack, whose boards have finished their last cycles.
+        segment: Segment of the rack. Its boards must have finished their last cycles.
         config: Config of the rack. Its `[supervision]` says how many cycles may be lost.
-        end: Length of the run, ticks.
+        end: Length of the run in ticks.
 
     Returns:
-        A line for each task that lost too many cycles, and a line for each task that would have
-        lost too many without the excuse.
+        A line for each task that lost too many cycles, and a line for each task that lost too many
+        only if cycles during faults and recoveries count as well.
     """
     late = []
     excused = []
@@ -82,12 +82,12 @@ def _count_releases(task: TaskSpec, spans: Iterable[tuple[int, int]]) -> int:
 def _count_permitted(due: int, fraction: float, plan: int) -> int:
     """Return how many of the due cycles may be lost.
 
-    The fraction is rounded up, so that one late cycle or plan does not fail a short run. Not all
-    cycles may be lost, however.
+    The fraction is rounded up, so that one late cycle or plan does not fail a short run. A run in
+    which all cycles are lost fails nevertheless, unless the fraction is 1.
 
     Args:
         due: Number of cycles that were due.
-        fraction: Fraction of them that may be lost. 1 permits all.
+        fraction: Fraction of them that may be lost.
         plan: Number of cycles that one late plan costs.
     """
     most = plan * math.ceil(fraction * due / plan)

@@ -41,7 +41,7 @@ def check_realtime(plan: Resolved, segment: Segment) -> None:
 
 
 def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
-    """Yield what a launch reports: replaced cores, refused priorities and other limits."""
+    """Yield the notes of a launch on replaced cores, refused priorities and other limits."""
     config = plan.config
     yield from (*config.format_notes, *list_replaced_cores(config))
     if (network := load_network_rules(config)) is not None:
@@ -75,7 +75,10 @@ def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
 
 
 def _find_refusal(plan: Resolved, segment: Segment) -> str:
-    """Return which tasks were refused their priority. Empty if none, or in lockstep."""
+    """Return a clause that names the tasks whose real-time priority was refused.
+
+    It is empty if there are none, or in lockstep.
+    """
     refused = [
         task.name
         for task in plan.layout.tasks
@@ -87,7 +90,7 @@ def _find_refusal(plan: Resolved, segment: Segment) -> str:
 
 
 def _list_reservations(plan: Resolved, segment: Segment) -> Iterator[str]:
-    """Yield which tasks have a reservation, on which cores, and which were refused one."""
+    """Yield clauses on which tasks have reserved processor time and which were refused it."""
     blocks = {
         task.task: segment.get_block(task.task)
         for task in plan.tasks

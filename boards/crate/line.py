@@ -40,14 +40,14 @@ END_S = 1.0
 LEAVE_S = 10.0
 """Longest time that a crate takes to leave a rack. It may still be importing."""
 NO_WINDOWS = {"MUJOCO_GL": "disable"}
-"""Setting that stops MuJoCo from starting a process that looks for OpenGL, which nobody needs."""
+"""Setting that stops MuJoCo from starting a process that looks for OpenGL. Boards do not draw."""
 
 
 class CrateLine:
     """A running crate: connection, notifications and output of its boards.
 
-    A `Rack` closes the line that it is given. As a context, the line also closes if no Rack was
-    created.
+    A `Rack` closes the line that it is given. Use the line as a context to close it also if no Rack
+    is created.
 
     Attributes:
         line: Connection to the crate.
@@ -99,14 +99,17 @@ class CrateLine:
         return [text for line in lines for text in line.decode(errors="replace").splitlines()]
 
     def send_request(self, request: object) -> None:
-        """Send a request to the crate. If it is gone, raises `LaunchError` with its output."""
+        """Send a request to the crate. Raise `LaunchError` with its output if it has ended."""
         try:
             self.line.send(request)
         except OSError:
             raise LaunchError("\n".join(self.read_output()) or "the crate has ended") from None
 
     def try_request(self, request: object) -> None:
-        """Send a request to the crate, or nothing if it is gone: `receive` will notice that."""
+        """Send a request to the crate. Do nothing if the crate is gone.
+
+        In that case `receive_message` returns None.
+        """
         with suppress(LaunchError):
             self.send_request(request)
 
@@ -118,7 +121,7 @@ class CrateLine:
         """Close the line, so that the crate ends its boards and itself.
 
         Args:
-            timeout_s: Time after which the crate is killed, s.
+            timeout_s: Time in s after which the crate is killed.
         """
         if self._is_closed:
             return
@@ -136,7 +139,8 @@ class CrateLine:
 class WarmCrate(CrateLine):
     """Crate for several racks in succession, which keeps what it has imported and compiled.
 
-    When a Rack closes it, it only leaves that rack. Its owner ends it by `end` or as a context.
+    When a Rack closes it, it only leaves that rack. Its owner ends it by `end_crate` or by using it
+    as a context.
 
     Attributes:
         is_last: Whether it ends together with its present rack.
@@ -151,11 +155,17 @@ class WarmCrate(CrateLine):
 
     @property
     def is_over(self) -> bool:
-        """Whether the crate has ended, also because it did not leave a rack in time."""
+        """Whether the crate has ended, for instance because it did not leave a rack in time."""
         return self._is_closed
 
     def close(self, timeout_s: float) -> None:
-        """Make the crate end the boards of its rack, and wait until none is left."""
+        """Make the crate end the boards of its rack, and wait until it has done so.
+
+        If `is_last` is set, the crate itself ends as well.
+
+        Args:
+            timeout_s: Time in s after which a crate that ends is killed.
+        """
         if self._is_closed:
             return
         if self.is_last:

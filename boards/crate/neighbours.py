@@ -45,7 +45,7 @@ class Holder:
 
 
 def find_holders(ignored: str) -> dict[int, Holder]:
-    """Return the rack that occupies each core. The rack named `ignored` does not count."""
+    """Return the rack that occupies each core. The rack called `ignored` is left out."""
     occupied: dict[int, Holder] = {}
     for name in list_racks():
         if name == ignored:

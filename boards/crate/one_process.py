@@ -9,8 +9,9 @@ Use it to test your own level, or to measure the work of the levels without the 
         assert rack.newest("power.status").energy > 0.0
 
 Levels, ports and delays are those of the resolved config. As under protocol time-slice, the tick
-alone determines when a message becomes visible. Every level therefore reads and does the same as in
-a rack in lockstep. There is no clock, shared memory, check or trace, and no commands or faults.
+alone determines when a message becomes visible. Every level therefore reads the same messages and
+acts in the same way as in a rack in lockstep. There is no clock, shared memory, check or trace, and
+there are no commands or faults.
 """
 
 from __future__ import annotations
@@ -146,11 +147,11 @@ class PrivateMailbox:
         self.kept: deque[tuple[int, int, bytes]] = deque(maxlen=spec.delay // spec.every + 2)
 
     def write(self, tick: int, cycle: int) -> None:
-        """Write the message, if the present cycle is one that writes it.
+        """Store the message if the mailbox is due at the end of the present cycle.
 
         Args:
             tick: Tick at which the cycle was released.
-            cycle: Length of the cycle, ticks.
+            cycle: Length of the cycle in ticks.
         """
         if not (tick + cycle - self.spec.phase) % self.spec.every:
             self.serial += 1
@@ -165,7 +166,7 @@ class PrivateMailbox:
 
 
 class PrivateReader:
-    """Reader of a `Post`, which returns messages with verdicts as a board's reader does."""
+    """Reader of a `PrivateMailbox`. It returns messages with verdicts as a board's reader does."""
 
     def __init__(self, post: PrivateMailbox, kind: type[Message]) -> None:
         self._post = post
@@ -225,10 +226,12 @@ class PrivateTask:
         self.cycle = self._run_executor if isinstance(level, Executor) else self._run_planner
 
     def _add_reader(self, values: dict[str, Any], key: str, reader: PrivateReader) -> None:
+        """Add a reader whose newest reading is stored as `values[key]`."""
         values[key] = reader.read(-1)
         self._readers.append((values, key, reader.read))
 
     def _run_executor(self, tick: int) -> None:
+        """Run the cycle of an executor that is released at `tick`."""
         self._read_inputs(tick)
         assert isinstance(self.level, Executor), "a planner plans"
         self.level.process(tick)
@@ -236,6 +239,7 @@ class PrivateTask:
         self._write_outputs(tick)
 
     def _run_planner(self, tick: int) -> None:
+        """Make a plan if the time slice of the last plan is over and the planner wants to plan."""
         if tick < self._busy_until:
             return
         self._read_inputs(tick)
@@ -246,9 +250,11 @@ class PrivateTask:
             self._write_outputs(tick)
 
     def _read_inputs(self, tick: int) -> None:
+        """Store the reading of every input in the table of its port."""
         for values, key, read in self._readers:
             values[key] = read(tick)
 
     def _write_outputs(self, tick: int) -> None:
+        """Write all mailboxes that are due at the end of this cycle."""
         for post in self._posts:
             post.write(tick, self.spec.every)

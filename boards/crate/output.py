@@ -9,7 +9,7 @@ from contextlib import suppress
 MOST_LINES = 10_000
 """Largest number of lines of one host board that a run keeps."""
 LONGEST_LINE = 1000
-"""Longest line, bytes. The rest of a longer line becomes another line."""
+"""Longest line in bytes. The rest of a longer line becomes another line."""
 MOST_READ = 1 << 16
 _LINE = re.compile(rb"[^\n]{%d}\n?|[^\n]*\n" % LONGEST_LINE)
 
@@ -42,10 +42,10 @@ class HostOutput:
         os.close(self.writer)
 
     def copy_output(self, is_over: bool = False) -> None:
-        """Copy new output. Each time that the number of dropped lines has doubled, print it.
+        """Copy new output, and report the number of dropped lines each time it has doubled.
 
         Args:
-            is_over: Whether the board has ended, so that an incomplete line is complete.
+            is_over: Whether the board has ended, so that an incomplete last line is complete.
         """
         with suppress(BlockingIOError):
             self._rest += os.read(self.reader, MOST_READ)

@@ -15,7 +15,7 @@ from rack.boards.lan.awaited import find_waits
 COMPILE_S = 300.0
 """Time limit for compiling one function: thirty times the longest on an idle machine."""
 PATIENCE_S = 2.0
-"""Time after which a wait is reported. It is reported again each time that it has doubled."""
+"""Time after which a wait is reported. The report is repeated each time the wait has doubled."""
 
 
 class ReportedWait:
@@ -23,7 +23,7 @@ class ReportedWait:
 
     Args:
         journal: Journal to which a long wait is reported.
-        limit_s: Longest time to wait, s.
+        limit_s: Longest time to wait in s.
     """
 
     def __init__(self, journal: Journal, limit_s: float) -> None:
@@ -39,7 +39,7 @@ class ReportedWait:
 
     @property
     def left_s(self) -> float:
-        """Time until the next report is due or the time limit is reached, s."""
+        """Time in s until the next report is due or the time limit is reached."""
         return max(0.0, min(self._report_s, self._limit_s) - self._waited_s)
 
     def restart_limit(self, limit_s: float) -> None:
@@ -55,11 +55,12 @@ class ReportedWait:
 
     @property
     def _waited_s(self) -> float:
+        """Time in s since the wait began."""
         return time.monotonic() - self._began
 
 
 class PeerWaitReporter:
-    """Reports of adapters that wait for another rack in lockstep, which has no time limit."""
+    """Reports adapters that wait for another rack in lockstep. Such waits have no time limit."""
 
     def __init__(self, segment: Segment, journal: Journal) -> None:
         self._segment = segment
@@ -83,7 +84,7 @@ def await_open_segment(crate: CrateLine, journal: Journal, limit_s: float) -> in
     Args:
         crate: The crate.
         journal: Journal to which a long wait is reported.
-        limit_s: Time limit for each class, s.
+        limit_s: Time limit in s for each class.
 
     Returns:
         Tick of the snapshot from which the rack continues. -1 without one.

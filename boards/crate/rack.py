@@ -147,7 +147,7 @@ class Rack:
         shared = find_conflicts(self.config, occupied)
         if shared and not self._share:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
-        # Report occupied cores first, because the next steps take long on them.
+        # Report shared cores first, because the next steps take long on them.
         for note in shared:
             self._journal.add_event("waiting", "", note)
         self._crate = crate = self._crate or CrateLine()
@@ -158,7 +158,7 @@ class Rack:
         )
         plan = resolve(self.config).for_run(self._repeats, self._entries)
         if self._snapshots is not None:
-            # In a replay the wiring contains what came from outside.
+            # In a replay the wiring contains the recorded messages from outside.
             why = "" if plan.is_replay else self.config.outside_state
             if self.config.clock.mode != "lockstep":
                 why = "they are taken in lockstep; add --lockstep"
@@ -214,7 +214,7 @@ class Rack:
             desk.add_request(request_entry)
 
     def take_over_events(self, events: Iterable[Event]) -> None:
-        """Take over events of the continued run from before its snapshot.
+        """Add the events of the continued run from before its snapshot to those of this run.
 
         The outcome of this run counts them.
         """
@@ -224,7 +224,7 @@ class Rack:
         """Power on the clock, which begins the run.
 
         Args:
-            seconds: Simulated time that the run lasts, s. None to run until the task ends.
+            seconds: Simulated time in s that the run lasts. None to run until the task ends.
         """
         supervisor = self._supervisor
         plan = supervisor.plan
@@ -271,6 +271,7 @@ class Rack:
         self._thread.start()
 
     def _supervise(self) -> None:
+        """Supervise the boards until the run ends. This runs in the background thread."""
         try:
             while self.watch(WATCH_S):
                 continue
@@ -283,7 +284,7 @@ class Rack:
         """Wait until the run in the background is over.
 
         Args:
-            timeout_s: Longest time to wait, s. None to wait without a limit.
+            timeout_s: Longest time to wait in s. None to wait without a limit.
 
         Returns:
             The outcome. None if the run is not over.
@@ -298,7 +299,7 @@ class Rack:
         return self.outcome
 
     def watch(self, timeout_s: float) -> bool:
-        """Supervise the boards for `timeout_s` or until the run ends. Return False if it has."""
+        """Supervise the boards for up to `timeout_s`. Return False if the run has ended."""
         return self._supervisor.watch(timeout_s)
 
     def stop(self, why: str = "stopped by its program") -> None:
@@ -329,7 +330,7 @@ class Rack:
         return OperatorTable(self.segment).add_request(entry)
 
     def close(self) -> None:
-        """End the rack. No process and no segment of it is left."""
+        """End the rack. No process and no segment is left behind."""
         atexit.unregister(self.close)
         if (crate := self._crate) is None:
             return
@@ -356,6 +357,7 @@ class Rack:
 
     @property
     def _supervisor(self) -> Supervisor:
+        """Supervisor of the rack. It exists from the launch on."""
         assert self._launched is not None, "the rack is launched"
         return self._launched
 

@@ -67,9 +67,9 @@ class RestartPolicy:
         return f"restart {len(recent) + 1} of at most {most} in {within_s:g} s"
 
     def sort_by_dependency(self, tasks: list[str]) -> list[str]:
-        """Return the tasks in the order of restart.
+        """Return the tasks in the order in which they must be restarted.
 
-        The clock comes first, lower levels come before higher ones, executors before planners.
+        The clock comes first, lower levels come before higher ones, and executors before planners.
         """
         # A task has more dependencies than any task it depends on, so sorting by count is enough.
         return sorted(tasks, key=lambda task: len(self._needs[task]))
@@ -165,19 +165,24 @@ class Recovery:
         self._record_giving_up(name, text, is_host)
 
     def record_crate_loss(self) -> None:
-        """Record the end of the crate, with which all boards have ended."""
+        """Record that the crate, and with it every board, has ended."""
         self.is_beyond_help = True
         text = "the crate ended, and all boards with it"
         self._journal.add_event("died", "crate", text, "died")
         self._record_giving_up("crate", text)
 
     def report_hanging(self, board: str, why: str = "") -> None:
-        """Record that a board hangs, followed by `why`."""
+        """Record that a board hangs.
+
+        Args:
+            board: Name of the board.
+            why: Text appended to the event, with its separator, as in ": stopped by a signal".
+        """
         text = f"'{board}' is not responding{why}"
         self._journal.add_event("detection", "rack", text, "hang", subject=board)
 
     def kill_hanging(self, board: str) -> None:
-        """Kill a hanging board, so that it is lost, unless it is already being restarted."""
+        """Kill a hanging board, unless it is already being restarted. It then counts as lost."""
         if board not in (*self._waiting, *self._starting):
             self._crate.try_request(PowerOff(board))
 
@@ -205,11 +210,18 @@ class Recovery:
                 self._crate.try_request(PowerOff(name))
 
     def _find_printed_reason(self, board: str) -> str:
-        """Return the last reason that a board has printed. Empty if it has printed none."""
+        """Return the reason that a board printed last. Empty if it has printed none."""
         printed = (event.text for event in reversed(self._journal.events))
         return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
 
     def _record_giving_up(self, board: str, text: str, is_host: bool = False) -> None:
+        """Record that a board, or the crate, was given up.
+
+        Args:
+            board: Name of the board, or "crate".
+            text: The reason, which becomes a fault of the run.
+            is_host: Whether it is a host board, whose loss the run survives.
+        """
         self.faults.append(text)
         self.given_up |= not is_host
         self._journal.add_event("reaction", board, f"gave up on '{board}'", "given_up")

@@ -56,7 +56,7 @@ class Open:
 
 @dataclass(frozen=True)
 class HogWiring:
-    """Wiring of a hog, which occupies a core: the index of its entry in the fault table."""
+    """Wiring of a hog, a process that occupies a core: index of its fault in the fault table."""
 
     entry: int
 
@@ -160,7 +160,7 @@ class Ended:
         name: Name of the board.
         pid: The process.
         status: Exit status. Negative for a signal, as in `subprocess`.
-        seen_ns: Time at which the crate noticed the end, CLOCK_MONOTONIC, ns.
+        seen_ns: CLOCK_MONOTONIC time in ns at which the crate noticed the end.
         tick: Tick at which the board was lost.
     """
 

@@ -22,7 +22,7 @@ from rack.boards.wiring import ClockWiring, TaskWiring
 
 MOST_SNAPSHOTS = 32
 MEMORY_PART = 4
-"""Snapshots may use the machine's memory divided by this number."""
+"""Snapshots may use this part of the machine's memory: 1 / `MEMORY_PART`."""
 SHOW_S = 10.0
 """Longest wait for a copy that reports the attributes of its level."""
 Wiring = TaskWiring | ClockWiring
@@ -30,7 +30,7 @@ Wiring = TaskWiring | ClockWiring
 
 @dataclass
 class WaitingCopy:
-    """Waiting copy of one process.
+    """Copy of one process that waits to continue from a snapshot.
 
     Attributes:
         wiring: Wiring of the process.
@@ -53,7 +53,9 @@ class WaitingCopy:
         return before == wiring
 
     def continue_as(self, wiring: Wiring, rack: str) -> int:
-        """Let the copy continue as a board of a rack. Its successor reports by a note later.
+        """Let the copy continue as a board of a rack.
+
+        The waiting copy that replaces it reports later by a note.
 
         Args:
             wiring: Wiring with the context that its level gets.
@@ -90,7 +92,7 @@ class HeldSnapshot:
         tick: The tick.
         copies: Copies of all processes, by name.
         memory: Descriptor of a file with a copy of the segment. -1 until it is received.
-        private_bytes: Memory that the snapshot does not share, at the last measurement.
+        private_bytes: Memory that it does not share with other processes, as last measured.
         is_whole: Whether all copies are present.
     """
 
@@ -134,6 +136,7 @@ class SnapshotShelf:
 
     @property
     def _whole_snapshots(self) -> list[HeldSnapshot]:
+        """Snapshots with copies of all processes, in the order in which they were taken."""
         return [snapshot for snapshot in self._snapshots if snapshot.is_whole]
 
     def receive_note(self, wirings: Mapping[str, Wiring]) -> None:
@@ -190,6 +193,7 @@ class SnapshotShelf:
         candidates = [old for old in older if old.tick != ticks[0] and old is not held[-1]]
 
         def gap(snapshot: HeldSnapshot) -> int:
+            """Return the ticks between the snapshots before and after this one."""
             at = ticks.index(snapshot.tick)
             return ticks[min(at + 1, len(ticks) - 1)] - ticks[at - 1]
 
@@ -200,7 +204,7 @@ class SnapshotShelf:
 
     @property
     def private_bytes(self) -> int:
-        """Memory that all snapshots together do not share, bytes."""
+        """Memory in bytes that the snapshots do not share with other processes, in total."""
         return sum(snapshot.private_bytes for snapshot in self._whole_snapshots)
 
     @property

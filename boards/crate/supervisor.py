@@ -44,7 +44,7 @@ class Supervisor:
         recovery: Recovery of lost boards.
         alarms: Reader of the boards' alarms.
         pids: Processes of the boards, by name.
-        is_armed: Whether the emergency stop, which is set at first, was reset.
+        is_armed: Whether the emergency stop, which is set at the launch, has been reset.
         outcome: Outcome of the run. None while it lasts.
     """
 
@@ -70,7 +70,7 @@ class Supervisor:
         """Wait until all boards have passed their self-tests.
 
         Args:
-            limit_s: Time limit, s.
+            limit_s: Time limit in s.
 
         Raises:
             LaunchError: A board failed, or the time limit is exceeded.
@@ -89,7 +89,7 @@ class Supervisor:
             patience.report_if_due(f"boards {', '.join(absent)} are starting")
 
     def watch(self, timeout_s: float) -> bool:
-        """Supervise the boards for `timeout_s` or until the run ends. Return False if it has."""
+        """Supervise the boards for up to `timeout_s`. Return False if the run has ended."""
         deadline = time.monotonic() + timeout_s
         while self.outcome is None:
             self._wait_for_messages(min(deadline, self._stop_by or deadline) - time.monotonic())
@@ -138,13 +138,14 @@ class Supervisor:
         self.segment.words[System.STATE] = Run.STOPPED
 
     def _record_printed(self) -> None:
+        """Record each line that boards have printed as an event."""
         for line in self._crate.read_output():
             self._journal.add_event(
                 "ready" if line.startswith(NO_SNAPSHOTS_PREFIX) else "printed", "", line
             )
 
     def _wait_for_messages(self, timeout_s: float) -> None:
-        """Wait for a message of the crate or an alarm, at most `timeout_s`."""
+        """Wait up to `timeout_s` for an alarm or a message of the crate, and handle the message."""
         attention = self._crate.attention
         for ready in wait([self._crate.line, attention], timeout_s):
             if ready == attention:
@@ -153,6 +154,7 @@ class Supervisor:
                 self._handle_message()
 
     def _handle_message(self) -> None:
+        """Receive a message of the crate and act on it."""
         message = self._crate.receive_message()
         if isinstance(message, ForkFailed):
             if self.segment.words[System.STATE] == Run.STARTING:
@@ -229,6 +231,7 @@ class Supervisor:
         )
 
     def _is_cycling(self, name: str) -> bool:
+        """Return True if a board is still in a cycle that it can finish."""
         if self.recovery.is_beyond_help or name not in self.segment.map.blocks:
             return False
         block = self.segment.get_block(name)
@@ -236,4 +239,5 @@ class Supervisor:
 
     @property
     def _is_stopped(self) -> bool:
+        """Whether the run has stopped."""
         return self.segment.words[System.STATE] == Run.STOPPED

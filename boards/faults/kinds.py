@@ -50,7 +50,7 @@ _torque = partial(
 def _joint_parameter(drawn: draw.Draw = draw.draw_joint, default: float = 0) -> Parameter:
     """Return the parameter that selects a joint."""
     return Parameter(
-        "joint", "1", "joint, counted from 0; -1: all", default, -1, 15, is_whole=True, drawn=drawn
+        "joint", "1", "joint, counted from 0 (-1: all)", default, -1, 15, is_whole=True, drawn=drawn
     )
 
 
@@ -123,7 +123,13 @@ KINDS.add(
                 drawn=draw.uniform_number(1.2, 2.5),
             ),
             Parameter(
-                "random", "1", "1: uniform between 0 and by; 0: always by", 0, 0, 1, is_whole=True
+                "random",
+                "1",
+                "1 for a delay drawn uniformly from 0 to `by`, 0 for always `by`",
+                0,
+                0,
+                1,
+                is_whole=True,
             ),
         ),
         detected_as=(Alarm.LATE, Alarm.STARVED),

@@ -23,7 +23,7 @@ class Adapter(Executor):
     """
 
     wired_by: ClassVar[str]
-    """Key of its board that lists its ports."""
+    """Key of its board's table that lists its ports."""
     joins_sides: ClassVar[bool] = False
     """Whether it connects the real-time side with host boards and reads mailboxes of both."""
 
@@ -50,11 +50,12 @@ class Adapter(Executor):
         return {}
 
     def attach_segment(self, segment: Segment, entries: ExchangedEntries | None) -> None:
-        """Receive the segment. This is called before the self-test.
+        """Open what the adapter needs in the segment. The board calls this before the self-test.
 
         Args:
             segment: Segment of the rack.
-            entries: In a replay, the recorded messages that replace the outside. Otherwise None.
+            entries: In a replay, the recorded messages that replace those from outside. Otherwise
+                None.
         """
 
     def open_connections(self) -> None:

@@ -33,7 +33,7 @@ FAILED_STATUS = 1
 def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output: int) -> int:
     """Run the program of a host board in this process, which becomes the leader of a session.
 
-    Orphans of its children become its children, and children of the crate when it ends. The crate
+    It adopts the orphans of its children. When it ends, they become children of the crate, which
     kills them.
 
     Args:
@@ -66,7 +66,7 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
             return _report_failure(wiring.board, end)
     except Exception as error:
         return _report_failure(wiring.board, error)
-    bus.declare_done()
+    bus.finish()
     return 0
 
 
@@ -87,6 +87,7 @@ def _open_bus(segment: Segment, wiring: HostWiring) -> HostBus:
 
 
 def _exit_on_signal(number: int, frame: FrameType | None) -> None:
+    """Raise `SystemExit` in the program that a signal interrupts."""
     raise SystemExit(f"ended by {signal.Signals(number).name}")
 
 

@@ -21,7 +21,7 @@ from rack.levels.host_program import HostProgram
 WORD = 8
 """Bytes of a word of the crate's memory."""
 LONGEST_S = 1e9
-"""Longest time-out of a paced program, s. Longer ones are reduced to it."""
+"""Longest time-out of a paced program in s. Longer time-outs are reduced to it."""
 
 
 class BusReceiver:
@@ -52,6 +52,7 @@ class BusSender:
         self._clear_message()
 
     def _clear_message(self) -> None:
+        """Clear the message. If messages have an id, set that of the next message."""
         self.message.clear()
         if COMMAND_ID in (self.message.record.dtype.names or ()):
             self.message.id = self.sent + 1
@@ -111,7 +112,7 @@ class HostBus:
         self.block[Block.STATE] = TaskState.RUNNING
 
     def connect_ports(self, program: HostProgram) -> None:
-        """Set the ports of a program to objects that receive and send its messages."""
+        """Give a program the objects through which its ports receive and send messages."""
         ports = vars(program)
         for port, mailbox in self._wiring.inputs.items():
             self._segment.message_classes[mailbox] = program.inputs[port].message
@@ -126,7 +127,7 @@ class HostBus:
 
     @property
     def time_s(self) -> float:
-        """Time since an arbitrary moment, s. For a paced program it is simulated time."""
+        """Time in s since an arbitrary moment. For a paced program it is simulated time."""
         return self.tick * self._wiring.context.tick_s if self._is_paced else time.monotonic()
 
     @property
@@ -135,7 +136,14 @@ class HostBus:
         return self._segment.run_is_over
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until a message arrives. Return False after the time-out or the end of the run."""
+        """Wait until a message arrives.
+
+        Args:
+            timeout_s: Longest time to wait in s. For a paced program it is simulated time.
+
+        Returns:
+            False after the time-out or at the end of the run.
+        """
         if self._is_paced:
             ticks = round(min(timeout_s, LONGEST_S) / self._wiring.context.tick_s)
             self.block[Block.WAITS_UNTIL] = self.tick + max(1, ticks)
@@ -164,7 +172,7 @@ class HostBus:
             self._semaphore.acquire(CHECK_S)
 
     def _end_turn(self) -> None:
-        """Let the adapter continue its cycle."""
+        """End the program's turn, so that the adapter continues its cycle."""
         block = self.block
         block[Block.DEADLINE] = self.tick + self._wiring.computing
         block[Block.DONE] = block[Block.RELEASED]
@@ -175,11 +183,11 @@ class HostBus:
         """Names of the crate's tasks."""
         return [task.name for task in self._segment.layout.tasks]
 
-    def find_address(self, name: str) -> int:
+    def address(self, name: str) -> int:
         """Return the bus address of a mailbox, or of the control block of a task.
 
         Raises:
-            LookupError: The bus has neither of this name.
+            LookupError: No mailbox and no task has this name.
         """
         places = self._segment.map
         known = {**places.blocks, **places.mailboxes}
@@ -187,7 +195,7 @@ class HostBus:
             raise LookupError(f"nothing on the bus is called '{name}'; known: {', '.join(known)}")
         return known[name]
 
-    def read_words(self, address: int, count: int = 1) -> list[int]:
+    def words(self, address: int, count: int = 1) -> list[int]:
         """Read words of the crate's memory.
 
         Args:
@@ -206,8 +214,8 @@ class HostBus:
             )
         return list(self._words[address // WORD : last // WORD])
 
-    def declare_done(self) -> None:
-        """Record that the program is finished, as its return does."""
+    def finish(self) -> None:
+        """Record that the program is finished, as happens when its `run` returns."""
         self.block[Block.STATE] = TaskState.ENDED
         if self._is_paced:
             self._end_turn()
@@ -220,6 +228,7 @@ class HostBus:
 
 
 def _claim_board(segment: Segment, board: str) -> ByteLock:
+    """Claim a host board. Raises `MailboxError` if another process has claimed it."""
     claim = ByteLock(segment.fd, segment.map.blocks[board] + WORD * Block.PID)
     if not claim.take():
         claim.close()

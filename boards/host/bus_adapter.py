@@ -1,7 +1,7 @@
 """The bus adapter between the real-time side and host boards, also called bridge.
 
 A bridge is an ordinary board with a rate and a priority. Each entry of its table passes one mailbox
-to the other side; the side of the source determines the direction.
+to the other side. The side of the source mailbox determines the direction.
 
 Into real time, the bridge takes messages from the ring of a host board, checks them, and writes
 them to its mailbox `<bridge>.<port>`. Levels read that mailbox at ticks like any other, so that
@@ -82,7 +82,7 @@ class BusAdapter(Adapter):
     def build_ports(
         cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
     ) -> ConfiguredPorts:
-        """Return the ports that the entries add: an input and an output each, and the status.
+        """Return an input and an output port for each entry, and the output port of the status.
 
         Args:
             params: Parameters of the adapter's board.
@@ -94,8 +94,8 @@ class BusAdapter(Adapter):
             port: Input(types.get(entry.source, AdapterEntry), entry.source)
             for port, entry in entries.items()
         }
-        # Messages that are passed once must be queued. Messages to host boards the bridge writes
-        # itself.
+        # Messages that are passed exactly once need a queue. The bridge itself writes the messages
+        # to host boards.
         outputs = {
             port: (QueuedOutput if entry.asynchronous else Output)(
                 types[entry.source], rests_on=inputs[port]
@@ -109,7 +109,10 @@ class BusAdapter(Adapter):
 
     @classmethod
     def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return the ports with messages of host boards, and the status."""
+        """Return the ports with messages of host boards, and the status.
+
+        The arguments and the result are those of `Adapter.list_replayed_ports`.
+        """
         hosts = {host.name for host in layout.hosts}
         sent = {
             port: entry.asynchronous
@@ -159,7 +162,7 @@ class BusAdapter(Adapter):
             self._statuses = ReplayedEntry(entries[STATUS], STATUS, is_sent=False)
 
     def process(self, tick: int) -> None:
-        """Exchange the entries that are due. In lockstep, let programs run afterwards."""
+        """Exchange messages of all due entries. In lockstep, then run the programs that are due."""
         for port, message in self._before.items():
             out = self.ports[port]
             (out.message if isinstance(out, Sender) else out).raw[:] = message
@@ -176,6 +179,7 @@ class BusAdapter(Adapter):
             self._write_status(self.ports[STATUS], tick)
 
     def _write_status(self, status: Status, tick: int) -> None:
+        """Write the counters and the state of the host boards to the status."""
         for port, count in self._counts.items():
             count.write_counts(getattr(status, port), tick)
         states = {name: block[Block.STATE] for name, block in self._hosts.items()}
@@ -185,7 +189,7 @@ class BusAdapter(Adapter):
         status.error = 0
         status.reason = ""
         if lost:
-            # This comes first, because in lockstep the Rack may give a board up at any moment, and
+            # Report the loss first: in lockstep the Rack may give a board up at any moment, and
             # only the clock's confirmation comes at a determined tick.
             status.state = State.HOLDING
             status.reason = f"host board '{lost[0]}' is lost: it is being restarted"

@@ -21,14 +21,14 @@ from rack.boards.wiring import EntityRows
 from rack.levels.tables import LAST_TICK, Table
 
 NEVER = -1
-"""Tick in place of one when nothing has happened yet."""
+"""Value in place of a tick for something that has not happened yet."""
 PORT = re.compile(r"[a-z][a-z0-9_]*")
 RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clear", "copy_from")
 """Names that no port may have, because the status of an adapter has fields of these names."""
 
 
 def declare_counter(doc: str) -> Any:
-    """Declare a counter among the fields of an adapter's status. `doc` is its meaning."""
+    """Return the declaration of a counter in an adapter's status. `doc` is its meaning."""
     return field("u4", unit="1", doc=doc)
 
 
@@ -45,9 +45,9 @@ class AdapterEntry(Message, version=1):
     )
     waiting: int = declare_counter("messages that wait for the next cycles")
     arrived: int = field(
-        unit="tick", doc="tick at which the newest message reached the other side; -1: none yet"
+        unit="tick", doc="tick at which the newest message reached the other side (-1: none yet)"
     )
-    age: int = field(unit="tick", doc="time since that message was written; -1: none yet")
+    age: int = field(unit="tick", doc="time since that message was written (-1: none yet)")
 
 
 _COUNTED = ("passed", "refused", "superseded", "full", "waiting", "arrived")
@@ -69,6 +69,7 @@ class EntryConfig(Table):
 
     @model_validator(mode="after")
     def _check_mode(self) -> Self:
+        """Check that `phase` is below `every`, and that asynchronous entries have `every` = 1."""
         if self.phase >= self.every:
             raise ValueError(f"phase = {self.phase}: must be less than every, {self.every}")
         if self.asynchronous and self.every > 1:
@@ -90,6 +91,7 @@ class AdapterParams(Table):
 
     @model_validator(mode="after")
     def _check_ports(self) -> Self:
+        """Check that all names of ports are valid and differ from the fields of a status."""
         for port in self.entries:
             if not PORT.fullmatch(port) or port in RESERVED:
                 why = f"valid: a-z, 0-9 and _, except {', '.join(RESERVED)}"
@@ -122,7 +124,7 @@ class EntryCounters:
     written: int = NEVER
 
     def restore_counts(self, record: Any, tick: int) -> None:
-        """Take over the counters from the status of an earlier cycle.
+        """Restore the counters from the status of an earlier cycle.
 
         Args:
             record: The entry's group of fields in that status.
@@ -151,7 +153,7 @@ class EntryCounters:
 
 
 class InwardEntry:
-    """Entry into real time: from the ring of a host board to a mailbox of the adapter.
+    """Entry that passes messages from the ring of a host board to a mailbox of the adapter.
 
     Levels read that mailbox at ticks.
 
@@ -205,9 +207,9 @@ class InwardEntry:
 
 
 class OutwardEntry:
-    """Entry out of real time: from a level's mailbox to one that host boards read.
+    """Entry that passes messages of a level to a mailbox that host boards read.
 
-    The host boards are woken.
+    Each exchange wakes these host boards.
 
     Args:
         segment: Segment of the rack.
@@ -261,7 +263,7 @@ def read_last_written(segment: Segment, mailbox: str) -> tuple[AnyMessage | None
     """Return the newest message of a mailbox and the tick at which it was written.
 
     Returns:
-        None and `NEVER` if the mailbox is empty.
+        The message and the tick, or None and `NEVER` if the mailbox is empty.
     """
     observer = open_observer(segment, mailbox)
     reading = observer.peek()
@@ -272,7 +274,7 @@ class ReplayedEntry:
     """Entry in a replay: writes the messages of the recorded run again, at the same ticks.
 
     Args:
-        rows: Tick, basis and content of each recorded message.
+        rows: Recorded messages. See `rack.boards.wiring.EntityRows`.
         port: Port of the adapter.
         is_sent: Whether messages are sent one by one, in order, and none may be repeated.
         since: Tick up to which messages were already sent, before a restart of the adapter.
@@ -311,4 +313,4 @@ class ReplayedEntry:
 
 
 ActiveEntry = InwardEntry | OutwardEntry | ReplayedEntry
-"""An entry in operation. Its `exchange` is called in the cycles in which the entry is due."""
+"""An entry in operation. Its `exchange_messages` is called in cycles in which the entry is due."""

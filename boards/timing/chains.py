@@ -33,7 +33,7 @@ class ParallelChains:
     Attributes:
         chains: Boards of each chain, the highest first. If there are several chains, they are all
             combinations of the boards of each level.
-        cycles: Cycle of each level, ticks.
+        cycles: Cycle of each level in ticks.
     """
 
     chains: tuple[tuple[str, ...], ...]
@@ -48,10 +48,10 @@ class ParallelChains:
 
     @property
     def bound(self) -> int:
-        """Bound on the system response along the chains, n R_max for n levels (eq. 3.2), ticks."""
+        """Bound on the system response in ticks: n R_max for n levels (eq. 3.2)."""
         return len(self.cycles) * max(self.cycles, default=0)
 
     @property
     def text(self) -> str:
-        """All chains in one line: "trajectory > joint1 ... joint6 > arm"."""
+        """All chains as one line of text, as in "trajectory > joint1 ... joint6 > arm"."""
         return " > ".join(self.levels)

@@ -31,11 +31,15 @@ class CommandPath:
 
     @property
     def cycles(self) -> tuple[int, ...]:
-        """Cycle of each level, ticks."""
+        """Cycle of each level in ticks."""
         return tuple(releases.every for releases in self.releases)
 
     def find_reading_release(self, visible_at: int) -> int:
-        """Return the first release that reads a command, from the tick at which it is visible."""
+        """Return the first release at which the first level can read a command.
+
+        Args:
+            visible_at: Tick at which the command becomes visible to that level.
+        """
         return self.reads[0].find_tick(visible_at)
 
     def find_acting_release(self, visible_at: int) -> int:
@@ -52,7 +56,7 @@ class CommandPath:
         return release
 
     def compute_response(self, given: int, acts: int) -> int:
-        """Return the time from a command to the end of the cycle that acts on it, ticks.
+        """Return the time in ticks from a command to the end of the cycle that acts on it.
 
         Args:
             given: Tick at which the command is issued.
@@ -62,23 +66,24 @@ class CommandPath:
 
     @property
     def bound_eq_3_2(self) -> int:
-        """Bound of eq. 3.2, the number of levels times the longest cycle, ticks.
+        """Bound of eq. 3.2 in ticks: the number of levels times the longest cycle.
 
-        It counts from the release that reads the command.
+        The response is measured from the release that reads the command.
         """
         return len(self.cycles) * max(self.cycles)
 
     @property
     def sum_eq_3_3(self) -> int:
-        """Bound of eq. 3.3, the sum of the cycles, ticks, if each cycle divides the one above it.
+        """Bound of eq. 3.3 in ticks: the sum of the cycles.
 
-        It counts from the release that reads the command.
+        It is valid if each cycle divides the cycle of the level above. The response is measured
+        from the release that reads the command.
         """
         return sum(self.cycles)
 
     @property
     def longest(self) -> int:
-        """Longest response, ticks: the command just misses a release and waits at every level."""
+        """Longest response in ticks: the command just misses a release and waits at every level."""
         waits = [
             compute_grid_wait(written, read)
             for written, read in zip(self.releases, self.reads[1:], strict=False)

@@ -62,11 +62,11 @@ class Forecast:
 
     @property
     def holds(self) -> bool:
-        """Whether every verdict holds."""
+        """Whether the rack satisfies every equation and criterion."""
         return all(verdict.holds for verdict in self.verdicts)
 
     def to_document(self) -> dict[str, Any]:
-        """Return the forecast as plain data, for JSON. Times with names in _ns are wall-clock."""
+        """Return the forecast as plain data, for JSON. Times named `_ns` are wall-clock times."""
         rack = self.rack
         schedule = None
         if rack.schedule is not None:
@@ -88,7 +88,7 @@ class Forecast:
 
 
 def _list_uncounted(rack: RackTiming) -> dict[str, str]:
-    """Return the tasks without a cost, each with the reason."""
+    """Return the tasks that the forecast does not include, each with the reason."""
     counted = {task.name for task in rack.tasks if task.cost_ns}
     # A budget with an update but no planning time does not include a plan.
     counted -= {f"{b.name}.planner" for b in rack.boards.values() if not b.is_plan_budgeted}
@@ -99,6 +99,7 @@ def _list_uncounted(rack: RackTiming) -> dict[str, str]:
 
 
 def _list_notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
+    """Yield the limits of the prediction, one sentence each."""
     if queues := [
         queue for rank in rack.ranks for name in rank for queue in rack.boards[name].queues
     ]:

@@ -19,20 +19,20 @@ from rack.boards.timing.schedule import Span, simulate_schedule
 from rack.boards.timing.tasks import TimedTask
 
 Work = dict[tuple[str, int], list[Span]]
-"""Spans of every job in order of time, by its task and release time in ns."""
+"""Spans of every job in order of time. The key is the job's task and its release time in ns."""
 
 
 @dataclass(frozen=True)
 class FramePlace:
-    """Place of a board in a frame. Times are ns from the start of the frame.
+    """Place of a board in a frame. Times are in ns from the start of the frame.
 
     Attributes:
         board: The board.
         offset_ns: Time at which it begins.
-        job_ns: Its budget with two context switches, ns.
+        job_ns: Its budget with two context switches.
         limit_ns: Time at which it must be done.
-        slack_ns: Time from its end to the limit, ns. If negative, the work that is left at the
-            limit.
+        slack_ns: Time from its end to the limit. If negative, the processor time that it still
+            needs at the limit.
         until: Board that begins at the limit. Empty if the frame ends at the limit.
     """
 
@@ -59,7 +59,7 @@ class CoreFrames:
     places: tuple[FramePlace, ...]
 
     def to_document(self) -> dict[str, Any]:
-        """Return the frames as plain data, for JSON. Times are ms."""
+        """Return the frames as plain data, for JSON. Times are in ms."""
         names = ("offset", "job", "limit", "slack")
         places = [
             {
@@ -106,8 +106,8 @@ def _list_places(
     Args:
         tasks: Tasks of the core.
         work: Spans of all jobs.
-        start: Start of the frame, ns.
-        minor: Length of the frame, ns.
+        start: Start of the frame in ns.
+        minor: Length of the frame in ns.
     """
     frame_end = start + minor
     released = sorted(

@@ -15,8 +15,8 @@ class InboxTiming:
     Attributes:
         task: Task that serves the inbox.
         mailboxes: Mailboxes whose messages interrupt the board.
-        sources: Their periods and service times, in the same order, ns of simulated time. A mailbox
-            that is not written in every cycle counts as if it were.
+        sources: Their periods and service times in ns of simulated time, in the same order. A
+            mailbox that is not written in every cycle counts as if it were.
         depth: Largest number of pending interrupts.
     """
 
@@ -26,7 +26,7 @@ class InboxTiming:
     depth: int
 
     def cost_ns(self, span_ns: int) -> int:
-        """Return the processor time of the interrupts that arrive in a span of time, ns."""
+        """Return the processor time in ns of all interrupts that can arrive within `span_ns`."""
         return sum(source.service_ns * -(-span_ns // source.every_ns) for source in self.sources)
 
     @property
@@ -35,7 +35,7 @@ class InboxTiming:
         return compute_burst(self.sources)
 
     def to_document(self, cycle_ns: int) -> dict[str, Any]:
-        """Return the worst case as plain data, for JSON. `cycle_ns` is the board's cycle, ns."""
+        """Return the worst case as plain data, for JSON. `cycle_ns` is the cycle of the board."""
         burst = self.burst
         return {
             "task": self.task,

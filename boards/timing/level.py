@@ -21,7 +21,7 @@ class BoardTiming:
         above: Boards directly above it.
         below: Boards directly below it. The relation holds if either board names the other.
         coupling: How executor and planner share processors.
-        every: Period of the executor, ticks.
+        every: Period of the executor in ticks.
         within_cycles: Cycles that a plan may take.
         core: Core that the config requests for the executor.
         priority: SCHED_FIFO priority of the executor.
@@ -31,9 +31,9 @@ class BoardTiming:
         is_critical: Whether the plan update is the paper's critical section, for which the executor
             has to wait.
         budget: Processor times. None if they are not known.
-        plan_within_ns: Longest time for a new plan that the config accepts, ns of the wall clock.
+        plan_within_ns: Longest time for a new plan that the config accepts. None without a limit.
         queues: Queues that it reads.
-        phase: First release, ticks.
+        phase: Tick of the first release.
         reads: Ticks at which it reads the messages of another board, by that board. Boards whose
             messages it reads in every cycle are left out.
     """
@@ -68,13 +68,13 @@ class BoardTiming:
 
     @property
     def exchange_ns(self) -> int:
-        """Time for reading the plan in each cycle, ns. 0 without a planner or a budget."""
+        """Time in ns for reading the plan in each cycle. 0 without a planner or a budget."""
         return self.budget.exchange_ns if self.has_planner and self.budget is not None else 0
 
 
 @dataclass(frozen=True)
 class LevelTiming:
-    """Worst-case times of one level, ns of the wall clock.
+    """Worst-case times of one level in ns of the wall clock.
 
     Attributes:
         board: Board of the level.
@@ -116,7 +116,7 @@ class LevelTiming:
 
     @property
     def executor_planner_ns(self) -> int:
-        """t_executor-planner of eqs 3.9 and 3.10: C + U, which coincide in the worst cycle."""
+        """t_executor-planner of eqs 3.9 and 3.10: C + U. Both fall into the worst cycle."""
         return self.exchange_ns + self.update_ns
 
     @property
@@ -134,7 +134,7 @@ class LevelTiming:
 
     @property
     def slice_ns(self) -> int | None:
-        """Time from a planner's release until its plan is available, d R_i. None without one."""
+        """Time from a planner's release until its plan is available, d R_i. None without a plan."""
         return None if self.within_cycles is None else self.within_cycles * self.cycle_ns
 
     def to_document(self) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 
 class CyclicSchedule(NamedTuple):
-    """Static cyclic schedule: length of the minor frame and of the major frame, ticks."""
+    """Static cyclic schedule: lengths of the minor frame and of the major frame in ticks."""
 
     minor: int
     major: int
@@ -32,12 +32,12 @@ class RackTiming:
         is_lockstep: Whether the clock runs in lockstep.
         speed: Simulated time divided by real time. It changes cycles, but not budgets, which are
             processor times.
-        clock_ns: One tick, ns of simulated time.
+        clock_ns: Length of a tick in ns of simulated time.
         clock: Task of the system clock, released every tick. Its cost is 0 if it is not known.
         boards: Boards by name.
-        context_switch_ns: t_cs, the time of one context switch, ns.
-        small_share: Limit of eq. 3.10.
-        response_goal_ns: Goal for the system response, ns of simulated time. None without a goal.
+        context_switch_ns: t_cs, the time of one context switch.
+        small_share: Largest fraction of a cycle that eq. 3.10 accepts as small.
+        response_goal_ns: Goal for the system response in ns of simulated time. None without a goal.
         inboxes: Inboxes of boards that messages interrupt, by task. Budgets do not include the time
             of interrupts.
         schedule: Static cyclic schedule. None if the rack has none.
@@ -56,7 +56,7 @@ class RackTiming:
 
     @property
     def tick_ns(self) -> int:
-        """One tick, ns of the wall clock."""
+        """Length of a tick in ns of the wall clock."""
         return self.clock.every_ns
 
     def replace_board(self, board: str, **changes: Any) -> RackTiming:
@@ -82,9 +82,10 @@ class RackTiming:
 
     @cached_property
     def chain_groups(self) -> tuple[ParallelChains, ...]:
-        """All chains, grouped.
+        """All chains in groups with equal timing.
 
-        Chains of equal cycles form a group if they are all combinations of their boards.
+        Chains with equal cycles form one group if they are all combinations of their boards.
+        Otherwise each of them is a group.
         """
         by_cycles: dict[tuple[int, ...], list[tuple[str, ...]]] = {}
         for chain in self.chains:
@@ -98,28 +99,28 @@ class RackTiming:
 
     @property
     def hierarchy(self) -> ParallelChains:
-        """Group of chains with the longest response. Empty if no board is above another."""
+        """Chains with the longest response to a command. Empty if no board is above another."""
         return max(
             self.chain_groups, key=self.compute_command_ticks, default=ParallelChains((), ())
         )
 
     def compute_command_ticks(self, chains: ParallelChains) -> int:
-        """Return the longest response of a command along any of these chains, ticks."""
+        """Return the longest response in ticks of a command along any of these chains."""
         return max((self.compute_response_ticks(chain) for chain in chains.chains), default=0)
 
     def compute_status_ticks(self, chains: ParallelChains) -> int:
-        """Return the longest response of a status along any of these chains, ticks."""
+        """Return the longest response in ticks of a status along any of these chains."""
         return max((self.compute_response_ticks(chain[::-1]) for chain in chains.chains), default=0)
 
     def compute_response_ticks(self, boards: Sequence[str]) -> int:
-        """Return the longest response along a row of boards, ticks.
+        """Return the longest response along a sequence of boards in ticks.
 
         It lasts from the release of the first board to the end of the cycle in which the last board
-        acts. Each level takes one cycle (eq. 3.3), and each message waits for the next read of its
-        reader.
+        acts. Each level takes one cycle (eq. 3.3), and each message waits until its reader reads
+        it.
 
         Args:
-            boards: Names of the boards, in the order in which the information passes.
+            boards: Names of the boards, in the order in which the information flows.
         """
         row = [self.boards[name] for name in boards]
         waits = [
@@ -144,7 +145,7 @@ class RackTiming:
 
     @cached_property
     def longest_cycles(self) -> dict[str, float]:
-        """R_max by board: the longest cycle that a level may have, ticks.
+        """R_max by board: the longest cycle in ticks that a level may have.
 
         With a goal for the response it is R_s / n (eq. 3.2), where n is the number of levels in the
         longest chain through the board. Otherwise it is the longest cycle in the hierarchy of the
@@ -185,7 +186,7 @@ class RackTiming:
         )
 
     def compute_interrupted_ns(self, task: str) -> int:
-        """Return the processor time of interrupts in one cycle of a task, or in one plan, ns.
+        """Return the processor time in ns that interrupts take from one cycle or plan of a task.
 
         0 if the task does not serve an inbox.
         """
@@ -193,7 +194,7 @@ class RackTiming:
         return 0 if inbox is None else inbox.cost_ns(self.find_slice_ticks(task) * self.clock_ns)
 
     def find_slice_ticks(self, task: str) -> int:
-        """Return the cycle of an executor, or the time slice of a planner's plan, ticks."""
+        """Return the cycle of an executor, or the time slice of a planner's plan, in ticks."""
         board = self.boards[task.removesuffix(".planner")]
         if task == board.name:
             return board.every
@@ -218,6 +219,7 @@ class RackTiming:
         )
 
     def _build_tasks(self, board: BoardTiming) -> list[TimedTask]:
+        """Return a board's executor and, if it has one, its planner. Empty without a budget."""
         budget = board.budget
         if budget is None:
             return []
@@ -272,7 +274,7 @@ class RackTiming:
 
     @cached_property
     def responses(self) -> tuple[TaskResponse, ...]:
-        """Worst case of every task that has a cost."""
+        """Worst-case response of every task that has a cost."""
         return compute_task_responses(self.tasks, self.context_switch_ns)
 
     @cached_property
@@ -282,11 +284,12 @@ class RackTiming:
 
 
 def _drop_empty_parts(*parts: Part) -> tuple[Part, ...]:
+    """Return the parts that take any time."""
     return tuple(part for part in parts if part.time_ns)
 
 
 def compute_grid_wait(written: TickGrid, read: TickGrid) -> int:
-    """Return the longest time from writing a message to the next read of its reader, ticks.
+    """Return the longest time in ticks from writing a message until its reader reads it.
 
     Args:
         written: Ticks at which messages become visible.

@@ -27,19 +27,19 @@ from rack.boards.timing.schedule import simulate_schedule
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 Load = tuple[int, int]
-"""Demand of a task on its core: cost C of a job and period T, in one unit."""
+"""Demand of a task on its core: cost C of a job and period T, in the same unit."""
 
 TURN_NS = 4_000_000
-"""Longest turn of a task under ordinary scheduling while another waits.
+"""Longest time in ns that a task under ordinary scheduling runs while another waits.
 
 One tick of a 250 Hz kernel. The time slice of Linux is 3 ms.
 """
 MAX_DEADLINES = 10
-"""Number of deadlines after which the search ends, because it converges slowly near full load."""
+"""The search ends after this many deadlines, because it converges slowly near full load."""
 MAX_JOBS = 20_000
-"""Largest schedule, in jobs, that is computed for response times. For others the bound is used."""
+"""Largest number of jobs in a schedule that is simulated. Longer schedules use the bound."""
 MAX_STEPS = 10_000
-"""Limit on the steps of one search, which a 10 us tick below a plan of hours would exceed."""
+"""Maximum number of steps of a search. A plan of hours with a tick of 10 us would need more."""
 
 
 def compute_response_time(
@@ -61,18 +61,19 @@ def compute_response_time(
         above: Tasks of higher or equal priority on the core. Each delays the job by whole jobs.
         blocking: Longest part of a task of lower priority that cannot be preempted.
         sharing: Tasks under ordinary scheduling that take turns with this one. While the job waits,
-            each of them computes at most as long as the job plus one turn. This assumes fair turns,
+            each of them runs at most as long as the job plus one turn. This assumes fair turns,
             which Linux does not guarantee.
         horizon: Time after which the search ends.
 
     Returns:
-        None if there is no bound, or none within the horizon.
+        The time, or None if there is no bound or none within the horizon.
     """
     # A bound exists below full load, but near full load the search for it may take too long.
     if cost and sum(Fraction(*load) for load in above) >= 1:
         return None
 
     def work(until: int) -> int:
+        """Return the work that must be done before the job ends if it ends at `until`."""
         turns = sum(min(_sum_released_work(until, load), cost + TURN_NS) for load in sharing)
         return blocking + cost + turns + sum(_sum_released_work(until, load) for load in above)
 
@@ -88,6 +89,7 @@ def compute_response_time(
 
 
 def _sum_released_work(until: int, load: Load) -> int:
+    """Return the processor time of all jobs of a task that are released before `until`."""
     cost, period = load
     return -(-until // period) * cost
 
@@ -95,15 +97,15 @@ def _sum_released_work(until: int, load: Load) -> int:
 def _compute_scheduled_responses(
     tasks: Sequence[TimedTask], context_switch_ns: int
 ) -> dict[str, int]:
-    """Return exact response times of the tasks of one core from their schedule, by task.
+    """Return the exact response times of the tasks of one core, taken from their schedule.
 
     In the worst case every job uses its whole budget, because under fixed priorities a shorter job
     never delays another.
 
     Returns:
-        Empty if the schedule is not exact: if there are planners, which may plan at any release; if
-        tasks of equal priority wait at the same time, so that their order is not fixed; if a
-        deadline is missed; or if the schedule is too long.
+        The times by task. Empty if the schedule is not exact: if there are planners, which may plan
+        at any release; if tasks of equal priority wait at the same time, so that their order is not
+        fixed; if a deadline is missed; or if the schedule is too long.
     """
     period = lcm(*(task.period_ns for task in tasks))
     first = max(task.phase_ns for task in tasks)
@@ -133,16 +135,16 @@ def _compute_scheduled_responses(
 
 @dataclass(frozen=True)
 class TaskResponse:
-    """Worst case of one task.
+    """Worst-case response of one task.
 
     Attributes:
         task: Name of the task.
         core: Its core.
         priority: Its SCHED_FIFO priority.
-        job_ns: Processor time of a job with two context switches, ns.
-        blocking_ns: Longest wait for a task of lower priority, ns.
-        response_ns: Time from the release of a job to its end, ns. None without a bound.
-        deadline_ns: Time from the release to the deadline, ns.
+        job_ns: Processor time of a job with two context switches.
+        blocking_ns: Longest wait for a task of lower priority.
+        response_ns: Longest time from the release of a job to its end. None without a bound.
+        deadline_ns: Time from the release to the deadline.
     """
 
     task: str
@@ -159,14 +161,14 @@ class TaskResponse:
         return self.response_ns is not None and self.response_ns <= self.deadline_ns
 
     def to_document(self) -> dict[str, Any]:
-        """Return the worst case as plain data, for JSON."""
+        """Return the response as plain data, for JSON."""
         return asdict(self) | {"holds": self.holds}
 
 
 def compute_task_responses(
     tasks: Iterable[TimedTask], context_switch_ns: int = 0
 ) -> tuple[TaskResponse, ...]:
-    """Compute the worst case of every task that has a cost.
+    """Compute the worst-case response of every task that has a cost.
 
     A job has two context switches, to it and from it (eq. 3.9), and its response includes both.
     Tasks of equal priority delay each other by whole jobs. Tasks under ordinary scheduling
@@ -213,17 +215,17 @@ def compute_task_responses(
 
 
 def compute_job_ns(task: TimedTask, context_switch_ns: int) -> int:
-    """Return the processor time of one job with its two context switches, ns."""
+    """Return the processor time in ns of one job with its two context switches."""
     return task.cost_ns + 2 * context_switch_ns
 
 
 def merge_parts(task: TimedTask, context_switch_ns: int) -> TimedTask:
-    """Return a copy of a task whose job and context switches are one single part."""
+    """Return a copy of a task whose job, with its context switches, is one single part."""
     return replace(task, parts=(Part(Unit.PROCESS, compute_job_ns(task, context_switch_ns)),))
 
 
 def compute_blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
-    """Return the longest wait of a task for a task of lower priority on its core, ns.
+    """Return the longest wait in ns of a task for a task of lower priority on its core.
 
     It waits for one plan update that began before its release, if the ceiling of the update is at
     least the priority of this task (eq. 3.10).
@@ -245,4 +247,5 @@ def compute_loads(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[in
 
 
 def _compute_demand(task: TimedTask, context_switch_ns: int) -> Load:
+    """Return the demand of a task on its core, including context switches."""
     return compute_job_ns(task, context_switch_ns), task.period_ns

@@ -18,15 +18,15 @@ Variants = Mapping[str, Sequence[Sequence[Part]]]
 
 @dataclass(frozen=True)
 class Span:
-    """Uninterrupted interval in which a task computes one unit function.
+    """Uninterrupted interval in which a task runs one unit function.
 
     Attributes:
         task: Name of the task.
         core: Its core.
         unit: The unit function.
-        start_ns: Start of the interval, ns.
-        end_ns: End of the interval, ns.
-        release_ns: Release of the job, ns.
+        start_ns: Start of the interval.
+        end_ns: End of the interval.
+        release_ns: Release of the job.
     """
 
     task: str
@@ -39,13 +39,13 @@ class Span:
 
 @dataclass(frozen=True)
 class Job:
-    """Work of one release. A release that a late executor skipped is a job that never ends.
+    """Work of one release. The job of a release that a late executor skipped never ends.
 
     Attributes:
         task: Name of the task.
-        release_ns: Release, ns.
-        deadline_ns: Deadline, ns.
-        end_ns: End, ns. None if the job is unfinished.
+        release_ns: Time of the release.
+        deadline_ns: Time of the deadline.
+        end_ns: Time of the end. None if the job is unfinished.
     """
 
     task: str
@@ -56,7 +56,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Chart:
-    """Schedule between two times, ns. Spans and jobs are in order of time."""
+    """Schedule between two times. Spans and jobs are in order of time."""
 
     start_ns: int
     end_ns: int
@@ -64,7 +64,7 @@ class Chart:
     jobs: tuple[Job, ...]
 
     def list_late_jobs(self, task: str) -> list[Job]:
-        """Return the jobs of a task that missed their deadline, including unfinished jobs."""
+        """Return the jobs of a task that missed their deadlines, including unfinished jobs."""
         # An unfinished job also misses a deadline at the very end of the chart.
         unfinished = self.end_ns + 1
         return [
@@ -75,7 +75,7 @@ class Chart:
         ]
 
     def cut_window(self, start_ns: int, end_ns: int) -> Chart:
-        """Return the part of the chart between two times. Spans are cut there, jobs are not.
+        """Return the part of the chart between two times. Spans are cut at them, jobs are not.
 
         A job belongs to the window if it is released in it, or if it is unfinished or not yet due
         at its start.
@@ -106,8 +106,8 @@ def simulate_schedule(
 
     Args:
         tasks: The tasks, on any cores. Each is first released at its phase.
-        until_ns: End of the schedule, ns.
-        context_switch_ns: Time of one context switch, ns.
+        until_ns: End of the schedule.
+        context_switch_ns: Time of one context switch.
         variants: Parts of tasks whose cycles differ. Other tasks use `TimedTask.parts`.
     """
     runners = [
@@ -145,7 +145,7 @@ class _TaskSimulation:
     Attributes:
         task: The task.
         spans: Its spans so far.
-        ready_at: Time at which its present job could begin, or its next one can, ns.
+        ready_at: Time in ns from which its present job, or else its next job, can run.
     """
 
     def __init__(
@@ -160,19 +160,19 @@ class _TaskSimulation:
         self._steps: list[Part] = []
         self._spent_ns = 0
         self._release = -1
-        # Largest age of the release of the next job. No planner can be late for its first plan.
+        # Largest age of the release of the next job. A planner is never late for its first plan.
         self._slack_ns = 0
         self._ends: dict[int, int | None] = {}
 
     def compute_rank(self) -> tuple[int, bool, int, str]:
-        """Return the rank among the ready tasks. The task with the lowest rank computes."""
+        """Return a sort key for ready tasks. The task with the smallest key runs."""
         is_locked = self._spent_ns > 0 and not self._steps[0].preemptible
         priority = max(self.task.priority, self.task.ceiling) if is_locked else self.task.priority
         # A protected part that has begun precedes tasks of the same priority released since.
         return -priority, not is_locked, self.ready_at, self.task.name
 
     def compute_step(self, now_ns: int, until_ns: int) -> int:
-        """Compute from `now_ns` until a part ends or until `until_ns`, and return that time."""
+        """Run the task from `now_ns` until a part ends or `until_ns`, and return that time."""
         if not self._steps:
             self._begin_job(now_ns)
         if not self._steps:
@@ -203,7 +203,7 @@ class _TaskSimulation:
         return end
 
     def _begin_job(self, now_ns: int) -> None:
-        """Begin the job of the oldest release that has not expired."""
+        """Begin the job of the oldest release that has not expired. Executors skip older ones."""
         every = self.task.every_ns
         first = self.task.phase_ns
         newest = first + (now_ns - first) // every * every
@@ -216,6 +216,7 @@ class _TaskSimulation:
         self._steps = [*self._switch, *steps, *self._switch]
 
     def _end_job(self, now_ns: int) -> None:
+        """Record the end of the present job and determine the release of the next one."""
         self._ends.setdefault(self._release, now_ns)
         self.ready_at = self._release + self.task.period_ns
 

@@ -12,7 +12,7 @@ from rack.boards.timing.rack import RackTiming
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted response of the hierarchy, ms of simulated time. All times are 0 without one.
+    """Predicted response of the hierarchy in simulated time. Without a hierarchy it is 0.
 
     Attributes:
         levels: Boards of each level, as text.
@@ -48,7 +48,7 @@ def predict_response(rack: RackTiming) -> Prediction:
 
 
 def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
-    """Return the mailboxes that carry information along a row of boards.
+    """Return the mailboxes that carry information along a sequence of boards.
 
     Each mailbox depends on the one before it. If the path is interrupted, only the longest part
     that reaches the last board is returned. Queues interrupt it, because the writer determines how
@@ -56,7 +56,7 @@ def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxS
 
     Args:
         layout: Layout of the rack.
-        boards: Names of the boards, in the order in which the information passes.
+        boards: Names of the boards, in the order in which the information flows.
     """
     if len(boards) < 2:
         return ()
@@ -71,7 +71,10 @@ def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxS
 def _find_longest_row(
     layout: Layout, boards: Sequence[str], taken: Collection[str]
 ) -> tuple[MailboxSpec, ...]:
-    """Return the longest row of mailboxes, one per board, that ends with one in `taken`."""
+    """Return the longest sequence of dependent mailboxes that ends in one of those in `taken`.
+
+    It has one mailbox for each board, or fewer if it does not reach back to the first board.
+    """
     if not boards:
         return ()
     last = [box for box in layout.mailboxes if box.writer == boards[-1] and box.name in taken]

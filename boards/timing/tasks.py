@@ -9,7 +9,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Budget:
-    """Worst-case processor times of one level, ns. 0 if the level has no such part.
+    """Worst-case processor times of one level in ns. 0 if the level has no such part.
 
     Attributes:
         read_ns: R, reading commands and statuses in one cycle.
@@ -54,7 +54,7 @@ class Part:
 
     Attributes:
         unit: Its unit function. None for a context switch.
-        time_ns: Its processor time, ns.
+        time_ns: Its processor time.
         preemptible: Whether tasks of higher priority may interrupt it. If not, it runs at the
             ceiling of its task.
     """
@@ -75,12 +75,12 @@ class TimedTask:
         core: Its core.
         priority: SCHED_FIFO priority. A higher one preempts. Tasks of equal priority run in the
             order of their releases, then of their names. 0 is ordinary scheduling, below all.
-        every_ns: Time between two releases, ns.
+        every_ns: Time between two releases.
         parts: Parts of a job, in order.
         within_cycles: Number of releases that a job may last. The next job is released after them.
         ceiling: Priority of the parts that are not preemptible. A plan update blocks its executor
             and every task that has no higher priority than the executor (eq. 3.10).
-        phase_ns: First release, ns.
+        phase_ns: Time of the first release.
     """
 
     name: str
@@ -96,10 +96,10 @@ class TimedTask:
 
     @property
     def period_ns(self) -> int:
-        """Shortest time between the releases of two jobs, which is also a job's deadline, ns."""
+        """Shortest time between the releases of two jobs. It is also the deadline of a job."""
         return self.every_ns * self.within_cycles
 
     @property
     def cost_ns(self) -> int:
-        """Processor time of one job without context switches, ns."""
+        """Processor time of one job without context switches."""
         return sum(part.time_ns for part in self.parts)

@@ -1,7 +1,7 @@
 """Measured times of the timing model, computed from trace records.
 
-Report, analysis, charts, viewer, snapshots and benchmarks all use these functions. Times are ns of
-the wall clock unless a function states otherwise.
+Report, analysis, charts, viewer, snapshots and benchmarks all use these functions. Times are in ns
+of the wall clock unless a function states otherwise.
 
 A trace measures unit functions in two ways: their borders have wall-clock time stamps, and the
 processor time is counted for the whole cycle. If a cycle was preempted, the two differ, and
@@ -46,52 +46,52 @@ Distribution = dict[str, float]
 
 
 def compute_lateness_ns(rows: EntityRows) -> Values:
-    """Return the time from the release of each cycle to its start, ns."""
+    """Return the time in ns from the release of each cycle to its start."""
     return np.asarray(rows["start_ns"] - rows["release_ns"])
 
 
 def compute_response_ns(rows: EntityRows) -> Values:
-    """Return the time from the release of each cycle to its end, ns."""
+    """Return the time in ns from the release of each cycle to its end."""
     return np.asarray(rows["end_ns"] - rows["release_ns"])
 
 
 def compute_duration_ns(rows: EntityRows) -> Values:
-    """Return the time from the start of each cycle to its end, including preemption, ns."""
+    """Return the time in ns from the start of each cycle to its end, including preemption."""
     return np.asarray(rows["end_ns"] - rows["start_ns"])
 
 
 def compute_execution_ns(rows: EntityRows) -> Values:
-    """Return t_exec of eq. 3.5, or the planning time of a planner, including preemption, ns."""
+    """Return t_exec of eq. 3.5 or, for a planner, the planning time. Both include preemption."""
     return np.asarray(rows["process_ns"] - rows["read_ns"])
 
 
 def compute_communication_ns(rows: EntityRows) -> Values:
-    """Return t_comm of eq. 3.5, all of each cycle that is not execution, ns."""
+    """Return t_comm of eq. 3.5: the time in ns of each cycle that is not execution."""
     return np.asarray(rows["read_ns"] - rows["start_ns"] + rows["end_ns"] - rows["process_ns"])
 
 
 def compute_residual_ns(rows: EntityRows, slice_ns: int) -> Values:
-    """Return t_residual, the rest of the time slice at the end of each cycle, ns.
+    """Return t_residual: the time in ns from the end of each cycle to its deadline.
 
-    It is negative if the deadline was missed.
+    It is negative if the deadline was missed. The deadline is `slice_ns` after the release.
     """
     return np.asarray(rows["release_ns"] + slice_ns - rows["end_ns"])
 
 
 def compute_gaps_ns(rows: EntityRows, stretches: Values | None = None) -> Values:
-    """Return the time from each start to the next one, ns, shape (n - 1,).
+    """Return the time in ns from the start of each cycle to the next start, shape (n - 1,).
 
     Args:
         rows: Trace records.
-        stretches: For each record, the number of the recorded stretch that contains it, shape (n,).
-            Times between two stretches are unknown and left out. None for one single stretch.
+        stretches: For each record, the number of the recorded period that contains it, shape (n,).
+            Times from one period to the next are left out. None for a single period.
     """
     gaps = np.diff(rows["start_ns"])
     return gaps if stretches is None else gaps[np.diff(stretches) == 0]
 
 
 def find_missed(rows: EntityRows) -> Values:
-    """Return whether each cycle missed its deadline or wrote a message too late, bool."""
+    """Return for each cycle whether it missed its deadline or wrote a message too late."""
     return np.asarray((rows["flags"] & Flag.MISSED) > 0)
 
 
@@ -106,9 +106,9 @@ def count_misses_and_skips(rows: EntityRows) -> tuple[int, int]:
 
 
 def select_plans(rows: EntityRows) -> Values:
-    """Return the records of a planner in which it made a plan.
+    """Return the records of a planner that belong to a plan.
 
-    A release without a plan may also leave a record.
+    A release at which the planner did not plan may also leave a record.
     """
     return rows[(rows["flags"] & Flag.PLANNED) > 0]
 
@@ -125,7 +125,7 @@ def find_newest_visible(ticks: Values, visible_at: Values) -> Values:
 
 
 def compute_plan_ages(executor: Values, made: Values, visible_at: Values) -> Values:
-    """Return the age of the plan that each cycle of an executor could read, ticks.
+    """Return the age in ticks of the newest plan that each cycle of an executor could read.
 
     Cycles before the first visible plan are left out.
 
@@ -156,12 +156,12 @@ class Occupation:
     """Union of time intervals in which a core was occupied.
 
     Attributes:
-        starts: Starts of the disjoint intervals, ns, (n,).
-        ends: Their ends, ns, (n,).
+        starts: Starts of the disjoint intervals in ns, shape (n,).
+        ends: Their ends in ns, shape (n,).
     """
 
     def __init__(self, starts: Values, ends: Values) -> None:
-        """Form the union of intervals from `starts` to `ends`, ns, (m,), in any order."""
+        """Form the union of intervals from `starts` to `ends`, in ns, shape (m,), in any order."""
         order = np.argsort(starts, kind="stable")
         starts, ends = starts[order], np.maximum.accumulate(np.maximum(starts, ends)[order])
         # An interval that begins after the end of all earlier ones starts a new interval of the
@@ -188,13 +188,13 @@ class Occupation:
         )
 
     def compute_overlap(self, starts: Values, ends: Values) -> Values:
-        """Return the occupied time in each interval from `starts` to `ends`, ns, of their shape."""
+        """Return the occupied time in ns within each interval from `starts` to `ends`."""
         return np.asarray(
             self._compute_occupied_before(ends) - self._compute_occupied_before(starts)
         )
 
     def _compute_occupied_before(self, times: Values) -> Values:
-        """Return the occupied time before each of `times`, ns."""
+        """Return the occupied time in ns before each of `times`."""
         begun = np.searchsorted(self.starts, times, side="right")
         if not len(self.starts):
             return np.zeros(np.shape(times), np.int64)
@@ -204,14 +204,14 @@ class Occupation:
 
 
 def compute_waking_ns(rows: EntityRows) -> Values:
-    """Return the processor time that each cycle used to wake up, before its start, ns."""
+    """Return the processor time in ns that waking up took before the start of each cycle."""
     return np.asarray(
         np.clip(_compute_unstamped_ns(rows), 0, np.maximum(compute_lateness_ns(rows), 0))
     )
 
 
 def compute_overhead_ns(rows: EntityRows) -> int:
-    """Return the median processor time for waking up and for closing a cycle, ns.
+    """Return the median processor time in ns for waking up and for closing a cycle.
 
     0 if every cycle was disturbed.
     """
@@ -221,14 +221,18 @@ def compute_overhead_ns(rows: EntityRows) -> int:
 
 
 def _compute_unstamped_ns(rows: EntityRows) -> Values:
-    """Return the processor time minus the time from start to end, ns. Negative after preemption."""
+    """Return the processor time in ns of each cycle outside its time stamps.
+
+    It is negative if the cycle was preempted.
+    """
     return np.asarray(rows["processor_ns"] - compute_duration_ns(rows))
 
 
 def compute_unit_times(rows: EntityRows, above: Occupation) -> Values:
-    """Return the processor time of each part of a cycle, ns, shape (n, 4).
+    """Return the processor time in ns of each part of a cycle, shape (n, 4).
 
-    The parts of an executor are C, R, X and W, those of a planner are nothing, reading, P and U.
+    The parts of an executor are C, R, X and W. Those of a planner are an unused one, reading, P
+    without reading, and U.
 
     If the parts exceed the processor time of the cycle, because ordinary scheduling or the machine
     interfered, the excess is subtracted from what the parts took beyond their undisturbed times,
@@ -252,7 +256,7 @@ def compute_unit_times(rows: EntityRows, above: Occupation) -> Values:
 
 
 def _estimate_undisturbed(parts: Values, processor_ns: Values) -> Values:
-    """Return the undisturbed time of each part, ns, shape (4,).
+    """Return the undisturbed time in ns of each part, shape (4,).
 
     Short parts are undisturbed in many cycles. The longest part may be disturbed in all of them, so
     it gets at most the processor time that the others leave.

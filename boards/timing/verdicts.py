@@ -71,7 +71,7 @@ class EquationVerdict:
 
     @property
     def holds(self) -> bool:
-        """Whether the values satisfy the equation."""
+        """Whether the two sides satisfy the equation."""
         return _HOLDS[self.sign](self.left, self.right)
 
     @property
@@ -94,7 +94,7 @@ class EquationVerdict:
 def judge_rack(rack: RackTiming) -> list[EquationVerdict]:
     """Return all verdicts on a rack, in the order of the equations.
 
-    Only what has a budget is judged. A response time without a bound is infinite.
+    Only levels and tasks with a budget are judged. A response time without a bound is infinite.
     """
     levels = (judge_level(rack, level) for level in rack.levels.values())
     beyond = _judge_tasks(rack), _judge_cores(rack), _judge_frames(rack), _judge_inboxes(rack)
@@ -134,6 +134,7 @@ def name_response_subject(rack: RackTiming, chains: ParallelChains) -> str:
 def _judge_chains(
     rack: RackTiming, chains: ParallelChains, goal_ns: float | None
 ) -> Iterator[EquationVerdict]:
+    """Yield the verdicts of eqs 3.2 and 3.3 on the response along a group of chains."""
     subject = name_response_subject(rack, chains)
     bound = goal_ns
     limit = "timing.response_ms"
@@ -151,6 +152,7 @@ def _judge_chains(
 
 
 def _judge_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
+    """Yield the verdicts of eqs 3.1 and 3.4 to 3.7 on the cycle of a level."""
     board = level.board
     cycle = level.cycle_ns
     used = level.execution_ns + level.communication_ns
@@ -166,6 +168,7 @@ def _judge_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
 
 
 def _judge_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
+    """Yield the verdicts on the planner of a level. Nothing if its planning time is unknown."""
     if level.planning_ns is None or level.within_cycles is None or level.slice_ns is None:
         return
     board = level.board
@@ -194,6 +197,7 @@ def _judge_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator
 
 
 def _judge_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
+    """Yield a verdict on the worst-case response time of each task."""
     for task in rack.responses:
         response_ns: float | None = task.response_ns
         endless = ""
@@ -217,6 +221,7 @@ def _judge_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 
 def _judge_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
+    """Yield a verdict on the load of each core."""
     for core, load in rack.loads.items():
         meaning = "share of its time that its tasks compute"
         yield EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
@@ -233,6 +238,7 @@ def _judge_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 
 def _judge_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
+    """Yield a verdict on the number of interrupts that wait at each inbox after a burst."""
     for name, inbox in rack.inboxes.items():
         burst = inbox.burst
         most = inf

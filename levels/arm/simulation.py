@@ -82,7 +82,7 @@ class Simulation(Plant):
         position[:] = self._data.qpos[self.cell.qpos]
         velocity[:] = self._data.qvel[self.cell.dof]
 
-    def named(self, contact: tuple[int, int] | NDArray[np.int32]) -> str:
+    def describe_contact(self, contact: tuple[int, int] | NDArray[np.int32]) -> str:
         """Describe a `contact` by the names of the geoms."""
         first, second = (find_geom_name(self.cell.model, geom) for geom in contact)
         return f"'{first}' touches '{second}'"
@@ -155,7 +155,7 @@ class Simulation(Plant):
         if not len(pairs):
             return
         if not self.first_touch:
-            named = self.named(pairs[0])
+            named = self.describe_contact(pairs[0])
             self.first_touch = f"unintended contact: {named} at {self._data.time:.3f} s"
         self.touches += len(pairs)
         own_pairs = pairs[self._mark_own_geoms()[pairs].any(axis=1)]

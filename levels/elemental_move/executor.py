@@ -33,11 +33,11 @@ from rack.levels.operator import (
 
 
 class ElementalMoveExecutor(Executor):
-    """Hands segments down as soon as they are planned.
+    """Hands the segments of planned moves to the primitive level.
 
-    Where the arm is blocked, it requests another path. After a restart of its board it continues
-    from its own last messages. The arm is held on its path while the board above is lost, and on
-    `hold` from above or from an operator.
+    If an obstacle blocks the arm, the executor requests another path from its planner. After a
+    restart of its board it continues from its own last command and status. The arm stops on its
+    path while the board above is lost, or while the level above or an operator commands `hold`.
     """
 
     above = Input(TaskCommand, "above.command")
@@ -70,7 +70,7 @@ class ElementalMoveExecutor(Executor):
         self._reason = ""
 
     def process(self, tick: int) -> None:
-        """Do one cycle: read command, status and plan, and keep the window of segments full."""
+        """Run one cycle: read command, status and plan, and fill the window of segments."""
         segments = SegmentWindow(self.command)
         if not self._started:
             self._restore_state(segments)
@@ -80,7 +80,7 @@ class ElementalMoveExecutor(Executor):
         self._plans.store_plan(self.plan, self._done, self._handed_down, self.status.end)
         self._restart_on_new_window(command.message, status, segments)
         if not self._error:
-            # Count segments that are done; fail on a grasp that holds nothing.
+            # Remove finished segments. A grasp that has closed on nothing is an error.
             while (taken := segments.pop_done(status.done)) is not None:
                 self._done = int(taken["move"])
                 self._replans_of_move = 0
@@ -120,12 +120,14 @@ class ElementalMoveExecutor(Executor):
     def _restart_on_new_window(
         self, command: TaskCommand, status: PrimitiveStatus, segments: SegmentWindow
     ) -> None:
-        """Restart on a window that does not continue the last one, once the arm rests.
+        """Start a new window of moves that does not continue the previous one.
+
+        All segments are withdrawn at once. The new window begins when the arm is at rest.
 
         Args:
             command: Command that contains the window.
             status: Status of the primitive level.
-            segments: Segments handed down, which are withdrawn.
+            segments: Segments handed down so far.
         """
         first = int(command.moves["id"][0]) if command.count else 0
         if first <= self._handed_down + 1:
@@ -138,7 +140,7 @@ class ElementalMoveExecutor(Executor):
             self._reason = ""
 
     def _check_below(self, status: PrimitiveStatus, segments: SegmentWindow) -> None:
-        """Fail if the level below has failed, or the held object is lost."""
+        """Set the error if the level below has failed or the held object is lost."""
         if status.state == State.ERROR:
             self._set_error(Error(status.error), status.reason)
         moving = segments.count and segments.first["kind"] == SegmentKind.PATH
@@ -148,9 +150,9 @@ class ElementalMoveExecutor(Executor):
     def _replan_if_blocked(
         self, status: PrimitiveStatus, segments: SegmentWindow, tick: int
     ) -> None:
-        """Request another path if the arm rests in front of an obstacle, and use the answer.
+        """Request another path while an obstacle blocks the arm at rest, and use the answer.
 
-        The request is cancelled when the way is free.
+        The request is cancelled when the path is free again.
 
         Args:
             status: Status of the primitive level.
@@ -176,7 +178,7 @@ class ElementalMoveExecutor(Executor):
             if plan.error:
                 self._wait_for_path(plan, tick)
             elif not can_join(plan, status.position):
-                # The arm has moved since the request.
+                # The arm has moved since the request, so the path starts at the wrong position.
                 self._open_request(tick)
             else:
                 segments.replace_first(plan)
@@ -186,18 +188,21 @@ class ElementalMoveExecutor(Executor):
                 self._replans_of_move += 1
 
     def _open_request(self, tick: int) -> None:
-        """Request another path. The cycle's number identifies it, even across a restart."""
+        """Request another path.
+
+        The number of the cycle serves as the id of the request. It stays unique across restarts.
+        """
         self._request = tick // self.context.every
 
     def _close_request(self) -> None:
-        """Cancel an open request."""
+        """Cancel the request for another path, if one is open."""
         if self._request:
             self._request = 0
             self._waiting_since = None
             self._reason = ""
 
     def _fill_window(self, command: TaskCommand, segments: SegmentWindow, tick: int) -> None:
-        """Hand down the next moves, as far as they are planned and the window has room."""
+        """Hand down the next planned moves until the window of segments is full."""
         while not (self._request or self._error or segments.is_full):
             move = find_move(command.moves[: command.count], self._handed_down + 1)
             if move is None or not self._hand_down(move, segments, tick):
@@ -207,7 +212,11 @@ class ElementalMoveExecutor(Executor):
             self._reason = ""
 
     def _hand_down(self, move: Any, segments: SegmentWindow, tick: int) -> bool:
-        """Hand down one move as a segment. Return False if that is not possible yet."""
+        """Hand down one move as a segment.
+
+        Returns:
+            False if the move has no path yet, or needs a gripper that the robot does not have.
+        """
         if move["verb"] in (Verb.GRASP, Verb.RELEASE):
             gripper = self._gripper
             if gripper is None:
@@ -233,7 +242,7 @@ class ElementalMoveExecutor(Executor):
         return True
 
     def _wait_for_path(self, refusal: MovePlan, tick: int) -> None:
-        """Wait for a free path within `patience`. Fail at once on any other refusal."""
+        """Wait up to `patience` for a free path. Fail at once if the refusal has another reason."""
         if self._waiting_since is None:
             self._waiting_since = tick
         self._reason = refusal.reason
@@ -246,7 +255,7 @@ class ElementalMoveExecutor(Executor):
 
         Args:
             status: Status with the opening.
-            wanted: Commanded opening. Only the closed one is judged; None stands for it.
+            wanted: Commanded opening. The grip is only checked if this is the closed one or None.
         """
         gripper = self._gripper
         if gripper is None or wanted not in (None, gripper.closed):
@@ -254,19 +263,19 @@ class ElementalMoveExecutor(Executor):
         opening_gap = status.opening - gripper.closed
         if not abs(opening_gap) < (self.settings.grasp_gap or gripper.rest_threshold):
             return ""
-        # As a part of the travel, because an opening may be a length or an angle.
+        # Report a part of the travel, because an opening may be a length or an angle.
         travel_part = opening_gap / (gripper.open - gripper.closed)
         return f"the gripper has closed to {travel_part:.1%} of its way"
 
     def _set_error(self, error: Error, reason: str) -> None:
-        """Set the error of the present window; the first one counts."""
+        """Set the error of the present window of moves, unless it already has one."""
         if not self._error:
             self._error = error
             self._reason = reason
             self._request = 0
 
     def _write_status(self, segments: SegmentWindow, report: MoveStatus) -> None:
-        """Fill the status of this level."""
+        """Fill the status: the state, the moves done and planned, and the planned end position."""
         command = self.above.message
         status = self.below.message
         report.echo = command.id
@@ -292,7 +301,7 @@ class ElementalMoveExecutor(Executor):
         report.planned = self._plans.find_last_planned_move(window, self._handed_down)
         end = self._plans.find_path_end(report.planned)
         if end is None:
-            # The path was handed down before a restart, or has replaced such a path.
+            # No plan is stored: the path was handed down before a restart, or replaced such a path.
             end = segments.find_path_end()
         if report.planned <= self._done and status.resting:
             report.end = status.position
@@ -302,18 +311,18 @@ class ElementalMoveExecutor(Executor):
         report.start = status.position
 
     def _answer_operator(self) -> None:
-        """Answer the operator, and pass down the newest command on which this cycle is based."""
+        """Report on the operator's commands, and pass down the newest one that this cycle obeys."""
         above = self.above.message.operator
         below = self.below.message
         self.command.operator = self._orders.find_basis(above)
-        # Rest only counts once the level below has received the command.
+        # The arm only counts as at rest once the level below has received the command.
         self.status.resting = below.resting and below.operator >= self.command.operator
         if self.status.resting:
             self._orders.report_done()
         self._orders.fill_status(self.status, above)
 
     def _reason_to_wait(self) -> str:
-        """Return why the level waits and what ends the wait, or an empty text if it does not."""
+        """Return why the level waits and what ends the wait. Empty if it does not wait."""
         command = self.above
         below = self.below
         if self._orders.is_in_force:
@@ -329,7 +338,7 @@ class ElementalMoveExecutor(Executor):
         return HELD_FROM_ABOVE if command.message.hold else ""
 
     def _find_state(self, command: TaskCommand) -> State:
-        """Return the state to report, apart from HOLDING."""
+        """Return the state to report. EXECUTING becomes HOLDING while the level waits."""
         if self._error:
             return State.ERROR
         if not command.id:
@@ -338,5 +347,5 @@ class ElementalMoveExecutor(Executor):
 
 
 def find_move(window: Any, serial: int) -> Any:
-    """Return the move with a serial in a window of `ElementalMove`, or None."""
+    """Return the move with the id `serial` in a window of `ElementalMove`, or None."""
     return next((move for move in window if move["id"] == serial), None)

@@ -45,24 +45,25 @@ class ElementalMoveParams(Table):
 
 
 class PlanStore:
-    """The newest plan of every move from the present one, and the answer to the open request."""
+    """Stores the newest plan of each move that lies ahead, and the answer to the open request."""
 
     def __init__(self) -> None:
         self._by_move: dict[int, MovePlan] = {}
         self._answer: MovePlan | None = None
 
     def store_plan(self, plan: Reading[MovePlan], done: int, handed_down: int, end: Array) -> None:
-        """Store a new plan of a move that was not handed down, if it joins the path before it.
+        """Store a new plan if its move was not handed down and its path joins the previous one.
 
-        A plan that does not join is based on a path that was lost or replaced; the planner will
-        make it again. Plans of done moves are dropped. After a refusal, or a path that ends
-        elsewhere than the previous one, all later plans are dropped.
+        A path that does not join begins at the end of a path that has been lost or replaced since;
+        the planner will plan the move again. Plans of finished moves are dropped. If the new plan
+        is a refusal, or its path ends elsewhere than the move's previous path, the plans of all
+        later moves are dropped.
 
         Args:
             plan: Newest plan and its verdict.
             done: Newest move done.
             handed_down: Newest move handed down.
-            end: End of the last path whose plan has been dropped, (joints,), rad.
+            end: End of the path that precedes the stored ones, (joints,), rad.
         """
         if not plan.is_new:
             return
@@ -89,15 +90,20 @@ class PlanStore:
             self._by_move[message.move] = message
 
     def find_plan(self, move: int) -> MovePlan | None:
-        """Return the plan of a move, which may be a refusal, or None."""
+        """Return the stored plan of a move, which may be a refusal. None if there is none."""
         return self._by_move.get(move)
 
     def find_answer(self, request: int) -> MovePlan | None:
-        """Return the answer to a request for another path, or None."""
+        """Return the answer to a request for another path, or None if it has not been received."""
         return self._answer if self._answer is not None and self._answer.replan == request else None
 
     def find_last_planned_move(self, window: Any, handed_down: int) -> int:
-        """Return the last move, at least `handed_down`, before the first one that lacks a path."""
+        """Return the last move before the first one that still lacks a path.
+
+        Args:
+            window: Moves of the level above, an array of `ElementalMove`.
+            handed_down: Newest move handed down, which is returned if no later move is planned.
+        """
         reached = handed_down
         for move in window:
             if move["id"] == reached + 1:
@@ -109,31 +115,45 @@ class PlanStore:
         return reached
 
     def find_path_end(self, move: int) -> Array | None:
-        """Return the end of the newest path of any move up to `move`, (joints,), rad, or None."""
+        """Return the end of the last stored path among the moves up to `move`.
+
+        Returns:
+            Last waypoint, (joints,), rad, or None if there is no such path.
+        """
         paths = [m for m, plan in self._by_move.items() if m <= move and plan.error == Error.NONE]
         return find_end(self._by_move[max(paths)]) if paths else None
 
 
 def can_join(plan: MovePlan, position: Array) -> bool:
-    """Return True if the path of a `MOVE_PLAN` begins at `position`, (joints,), rad."""
+    """Return True if the path of a plan begins where the arm or another path is.
+
+    Args:
+        plan: Plan with a path.
+        position: Position at which the path should begin, (joints,), rad.
+    """
     return is_close(np.asarray(plan.waypoints[0]), position)
 
 
 def find_end(plan: MovePlan) -> Array:
-    """Return the end of the path of a `MOVE_PLAN`, (joints,), rad."""
+    """Return the last waypoint of the path of a `MovePlan`, in rad."""
     return np.asarray(plan.waypoints[plan.count - 1])
 
 
 def is_close(a: Array, b: Array) -> bool:
-    """Return True if a path that ends at `a` joins one that begins at `b`, (joints,), rad."""
+    """Return True if a path that begins at `b` can follow a path that ends at `a`.
+
+    Args:
+        a: End of the first path, (joints,), rad.
+        b: Start of the second path, (joints,), rad.
+    """
     return float(np.abs(a - b).max()) <= MAX_GAP_RAD
 
 
 class SegmentWindow:
-    """Segments that were handed down and are not known to be done, oldest first.
+    """The segments that were handed down and are not yet reported done, oldest first.
 
-    They are kept in the outgoing `MoveCommand` itself. Serials are never reused: a segment that
-    replaces another one has a newer serial.
+    The segments are stored in the outgoing `MoveCommand` itself. A serial is never reused: a
+    segment that replaces another one gets a new serial.
     """
 
     def __init__(self, command: MoveCommand) -> None:
@@ -147,12 +167,12 @@ class SegmentWindow:
 
     @property
     def is_full(self) -> bool:
-        """True if no segment may be added."""
+        """True if there is no room for another segment."""
         return self.count >= SEGMENTS
 
     @property
     def first(self) -> Any:
-        """The oldest segment. All zeros while `count` is 0."""
+        """The oldest segment. Its fields are zero if the window is empty."""
         return self._segments[0]
 
     def pop_done(self, done: int) -> Any:
@@ -166,7 +186,7 @@ class SegmentWindow:
         return segment
 
     def withdraw_all(self) -> None:
-        """Withdraw every segment."""
+        """Withdraw all segments by emptying the window."""
         self._command.count = 0
         self._clear_unused()
 
@@ -174,9 +194,9 @@ class SegmentWindow:
         """Hand down a path.
 
         Args:
-            move: The move, an element of a window of `ELEMENTAL_MOVE`.
-            plan: Plan with its path.
-            by_s: Simulated time by which the segment must be done, or 0.
+            move: The move, an element of a window of `ElementalMove`.
+            plan: Plan that contains the path.
+            by_s: Simulated time by which the segment must be done. 0 if it has no deadline.
         """
         segment = self._add_segment(move, SegmentKind.PATH)
         segment["touch"] = move["verb"] in (Verb.APPROACH, Verb.DEPART)
@@ -184,7 +204,7 @@ class SegmentWindow:
         self._write_path(segment, plan)
 
     def replace_first(self, plan: MovePlan) -> None:
-        """Withdraw all segments, and hand down the oldest one again with another path."""
+        """Withdraw all segments, then hand down the oldest move again with another path."""
         self._command.count = 1
         self._clear_unused()
         self._command.id = self.first["id"] = self._command.id + 1
@@ -194,7 +214,7 @@ class SegmentWindow:
         """Hand down a motion of the gripper.
 
         Args:
-            move: The move, an element of a window of `ELEMENTAL_MOVE`.
+            move: The move, an element of a window of `ElementalMove`.
             opening: Opening to reach, m or rad.
             force: Largest force, N or N m.
         """

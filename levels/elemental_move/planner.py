@@ -63,9 +63,11 @@ class Refusal(NamedTuple):
 
 
 class ElementalMovePlanner(Planner):
-    """Plans one move at a time: the next one without a path, from the end of the one before.
+    """Plans the path of one move at a time.
 
-    After a restart it continues from the status of the executor.
+    A path that the executor requests comes first, then a path that has become blocked, then the
+    next move without a path, from the end of the previous path. After a restart the planner
+    continues from the status of the executor.
     """
 
     above = Input(TaskCommand, "above.command")
@@ -104,7 +106,7 @@ class ElementalMovePlanner(Planner):
         self._answer_due = 0  # tick by which the executor must have used the answer
 
     def wanted(self, tick: int) -> bool:
-        """Return True if a path is requested, blocked or missing."""
+        """Return True if a path must be planned, because it is requested, blocked or missing."""
         ports = (self.above, self.status, self.primitive, self.scene, self.world)
         # A plan for a lost executor would be based on an old status, so wait until it reports.
         if not all(port.has_message for port in ports) or self.status.is_lost:
@@ -118,8 +120,8 @@ class ElementalMovePlanner(Planner):
             p.move.id for p in open_paths if p.move.id > status.planned and p.visible_at <= late
         ]
         self._published = [p for p in open_paths if not lost or p.move.id < lost[0]]
-        # Find how the next object, still at rest, will be grasped, or how it is held after a
-        # restart.
+        # Compute the grip from the planned grasp of an object that is still at rest or, after a
+        # restart, from the sensed pose of an object that is held.
         world = self.world.message
         held = self.primitive.message.held
         if held < 0:
@@ -142,7 +144,7 @@ class ElementalMovePlanner(Planner):
         return self._job is not None and self._can_try(self._job, self.world.message.revision, tick)
 
     def plan(self, tick: int) -> None:
-        """Plan the path of one move, or give the reason why there is none."""
+        """Plan the path of one move, or write the reason why it has none."""
         job = self._job
         plan = self.output
         assert job is not None, "plan is called only when one is wanted"
@@ -173,9 +175,9 @@ class ElementalMovePlanner(Planner):
         self._record_path(job, path, visible_at)
 
     def _find_requested_job(self, tick: int) -> PlanningJob | None:
-        """Return the job that the executor requests where the arm is blocked, or None.
+        """Return a job for the path that the executor requests because the arm is blocked, or None.
 
-        The path keeps its end, so that the moves after it remain valid.
+        The new path must end where the old one ends, so that the paths of later moves remain valid.
         """
         status = self.status.message
         if not status.replan or (status.replan == self._answered and tick < self._answer_due):
@@ -187,9 +189,9 @@ class ElementalMovePlanner(Planner):
         return None
 
     def _find_blocked_job(self) -> PlanningJob | None:
-        """Return a job for the first path ahead that a change of the world has blocked, or None.
+        """Return a job for the first later path that a change of the world has blocked, or None.
 
-        The path keeps its end, so that the moves after it remain valid.
+        The new path must end where the old one ends, so that the paths of later moves remain valid.
         """
         status = self.status.message
         revision = self.world.message.revision
@@ -208,8 +210,8 @@ class ElementalMovePlanner(Planner):
         """Return a job for the first move without a path, or None."""
         status = self.status.message
         primitive = self.primitive.message
-        # The end of a path that the executor reports is exact, but the executor may not have
-        # received the newest path yet.
+        # Prefer the end of a path that the executor reports, because it is exact. But the executor
+        # may not have received the newest path yet.
         unseen = [p for p in self._published[-1:] if p.move.id > status.planned]
         move = find_next_motion(self._window, unseen[0].move.id if unseen else status.planned)
         if move is None:
@@ -221,7 +223,7 @@ class ElementalMovePlanner(Planner):
         return PlanningJob(move, np.array(primitive.position)) if primitive.resting else None
 
     def _predict_situation(self, move: Move) -> Situation:
-        """Return the situation when `move` begins: the sensed world after the moves before it."""
+        """Return the situation in which `move` will begin, predicted from the sensed world."""
         world = self.world.message
         held = self.primitive.message.held
         done = self.status.message.done
@@ -230,17 +232,17 @@ class ElementalMovePlanner(Planner):
             grip = None if self._grip is None else self._grip[1]
             situation = situation.with_object_held(held, grip)
         for earlier in self._window:
-            # A grasp may be reported done only after the object is reported held. It must not count
-            # twice.
+            # An object may be reported as held before its grasp is reported as done. Do not apply
+            # such a grasp twice.
             is_counted = earlier.verb is Verb.GRASP and earlier.object == situation.held
             if done < earlier.id < move.id and not is_counted:
                 situation = situation.predict_after(earlier)
         return situation
 
     def _can_try(self, job: PlanningJob, revision: int, tick: int) -> bool:
-        """Return True if a job may be tried.
+        """Return True if a job is new, or was refused and may be tried again.
 
-        A refused job is tried again after a change of the world or after `retry`.
+        A job without a free path is tried again after a change of the world or after `retry`.
 
         Args:
             job: Job to try.
@@ -256,11 +258,11 @@ class ElementalMovePlanner(Planner):
         )
 
     def _record_path(self, job: PlanningJob, path: Path, visible_at: int) -> None:
-        """Record a path that was found; it may replace an earlier one.
+        """Record a new path. It replaces an earlier path of the same move.
 
         Args:
-            job: Job that is done.
-            path: Its path.
+            job: Job for which the path was planned.
+            path: The path.
             visible_at: Tick from which the executor sees the path.
         """
         self._refusal = None
@@ -276,7 +278,11 @@ class ElementalMovePlanner(Planner):
 
 
 def find_next_motion(window: Sequence[Move], newest: int) -> Move | None:
-    """Return the first motion after move `newest`, or None if the window has a gap before it."""
+    """Return the first move after `newest` that needs a path.
+
+    Returns:
+        The move, or None if there is none or the window has a gap before it.
+    """
     for move in window:
         if move.id == newest + 1:
             if move.is_motion:
@@ -286,7 +292,7 @@ def find_next_motion(window: Sequence[Move], newest: int) -> Move | None:
 
 
 def compute_grip(row: int, tool: Pose, seen: Scene | WorldState) -> Pose:
-    """Return the pose of an object in the frame of the tool.
+    """Return the pose of an object relative to the tool.
 
     Args:
         row: Row of the object.

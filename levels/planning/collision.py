@@ -59,16 +59,17 @@ def place_bodies(cell: Cell, data: mujoco.MjData, positions: Array, quaternions:
 
 
 class CollisionChecker:
-    """Decides whether a configuration of the arm is free, on a copy of the cell's model.
+    """Checks whether a configuration of the arm is free, on a copy of the cell's model.
 
-    The arm, with its open gripper and its load, must keep `scene.clearance` from everything else.
-    Links must keep `margin`, m, from each other and from the body that carries the arm. The gripper
-    must keep it from supports. The first link may be near its base. One instance serves one task. A
-    check takes some microseconds.
+    A configuration is free if every pair of geoms keeps its required distance. The arm, with its
+    open gripper and its load, must keep `scene.clearance` from its surroundings. Links must keep
+    `margin`, a distance in m, from each other and from the body that carries the arm; the first
+    link may be near its base. The gripper must only keep `margin` from supports while contact with
+    them is permitted. Each task needs its own instance. A check takes some microseconds.
 
     Attributes:
         held: Row of the object that is carried, or None.
-        longest_opening: Opening at which the gripper is longest, or None when that is the open one.
+        longest_opening: Opening at which the gripper reaches farthest. None if it is the open one.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig, margin: float = 0.0) -> None:
@@ -104,27 +105,40 @@ class CollisionChecker:
         )
 
     def compute_tool_pose(self, q: Array) -> Pose:
-        """Return the pose of the tool at `q`, (joints,), rad."""
+        """Return the pose of the tool at a configuration.
+
+        Args:
+            q: Configuration, (joints,), rad.
+        """
         self._data.qpos[self.cell.qpos] = q
         mujoco.mj_kinematics(self._model, self._data)
         return read_site_pose(self._data, self.cell.tool)
 
     def place_bodies(self, positions: Array, quaternions: Array) -> None:
-        """Place objects and obstacles, as the function `place_bodies` does."""
+        """Place objects and obstacles at the poses of the world model.
+
+        Args:
+            positions: (bodies, 3), m.
+            quaternions: (bodies, 4), as w, x, y, z.
+        """
         place_bodies(self.cell, self._data, positions, quaternions)
 
     def open_gripper(self, opening: float) -> None:
-        """Set the gripper to `opening`, m or rad. Initially it is open."""
+        """Set the opening of the gripper, which is open at first.
+
+        Args:
+            opening: Opening, m or rad.
+        """
         if self.cell.gripper is not None:
             self.cell.gripper.linkage.set_opening(self._data.qpos, opening)
 
     def hold_object(
         self, row: int | None, position: ArrayLike = (0, 0, 0), quaternion: ArrayLike = (1, 0, 0, 0)
     ) -> None:
-        """Carry an object with the tool.
+        """Attach an object to the tool, or detach it.
 
         Args:
-            row: Row of the object, or None to carry nothing.
+            row: Row of the object, or None for an empty gripper.
             position: Position in the frame of the tool, m.
             quaternion: Orientation in that frame, as w, x, y, z.
         """
@@ -137,8 +151,8 @@ class CollisionChecker:
         m = self._model
         m.geom_contype[:], m.geom_conaffinity[:] = self._types
         if row is not None:
-            # The load touches the gripper, which is permitted. Skipping these pairs saves a fifth
-            # of a check.
+            # The load may touch the gripper. Skipping these pairs saves a fifth of the time of a
+            # check.
             m.geom_contype[self._row_geoms[row]] = LOAD
             m.geom_conaffinity[self._row_geoms[row]] &= LINK
         self._update_required()
@@ -149,26 +163,28 @@ class CollisionChecker:
         While it is permitted, the gripper may also come closer to supports.
 
         Args:
-            row: Row of the object, or None.
+            row: Row of the object, or None for no object.
             touch: False forbids the contact.
         """
         self._touched = row if touch else None
         self._update_required()
 
     def is_free(self, q: Array, clearance: float | None = None) -> bool:
-        """Return True if the arm at `q`, (joints,), rad, keeps its required distances.
+        """Return True if the arm keeps its required distances at a configuration.
 
-        A `clearance`, m, may lower the one of the scene.
+        Args:
+            q: Configuration, (joints,), rad.
+            clearance: Clearance to use if it is smaller than the scene's, m.
         """
         self._one[0] = q
         return self.find_first_blocked(self._one, clearance) == 1
 
     def find_first_blocked(self, path: Array, clearance: float | None = None) -> int:
-        """Find the first configuration of a path that is not free; later ones are not checked.
+        """Find the first configuration of a path that is not free. Later ones are not checked.
 
         Args:
             path: Configurations, (n, joints), rad.
-            clearance: Lowers the clearance of the scene, m.
+            clearance: Clearance to use if it is smaller than the scene's, m.
 
         Returns:
             Index of that configuration, or n if all are free.
@@ -178,9 +194,13 @@ class CollisionChecker:
         return self._first_blocked(held_qpos, self._least, path)
 
     def find_clearance(self, q: Array) -> float:
-        """Return the largest clearance with which `q` is free, m, at most the scene's.
+        """Return the largest clearance with which a configuration is free, up to the scene's.
 
-        It is negative if `q` is not free with any clearance.
+        Args:
+            q: Configuration, (joints,), rad.
+
+        Returns:
+            Clearance, m. Negative if the configuration is not free with any clearance.
         """
         self.is_free(q)
         short = self._compute_shortfalls()
@@ -194,15 +214,20 @@ class CollisionChecker:
         return self.clearance - max(0.0, float(np.max(lacking, initial=0.0)))
 
     def describe_collision(self, q: Array, clearance: float | None = None) -> str:
-        """Describe the worst violation at `q`: the pair of geoms and both distances.
+        """Describe the worst violation at a configuration.
 
-        The text is empty if `q` is free.
+        Args:
+            q: Configuration, (joints,), rad.
+            clearance: Clearance to use if it is smaller than the scene's, m.
+
+        Returns:
+            The pair of geoms, their distance and the required distance. Empty if `q` is free.
         """
         self.is_free(q, clearance)
         return self.describe_worst_pair()
 
     def describe_worst_pair(self) -> str:
-        """Describe the worst violation at the last configuration checked."""
+        """Describe the worst violation at the configuration checked last. Empty if it is free."""
         short = self._compute_shortfalls()
         if not np.any(short > 0):
             return ""
@@ -214,9 +239,9 @@ class CollisionChecker:
         return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {required * 1e3:.1f} mm"
 
     def _compute_shortfalls(self) -> Array:
-        """Return by how much each close pair misses its required distance, m.
+        """Return how much each close pair of geoms lacks to its required distance, in m.
 
-        It refers to the last configuration checked.
+        The pairs are those of the configuration checked last.
         """
         contact = self._data.contact
         pairs = contact.geom
@@ -225,7 +250,11 @@ class CollisionChecker:
         )
 
     def _find_longest_opening(self) -> float | None:
-        """Return the opening at which the gripper reaches farthest along the tool, None if open."""
+        """Find the opening at which the gripper reaches farthest along the tool.
+
+        Returns:
+            Opening, m or rad. None if the open gripper reaches farthest, or there is no gripper.
+        """
         gripper = self.cell.gripper
         if gripper is None:
             return None
@@ -243,7 +272,7 @@ class CollisionChecker:
         return float(opening) if reached > extents[0][0] + self._margin else None
 
     def _update_required(self) -> None:
-        """Update the required distances for the held object and the one that may be touched."""
+        """Update the required distances for the held object and the object that may be touched."""
         self._required[:] = self._base
         arm, gripper, supports, _ = self.cell.geoms
         if self.held is not None:
@@ -263,7 +292,7 @@ class CollisionChecker:
             self._set_required(gripper, supports, self._margin)
 
     def _set_required(self, group: Ints, other_group: Ints, distance: float) -> None:
-        """Set the required distance, m, of all pairs between two groups of geoms."""
+        """Require `distance`, in m, between all geoms of one group and all geoms of another."""
         self._required[group[:, None], other_group] = distance
         self._required[other_group[:, None], group] = distance
 
@@ -271,7 +300,7 @@ class CollisionChecker:
 def restrict_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjModel:
     """Return a copy of the model in which MuJoCo only finds close pairs that involve the arm.
 
-    This is a tenth of the work. Pairs within the gripper are left out.
+    A check of this copy takes a tenth of the time. Pairs within the gripper are omitted.
 
     Args:
         cell: Cell with the model.
@@ -297,9 +326,9 @@ def compute_required_distances(
 ) -> Array:
     """Return the required distance of every pair of geoms.
 
-    Arm and surroundings must keep the clearance, links that may collide the margin. Some links are
-    always close to each other, and links near the base are close to fixed bodies. Such pairs only
-    have to keep half of their distance at home.
+    The arm must keep the clearance from its surroundings; links that may collide with each other
+    must keep the margin. Some links are always close to each other, and links near the base are
+    close to fixed bodies. Such pairs only have to keep half of the distance that they have at home.
 
     Args:
         cell: Cell with the model.
@@ -345,7 +374,7 @@ def compute_required_distances(
 def compute_extent(
     model: mujoco.MjModel, data: mujoco.MjData, geoms: Ints, axis: ArrayLike
 ) -> float:
-    """Return how far the bounding boxes of geoms reach along an axis from the origin, m.
+    """Return how far, in m, the bounding boxes of geoms reach from the origin along an axis.
 
     Args:
         model: Model of the geoms.

@@ -60,7 +60,11 @@ class InverseKinematics:
         self._low, self._high = find_sampling_range(cell)
 
     def compute_tool_pose(self, q: Array) -> Pose:
-        """Return the pose of the tool at `q`, (joints,), rad."""
+        """Return the pose of the tool at a configuration.
+
+        Args:
+            q: Configuration, (joints,), rad.
+        """
         self._data.qpos[self._cell.qpos] = q
         mujoco.mj_kinematics(self._cell.model, self._data)
         return read_site_pose(self._data, self._cell.tool)
@@ -68,7 +72,7 @@ class InverseKinematics:
     def find_configuration(
         self, target: Pose, start: Array, match_orientation: bool = True
     ) -> Array | None:
-        """Find a configuration by one descent.
+        """Find a configuration that puts the tool at a pose, by one descent from `start`.
 
         Args:
             target: Pose for the tool.
@@ -76,7 +80,7 @@ class InverseKinematics:
             match_orientation: False accepts any orientation of the tool.
 
         Returns:
-            Configuration, (joints,), rad, or None.
+            Configuration, (joints,), rad, or None if the descent finds none.
         """
         q = np.clip(start, self._inner_low, self._inner_high)
         errors: list[float] = []
@@ -118,7 +122,7 @@ class InverseKinematics:
 
         Args:
             target: Pose for the tool.
-            reference: Configuration to reach them from, (joints,), rad.
+            reference: Configuration from which the arm moves to them, (joints,), rad.
             free: Decides whether a configuration is free.
             restarts: Maximum number of random starts.
 
@@ -139,7 +143,7 @@ class InverseKinematics:
 
         Args:
             target: Pose for the tool.
-            reference: Configuration to reach them from, (joints,), rad.
+            reference: Configuration from which the arm moves to them, (joints,), rad.
             match_orientation: False accepts any orientation of the tool.
             restarts: Maximum number of random starts.
 
@@ -162,11 +166,19 @@ class InverseKinematics:
         return sorted(solutions, key=lambda q: self.compute_travel_time(reference, q))
 
     def compute_travel_time(self, start: Array, end: Array) -> float:
-        """Return the time that the slowest joint takes at its velocity limit, s."""
+        """Return the time in s that the slowest joint needs at its velocity limit."""
         return float(np.max(np.abs(start - end) * self._pace))
 
     def _compute_error(self, target: Pose, q: Array) -> Array:
-        """Return the error of the tool at `q`, (6,): distance, m, then rotation, rad."""
+        """Return the error of the tool's pose at a configuration.
+
+        Args:
+            target: Pose for the tool.
+            q: Configuration, (joints,), rad.
+
+        Returns:
+            Distance, m, then rotation, rad, (6,).
+        """
         tool = self.compute_tool_pose(q)
         turn = np.zeros(3)
         error = np.zeros(6)
@@ -176,12 +188,15 @@ class InverseKinematics:
         return error
 
     def _compute_step(self, error: Array, q: Array, match_orientation: bool) -> Array | None:
-        """Return the bounded step that best reduces the error, (joints,), rad, or None.
+        """Return the bounded step that best reduces the error.
 
         Args:
             error: Error at `q`.
             q: Configuration, (joints,), rad.
             match_orientation: False ignores the orientation.
+
+        Returns:
+            Step, (joints,), rad, or None if the solver finds none.
         """
         m = self._cell.model
         d = self._data
@@ -201,6 +216,11 @@ class InverseKinematics:
 
 
 def find_sampling_range(cell: Cell) -> tuple[Array, Array]:
-    """Return low and high, (joints,), rad: the limits, or one turn for a joint without limits."""
+    """Return the range from which random configurations are drawn.
+
+    Returns:
+        Lowest and highest positions, (joints,), rad: the position limits, or one turn for a joint
+        without limits.
+    """
     low, high = cell.limits.position.T
     return np.where(np.isfinite(low), low, -np.pi), np.where(np.isfinite(high), high, np.pi)

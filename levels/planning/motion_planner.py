@@ -1,6 +1,6 @@
 """The path of one elemental move: inverse kinematics, then a straight line or a search.
 
-A straight line is one of the tool, a search is in joint space.
+The tool follows the straight line; the search is in joint space.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ DEVIATION_SAMPLES = 5
 
 
 def preload() -> None:
-    """Load what every process that plans motions needs."""
+    """Load the modules and compiled functions that motion planning needs."""
     import numpy.random  # noqa: F401  # numpy loads it at its first use
 
     compiled.preload(collision, paths, path_planner)
@@ -111,7 +111,7 @@ class MotionPlanner:
         situation.apply_to(self.checker, touched)
 
     def find_goal(self, move: Move, start: Array) -> Array:
-        """Return the configuration at the end of a free motion, in the present situation.
+        """Return the configuration at the end of a free motion, in the situation set last.
 
         Raises:
             Refused: No configuration can be reached, or all are blocked.
@@ -143,13 +143,13 @@ class MotionPlanner:
         )
 
     def is_still_free(self, move: Move, path: Path, situation: Situation) -> bool:
-        """Return True if an earlier path of `move` can still be used in `situation`."""
+        """Return True if an earlier path of `move` is still free of collisions in `situation`."""
         self.set_situation(move, situation)
         first_blocked = self._bind_clearance(REUSE_CLEARANCE_PART * self.clearance)
         return self.paths.find_blocked_configuration(path, first_blocked) is None
 
     def _bind_clearance(self, clearance: float) -> FirstBlocked:
-        """Return the collision check for paths with a clearance, m."""
+        """Return a collision check for paths that requires a clearance, in m."""
         return partial(self.checker.find_first_blocked, clearance=clearance)
 
     def _explain_failure(self, start: Array, goal: Array, clearance: float) -> str:
@@ -170,7 +170,11 @@ class MotionPlanner:
         return f"no path found around {obstacle}" if obstacle else "no path found"
 
     def _plan_line(self, move: Move, start: Array, goal: Array | None) -> Path:
-        """Plan a straight line of the tool, with the arguments of `plan`."""
+        """Plan a straight line of the tool. The arguments are those of `plan`.
+
+        Raises:
+            Refused: The line leaves the reach of the arm, or is blocked.
+        """
         name = VERB_NAMES[move.verb]
         place = format_position(move.tool)
         path = plan_straight_line(self.ik, start, move.tool)
@@ -188,7 +192,10 @@ class MotionPlanner:
         return path
 
     def _find_clearance(self, start: Array) -> float:
-        """Return the clearance of the scene, or less if an obstacle has come closer to the arm."""
+        """Return the clearance that a path from `start` must keep, in m.
+
+        It is the scene's clearance, or less if the arm is already closer to an obstacle.
+        """
         available = self.checker.find_clearance(start)
         return (
             self.clearance
@@ -229,7 +236,7 @@ def plan_straight_line(ik: InverseKinematics, start: Array, target: Pose) -> Pat
 
 
 def _compute_deviation(ik: InverseKinematics, path: Path, begin: Pose, target: Pose) -> float:
-    """Return the largest distance of the tool from the straight line, m."""
+    """Return the largest distance of the tool from the straight line, in m."""
     blended = BlendedPath(*path)
     if blended.length == 0.0:
         return 0.0
@@ -245,5 +252,5 @@ def _compute_deviation(ik: InverseKinematics, path: Path, begin: Pose, target: P
 
 
 def format_position(tool: Pose) -> str:
-    """Format the position of a tool, in m."""
+    """Return the position of a tool, in m, as text."""
     return "[{:.3f}, {:.3f}, {:.3f}]".format(*tool.position)

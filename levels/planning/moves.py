@@ -17,7 +17,7 @@ VERB_NAMES |= {Verb.NONE: "rest", Verb.MOVE_JOINTS: "move"}
 
 
 class Move(NamedTuple):
-    """One `ElementalMove`."""
+    """One elemental move, read from an `ElementalMove` record."""
 
     id: int
     action: int
@@ -39,7 +39,7 @@ class Move(NamedTuple):
         return self.verb in (Verb.APPROACH, Verb.DEPART)
 
     def write_to(self, record: Any) -> None:
-        """Fill one element of an array of `ElementalMove`."""
+        """Write the move to one element of an array of `ElementalMove`."""
         record["id"] = self.id
         record["action"] = self.action
         record["verb"] = self.verb
@@ -66,7 +66,7 @@ def read_move(record: Any) -> Move:
 
 
 def read_window(command: TaskCommand | TaskPlan) -> list[Move]:
-    """Return the moves of a `TASK_COMMAND` or a `TASK_PLAN`, oldest first."""
+    """Return the moves of a `TaskCommand` or a `TaskPlan`, oldest first."""
     return [read_move(record) for record in command.moves[: command.count]]
 
 

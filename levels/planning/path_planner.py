@@ -1,8 +1,8 @@
 """Collision-free paths between two configurations, with rounded corners.
 
-A path is straight where that is free. Otherwise OMPL's RRTConnect searches one and shortens it. The
-search ends after a number of checks, never by time, and every call seeds the random numbers. So
-equal arguments give equal paths in every process.
+A path is a straight line if that is free of collisions. Otherwise OMPL's RRTConnect searches for a
+path, which is then shortened. A search is limited by its number of checks, not by time, and every
+call seeds the random numbers, so equal arguments give equal paths in every process.
 """
 
 from __future__ import annotations
@@ -99,7 +99,12 @@ class PathPlanner:
         return min(paths, key=self.compute_duration, default=None)
 
     def round_corners(self, waypoints: Array, first_blocked: FirstBlocked) -> Path:
-        """Return the path along `waypoints`, with each corner rounded as far as it stays free."""
+        """Return the path along `waypoints`, with corners rounded as far as collisions permit.
+
+        Args:
+            waypoints: Waypoints, (n, joints), rad.
+            first_blocked: Finds the first configuration that is not free.
+        """
         # Blends must not overlap: they use up to half of an inner line, and most of the first and
         # the last line.
         lengths = np.linalg.norm(np.diff(waypoints, axis=0), axis=1)
@@ -119,13 +124,13 @@ class PathPlanner:
         return samples[index] if index < len(samples) else None
 
     def compute_duration(self, path: Path) -> float:
-        """Return the duration of `path`, from rest to rest, s."""
+        """Return the duration of `path`, from rest to rest, in s."""
         return make_trajectory(BlendedPath(*path), self._limits).duration
 
     def _search_paths(
         self, ends: Array, first_blocked: FirstBlocked, attempt: int, searches: int
     ) -> list[Path]:
-        """Search paths around obstacles until enough are found, or the checks are used up.
+        """Search for paths around obstacles until there are enough, or too many checks were made.
 
         Args:
             ends: Start and goal, (2, joints), rad.
@@ -148,7 +153,7 @@ class PathPlanner:
     def _find_free_blend(
         self, waypoints: Array, corner: int, largest: float, first_blocked: FirstBlocked
     ) -> float:
-        """Return the largest free blend at a corner, rad, or 0.
+        """Return the largest collision-free blend at a corner, in rad. 0 if there is none.
 
         Args:
             waypoints: Waypoints of the path, (n, joints), rad.
@@ -168,7 +173,7 @@ class PathPlanner:
     def _search_once(
         self, ends: Array, first_blocked: FirstBlocked, seed: int, budget: int
     ) -> tuple[Array | None, int]:
-        """Search a free polyline in joint space scaled by the lever arms.
+        """Search for a collision-free polyline, in joint space scaled by the lever arms.
 
         Args:
             ends: Start and goal, (2, joints), rad.
@@ -183,7 +188,7 @@ class PathPlanner:
         count = 0
 
         def is_free(scaled: Array) -> bool:
-            """Check scaled configurations, and count the checks."""
+            """Return True if all scaled configurations are free, and count the checks."""
             nonlocal count
             index = first_blocked(scaled / self._levers)
             count += min(index + 1, len(scaled))
@@ -211,7 +216,12 @@ class PathPlanner:
         return polyline, count
 
     def _build_space(self, ends: Array, free: Free) -> base.SpaceInformation:
-        """Build the scaled space of OMPL around `ends`, (2, joints), with its collision check."""
+        """Build the scaled space of OMPL around start and goal, with its collision check.
+
+        Args:
+            ends: Start and goal, (2, joints), rad.
+            free: Checks scaled configurations.
+        """
         least = ends.min(axis=0)
         most = ends.max(axis=0)
         low, high = self._limits.position.T
@@ -233,7 +243,12 @@ class PathPlanner:
         return information
 
     def _to_state(self, information: base.SpaceInformation, q: Array) -> base.State:
-        """Return the OMPL state of configuration `q`, (joints,), rad."""
+        """Return the OMPL state of a configuration.
+
+        Args:
+            information: Scaled space of OMPL.
+            q: Configuration, (joints,), rad.
+        """
         state = information.allocState()
         for j, value in enumerate(q * self._levers):
             state[j] = value
@@ -270,14 +285,14 @@ class MotionCheck(base.MotionValidator):  # type: ignore[misc]  # untyped
 
 @compiled_for("f8[:,::1], i8")
 def list_bisection_points(ends: Array, count: int) -> Array:
-    """Return the points at which a line is checked: its end, its middle, and so on by halves.
+    """Return the points of a line in the order of checking: its end, then repeated bisection.
 
     Args:
         ends: Ends of the line, (2, joints).
         count: Number of parts of the line.
 
     Returns:
-        Points, (count, joints), in the order of checking.
+        Points, (count, joints).
     """
     places = np.empty((count, ends.shape[1]))
     places[0] = ends[1]
@@ -298,7 +313,7 @@ def list_bisection_points(ends: Array, count: int) -> Array:
 
 
 def compute_lever_arms(cell: Cell, seed: int) -> Array:
-    """Return how far each joint can move any geom of the arm, per rad or per m.
+    """Return how far a unit motion of each joint can move any geom of the arm.
 
     A joint step dq moves no point of the arm by more than sum |lever_j dq_j|.
 
@@ -307,7 +322,7 @@ def compute_lever_arms(cell: Cell, seed: int) -> Array:
         seed: Seed of the random configurations that are measured.
 
     Returns:
-        Lever arms, (joints,), m.
+        Lever arms, (joints,), m per rad. They are 1 for sliding joints.
     """
     m = cell.model
     data = mujoco.MjData(m)
@@ -323,7 +338,7 @@ def compute_lever_arms(cell: Cell, seed: int) -> Array:
         axes[sample] = data.xaxis
 
     def measure_lever(joint: int) -> float:
-        """Return the lever arm of one joint."""
+        """Return the lever arm of a joint: its largest distance from a geom that it moves."""
         if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
             return 1.0
         carried = list_geoms(m, mark_descendants(m, m.jnt_bodyid[[joint]]))

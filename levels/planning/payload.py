@@ -48,7 +48,10 @@ class Jaws(NamedTuple):
 
 
 class Payloads:
-    """Checks the payloads of one arm. `names` are the objects by row."""
+    """Checks whether the gripper and the motors of one arm can carry an object.
+
+    Objects are identified by their row in the world model. `names` lists their names in that order.
+    """
 
     def __init__(self, cell: Cell, names: tuple[str, ...]) -> None:
         self._cell = cell
@@ -99,15 +102,15 @@ class Payloads:
                 )
 
     def _find_mass(self, row: int) -> float:
-        """Return the mass of object `row`, kg."""
+        """Return the mass of object `row`, in kg."""
         return float(self._cell.model.body_subtreemass[self._cell.bodies[row]])
 
     def _format_object(self, row: int) -> str:
-        """Format name and mass of object `row`."""
+        """Return the name and the mass of object `row` as text."""
         return f"'{self._names[row]}' {self._find_mass(row):.3g} kg"
 
     def _compute_holding_force(self, row: int, grip: Pose) -> float | None:
-        """Return the friction force that can carry object `row`, N, or None if it is unknown."""
+        """Return the friction force that can hold object `row`, in N. None if it is unknown."""
         width = self._measure_width(row, grip)
         # Find the last jaws that are wider than the object, and the first that are not.
         pairs = (pair for pair in pairwise(self.jaws) if pair[0].gap > width >= pair[1].gap)
@@ -127,7 +130,15 @@ class Payloads:
         )
 
     def _measure_width(self, row: int, grip: Pose) -> float:
-        """Return the width of the object on the line through the tool, m, or -inf if it misses."""
+        """Return the width of an object along the y axis of the tool, in m.
+
+        Args:
+            row: Row of the object.
+            grip: Pose of the object in the frame of the tool.
+
+        Returns:
+            Width, or -inf if the axis does not meet the object.
+        """
         cell = self._cell
         data = self._data
         address = cell.object_qpos[row]
@@ -141,7 +152,7 @@ class Payloads:
         )
 
     def _find_jaws(self) -> list[Jaws]:
-        """Return the jaws from open to closed, while there is a gap and a finger on either side."""
+        """Return the jaws at openings from open to closed, while a gap separates two fingers."""
         cell = self._cell
         gripper = cell.gripper
         if gripper is None:
@@ -161,7 +172,12 @@ class Payloads:
         )
 
     def _sample_jaws(self, fingers: Ints, openings: Array) -> list[Jaws]:
-        """Return the jaws that some geoms form at these openings, as long as there is a gap."""
+        """Return the jaws that geoms form at each of some openings, until there is no gap.
+
+        Args:
+            fingers: Ids of the geoms that may form the jaws.
+            openings: Openings, from open to closed, m or rad.
+        """
         cell = self._cell
         data = self._data
         gripper = cell.gripper
@@ -211,7 +227,10 @@ class Payloads:
 
 
 def _compute_friction(model: mujoco.MjModel, one: int, other: int) -> float:
-    """Return the sliding friction of two geoms, as MuJoCo combines it. 0 if frictionless."""
+    """Return the sliding friction of two geoms, as MuJoCo combines it.
+
+    It is 0 if their contact is frictionless.
+    """
     if model.geom_priority[one] == model.geom_priority[other]:
         mixed = [one, other]
     elif model.geom_priority[one] > model.geom_priority[other]:
@@ -236,7 +255,7 @@ STILL_TOLERANCE = 1e-6
 
 
 class FixedJaw:
-    """The jaw of a gripper that does not move, and the geoms that are fixed to it."""
+    """The jaw that does not move, of a gripper with one moving finger."""
 
     def __init__(self, cell: Cell, geoms: Ints, side: float) -> None:
         self._cell = cell
@@ -273,7 +292,12 @@ class FixedJaw:
         return Pose(tool.position - (travel - GAP_M) * across, tool.quaternion)
 
     def _measure_distance(self, row: int, at: Pose) -> float:
-        """Return the distance of object `row` from the fixed geoms, m, or 0 if they touch."""
+        """Return the distance of an object from the fixed geoms, in m. 0 if they touch.
+
+        Args:
+            row: Row of the object.
+            at: Pose of the object in the world.
+        """
         model = self._cell.model
         data = self._data
         address = self._cell.object_qpos[row]

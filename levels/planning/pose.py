@@ -31,14 +31,14 @@ class Pose(NamedTuple):
         return Pose(position, quaternion)
 
     def inverse(self) -> Pose:
-        """Return the pose of the reference frame in the frame of this pose."""
+        """Return the inverse: the pose of the reference frame relative to this pose."""
         position = np.zeros(3)
         quaternion = np.zeros(4)
         mujoco.mju_negPose(position, quaternion, *self)
         return Pose(position, quaternion)
 
     def raise_by(self, height: float) -> Pose:
-        """Return the pose moved by `height`, m, along the z axis of the world."""
+        """Return the pose moved by `height`, in m, along the world's z axis."""
         return Pose(self.position + np.array([0.0, 0.0, height]), self.quaternion)
 
     def is_near(self, other: Pose) -> bool:
@@ -49,20 +49,22 @@ class Pose(NamedTuple):
         )
 
     def compute_angle(self, other: Pose) -> float:
-        """Return the angle between the two orientations, rad."""
+        """Return the angle between the two orientations, in rad."""
         return norm(self._compute_turn(other))
 
     def interpolate_to(self, other: Pose, part: float) -> Pose:
-        """Return the pose at `part`, 0 to 1, of a straight motion to `other`.
+        """Return a pose on the straight motion to `other`, which turns at a constant rate.
 
-        The pose turns at a constant rate.
+        Args:
+            other: Pose at the end of the motion.
+            part: Part of the motion that is done, 0 to 1.
         """
         quaternion = self.quaternion.copy()
         mujoco.mju_quatIntegrate(quaternion, self._compute_turn(other), part)
         return Pose((1.0 - part) * self.position + part * other.position, quaternion)
 
     def _compute_turn(self, other: Pose) -> Array:
-        """Return the rotation vector from this orientation to `other`, (3,), rad."""
+        """Return the rotation from this orientation to `other`, a rotation vector (3,) in rad."""
         turn = np.zeros(3)
         mujoco.mju_subQuat(turn, other.quaternion, self.quaternion)
         return turn
@@ -83,19 +85,24 @@ def read_site_pose(data: mujoco.MjData, site: int) -> Pose:
 
 
 def build_yaw_quaternion(yaw: float) -> Array:
-    """Return the quaternion of a rotation by `yaw`, rad, about z."""
+    """Return the quaternion of a rotation about the z axis by `yaw`, in rad."""
     return np.array([math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0)])
 
 
 def compute_yaw(quaternion: Array) -> float:
-    """Return the angle about the world's z axis by which `quaternion` turns the x axis, rad."""
+    """Return the angle in rad by which `quaternion` turns the x axis about the world's z axis."""
     turned = np.zeros(3)
     mujoco.mju_rotVecQuat(turned, np.array([1.0, 0.0, 0.0]), quaternion)
     return math.atan2(turned[1], turned[0])
 
 
 def build_pointing_quaternion(direction: ArrayLike, yaw: float = 0.0) -> Array:
-    """Return a quaternion that turns z to `direction`, (3,), and by `yaw`, rad, about it."""
+    """Return the orientation of a frame whose z axis has a given direction.
+
+    Args:
+        direction: Direction of the z axis, (3,), of any length.
+        yaw: Angle by which the frame is turned about its z axis, rad.
+    """
     target = np.array(direction, dtype=float)
     target /= norm(target)
     axis = np.cross([0.0, 0.0, 1.0], target)

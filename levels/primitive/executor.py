@@ -57,12 +57,12 @@ during this time."""
 
 
 class PrimitiveExecutor(Executor):
-    """Executes the segments of the window, oldest first, while the next one is planned.
+    """Executes the segments of the window in order, while its planner times the next one.
 
-    Every segment begins and ends at rest. The set point written at tick T is due `LEAD_CYCLES`
-    later. After a restart the level restores its state from its own last messages. It rests on its
-    path while the board above is lost, and on `hold` from above or from an operator. While the
-    servo level does not follow, it waits.
+    Every segment begins and ends at rest. A set point is due `LEAD_CYCLES` cycles after the cycle
+    that writes it. After a restart the level restores its state from its own last messages. It
+    brings the arm to rest on its path while the board above is lost, or while the level above or an
+    operator commands `hold`. While the servo level does not follow set points, it waits.
     """
 
     above = Input(MoveCommand, "above.command")
@@ -110,7 +110,7 @@ class PrimitiveExecutor(Executor):
         self._displaced = False
 
     def process(self, tick: int) -> None:
-        """Do one cycle: read all inputs, advance the segment, write set point and status."""
+        """Run one cycle: read all inputs, advance the segment, write set point and status."""
         if self._tick is None:
             self._tick = tick - self.context.every
             self._memory = restore_memory(self.last_status, self.last_command)
@@ -140,7 +140,7 @@ class PrimitiveExecutor(Executor):
         self._answer_operator(self.above.message.operator)
 
     def _resume_motion(self, servo: ServoStatus, tick: int) -> None:
-        """Continue from the position at which the servo holds the arm."""
+        """Continue the segment from the position at which the servo holds the arm."""
         work = self._work
         self._displaced |= self._memory.is_known
         if not self._memory.is_known:
@@ -157,11 +157,16 @@ class PrimitiveExecutor(Executor):
             work.restart_wait()
 
     def _carry_object(self, row: int, tick: int) -> None:
-        """Let the guard carry object `row`, or nothing if -1, once a scene shows it."""
+        """Tell the guard which object the tool carries, once a new scene shows it.
+
+        Args:
+            row: Row of the object, or -1 for none.
+            tick: Tick of the cycle.
+        """
         self._sight.carry_object(row, tick - SEEN_CYCLES * self.context.every)
 
     def _do_segments(self, serials: list[int], tick: int, passed_s: float) -> None:
-        """Do one cycle of the current segment: finish, withdraw, begin or advance it.
+        """Run one cycle of the current segment: finish, withdraw, begin or advance it.
 
         Args:
             serials: Segments in the window of the level above.
@@ -208,10 +213,10 @@ class PrimitiveExecutor(Executor):
         self._work = None
 
     def _withdraw_segment(self, serials: list[int]) -> bool:
-        """Drop a segment and a fault that have left the window.
+        """Drop the current segment and its fault if the segment has left the window.
 
         Returns:
-            True if the segment must first ramp to rest.
+            True if the motion must come to rest before the segment can be dropped.
         """
         serial = self._work.segment.id if self._work is not None else self._begun
         if serial in serials:
@@ -227,7 +232,7 @@ class PrimitiveExecutor(Executor):
         return False
 
     def _begin_segment(self, serials: list[int], hold: bool) -> None:
-        """Begin the oldest segment that is not done. With `hold`, a gripper segment waits."""
+        """Begin the oldest segment that is not done. With `hold`, a gripper segment must wait."""
         memory = self._memory
         serial = next((s for s in serials if s > memory.done), 0)
         if not serial:
@@ -250,7 +255,16 @@ class PrimitiveExecutor(Executor):
         memory.interrupted = 0
 
     def _begin_path(self, segment: MotionSegment, memory: Memory) -> PathWork:
-        """Begin a path, from where the arm is if it may be off the start of the path."""
+        """Begin a path segment.
+
+        The motion begins at the start of the path. If the path was interrupted, or the arm may have
+        been moved away from its start, the motion begins at the point of the path nearest to the
+        arm.
+
+        Args:
+            segment: The segment.
+            memory: State with the interrupted segment and its progress.
+        """
         path = segment.path()
         self._guard.watch_path(segment, path, self.below.message.opening, self.world.message)
         work = PathWork(segment, path, self._guard, self._rules)
@@ -267,8 +281,8 @@ class PrimitiveExecutor(Executor):
         """Find the segment that needs a trajectory next.
 
         Returns:
-            Its serial, or 0 for none, and the path parameter at which the trajectory must begin,
-            rad.
+            Serial of the segment, or 0 for none, and the path parameter, rad, at which its
+            trajectory must begin.
         """
         work = self._work
         kinds = self.above.message.segments["kind"].tolist()
@@ -289,12 +303,12 @@ class PrimitiveExecutor(Executor):
         return tick + LEAD_CYCLES * self.context.every
 
     def _write_set_point(self, command: JointCommand, tick: int) -> None:
-        """Write the set point, or none (`due` is 0) while the servo is out of step."""
+        """Write the set point. While the servo is out of step there is none, and `due` is 0."""
         work = self._work
         memory = self._memory
         in_step = self._tracking.in_step
         command.id = tick // self.context.every + 1 if memory.is_known else 0
-        # Out of step, the position of the arm is uncertain, and a set point might be wrong.
+        # While out of step, the position of the arm is uncertain, and a set point could be wrong.
         command.due = self._compute_due_tick(tick) if in_step else 0
         set_point = work.motion.set_point if in_step and isinstance(work, PathWork) else self._rest
         command.position[:] = self._position
@@ -306,7 +320,7 @@ class PrimitiveExecutor(Executor):
             command.held = memory.held
 
     def _write_status(self, status: PrimitiveStatus, serials: list[int], tick: int) -> None:
-        """Write the status of this level."""
+        """Fill the status: the state, the current segment and the trajectory that is wanted."""
         memory = self._memory
         work = self._work
         status.echo = self.above.message.id
@@ -332,14 +346,14 @@ class PrimitiveExecutor(Executor):
         status.ends = 0.0
         if isinstance(work, PathWork):
             status.progress = work.progress
-            # Out of step, motion does not hold because of an obstacle.
+            # While out of step, motion holds for that reason, not because of an obstacle.
             status.blocked = work.blocked and self._tracking.in_step
             status.resting = work.motion.is_resting
             status.ends = work.compute_end_s(self._compute_due_tick(tick) * self.context.tick_s)
         status.wants, status.begin = self._find_wanted_trajectory(serials)
 
     def _reason_to_wait(self) -> str:
-        """Return why the level waits and what ends the wait, or an empty text if it does not."""
+        """Return why the level waits and what ends the wait. Empty if it does not wait."""
         work = self._work
         command = self.above
         if not self._tracking.in_step:
@@ -361,14 +375,18 @@ class PrimitiveExecutor(Executor):
         return ""
 
     def _answer_operator(self, above: int) -> None:
-        """Answer the operator, and pass down the newest command on which this cycle is based."""
+        """Report on the operator's commands, and pass down the newest one that this cycle obeys.
+
+        Args:
+            above: Serial of the operator's command on which the command from above is based.
+        """
         if self.status.resting:
             self._orders.report_done()
         self.command.operator = self._orders.find_basis(above)
         self._orders.fill_status(self.status, above)
 
     def _find_state(self, serials: list[int]) -> State:
-        """Return the state to report, apart from HOLDING."""
+        """Return the state to report. EXECUTING becomes HOLDING while the level waits."""
         if self._fault is not None:
             return State.ERROR
         if self._work is not None or any(serial > self._memory.done for serial in serials):

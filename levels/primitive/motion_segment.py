@@ -32,7 +32,7 @@ class MotionSegment(MoveSegment):
     """A copy of one segment of a `MoveCommand`."""
 
     def path(self) -> BlendedPath:
-        """Return the path of the segment.
+        """Build the path of the segment.
 
         Raises:
             ValueError: The path is invalid.
@@ -41,7 +41,7 @@ class MotionSegment(MoveSegment):
 
     def build_lateness_fault(self, earliest_s: float) -> SegmentFault:
         """Return the fault of a segment that cannot be done before `earliest_s`."""
-        # Rounded up, so that the printed time can be met.
+        # Round up, so that the reported time can be met.
         earliest_s = ceil(earliest_s * 1e3) / 1e3
         reason = (
             f"segment {self.id} is wanted by {self.by:.3f} s; the earliest is {earliest_s:.3f} s"
@@ -50,16 +50,20 @@ class MotionSegment(MoveSegment):
 
 
 def window(command: MoveCommand) -> list[int]:
-    """Return the serials of the segments in a MOVE_COMMAND, oldest first."""
+    """Return the serials of the segments in a `MoveCommand`, oldest first."""
     serials: list[int] = command.segments["id"][: command.count].tolist()
     return serials
 
 
 def read_segment(command: MoveCommand, serial: int) -> MotionSegment:
-    """Return a copy of a segment, which must be in the window.
+    """Return a copy of a segment.
+
+    Args:
+        command: Command with the window.
+        serial: Serial of a segment in the window.
 
     Raises:
-        ValueError: Its kind is unknown, or a number is not finite.
+        ValueError: The kind of the segment is unknown, or a number is not finite.
     """
     record = command.segments[window(command).index(serial)]
     segment = MotionSegment(record.dtype)
@@ -88,7 +92,7 @@ class Memory:
 
 
 def restore_memory(status: Reading[PrimitiveStatus], command: Reading[JointCommand]) -> Memory:
-    """Return the state in the level's last messages; it is not known before the first ones."""
+    """Return the state from the level's last messages. It is not known if there are none."""
     if not (status.has_message and command.has_message and command.message.id):
         return Memory()
     return Memory(

@@ -30,16 +30,16 @@ MAX_REST_M_S = 0.01
 
 
 class PathGuard:
-    """Watches one path at a time against the world model.
+    """Checks the remaining path for collisions with the bodies of the world model.
 
     In every cycle it checks the path over the next `lookahead_s`, with every obstacle extrapolated
     by its velocity to the time at which the arm arrives. It also checks a few configurations of the
-    whole remaining path against all bodies where they are now. These count only while no obstacle
-    moves, because a moving one may be gone by the time the arm arrives. A cycle makes at most 13
-    checks.
+    whole remaining path against all bodies where they are now. The results of these count only
+    while no obstacle moves, because a moving obstacle may be gone by the time the arm arrives. A
+    cycle makes at most 13 checks. It watches one path at a time.
 
     Attributes:
-        obstacle: Last pair of geoms found too close, with its distance and the required one.
+        obstacle: Last pair of geoms found too close, with their distance and the required distance.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig, lookahead_s: float, delay_s: float) -> None:
@@ -88,7 +88,7 @@ class PathGuard:
         """Begin to watch the path of a segment.
 
         Args:
-            segment: Segment, which says what it may touch.
+            segment: Segment, which names the object that may be touched.
             path: Its path.
             opening: Opening of the gripper, m or rad.
             world: Newest world model.
@@ -97,7 +97,7 @@ class PathGuard:
         row = segment.object if segment.object >= 0 else None
         self._checker.permit_contact(row, segment.touch)
         self._checker.place_bodies(world.position, world.quaternion)
-        # Motion may start close to something, but must not get much closer.
+        # Motion may start close to an obstacle, but must not get much closer.
         start_clearance = self._checker.find_clearance(path.evaluate(0.0).q)
         self._least = min(self._clearance, max(start_clearance, 0.0) * CLEARANCE_PART)
         self._obstructed = None
@@ -107,12 +107,12 @@ class PathGuard:
     def is_clear(
         self, path: BlendedPath, trajectory: Trajectory, time_s: float, world: WorldState
     ) -> bool:
-        """Do the checks of one cycle.
+        """Check a few configurations of the path.
 
         Args:
             path: Watched path.
             trajectory: Trajectory along it.
-            time_s: Present time on the trajectory; only what follows is checked.
+            time_s: Present time on the trajectory; only later parts are checked.
             world: Newest world model.
 
         Returns:
@@ -130,7 +130,7 @@ class PathGuard:
     def _is_near_clear(
         self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: WorldState | None
     ) -> bool:
-        """Check the path within the look-ahead.
+        """Return True if the path within the look-ahead is clear.
 
         Args:
             path: Watched path.
@@ -153,7 +153,14 @@ class PathGuard:
         return True
 
     def _is_far_clear(self, path: BlendedPath, begin: float) -> bool:
-        """Check the configuration that was blocked last, then the next few after `begin`, rad."""
+        """Return True if the remaining path is clear where this cycle checks it.
+
+        It checks the configuration that was blocked last, then the next few of the remaining path.
+
+        Args:
+            path: Watched path.
+            begin: Path parameter at which the remaining path begins, rad.
+        """
         if self._obstructed is not None and self._obstructed >= begin:
             if not self._is_free(path, self._obstructed):
                 return False
@@ -188,7 +195,7 @@ class SceneWatch:
         Args:
             guard: Guard to tell about a held object.
             blind_ticks: Age from which a scene is stale.
-            has_bodies: False for a scene without bodies, which never is stale.
+            has_bodies: False for a scene without bodies, which is never stale.
         """
         self._guard = guard
         self._blind_ticks = blind_ticks
@@ -197,20 +204,22 @@ class SceneWatch:
         self._waiting: tuple[int, int] | None = None
 
     def carry_object(self, row: int, since: int) -> None:
-        """Carry object `row` from its pose in the first scene sensed at tick `since` or later.
+        """Tell the guard which object the tool carries, once a new scene shows its pose.
 
-        A row of -1 carries nothing.
+        Args:
+            row: Row of the object, or -1 for none.
+            since: Earliest tick at which the scene may have been sensed.
         """
         self._waiting = (row, since) if row >= 0 else None
         if row < 0:
             self._guard.carry_nothing()
 
     def update_scene(self, world: Reading[WorldState], q: Array, tick: int) -> None:
-        """Process the newest world model, with the arm at rest at `q`, (joints,), rad.
+        """Process the newest world model.
 
         Args:
             world: Newest world model and its verdict.
-            q: Position of the arm.
+            q: Position of the arm, (joints,), rad.
             tick: Tick of the cycle.
         """
         model = world.message
@@ -222,7 +231,7 @@ class SceneWatch:
 
     @property
     def reason_to_wait(self) -> str:
-        """Why motion must wait for a new scene. Empty if it need not."""
+        """Why motion must wait for a new scene. Empty if it need not wait."""
         if self._blind:
             return "world model is stale: waiting for a new scene"
         return "waiting for a scene that shows the held object" if self._waiting is not None else ""

@@ -27,15 +27,15 @@ class JointSetPoint(NamedTuple):
 
 
 class PathMotion:
-    """The motion along one path.
+    """Moves the set point along one path.
 
-    The arm may begin slightly off the path. The motion removes this offset during its first
+    If the arm begins slightly off the path, the motion removes this offset during its first
     `bridging_s`.
 
     Attributes:
         path: The path.
         s: Path parameter of the set point, rad.
-        trajectory: Trajectory along the path, or None at rest.
+        trajectory: Trajectory along the path, or None while the set point does not move.
         time_s: Time since the trajectory began.
         stopping: The trajectory is a ramp to rest.
         set_point: Set point computed by the last `advance_by`.
@@ -60,26 +60,29 @@ class PathMotion:
 
     @property
     def is_finished(self) -> bool:
-        """True if the set point rests at the end of the path."""
+        """True if the set point is at rest at the end of the path."""
         return (
             self.is_resting and self.s >= self.path.length and self._bridged_s >= self._bridging_s
         )
 
     @property
     def remaining_s(self) -> float:
-        """Time until the present trajectory ends, in s."""
+        """Time until the present trajectory ends, in s. 0 without a trajectory."""
         return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
 
     def rest_at(self, position: Array) -> float:
-        """Rest at the start of the path, with the arm at `position`, (joints,), rad.
+        """Place the set point at rest at the start of the path.
+
+        Args:
+            position: Position of the arm, (joints,), rad.
 
         Returns:
-            Largest distance of a joint from the path.
+            Largest distance of a joint of the arm from the start of the path, rad.
         """
         return self._place_at_rest(0.0, position)
 
     def rest_near(self, position: Array, progress: float) -> float:
-        """Rest at the point of the path that is nearest to the arm.
+        """Place the set point at rest at the point of the path that is nearest to the arm.
 
         A path may return to itself. Of equally near points, the one closest to `progress` is taken.
 
@@ -88,7 +91,7 @@ class PathMotion:
             progress: Approximate part of the path that is done, 0 to 1.
 
         Returns:
-            Largest distance of a joint from the path.
+            Largest distance of a joint of the arm from that point, rad.
         """
         points = self.path.sample_points(NEAREST_STEP_RAD)
         distances = np.linalg.norm(points - position, axis=1)
@@ -99,13 +102,13 @@ class PathMotion:
             & (distances <= after)
             & (distances <= distances.min() + NEAREST_STEP_RAD)
         )
-        # `linspace` ends exactly: with rounding beyond the end, no trajectory could begin.
+        # `linspace` returns the exact end. No trajectory could begin at a value beyond the end.
         places = np.linspace(0.0, self.path.length, len(points))[minima]
         nearest = np.argmin(np.abs(places - progress * self.path.length))
         return self._place_at_rest(float(places[nearest]), position)
 
     def follow_trajectory(self, trajectory: Trajectory) -> None:
-        """Start along a trajectory that begins at rest where the motion rests."""
+        """Start to follow a trajectory. It must begin at rest at the present path parameter."""
         self.trajectory = trajectory
         self.time_s = 0.0
         self.stopping = False
@@ -138,7 +141,7 @@ class PathMotion:
         np.multiply(d2q_ds2, ds * ds, out=acceleration)
         acceleration += np.multiply(dq_ds, dds, out=self._scratch)
         if self._bridged_s < self._bridging_s:
-            # Add the remaining offset: a quintic from one to zero, at rest at both ends.
+            # Add the remaining offset. Its factor is a quintic from 1 to 0, at rest at both ends.
             self._bridged_s = min(self._bridged_s + duration_s, self._bridging_s)
             u = self._bridged_s / self._bridging_s
             per_s = 1.0 / self._bridging_s
@@ -151,7 +154,15 @@ class PathMotion:
             self._come_to_rest()
 
     def _place_at_rest(self, s: float, position: Array) -> float:
-        """Rest at path parameter `s` with the arm at `position`; return their largest distance."""
+        """Place the set point at rest at path parameter `s`.
+
+        Args:
+            s: Path parameter, rad.
+            position: Position of the arm, (joints,), rad.
+
+        Returns:
+            Largest distance of a joint of the arm from that point of the path, rad.
+        """
         self.s = s
         self._clear_trajectory()
         np.subtract(position, self.path.evaluate(s).q, out=self._offset)
@@ -161,7 +172,7 @@ class PathMotion:
         return distance
 
     def _come_to_rest(self) -> None:
-        """End the trajectory, once the offset from the path is removed."""
+        """End the trajectory, unless an offset from the path remains to be removed."""
         if self._bridged_s < self._bridging_s:
             return
         # Trajectories end with rounding errors, so set the exact end of the path.
@@ -171,7 +182,7 @@ class PathMotion:
         self._clear_trajectory()
 
     def _clear_trajectory(self) -> None:
-        """Follow no trajectory."""
+        """Drop the trajectory, and set velocity and acceleration to zero."""
         self.trajectory = None
         self.stopping = False
         self.set_point.velocity.fill(0.0)

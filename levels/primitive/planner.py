@@ -18,7 +18,7 @@ from rack.levels.robot.cell import build_level_cell
 class PrimitivePlanner(Planner):
     """Computes the trajectory that the status of the executor requests.
 
-    It is for the next segment, or for the rest of a path that was held.
+    The trajectory covers the next path segment, or the rest of a path on which motion was held.
     """
 
     above = Input(MoveCommand, "above.command")
@@ -40,12 +40,12 @@ class PrimitivePlanner(Planner):
         status = self.status.message
         if status.wants not in window(self.above.message):
             return False
-        # The status reflects a plan one cycle later. If the plan is still wanted after that, it was
-        # lost with the board.
+        # The status shows the effect of a plan one cycle later. If the plan is still wanted after
+        # that, it was lost in a restart of the board.
         return (status.wants, status.begin) != self._made or tick > self._answered_at
 
     def plan(self, tick: int) -> None:
-        """Time the wanted segment from where it is to begin, or give the reason why not."""
+        """Compute the trajectory of the wanted segment, or write why there is none."""
         plan = self.output
         status = self.status.message
         context = self.context
@@ -76,7 +76,7 @@ class PrimitivePlanner(Planner):
         plan.error, plan.reason, plan.earliest = fault or (Error.NONE, "", plan.earliest)
 
     def _build_path(self, segment: MotionSegment) -> BlendedPath:
-        """Return the path of a segment.
+        """Build the path of a segment, and check that the arm can follow it.
 
         Raises:
             ValueError: The path is invalid or leaves the range of a joint.
@@ -95,7 +95,7 @@ class PrimitivePlanner(Planner):
 
 
 class Plans:
-    """The executor's copies of plans: the newest trajectory or refusal of every open segment."""
+    """Stores the planner's answers: the newest trajectory or refusal of each open segment."""
 
     def __init__(self) -> None:
         self._plans: dict[int, Trajectory | SegmentFault] = {}

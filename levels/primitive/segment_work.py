@@ -1,7 +1,8 @@
 """Execution of segments.
 
-A path starts when it is planned and clear, holds on command or for the guard, and is done when the
-arm has settled. A gripper segment is done when the gripper is at rest.
+Motion along a path starts when the path is planned and clear. It holds on command, and when the
+guard finds an obstacle. The segment is done when the arm has settled. A gripper segment is done
+when the gripper is at rest.
 """
 
 from __future__ import annotations
@@ -73,7 +74,10 @@ class WorkRules:
 
     @property
     def braking_limits(self) -> Limits:
-        """Limits of a hold. They exceed the planned ones, which motion on a curve may use up."""
+        """Limits of the ramp to rest on a hold.
+
+        They exceed the planned limits, because motion along a curve may already use all of those.
+        """
         planned = self.limits
         factor = self.params.braking
         return replace(
@@ -86,14 +90,15 @@ class WorkRules:
 
     @property
     def latency_s(self) -> float:
-        """Time from the end of a trajectory until its segment is reported done, s."""
+        """Time from the end of a trajectory until its segment is reported done, in s."""
         return (self.params.settled_cycles + ANSWER_CYCLES) * self.period_s
 
 
 class SettlingCounter:
-    """Counts cycles to decide whether something has settled or takes too long.
+    """Counts cycles to decide whether arm or gripper has settled, or takes too long.
 
-    Enough consecutive quiet cycles mean that it has settled.
+    It has settled after enough consecutive quiet cycles: those in which its error or speed is
+    small.
     """
 
     def __init__(self, rules: WorkRules) -> None:
@@ -103,19 +108,26 @@ class SettlingCounter:
         self._cycles = 0
 
     def count_cycle(self, quiet: bool) -> bool:
-        """Count one cycle. Return True if it has settled."""
+        """Count one cycle.
+
+        Args:
+            quiet: The error or speed in this cycle is small.
+
+        Returns:
+            True if arm or gripper has settled.
+        """
         self._cycles += 1
         self._quiet = self._quiet + 1 if quiet else 0
         return self._quiet >= self._wanted_cycles
 
     @property
     def is_overdue(self) -> bool:
-        """True if it should have settled by now."""
+        """True if settling has taken longer than permitted."""
         return self._cycles > self._most_cycles
 
 
 class WorkCycle(NamedTuple):
-    """The inputs of one cycle of a path."""
+    """Inputs of a path segment in one cycle."""
 
     hold: bool
     plan: Trajectory | None  # begins where the motion rests
@@ -155,7 +167,11 @@ class PathWork:
         self._fresh = True
 
     def begin_at(self, position: Array) -> None:
-        """Prepare to start from `position`, (joints,), rad, where the path must begin."""
+        """Prepare to start at the beginning of the path. It is a fault if the arm is not near it.
+
+        Args:
+            position: Position of the arm, (joints,), rad.
+        """
         permitted = self._rules.params.astray
         distance = self.motion.rest_at(position)
         if distance > permitted:
@@ -163,10 +179,12 @@ class PathWork:
             self.fault = SegmentFault(Error.LIMIT, f"{begins}; valid: at most {permitted} rad")
 
     def begin_near(self, position: Array, progress: float) -> None:
-        """Prepare to continue from `position`, (joints,), rad. Blocked if that is off the path.
+        """Prepare to continue from the point of the path that is nearest to the arm.
+
+        The segment is blocked if the arm is too far from the path.
 
         Args:
-            position: Position of the arm.
+            position: Position of the arm, (joints,), rad.
             progress: Approximate part of the path that is done, 0 to 1.
         """
         self._fresh = False
@@ -177,7 +195,7 @@ class PathWork:
         self.obstacle = f"the arm is {distance:.3f} rad off its path"
 
     def step(self, cycle: WorkCycle) -> None:
-        """Do one cycle: check the path, start or hold the motion, and advance it."""
+        """Run one cycle: check the path, start or hold the motion, and advance it."""
         motion = self.motion
         waits = self.wanted_begin is not None
         if motion.trajectory is not None and not motion.stopping:
@@ -192,7 +210,7 @@ class PathWork:
         motion.advance_by(cycle.passed_s)
 
     def check_done(self, status: DrivenArm) -> bool:
-        """Return True if the set point and the arm rest at the end of the path.
+        """Return True if set point and arm are at rest at the end of the path.
 
         Call this once for each new status. It sets `fault` if the arm does not settle in time.
         """
@@ -213,7 +231,7 @@ class PathWork:
 
     @property
     def wanted_begin(self) -> float | None:
-        """Path parameter at which a trajectory must begin, rad. None if the motion needs none."""
+        """Path parameter in rad at which a trajectory must begin. None if the motion needs none."""
         motion = self.motion
         return (
             motion.s if motion.is_resting and not motion.is_finished and not self.astray else None
@@ -228,7 +246,8 @@ class PathWork:
     def compute_end_s(self, due_s: float) -> float:
         """Return the simulated time at which the segment should be done, or 0 if it is not known.
 
-        The set point commanded last is due at `due_s`.
+        Args:
+            due_s: Simulated time at which the set point commanded last is due.
         """
         if self.motion.stopping or (self.motion.is_resting and not self.motion.is_finished):
             return 0.0
@@ -251,16 +270,21 @@ class PathWork:
             self._clear_cycles = 0
 
     def _set_blocked(self, blocked: bool) -> None:
-        """Set `blocked`, and keep the obstacle that blocked the motion first."""
+        """Set `blocked`. When the path becomes blocked, record the obstacle."""
         if blocked and not self.blocked:
             self.obstacle = self._guard.obstacle
         self.blocked = blocked
 
     def _stretch_to_deadline(self, trajectory: Trajectory, due_s: float) -> Trajectory | None:
-        """Stretch a trajectory so that it ends just in time.
+        """Stretch a trajectory so that the segment is done just at its deadline, if it has one.
+
+        Args:
+            trajectory: Trajectory of the path.
+            due_s: Simulated time of its start.
 
         Returns:
-            The trajectory, or None if it would end too late and the path has not been started.
+            The trajectory. If a path that was not started would end too late, `fault` is set and
+            None returned.
         """
         if not self.segment.by or not trajectory.duration:
             return trajectory
@@ -288,7 +312,10 @@ class GripperWork:
         self.restart_wait()
 
     def restart_wait(self) -> None:
-        """Wait for the gripper to rest: at the start, and when the servo is back in step."""
+        """Start to wait until the gripper is at rest.
+
+        Called at the start of the segment, and again when the servo gets back into step.
+        """
         self._cycles = 0
         self._quiet = SettlingCounter(self._rules)
 
@@ -306,7 +333,7 @@ class GripperWork:
         Call this once for each new status. It sets `fault` if the gripper does not rest in time.
         """
         self._cycles += 1
-        # The gripper also rests until the command reaches it.
+        # The gripper is also at rest before the command reaches it.
         if self._cycles <= HANDOVER_CYCLES:
             return False
         speed = abs(status.opening_velocity)

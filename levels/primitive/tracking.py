@@ -29,11 +29,11 @@ MAX_UNEXPLAINED_CYCLES = 50
 
 
 class Tracking:
-    """Decides from the status of the servo whether it is in step with this level.
+    """Decides from the status of the servo whether it is in step, that is, follows the set points.
 
-    The two fall out of step when either restarts, or misses enough cycles for the servo to hold by
-    itself. They get back into step when the servo holds the arm at rest and is not stopped. Motion
-    then continues from the place where it is held.
+    The servo falls out of step when either level restarts, when it misses so many set points that
+    it holds by itself, or when it is stopped. It gets back into step when it holds the arm at rest
+    and is not stopped. Motion then continues from the position at which the arm is held.
 
     Attributes:
         in_step: The servo follows set points.
@@ -47,7 +47,7 @@ class Tracking:
         self._unexplained_cycles = 0
 
     def update_status(self, status: Reading[DrivenArm]) -> bool:
-        """Process one status. Return True in the cycle in which the two get into step."""
+        """Process one status. Return True in the cycle in which the servo gets into step."""
         heard = status.is_new and not status.is_lost
         self.silent_cycles = 0 if heard else self.silent_cycles + 1
         self._cycles_in_step += 1
@@ -71,7 +71,7 @@ class Tracking:
         return True
 
     def describe_wait(self, servo: DrivenArm) -> str:
-        """Describe what a level that is out of step waits for."""
+        """Return a text that tells what a level waits for while the servo is out of step."""
         if self.silent_cycles > MAX_MISSED_STATUSES:
             return f"waiting for servo: no status for {self.silent_cycles} cycles"
         if servo.state == State.HOLDING and servo.reason:
@@ -91,17 +91,18 @@ class DeviationMonitor:
     A few such cycles are permitted; motion holds during them.
 
     Attributes:
-        place: The joint and its distance, or empty if none is too far away.
-        fault: Set when it lasts too long.
+        place: Text with the joint and its distance. Empty if no joint is too far away.
+        fault: Set when a joint has been too far away for too long, else None.
     """
 
     def __init__(self, joints: Sequence[str], permitted_rad: float, permitted_cycles: int) -> None:
-        """Permit `permitted_rad` always, and more for `permitted_cycles` at most.
+        """Permit larger distances than `permitted_rad` for at most `permitted_cycles` cycles.
 
         Args:
             joints: Names of the joints.
-            permitted_rad: Distance that does not count.
-            permitted_cycles: Number of consecutive cycles with a larger distance that is no fault.
+            permitted_rad: Distance up to which a cycle does not count.
+            permitted_cycles: Number of consecutive cycles with a larger distance that are
+                tolerated.
         """
         self._joints = joints
         self._permitted_rad = permitted_rad
@@ -116,7 +117,7 @@ class DeviationMonitor:
         return self._cycles > 0
 
     def reset_count(self) -> None:
-        """Restart the count, and clear a fault."""
+        """Reset the count, and clear `place` and `fault`."""
         self._cycles = 0
         self.place = ""
         self.fault = None

@@ -1,4 +1,4 @@
-"""Judges from the motion of the arm whether its motors give the commanded torques."""
+"""Detects from the motion of the arm when a motor does not give its commanded torque."""
 
 from __future__ import annotations
 
@@ -63,15 +63,16 @@ ASTRAY = 2
 
 
 class ActuatorMonitor:
-    """Compares the torques that a motion must have taken with the commanded torques.
+    """Compares the torques that the sensed motion requires with the commanded torques.
 
-    A difference comes from motors that gave less than commanded, or from an external push. After a
-    difference that weak motors do not explain, a motor has only failed if it lacks more than
-    `MAX_CONTACT_PART`, until the difference is gone. For a cycle or two a pulling load looks like a
-    weak motor. But a working motor under load gives more when more is commanded.
+    They differ if a motor gives less than commanded, or if something pushes the arm. A push is
+    assumed from the first difference that weak motors cannot explain, until the difference is gone.
+    Meanwhile a motor only counts as failed if it lacks more than the part `MAX_CONTACT_FRACTION` of
+    its torque limit. For a cycle or two, a load that pulls at the arm looks like a weak motor. But
+    a working motor gives more torque when more is commanded.
 
-    A motor has also failed if the arm is farther than `following`, rad, from its set points. That
-    is the only criterion for drives that do not report the torque that they give.
+    A motor also counts as failed if its joint is farther than `following`, in rad, from its set
+    point. That is the only criterion for drives that do not report the torque that they give.
     """
 
     def __init__(
@@ -116,16 +117,19 @@ class ActuatorMonitor:
         self._alone = True  # it is the only motor that lacks torque
 
     def begin_cycle(self) -> None:
-        """Start a cycle with `torque`, at the state passed to `judge_cycle` last."""
+        """Begin a cycle in which the motors are commanded `torque`, in the state judged last."""
         self._begun = True
 
     def drop_cycle(self) -> None:
-        """Do not judge the present cycle: brakes, missed cycles or wrong samples intervened."""
+        """Do not judge the present cycle.
+
+        Call this if the arm was braked, cycles were missed or there was no usable sample.
+        """
         self._begun = self._pushed = False
         self._cycles = 0
 
     def judge_cycle(self, wanted: Array, state: Array, terms: Terms, holds: bool) -> Finding | None:
-        """Judge the cycle that ends now, and keep its final state for the next one.
+        """Judge the cycle that ends now. Its final state becomes the initial state of the next one.
 
         Args:
             wanted: Set points now; the first row is positions, (joints,), rad.
@@ -134,7 +138,7 @@ class ActuatorMonitor:
             holds: The gripper holds a part, which may touch something.
 
         Returns:
-            A failed motor, or None.
+            Finding that names a failed motor, or None.
         """
         verdict = self._judge(wanted, state, terms.inertia, terms.bias)
         if not self._begun:
@@ -150,7 +154,15 @@ class ActuatorMonitor:
         return self._track_lacking_torque(state[1], holds)
 
     def _track_lacking_torque(self, velocity: Array, holds: bool) -> Finding | None:
-        """Observe a motor whose lack of torque explains the difference, until it is certain."""
+        """Track the motor whose lack of torque explains the difference, until it counts as failed.
+
+        Args:
+            velocity: Sensed velocities, (joints,), rad/s.
+            holds: The gripper holds a part, which may touch something.
+
+        Returns:
+            Finding that names the motor once it is certain that it has failed, else None.
+        """
         motors = self._motors
         residual = motors["left"]
         noise = motors["noise"]
@@ -161,7 +173,7 @@ class ActuatorMonitor:
             self._pushed = True
             self._cycles = 0
         share = np.where(explained, lacks / self._limits, 0.0)
-        # While a joint turns, its dry friction is known, so any push is visible.
+        # While a joint turns, its dry friction is known, so a push on it can be detected.
         is_known = motors["most_friction"] - motors["least_friction"] <= noise
         rests = np.count_nonzero(is_known) < MIN_TURNING_JOINTS
         permitted_share = LACKING_PART
@@ -199,9 +211,9 @@ class ActuatorMonitor:
     def _is_certain(self, joint: int, commanded: float, lacks: float) -> bool:
         """Return True if it is certain that the motor has failed.
 
-        It gives nothing, gives no more when more is commanded, or lacks more than a push can
-        explain. Dry friction that changes sign can look like torque of a dead motor, up to twice
-        its value.
+        Then the motor gives no torque, gives no more when more is commanded, or lacks more than a
+        push can explain. Dry friction that changes sign can hide a dead motor: it looks like torque
+        of up to twice its value.
 
         Args:
             joint: Joint of the motor.
@@ -231,7 +243,7 @@ def compute_residuals(
     inertia: Array,  # (joints, joints), kg m2
     bias: Array,  # (joints,), N m
 ) -> int:
-    """Compare the torques that a motion took with those commanded, and keep the final state.
+    """Compare the torques that a motion required with those commanded, and store the final state.
 
     Args:
         motors: State of the monitor.

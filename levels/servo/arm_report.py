@@ -30,10 +30,10 @@ class SetPointStatus(NamedTuple):
 
 @dataclass
 class ArmReport:
-    """Fills the status and the estimate in the state of a level that drives an arm.
+    """Fills the status of a level that drives an arm, and the estimate in its state.
 
     Numbers change in every cycle and are written through views of the messages. The other fields
-    seldom change; they are written only in cycles in which one of them does.
+    are written only in cycles in which one of them has changed.
     """
 
     status: DrivenArm
@@ -68,7 +68,7 @@ class ArmReport:
 
         Args:
             followed: How the level follows its set points.
-            demand: Stop that the rack demands of the arm.
+            demand: Stop that the rack requires of the arm, if any.
             speed_scale: Permitted part of full speed, up to 1.
         """
         arm = self.arm

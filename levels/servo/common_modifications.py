@@ -36,7 +36,7 @@ class DeadZone(Modification):
         self._width = read_params(DeadZoneParams, context.params).width
 
     def modify(self, sample: LawSample) -> None:
-        """Move the position that the law sees towards the wanted one, by at most the width."""
+        """Move the position that the law uses towards the wanted one, by at most the width."""
         error = sample.wanted_position - sample.position
         sample.position += np.minimum(np.maximum(error, -self._width), self._width)
 
@@ -53,7 +53,7 @@ class JointPdParams(Table):
 
 
 class JointPd(Modification):
-    """Controls every joint by itself with PD on its error.
+    """Controls each joint separately by proportional-derivative (PD) control.
 
     It ignores the wanted acceleration, coupling between joints and friction.
     """
@@ -69,7 +69,7 @@ class JointPd(Modification):
         self._load = float(params.load)
 
     def modify(self, sample: LawSample) -> None:
-        """Set the torques by PD, scaled by each joint's inertia."""
+        """Set the torques by PD control, scaled by the inertia of each joint."""
         error = sample.wanted_position - sample.position
         slip = sample.wanted_velocity - sample.velocity
         pull = sample.inertia * (self._stiffness * error + self._damping * slip)
@@ -110,7 +110,7 @@ class Notch(Modification):
         self._unfiltered, self._filtered = np.zeros((2, 2, len(context.joints)))
 
     def begin(self, sample: LawSample) -> None:
-        """Start as if the torque had always been the present one."""
+        """Initialise the filter as if the torque had been constant so far."""
         self._unfiltered[:] = self._filtered[:] = sample.torque
 
     def modify(self, sample: LawSample) -> None:

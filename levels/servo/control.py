@@ -31,7 +31,7 @@ class LoopGains(Table):
     """damping ratio of the error"""
 
     def fill_constants(self, table: Array) -> None:
-        """Write stiffness, 1/s2, and damping, 1/s, to the first two rows of a law's constants."""
+        """Write stiffness in 1/s2 and damping in 1/s to the first two rows of a law's constants."""
         table[0] = self.bandwidth**2
         table[1] = 2.0 * self.damping * self.bandwidth
 
@@ -57,7 +57,7 @@ class ArmParams(Table):
     @field_validator("arm")
     @classmethod
     def _check_arm(cls, reference: str) -> str:
-        """Check that the class can be loaded and is an arm."""
+        """Check that the class can be loaded and is a class of an arm."""
         find_arm(reference)
         return reference
 
@@ -83,7 +83,12 @@ class ComputedTorque:
     """
 
     def __init__(self, friction: Array, gains: LoopGains) -> None:
-        """Compensate the dry friction `friction`, (joints,), N m."""
+        """Create the law.
+
+        Args:
+            friction: Dry friction to compensate, (joints,), N m.
+            gains: Gains of the joint loop.
+        """
         table = np.zeros((4, len(friction)))  # in the rows of `set_torque`
         self._constants = table
         self.set_gains(gains)
@@ -142,7 +147,15 @@ def set_torque(
 
 @compiled_for("f8[::1], f8[::1]")
 def limit_torques(torque: Array, limits: Array) -> bool:
-    """Cut torques, (joints,), N m, at their limits. NaN stays. Return True if one was cut."""
+    """Limit torques in place. NaN is not changed.
+
+    Args:
+        torque: Torques, (joints,), N m.
+        limits: Torque limits, (joints,), N m.
+
+    Returns:
+        True if a torque was limited.
+    """
     cut = False
     for j in range(len(torque)):
         if abs(torque[j]) > limits[j]:
@@ -154,9 +167,9 @@ def limit_torques(torque: Array, limits: Array) -> bool:
 class SetPointLaw:
     """Computes set points for drives that close a position or velocity loop.
 
-    A set point is the motion wanted at the end of the cycle. Velocity drives do not know the
-    position, so their set point also corrects the position error, as fast as `ComputedTorque`
-    would.
+    A set point is the motion wanted at the end of the cycle. Velocity drives do not control the
+    position, so their set point also contains a term that corrects the position error, as fast as
+    `ComputedTorque` would.
     """
 
     def __init__(self, cell: Cell, params: LoopGains, period_s: float) -> None:
@@ -174,7 +187,7 @@ class SetPointLaw:
         Args:
             wanted: Motion to follow.
             position: Sensed positions, (joints,), rad.
-            torque: Predicted torques, (joints,), N m, which are passed on.
+            torque: Predicted torques, (joints,), N m, which are passed on to the drives.
         """
         gained = self._period_s * wanted.acceleration
         return JointTarget(
@@ -185,10 +198,11 @@ class SetPointLaw:
 
 
 class Grip:
-    """Computes the gripper's force, N or N m.
+    """Computes the force of the gripper, in N or N m.
 
-    A spring and damper pull to the commanded opening, limited to the commanded force. Before the
-    first set point the gripper opens or, after `keep_force`, keeps its force.
+    A spring and a damper pull the gripper to the commanded opening, with at most the commanded
+    force. Before the first set point the gripper opens or, after `keep_force`, applies a constant
+    force.
     """
 
     def __init__(self, config: GripperConfig) -> None:
@@ -200,21 +214,24 @@ class Grip:
         self._kept: float | None = None
 
     def keep_force(self, force: float) -> None:
-        """Keep `force`, N or N m, until the first set point.
+        """Apply a constant force until the first set point.
 
         A held object must not be dropped when the board restarts.
+
+        Args:
+            force: Force, N or N m.
         """
         self._kept = force
 
     def take_command(self, command: ArmSetPoint) -> None:
-        """Take opening and force from a new `JOINT_SET_POINT`."""
+        """Take opening and force from a new set point."""
         if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
             self._opening = min(max(command.opening, self._least), self._most)
             self._limit = min(max(command.force, 0.0), self._most_force)
             self._kept = None
 
     def compute_force(self, opening: float, velocity: float) -> float:
-        """Return the force, N or N m.
+        """Return the force of the gripper, in N or N m.
 
         Args:
             opening: Sensed opening, m or rad.

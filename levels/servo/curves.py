@@ -19,9 +19,9 @@ REST = 6
 
 
 class Motion:
-    """Positions, rad, velocities, rad/s, and accelerations, rad/s2, of the joints.
+    """Positions, velocities and accelerations of the joints, in rad, rad/s and rad/s2.
 
-    Each is (joints,), and one row of `table`.
+    Each is a row of `table`, (joints,).
     """
 
     __slots__ = ("acceleration", "position", "table", "velocity")
@@ -32,7 +32,7 @@ class Motion:
 
 
 class SensedMotion:
-    """Positions, rad, and velocities, rad/s, of the joints: (joints,) each, rows of `table`."""
+    """Positions and velocities of the joints, in rad and rad/s: rows of `table`, (joints,) each."""
 
     __slots__ = ("position", "table", "velocity")
 
@@ -42,13 +42,13 @@ class SensedMotion:
 
 
 class Curve:
-    """A motion of all joints over time, which may change to rest at `ends_s`."""
+    """A motion of all joints over time. From `ends_s` on, the joints are at rest."""
 
     def __init__(self, *coefficients: Array, duration_s: float, rest: Array | None = None) -> None:
         """Take polynomial coefficients.
 
         Args:
-            coefficients: Of u^0, u^1, ..., (joints,) each, rad.
+            coefficients: Coefficients of u^0, u^1, ..., (joints,) each, rad.
             duration_s: Time at which u is 1.
             rest: Positions at rest after `duration_s`, (joints,), rad. None continues the
                 polynomial.
@@ -136,9 +136,12 @@ class Bridge(Curve):
         )
 
     def is_within(self, acceleration: Array) -> bool:
-        """Return True if no joint exceeds its `acceleration`, (joints,), rad/s2.
+        """Return True if no joint exceeds its acceleration limit on this curve.
 
         The acceleration of a cubic is greatest at one of its ends.
+
+        Args:
+            acceleration: Acceleration limits, (joints,), rad/s2.
         """
         begin = 2.0 * self.table[2] / self.duration_s**2
         end = (2.0 * self.table[2] + 6.0 * self.table[3]) / self.duration_s**2
@@ -152,7 +155,13 @@ class Ramp(Curve):
     """
 
     def __init__(self, start: Array, velocity: Array, acceleration: Array) -> None:
-        """Decelerate from `velocity`, rad/s, no joint harder than its `acceleration`, rad/s2."""
+        """Decelerate as quickly as the limits permit.
+
+        Args:
+            start: Position at the start, (joints,), rad.
+            velocity: Velocity at the start, (joints,), rad/s.
+            acceleration: Acceleration limits, (joints,), rad/s2.
+        """
         duration_s = float(np.max(np.abs(velocity) / acceleration))
         half = 0.5 * velocity * duration_s
         super().__init__(start, 2.0 * half, -half, duration_s=duration_s, rest=start + half)
@@ -165,7 +174,7 @@ class Decay(Curve):
     """
 
     def __init__(self, position: Array, velocity: Array, fastest: Array, hardest: Array) -> None:
-        """Choose the duration by what the decay may add to a motion, approximately.
+        """Choose the duration so that the decay adds about `fastest` and `hardest` at most.
 
         Args:
             position: Initial difference, (joints,), rad.

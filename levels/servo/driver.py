@@ -1,4 +1,4 @@
-"""The part of a level that drives an arm, whatever motion it is driven to follow.
+"""The part of a level that drives an arm, independent of the motion that the arm follows.
 
 A cycle has three phases:
 
@@ -51,18 +51,19 @@ SCENES = Output(Scene, cycles=8)
 
 
 class ArmDriver(Executor):
-    """Drives an arm and advances its time. Subclasses give the motion and the torques for it.
+    """Drives an arm and advances its time. Subclasses compute the motion and the torques.
 
-    A cycle first advances the arm by the ticks since the last one, so that its time equals the
-    clock even if cycles were missed. Safety comes first: on a demand of the rack, and while sensors
+    A cycle first advances the arm by the ticks since the last cycle, so that its time equals the
+    clock even if cycles were missed. Safety comes first: while the rack demands a stop, or sensors
     or motors are at fault, the arm holds, stops or is braked. Afterwards motion resumes from where
-    it is.
+    the arm is.
 
-    A subclass reads its last state as "before", and writes "status", "state" and "scene".
+    A subclass declares the input `before`, which reads its own last state, and the outputs
+    `status`, `state` and `scene`.
 
     Attributes:
-        followed: Id of the newest command.
-        rests_on: Serial of the operator's command that it is based on.
+        followed: Id of the newest command from the level above.
+        rests_on: Serial of the operator's command on which that command is based.
         abandoned: The arm was braked in the last cycle, so its set points were abandoned.
         speed_scale: Permitted part of full speed, up to 1.
     """
@@ -71,7 +72,7 @@ class ArmDriver(Executor):
     params: ClassVar[type[ArmParams]] = ArmParams
     settings: ArmParams
     gives_set_points: ClassVar[bool] = False
-    """True if it can also drive an arm by set points. Its torques are then predictions."""
+    """True if the level can also drive an arm by set points. Its torques are then predictions."""
     set_point_law: SetPointLaw | None = None
     """Computes set points for position or velocity drives. None for torque drives."""
     orders: Orders
@@ -122,11 +123,11 @@ class ArmDriver(Executor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield a robot that is a hand, and an arm that the level cannot drive or guard.
+        """Yield a mismatch if the robot is a hand, or an arm that the level cannot drive or guard.
 
-        A hand of tendons has a board of another kind. An arm that needs a guard must have encoders
-        that are fine enough for it. The arm must take the torques or set points that the level
-        gives.
+        A hand with tendons needs a board of another kind. An arm that needs a guard must have
+        encoders that are precise enough for it. The arm must accept the torques or set points of
+        the level.
         """
         robot = context.robot
         reference = read_params(cls.params, context.params).arm
@@ -150,7 +151,7 @@ class ArmDriver(Executor):
             yield "params.arm", reference, text
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the faults injected between this level and the arm."""
+        """Replace the faults that are injected between this level and the arm."""
         self._path.faulty.inject(faults)
         self._link = self._path.faulty if faults else self._path.faultless
 
@@ -162,8 +163,8 @@ class ArmDriver(Executor):
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
         """Return the motion wanted in this cycle, or None to brake.
 
-        After braking (`abandoned`) the motion must begin where the arm is. With a reaction it must
-        come to rest.
+        After braking (`abandoned`) the motion must begin where the arm is. If there is a reaction,
+        the motion must come to rest.
 
         Args:
             reaction: Reaction of this cycle, weaker than BRAKE.
@@ -172,20 +173,27 @@ class ArmDriver(Executor):
         """
 
     def find_terms(self) -> Terms:
-        """Return the equation of motion at the sensed state, with the payload."""
+        """Return the equation of motion at the sensed state, including the payload."""
         return self.arm.dynamics.terms(self.sensors.position, self.sensors.velocity, self.payload)
 
     @abstractmethod
     def compute_efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
-        """Return torques, (joints,), N m, and grip force, N, for the wanted motion.
+        """Compute what the motors must do for the wanted motion.
 
-        They may use `terms`, the equation of motion of this cycle.
+        Implementations may use `terms`, the equation of motion of this cycle.
+
+        Args:
+            wanted: Motion wanted in this cycle.
+            sensed: Sample of this cycle.
+
+        Returns:
+            Torques, (joints,), N m, and force of the gripper, N.
         """
 
     @property
     @abstractmethod
     def payload(self) -> Payload | None:
-        """Payload in the gripper. None if there is none, or it is not known."""
+        """Payload in the gripper. None if there is none or it is not known."""
 
     @property
     @abstractmethod
@@ -194,20 +202,24 @@ class ArmDriver(Executor):
 
     @abstractmethod
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return how the level follows its set points, for the status."""
+        """Return how the level follows its set points. The status reports it."""
 
     @cached_property
     def _report(self) -> ArmReport:
-        """Writer of status and state.
+        """Writer of the status and the state.
 
-        It is built in the first cycle, because the board provides the messages after the
-        constructor.
+        It is created in the first cycle, because the board provides the messages only after the
+        constructor has run.
         """
         parts = self.arm, self.sensors, self.stopping
         return ArmReport(self.status, self.state, *parts, self.enabling.slow)
 
     def obey_drive_command(self, command: OperatorCommand) -> str:
-        """Obey one of `rack.levels.operator.DRIVES`. Return why it is refused, or an empty text."""
+        """Carry out one of `rack.levels.operator.DRIVE_OPERATIONS`.
+
+        Returns:
+            Why the command is refused, or an empty text.
+        """
         if command.what != Operation.RELEASE:
             return self.enabling.obey_command(command)
         self.speed_scale = 1.0
@@ -215,16 +227,16 @@ class ArmDriver(Executor):
         return ""
 
     def sense_contact(self, tick: int) -> None:
-        """Sense more than the joints, before the reaction is decided. The default does nothing."""
+        """Read further sensors before the reaction is decided. The default does nothing."""
 
     def on_adopted(self) -> None:
-        """React to an arm that was just enabled, wherever it is. The default does nothing."""
+        """React to the adopted pose of an arm that was just enabled. The default does nothing."""
 
     def on_restored(self) -> None:
-        """React to a restart, after the arm was restored. The default does nothing."""
+        """React to a restart after the arm was restored. The default does nothing."""
 
     def process(self, tick: int) -> None:
-        """Do one cycle: advance the arm to `tick`, check it, drive or brake it, and report."""
+        """Run one cycle: advance the arm to `tick`, check it, drive or brake it, and report."""
         missed = self._advance_arm(tick)
         self.take_messages()
         sensed = self._link.sense()
@@ -247,7 +259,7 @@ class ArmDriver(Executor):
             self.arm.look(self.scene)
 
     def _advance_arm(self, tick: int) -> bool:
-        """Advance the arm to `tick`; take it over in the first cycle.
+        """Advance the arm to `tick`. In the first cycle, take the arm over before that.
 
         Returns:
             True if cycles were missed since the last one.
@@ -324,7 +336,7 @@ class ArmDriver(Executor):
             target = self.set_point_law.compute_target(wanted, self.sensors.position, torque)
             refused = self._link.follow(target, grip_force)
         if refused is not None:
-            # The arm has engaged its brakes by itself.
+            # The arm has engaged its brakes itself when it refused the command.
             self.stopping.register_refusal(refused, tick)
             return self.brake_arm()
         self._wanted = wanted.table

@@ -14,11 +14,11 @@ from rack.levels.servo.stopping import Stopping
 
 
 class Enabling:
-    """Follows the states of an arm's drives. Only an enabled arm is driven and judged.
+    """Tracks whether the drives of an arm are enabled. Only an enabled arm is driven and judged.
 
-    Whoever enables an arm must be able to see it. So it must be enabled again after a fault, or
-    after the drives have switched off their torque themselves. A restarted board leaves the drives
-    as they are.
+    Whoever enables an arm must be able to see it. An operator must therefore enable it again after
+    a fault, or after the drives have switched off by themselves. A restart of the board does not
+    change the state of the drives.
     """
 
     def __init__(self, arm: DrivableArm, context: LevelContext) -> None:
@@ -37,13 +37,17 @@ class Enabling:
         self._goal: Collection[DriveState] = ()  # states in which the command is done
 
     def start(self, restarted: bool) -> None:
-        """Enable the arm at the start, unless an operator must do so or the board was restarted."""
+        """Enable the arm, unless an operator must do so or the board was restarted."""
         self._restarted = restarted
         if self._at_start and not (restarted or self._guessed):
             self._arm.enable()
 
     def obey_command(self, command: OperatorCommand) -> str:
-        """Obey one of `rack.levels.operator.DRIVES`. Return why it is refused, or an empty text."""
+        """Carry out one of `rack.levels.operator.DRIVE_OPERATIONS`.
+
+        Returns:
+            Why the command is refused, or an empty text.
+        """
         arm = self._arm
         goal: Collection[DriveState] = list(DriveState)
         if command.what in (Operation.ENABLE, Operation.DISABLE):
@@ -67,7 +71,11 @@ class Enabling:
         return ""
 
     def pop_finished_command(self) -> int:
-        """Return, once, the serial of a command when the drives have carried it out, else 0."""
+        """Return the serial of a command that the drives have just carried out, else 0.
+
+        Call this once per cycle, after the commands of the cycle: a `disable` among them takes
+        effect here.
+        """
         self._restarted = False
         if self._disables:
             self._disables = False
@@ -101,8 +109,8 @@ class Enabling:
 class Takeover:
     """Restores an arm after a restart, and adopts its pose while it is not enabled.
 
-    An arm that is not enabled may be moved by hand, and its drives may give no samples. So samples
-    are not checked against earlier ones until the arm is enabled and its pose has been adopted.
+    An arm that is not enabled may be moved by hand, and its drives may give no samples. Samples are
+    therefore compared with earlier ones only after the arm was enabled and its pose adopted.
     """
 
     arm: DrivableArm
@@ -113,7 +121,7 @@ class Takeover:
     is_complete: bool = False  # the arm is enabled, and its pose was adopted since
 
     def start(self, before: Reading[ArmState]) -> bool:
-        """Start in the first cycle; return True if an arm was restored from its last state."""
+        """Start in the first cycle. Return True if the arm was restored from its last state."""
         self.is_started = True
         self.enabling.start(before.has_message)
         if before.has_message:

@@ -1,4 +1,4 @@
-"""The servo level of NASREM: computed torque, or set points for drives that close a loop."""
+"""The servo level of NASREM: computed torque, or set points for closed-loop drives."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class ServoExecutor(ServoLaw):
             self.set_point_law = SetPointLaw(self.cell, self.settings, context.period_s)
 
     def take_plan(self, plan: ServoPlan) -> None:
-        """Take over the held object and the planned inertia."""
+        """Adopt the payload in the gripper and the planned inertia."""
         super().take_plan(plan)
         self._loop.inertia = plan.inertia.copy()
 
     def _obey_command(self, command: OperatorCommand) -> str:
-        """Obey a command, and pass gains that it may have changed to the loops."""
+        """Carry out a command, and pass gains that it may have changed to the loops."""
         refusal = super()._obey_command(command)
         self._loop.set_gains(self.settings)
         if self.set_point_law is not None:

@@ -102,7 +102,7 @@ class ServoLaw(ArmDriver):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield control modifications that do not suit the law, and what `ArmDriver` yields."""
+        """Yield control modifications that do not suit the law, and mismatches of `ArmDriver`."""
         yield from super().find_mismatches(context, above, below)
         yield from find_misfits(context)
         interface = context.robot.interface
@@ -125,7 +125,7 @@ class ServoLaw(ArmDriver):
         """
 
     def take_messages(self) -> None:
-        """Process a new operator's command, plan or set point."""
+        """Process the new messages of this cycle: operator's command, plan and set point."""
         if self.operator.verdict is Verdict.NEW:
             self.operator_control.take_commands(self.operator, self.sensors.position)
         if self.plan.verdict is Verdict.NEW:
@@ -139,15 +139,15 @@ class ServoLaw(ArmDriver):
                 self._grip.take_command(command)
 
     def take_plan(self, plan: ServoPlan) -> None:
-        """Take over the payload in the gripper."""
+        """Adopt the payload in the gripper from a new plan."""
         self._holds = plan.held >= 0
         self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
 
     def _obey_command(self, command: OperatorCommand) -> str:
-        """Obey a command that leaves the one in force unchanged.
+        """Carry out a setting or a command to the drives. HOLD and SETPOINT remain in effect.
 
         Returns:
-            Why it is refused, or an empty text.
+            Why the command is refused, or an empty text.
         """
         if command.what == Operation.MODIFY:
             return self._modified.switch_modification(command.name, command.goal == Goal.ON)
@@ -159,16 +159,24 @@ class ServoLaw(ArmDriver):
         return refusal
 
     def on_adopted(self) -> None:
-        """Forget the operator's way back, because the arm may have been moved away from it."""
+        """Discard the operator's return path, because the arm may have been moved by hand."""
         self.operator_control.forget_return_path()
 
     def on_restored(self) -> None:
-        """Keep the grip on a held part."""
+        """Keep the force of the gripper, so that a held part is not dropped."""
         if self._grip is not None:
             self._grip.keep_force(self.arm.grip_force)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion:
-        """Return the wanted motion. After braking it begins where the arm is."""
+        """Return the motion wanted in this cycle, from the operator or from the level above.
+
+        After braking it begins where the arm is. With a reaction it ramps to rest.
+
+        Args:
+            reaction: Reaction of this cycle.
+            missed: Cycles before this one were missed.
+            tick: Tick of the cycle.
+        """
         sensors = self.sensors
         reference = self.reference
         if self.abandoned:
@@ -187,7 +195,7 @@ class ServoLaw(ArmDriver):
         )
 
     def compute_efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
-        """Return the torques, N m, and the grip force, N."""
+        """Return the torques in N m, and the force of the gripper in N."""
         grip = self._grip
         grip_force = (
             0.0 if grip is None else grip.compute_force(sensed.opening, sensed.opening_velocity)
@@ -205,7 +213,9 @@ class ServoLaw(ArmDriver):
         ), grip_force
 
     def _compute_limited_torque(self, set_point: Motion, sensed: SensedMotion) -> Array:
-        """Return the torques of the law, cut at their limits. Valid until the next call.
+        """Return the torques of the law, cut at their limits.
+
+        The array is valid until the next call.
 
         Raises:
             LevelError: `torques` did not return one number for each joint.
@@ -221,7 +231,7 @@ class ServoLaw(ArmDriver):
         return torque
 
     def brake_arm(self) -> None:
-        """Brake, and abandon set points and torques."""
+        """Engage the brakes, abandon the set points, and forget the last torque."""
         super().brake_arm()
         self._modified.forget_torque()
 
@@ -236,7 +246,7 @@ class ServoLaw(ArmDriver):
         return self._holds
 
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return how the level follows its set points, for the status."""
+        """Return how the level follows its set points. The status reports it."""
         operator = self.operator_control
         stands = operator.stands
         cut = self.reference.refused + self._cut

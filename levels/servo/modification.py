@@ -109,9 +109,9 @@ class Modification(ABC):
         self.context = context
 
     def begin(self, sample: LawSample) -> None:
-        """Reset internal state. Called in the first sample after switching on, before `modify`.
+        """Reset internal state. The default does nothing.
 
-        The default does nothing.
+        Called in the first sample after the modification was switched on, before `modify`.
         """
 
     @abstractmethod
@@ -148,7 +148,7 @@ class ModificationConfig(Table):
 
     @model_validator(mode="after")
     def _check_params(self) -> ModificationConfig:
-        """Check the params against the table that the class declares."""
+        """Check the params against the table of parameters that the class declares."""
         kind = self.kind.params
         if kind is None:
             if self.params:
@@ -162,7 +162,7 @@ class ModificationConfig(Table):
 
     @property
     def kind(self) -> type[Modification]:
-        """The class of the modification."""
+        """Class of the modification."""
         return validate_class(self.cls, Modification)
 
 
@@ -194,7 +194,7 @@ class ModifiableParams(Table):
 
 
 def list_names(params: Mapping[str, Any]) -> Sequence[str]:
-    """Return the names of the modifications in a board's parameters, for `Executor.names`.
+    """Return the names of the modifications in a board's parameters.
 
     The parameters need not be valid.
     """
@@ -203,7 +203,7 @@ def list_names(params: Mapping[str, Any]) -> Sequence[str]:
 
 
 def find_misfits(context: LevelContext) -> Mismatches:
-    """Yield the modifications of a board that do not suit its law, for `Executor.misfits`."""
+    """Yield the modifications of a board that do not suit its law, with the reasons."""
     params = read_params(
         ModifiableParams, {"modifications": context.params.get("modifications", {})}
     )

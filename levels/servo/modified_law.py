@@ -1,12 +1,12 @@
 """A servo law with control modifications, which are switched without a step in the torque.
 
 In the first sample after a switch the torque does not change. The difference from the torque of the
-newly modified law decays to zero, with zero slope at both ends, while the new law is already in
-force. A switch therefore adds only this difference, whatever the modifications compute. Torque
+newly modified law decays to zero, with zero slope at both ends, while the new law is already
+active. A switch therefore adds only this difference, whatever the modifications compute. Torque
 limits apply to the sum.
 
 Two alternatives were rejected. Evaluating the old and the new law in one sample would run a
-modification with state twice. A ramp of gains would have to know the inside of the law.
+modification with state twice. A ramp of gains would need to know the internals of the law.
 
 A modification that raises an exception, or whose result is not finite, is undone and switched off
 in the same sample, with the same smooth change of the torque.
@@ -57,11 +57,11 @@ class ModificationState:
     begins: bool = True  # the next sample is the first after it was switched on
 
     def apply_to(self, sample: LawSample, changed: Array) -> str:
-        """Modify a sample.
+        """Apply the modification to a sample. Undo it if it fails.
 
         Args:
             sample: Sample of the law.
-            changed: Array of the sample that the modification may change; restored after a failure.
+            changed: Array of the sample that the modification may change.
 
         Returns:
             Why the modification failed, or an empty text.
@@ -73,7 +73,8 @@ class ModificationState:
                 self.begins = False
                 self.modification.begin(sample)
             self.modification.modify(sample)
-        except Exception as error:  # a user's code may raise anything
+        # Code of users may raise any exception.
+        except Exception as error:
             failure = f"{type(error).__name__}: {error}"
         else:
             if not np.isfinite(changed).all():
@@ -87,8 +88,8 @@ class ModifiedLaw:
     """Applies control modifications to one law.
 
     Attributes:
-        exists: There are modifications, switched on or off. Otherwise the law may be called
-            directly.
+        exists: The config declares modifications, whether they are switched on or off. Otherwise
+            the law may be called directly.
         reason: Names of the active modifications, and why others have failed.
     """
 
@@ -135,6 +136,10 @@ class ModifiedLaw:
     def switch_modification(self, name: str, is_on: bool) -> str:
         """Switch a modification on or off from the next sample.
 
+        Args:
+            name: Name of the modification.
+            is_on: True to switch it on.
+
         Returns:
             Why that is refused, or an empty text.
         """
@@ -151,7 +156,7 @@ class ModifiedLaw:
         return ""
 
     def forget_torque(self) -> None:
-        """Forget the last torque, because the arm was braked."""
+        """Forget the last torque, which a braked arm no longer applies."""
         self._is_driving = False
 
     def compute_torque(self, law: Law, inputs: LawInputs) -> Array:
@@ -174,7 +179,7 @@ class ModifiedLaw:
             self._difference[:] = self._last - torque
         if self._since is not None:
             torque = self._blend_torque(torque, tick - self._since)
-        np.minimum(np.maximum(torque, -self._torque), self._torque, out=self._last)  # NaN stays
+        np.minimum(np.maximum(torque, -self._torque), self._torque, out=self._last)  # keeps NaN
         self._is_driving = True
         return self._last
 
@@ -196,7 +201,7 @@ class ModifiedLaw:
         return sample.torque
 
     def _apply_modification(self, state: ModificationState, changed: Array) -> bool:
-        """Apply one modification; switch it off if it fails. Return True if it succeeded."""
+        """Apply one modification, and switch it off if it fails. Return True if it succeeded."""
         failure = state.apply_to(self._sample, changed)
         if failure:
             state.is_on = False
@@ -206,15 +211,23 @@ class ModifiedLaw:
         return not failure
 
     def _blend_torque(self, torque: Array, ticks: int) -> Array:
-        """Return the torque plus what is left of the difference, `ticks` after the switch."""
-        passed = ticks / self._ticks  # part of the transfer
+        """Add the part of the last switch's step in torque that has not decayed yet.
+
+        Args:
+            torque: Torques of the law after the switch, (joints,), N m.
+            ticks: Ticks since the switch.
+
+        Returns:
+            Torques, (joints,), N m.
+        """
+        passed = ticks / self._ticks  # part of the transfer time that has passed
         if passed >= 1.0:
             self._since = None
             return torque
         return torque + (1.0 - passed) ** 2 * (1.0 + 2.0 * passed) * self._difference
 
     def _list_hooked(self, hook: Hook) -> Sequence[ModificationState]:
-        """Return the active modifications with a hook, in the order of the config."""
+        """Return the active modifications that declare `hook`, in the order of the config."""
         return [state for state in self._in if state.modification.hook == hook]
 
     def _update_hooks(self) -> None:

@@ -24,12 +24,13 @@ from rack.levels.servo.reference import Reference
 class OperatorControl:
     """Follows the commands of the operator.
 
-    To resume, the arm returns through the places from which it set out: that way was free, and the
-    level above finds the arm on its path. A restarted board has lost these places; the level above
+    An operator's HOLD or SETPOINT remains in force until RESUME. To resume, the arm returns through
+    the positions from which the operator moved it: the way through them was free, and the level
+    above finds the arm on its path. A restarted board has lost these positions; the level above
     then continues from where the arm is.
 
     Attributes:
-        orders: The commands in force.
+        orders: Commands of the operator and the answers to them.
         stands: The level follows the operator instead of the level above.
     """
 
@@ -49,7 +50,8 @@ class OperatorControl:
             joints: Names of all joints.
             ranges: Permitted positions, (joints, 2), rad.
             driven: Joints that the operator may move, (joints,). None permits all.
-            obey: Obeys a command that leaves the one in force unchanged, or returns why not.
+            obey: Carries out a setting or a command to the drives. Returns why it is refused, or an
+                empty text.
         """
         self.orders = Orders(commands)
         self.stands = False
@@ -60,11 +62,16 @@ class OperatorControl:
         # (joints,), rad: position of the arm at the newest command.
         self._position = np.zeros(len(joints))
         self._goal: Array | None = None  # (joints,), rad
-        # (joints,), rad each: places from which the arm set out, oldest first.
+        # (joints,), rad each: positions from which the operator moved the arm, oldest first.
         self._way: list[Array] = []
 
     def take_commands(self, operator: Reading[OperatorCommand], position: Array) -> None:
-        """Accept new commands, with the arm at `position`, (joints,), rad."""
+        """Accept new commands.
+
+        Args:
+            operator: Newest command and its verdict.
+            position: Position of the arm, (joints,), rad.
+        """
         self._position[:] = position
         if not self.orders.take_commands(operator, self._judge_command):
             return
@@ -73,7 +80,7 @@ class OperatorControl:
         self.stands = self.orders.is_in_force or bool(self._way)
 
     def forget_return_path(self) -> None:
-        """Forget the way back, so that the level above continues from where the arm is."""
+        """Discard the return path, so that the level above continues from where the arm is."""
         self._way.clear()
 
     @property
@@ -87,7 +94,7 @@ class OperatorControl:
         return f"{state} by the operator; `resume` releases it"
 
     def _judge_command(self, command: OperatorCommand) -> None:
-        """Accept the goal of a set point or refuse it; obey settings and drive commands."""
+        """Accept or refuse the goal of a SETPOINT, a setting or a command to the drives."""
         if command.what in (*SETTINGS, *DRIVE_OPERATIONS):
             if refusal := self._obey(command):
                 self.orders.refuse_newest(refusal)

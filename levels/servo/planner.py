@@ -33,7 +33,7 @@ class ServoPlanner(Planner):
         self._rest = np.zeros(len(cell.home))
 
     def wanted(self, tick: int) -> bool:
-        """Return True: the arm keeps moving, so its inertia keeps changing."""
+        """Return True, because the inertia changes whenever the arm moves."""
         return True
 
     def plan(self, tick: int) -> None:

@@ -1,7 +1,7 @@
 """Interpolates the set points of the level above for every servo cycle.
 
 A set point is to be reached at its `due` tick, and the next one should arrive before that. In
-between, the motion is the cubic Hermite curve through positions and velocities, so it is C1. If no
+between, the motion is the cubic Hermite curve through positions and velocities. If no
 set point arrives in time, the motion ramps to rest; when set points resume, it joins them smoothly.
 """
 
@@ -44,7 +44,7 @@ class Reference:
         speed_scale: Part of full speed for the motion of `move_to` and for joining the set points,
             up to 1.
         goal: Goal of `move_to`, (joints,), rad, until another motion begins, else None.
-        holding: No set point is fresh.
+        holding: No set point is followed: the motion ramps to rest or is at rest.
         refused: Number of set points cut at the bounds, and of cycles with one that is NaN or due
             too far ahead.
     """
@@ -68,7 +68,7 @@ class Reference:
         self._motions = np.zeros((2, 3, joints))
         self._wanted = Motion(self._motions[0])
         self._interpolate = set_motion.load_machine_code()
-        self._command: ArmSetPoint | None = None  # the newest `JOINT_SET_POINT`
+        self._command: ArmSetPoint | None = None  # the newest set point
         self._offered = 0  # tick at which that set point is due
         self._due = 0  # tick at which the present curve ends
         self._next: SetPoint | None = None  # set point to follow after that tick
@@ -79,11 +79,11 @@ class Reference:
         self.start(np.zeros(joints), np.zeros(joints), 0)
 
     def start(self, position: Array, velocity: Array, tick: int) -> None:
-        """Restart from a motion at `tick`: ramp to rest and hold.
+        """Restart from a motion at `tick`: ramp to rest, then hold.
 
         Args:
-            position: (joints,), rad.
-            velocity: (joints,), rad/s.
+            position: Position at `tick`, (joints,), rad.
+            velocity: Velocity at `tick`, (joints,), rad/s.
             tick: Tick of that motion.
         """
         self._curve: Curve = Ramp(position, velocity, self._limits.acceleration)
@@ -95,7 +95,7 @@ class Reference:
     def restart_if_astray(
         self, position: Array, velocity: Array, tick: int, tolerance_rad: float = ASTRAY_RAD
     ) -> None:
-        """After missed cycles, restart from where the arm is, if it has strayed from the motion.
+        """After missed cycles, restart from the arm's position if it is too far from the motion.
 
         The arm is then led back to the set points smoothly.
 
@@ -103,7 +103,7 @@ class Reference:
             position: Sensed positions, (joints,), rad.
             velocity: Sensed velocities, (joints,), rad/s.
             tick: Tick of the sample.
-            tolerance_rad: Distance from which the arm counts as strayed.
+            tolerance_rad: Distance from the motion at which a joint counts as too far away.
         """
         now = self._evaluate_motion(tick)
         if np.max(np.abs(now.position - position)) < tolerance_rad:
@@ -114,15 +114,18 @@ class Reference:
             self._begin_decay(position, velocity, tick)
 
     def take_command(self, command: ArmSetPoint) -> None:
-        """Accept a new `JOINT_SET_POINT`.
+        """Accept a new set point.
 
-        The message must stay the newest one until the next call, because it is copied later.
+        It is copied later, so the message must remain valid until the next call of this method.
+
+        Args:
+            command: Message with the set point.
         """
         self._command = command
         self._offered = command.due
 
     def compute_motion(self, tick: int) -> Motion:
-        """Return the motion wanted at `tick`, with the acceleration of the middle of the cycle."""
+        """Return the motion wanted at `tick`. Its acceleration is taken half a tick later."""
         if self._next is not None and (self.holding or tick >= self._due):
             self._begin_curve(self._next, tick)
         offered = self._offered
@@ -135,7 +138,7 @@ class Reference:
         return self._evaluate_motion(tick)
 
     def ramp_to_rest(self, tick: int) -> Motion:
-        """Return the motion wanted at `tick` when ramping to rest, ignoring the level above."""
+        """Return the motion wanted at `tick` on a ramp to rest that ignores the level above."""
         self._next = None
         if not self.holding or self.goal is not None:
             now = self._evaluate_motion(tick)
@@ -166,9 +169,13 @@ class Reference:
         return self._evaluate_motion(tick)
 
     def _receive_set_point(self, due: int, tick: int) -> None:
-        """Copy the set point that was offered.
+        """Copy the set point accepted last, unless it is not finite or due too far ahead.
 
-        It waits until the one before it is due, because some protocols deliver early.
+        It is followed once the previous set point is due, because some protocols deliver early.
+
+        Args:
+            due: Tick at which the set point is due.
+            tick: Present tick.
         """
         command = self._command
         if command is None:
@@ -186,7 +193,14 @@ class Reference:
             self._begin_curve(self._next, tick)
 
     def _begin_curve(self, set_point: SetPoint, tick: int) -> None:
-        """Begin the curve to the waiting set point, once the one before it is due."""
+        """Begin the curve to a set point.
+
+        Call this only when the previous set point is due, or none is followed.
+
+        Args:
+            set_point: Set point to reach.
+            tick: Present tick.
+        """
         due, position, velocity = set_point
         self._next = None
         if due <= tick:
@@ -213,12 +227,12 @@ class Reference:
         self._begin_decay(now.position, now.velocity, tick)
 
     def _begin_decay(self, position: Array, velocity: Array, tick: int) -> None:
-        """Let the difference between a motion at `tick` and the curve decay smoothly.
+        """Blend a motion into the curve: let their difference at `tick` decay smoothly.
 
         Args:
-            position: (joints,), rad.
-            velocity: (joints,), rad/s.
-            tick: Tick of that motion.
+            position: Position of the motion at `tick`, (joints,), rad.
+            velocity: Velocity of the motion at `tick`, (joints,), rad/s.
+            tick: Tick at which the blend begins.
         """
         curve = self._curve.compute_motion((tick - self._from) * self._tick_s)
         fastest = JOINING_SPEED_PART * self.speed_scale * self._limits.velocity
@@ -228,7 +242,7 @@ class Reference:
         self._differs_from = tick
 
     def _evaluate_motion(self, tick: int) -> Motion:
-        """Return the motion at `tick`, with the acceleration of the middle of the cycle.
+        """Evaluate the present curves at `tick`. The acceleration is taken half a tick later.
 
         The result is valid until the next call.
         """

@@ -87,7 +87,7 @@ class Tolerance(NamedTuple):
 def compute_tolerance(cell: Cell) -> Tolerance:
     """Return the errors that a `SensorMonitor` tolerates in one sample.
 
-    A position is compared with the sample before, so each sample gets half of the tolerance.
+    The monitor compares the positions of two samples, so each may use half of the tolerance.
     """
     position_error = 0.5 * FIT_RAD + cell.encoders.position_error
     jitter_s = float(np.min(position_error / cell.bounds.velocity))
@@ -95,23 +95,25 @@ def compute_tolerance(cell: Cell) -> Tolerance:
 
 
 class SensorMonitor:
-    """Checks every sample against the one before: positions must match integrated velocities.
+    """Checks every sample against the previous one: positions must match integrated velocities.
 
-    After a fault a joint is trusted again when its samples agree with the estimate, and with each
-    other, for `good_cycles` in a row. An offset greater than `doubt` is never accepted.
+    An episode of faults begins with the first fault. It ends when the samples have agreed with the
+    estimate, and with each other, for `good_cycles` in a row; all sensors are then trusted again.
+    An offset greater than `doubt` is never accepted.
 
     Attributes:
         position: (joints,), rad. Sensed, or estimated for joints whose sensor is suspect.
-        velocity: (joints,), rad/s, likewise. Unknown velocities are estimated as braked.
+        velocity: (joints,), rad/s, likewise. Unknown velocities are estimated as if braked.
         doubt: (joints,), rad. Largest error of `position`.
-        estimate: These three as rows, (3, joints).
+        estimate: `position`, `velocity` and `doubt` as rows, (3, joints).
         state: `position` and `velocity` as rows, (2, joints).
         fresh: There is a sample of this cycle.
-        faulty: A sensor is at fault, or was less than `good_cycles` ago.
+        faulty: An episode of faults has not ended.
         drivable: All velocities are known, so the arm could still be driven.
-        blamed: Joint, its reading and its error, rad. Without samples: -1, age in ticks, 0.
-        findings: New findings, one per episode. The reader clears the list.
-        missing: Why there was no usable sample last.
+        blamed: Joint at fault, its reading, rad, and its error, rad. If there are no samples: -1,
+            the age of the newest sample in ticks, and 0.
+        findings: New findings, one per alarm and episode. The reader clears the list.
+        missing: Why samples were missing the last time.
     """
 
     def __init__(self, cell: Cell, params: ArmParams, tick_s: float, every: int) -> None:
@@ -163,7 +165,7 @@ class SensorMonitor:
         self._rung: set[Alarm] = set()  # alarms raised in this episode
 
     def restore_estimate(self, state: ArmState) -> None:
-        """Continue from the estimate in an `ARM_STATE` after a restart."""
+        """Continue from the estimate in an `ArmState` after a restart."""
         self.position[:] = state.position
         self.velocity[:] = state.velocity
         self.doubt[:] = state.doubt
@@ -196,8 +198,8 @@ class SensorMonitor:
         Args:
             sensed: Newest sample.
             tick: Tick of the cycle.
-            wanted: Motion that the arm was driven to follow: rows of rad, rad/s, .... None if not
-                driven.
+            wanted: Motion that the arm was driven to follow: its first rows are rad and rad/s. None
+                if the arm was not driven.
             struck: Something has touched the arm since the last cycle.
         """
         q, qd, _, _, sampled = sensed
@@ -210,7 +212,7 @@ class SensorMonitor:
         if not self.fresh:
             self._estimate_blind(passed_s, tick - sampled)
             return
-        # The arm was driven for a while, then braked, so it was faster than at both ends.
+        # The arm was driven, then braked, so it may have been faster than in both samples.
         braked_s = 4.0 * self._every * self._tick_s if passed > self._every else 0.0
         blow = STRUCK_SPEED if struck else 0.0
         driven = wanted is not None
@@ -231,7 +233,11 @@ class SensorMonitor:
         self._judge_doubtful_sample(fitting & (np.abs(joints["velocity"]) <= fastest), passed_s)
 
     def _accept_sample(self, tolerance: Array) -> None:
-        """Accept the sample, and report joints that this moves by more than `tolerance`, rad."""
+        """Accept the sample as the new estimate.
+
+        Args:
+            tolerance: Change of the estimate, (joints,), rad, beyond which a joint is reported.
+        """
         joints = self._joints
         q = joints["position"]
         joints["unchanged"] = q == joints["last_position"]
@@ -246,7 +252,7 @@ class SensorMonitor:
         self._keep_sample()
 
     def _keep_sample(self) -> None:
-        """Keep the sample as the last one, for comparison with the next."""
+        """Store the sample for comparison with the next one."""
         for field in ("position", "velocity"):
             self._joints[f"last_{field}"] = self._joints[field]
 
@@ -283,14 +289,14 @@ class SensorMonitor:
         self._unproven |= still
         self._unproven &= unchanged
         if begins:
-            # A sensor without a change may have been stuck while its joint crept, so it may be off
-            # by the distance that this takes to detect.
+            # A sensor whose value did not change may have been stuck while its joint crept. Its
+            # error may be as large as the motion after which that is detected.
             np.maximum(
                 self.doubt,
                 np.where(joints["unchanged"], STUCK_RAD, PLAUSIBLE_RAD),
                 out=self.doubt,
             )
-            # If its joint was driven, it may have been stuck while the joint accelerated.
+            # A sensor may also have been stuck while its joint was accelerated.
             unseen = (UNSEEN_S * UNSEEN_S + BRAKE_TAIL_S2) * joints["braking"] + joints["unshown"]
             np.maximum(self.doubt, unseen, out=self.doubt, where=unchanged & self._sent)
         cycles[still] = 0
@@ -310,8 +316,9 @@ class SensorMonitor:
     ) -> None:
         """Estimate the suspect joints, and accept the others as sensed.
 
-        A suspect joint is estimated from its velocity, or as braked where that is unknown. Its
-        position is not used even if it happens to fit, because with noise the estimate would drift.
+        A suspect joint is estimated from its sensed velocity or, if that is unknown, as if braked.
+        Its sensed position is not used even if it happens to fit, because with noise the estimate
+        would drift.
 
         Args:
             q: Sensed positions, rad.
@@ -328,7 +335,12 @@ class SensorMonitor:
         np.copyto(self.velocity, qd, where=known)
 
     def _estimate_blind(self, passed_s: float, age: int) -> None:
-        """Estimate all joints without a sample; the newest one is `age` ticks old."""
+        """Estimate all joints in a cycle without a current sample.
+
+        Args:
+            passed_s: Time since the last cycle.
+            age: Age of the newest sample in ticks.
+        """
         is_late = self._late >= SILENT_CYCLES
         is_silent = age >= SILENT_CYCLES * self._every
         if is_late:
@@ -348,7 +360,12 @@ class SensorMonitor:
         self._estimate_braking(self._everyone, passed_s)
 
     def _estimate_braking(self, joints: Mask, passed_s: float) -> None:
-        """Estimate how the brakes have stopped `joints`."""
+        """Estimate the motion of joints under the brakes.
+
+        Args:
+            joints: Joints to estimate.
+            passed_s: Time since the last estimate.
+        """
         if not joints.any():
             return
         speed = np.abs(self.velocity)
@@ -364,7 +381,13 @@ class SensorMonitor:
         np.copyto(self.velocity, slower, where=joints)
 
     def _report_joint(self, alarm: Alarm, wrong: Mask, values: Array | Ints) -> None:
-        """Report the first joint that is `wrong`, with its value."""
+        """Report the first wrong joint, if there is one.
+
+        Args:
+            alarm: Alarm to report.
+            wrong: Joints that are wrong.
+            values: Value to report, by joint.
+        """
         if wrong.any():
             joint = int(wrong.argmax())
             self._report_fault(Finding(alarm, joint, float(values[joint])))
@@ -460,7 +483,7 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
             joint["claimed"] += passed_s * max(abs(qd) - joint["velocity_tolerance"], 0.0)
         else:
             joint["claimed"] = 0.0
-        # An exact sensor that is stuck does not fit in the next sample anyway.
+        # With exact encoders, the next sample of a stuck sensor does not fit anyway.
         frozen = coarse and joint["claimed"] > joint["tolerance"]
         good = good and fits and not (still or frozen)
         in_doubt = in_doubt or doubt[j] != 0.0

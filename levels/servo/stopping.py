@@ -34,21 +34,22 @@ class Cause(NamedTuple):
 
 
 class Stopping:
-    """Weighs demands of the rack, faults and blows; the strongest reaction wins.
+    """Weighs demands of the rack, faults and blows against each other; the strongest reaction wins.
 
-    A failed motor is retried after a while: the arm holds with it, and follows set points after
-    `good_cycles` without a fault. If the motor fails again while the arm ramps or holds, the brakes
-    engage. An arm that was struck, or pressed too hard, stays stopped until neither has happened
-    for the same time.
+    A blow is an unintended or too strong contact, or a joint beyond its limit. After a blow the arm
+    stays stopped until `retry` has passed without another one.
+
+    A failed motor is retried after `retry`: the arm holds with it, and follows set points after
+    `good_cycles` without a fault. If the motor fails again before that, the brakes engage.
 
     Faults may keep the arm from its set points for `patience`. That time counts up during faults
-    and down while the arm follows, so recurring faults use it up too. Then the fault is latched,
-    and the brakes stay engaged.
+    and down while the arm follows its set points, so recurring faults use it up too. Then the fault
+    is latched, and the brakes stay engaged.
 
     Attributes:
         refused: Finding about the last cycle's torque or set point, if the arm refused it.
-        error: The latched fault.
-        cause: The fault that keeps the arm from its set points.
+        error: The latched fault, or NONE.
+        cause: The fault that keeps the arm from its set points, or NONE.
         reason: Why the arm does not follow its set points, in one line, or empty.
         findings: New findings, one per episode. The reader clears the list.
     """
@@ -86,7 +87,7 @@ class Stopping:
         self._on_blow = Reaction.BRAKE  # reaction until that tick
 
     def restore_state(self, state: ArmState) -> None:
-        """Continue from an `ARM_STATE` after a restart."""
+        """Continue from an `ArmState` after a restart."""
         self._tick = state.tick
         self._kept = state.kept
         if state.error != Error.DISABLED:
@@ -94,7 +95,7 @@ class Stopping:
             self.reason = state.reason
 
     def save_state(self, state: ArmState) -> None:
-        """Write the state that `restore_state` needs; only when it has changed."""
+        """Write the state that `restore_state` needs, if it has changed."""
         error = self.error or (Error.DISABLED if self.is_disabled else Error.NONE)
         if (self._kept, error) != self._remembered:
             self._remembered = self._kept, error
@@ -109,7 +110,7 @@ class Stopping:
 
     @property
     def is_retrying(self) -> bool:
-        """True while a motor is at fault, or has not yet proved to work again."""
+        """True while a motor is at fault, or has not worked long enough since its retry."""
         return self._retry_at is not None
 
     def register_motor_failure(self, joint: int, lacking: float, tick: int) -> Reaction:
@@ -149,7 +150,7 @@ class Stopping:
             reaction: Reaction to it.
         """
         is_new = self._struck_until is None or blow.error is not self._blow.error
-        # The arm may have reported it in this cycle already.
+        # This alarm may have been reported in this cycle already.
         if is_new and all(known.alarm is not finding.alarm for known in self.findings):
             self.findings.append(finding)
         self._on_blow = reaction if self._struck_until is None else max(self._on_blow, reaction)
@@ -157,7 +158,9 @@ class Stopping:
         self._blow = blow
 
     def wait_for_enabling(self, error: Error, why: str, tick: int) -> Reaction:
-        """Return the reaction of this cycle while the arm is not enabled, without a time limit.
+        """Return the reaction of this cycle while the arm is not enabled.
+
+        There is no limit on this time: no fault is latched.
 
         Args:
             error: DISABLED or DRIVES.
@@ -214,12 +217,12 @@ class Stopping:
         return max(reaction, Reaction[demand.name]) if demand else reaction
 
     def _set_cause(self, cause: Cause, tick: int) -> None:
-        """Set `cause` and `reason`; the reason names the tick at which the fault is latched."""
+        """Set `cause` and `reason`. The reason tells at which tick the fault will be latched."""
         self.cause = cause.error
         self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 
     def _weigh_faults(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
-        """Return the strongest reaction to present faults, and the fault to report."""
+        """Return the strongest reaction to the present faults, and the fault to report, if any."""
         reaction = Reaction.NONE
         cause = None if self.refused is None else self._describe_refusal(self.refused)
         if sensors.faulty:

@@ -1,5 +1,4 @@
-"""Levels that only racks other than NASREM's use.
+"""Levels of the historical systems other than NASREM.
 
-They belong to the other historical systems: state tables, trajectories, force control, hands, and
-work shared by several racks.
+State tables, trajectories, force control, hands, and work shared by several racks.
 """

@@ -54,7 +54,7 @@ class FigureLoop(Executor):
     status = Output(FigureStatus)
     params = FigureParams
     plan_in_use = -1
-    """Release that the plan in force answers. -1 if no plan has arrived."""
+    """Release for which the plan in use was computed; -1 before the first plan."""
 
     def __init__(self, context: LevelContext) -> None:
         """Read the parameters. Raises `LevelError` if one of them is invalid."""
@@ -65,7 +65,7 @@ class FigureLoop(Executor):
         self._times_ns = [round(ms * NS_PER_MS) for ms in times_ms]
 
     def process(self, tick: int) -> None:
-        """Write the status, then consume X. Time while preempted does not count."""
+        """Write the status, then consume X. Time spent preempted does not count."""
         end = process_time_ns() + self._times_ns[tick // self.context.every % len(self._times_ns)]
         status = self.status
         status.state = State.EXECUTING
@@ -75,12 +75,12 @@ class FigureLoop(Executor):
 
 
 class FigureExecutor(FigureLoop):
-    """Executor that also reports which plan is in force."""
+    """Executor that consumes the processor time X in every cycle and reports the plan in use."""
 
     plan = Input(FigurePlan, "own.plan")
 
     def process(self, tick: int) -> None:
-        """Note the newest plan, then write the status and consume X."""
+        """Record the newest plan, then write the status and consume X."""
         if self.plan.has_message:
             self.plan_in_use = self.plan.message.made_at
         super().process(tick)
@@ -103,7 +103,7 @@ class FigurePlanner(Planner):
         return True
 
     def plan(self, tick: int) -> None:
-        """Write the plan, then consume P. Time while preempted does not count."""
+        """Write the plan, then consume P. Time spent preempted does not count."""
         end_ns = process_time_ns() + self._time_ns
         self.output.made_at = tick
         self.output.cycle = self.status.message.cycle if self.status.has_message else -1

@@ -143,7 +143,7 @@ class Lingering(Host):
 
     def run(self, bus: Bus) -> None:
         """Declare the work done; end with the rack."""
-        bus.declare_done()
+        bus.finish()
         time.sleep(3600)
 
 

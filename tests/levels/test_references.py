@@ -100,7 +100,7 @@ def test_output_of_an_imported_module_is_printed_once(tmp_path: Path) -> None:
     lines = [
         "import rack.levels.references as references",
         "references.SLOW_S = 60.0",
-        "references.module_and_name('it_prints:Level')",
+        "references.import_reference('it_prints:Level')",
     ]
     # Unbuffered, as in the processes of a rack.
     done = subprocess.run(

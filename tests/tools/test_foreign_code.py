@@ -35,7 +35,7 @@ from commanded_levels import Homing, Upper
 
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults import KINDS, Kind, Parameter
-from rack.boards.faults.bounds import DELIVERY, writes
+from rack.boards.faults.bounds import DELIVERY, write_bound
 from rack.boards.faults.message_steps import Drop
 
 KINDS.add(
@@ -44,7 +44,7 @@ KINDS.add(
         "writer",
         "a message is lost",
         detected_as=(Alarm.GAP,),
-        bound=writes(1) + DELIVERY,
+        bound=write_bound(1) + DELIVERY,
         step=Drop,
         parameters=(Parameter("probability", "1", "part that is lost", 1.0, 0.5, 1.0),),
     )

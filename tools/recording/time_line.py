@@ -87,7 +87,7 @@ class RackGrid:
 
 
 @dataclass(frozen=True)
-class ClockOffset:
+class TimeShift:
     """Offset between the CLOCK_MONOTONIC of two machines.
 
     Attributes:
@@ -107,9 +107,9 @@ class ClockOffset:
         by_ns = np.interp(stamps_ns - self.at_ns[0], self.at_ns - self.at_ns[0], self.by_ns - first)
         return np.asarray(stamps_ns - first - np.rint(by_ns).astype(np.int64))
 
-    def swap_machines(self) -> ClockOffset:
+    def swap_machines(self) -> TimeShift:
         """Return the offset with the two machines exchanged."""
-        return ClockOffset(self.at_ns - self.by_ns, -self.by_ns, self.uncertainty_ns)
+        return TimeShift(self.at_ns - self.by_ns, -self.by_ns, self.uncertainty_ns)
 
 
 class TimeLineNote(NamedTuple):
@@ -134,7 +134,7 @@ class RackPlace:
 
     own: RackGrid
     line: RackGrid
-    offsets: tuple[ClockOffset, ...] = ()
+    offsets: tuple[TimeShift, ...] = ()
     by_ticks: bool = False
     marks: tuple[TimeLineNote, ...] = ()
 
@@ -267,7 +267,7 @@ def _check_compatible(grid: RackGrid, others: Sequence[RackGrid]) -> None:
             raise Failure(f"{where}: they have no time in common", 2)
 
 
-def _find_offsets(grid: RackGrid, other: RackGrid) -> tuple[ClockOffset, ...] | None:
+def _find_offsets(grid: RackGrid, other: RackGrid) -> tuple[TimeShift, ...] | None:
     """Return the clock offset between two racks, or None if neither has met the other.
 
     In lockstep no offset is needed, so the result is empty.
@@ -298,7 +298,7 @@ def _find_peer_mailbox(observer: RackGrid, peer: RackGrid) -> str | None:
     return next((name for name in names if name in observer.recording.mailboxes), None)
 
 
-def _read_offset(observer: RackGrid, peer: RackGrid) -> ClockOffset | None:
+def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
     """Return the offset of a peer's clock as recorded by a rack, or None if it never measured it.
 
     Raises:
@@ -335,7 +335,7 @@ def _read_offset(observer: RackGrid, peer: RackGrid) -> ClockOffset | None:
     ends = peer.convert_ticks(np.array(peer.ticks))
     longest_gap_ns = int(np.diff(np.sort(np.concatenate((at_ns, ends)))).max())
     worst_ns = round(float(uncertainty[is_measured][is_this].max()) * 1e9)
-    return ClockOffset(at_ns, by_ns, worst_ns + longest_gap_ns * DRIFT_PPM // 1_000_000)
+    return TimeShift(at_ns, by_ns, worst_ns + longest_gap_ns * DRIFT_PPM // 1_000_000)
 
 
 def _has_met(observer: RackGrid, peer: RackGrid) -> bool:

@@ -1,7 +1,7 @@
 """Inventory of a config.
 
-It lists the tasks, the mailboxes with their bus addresses, the host side and the network, and tells
-what an arm does without torques.
+It lists the tasks, the mailboxes with their bus addresses, the host side and the network, and
+states how an arm behaves without new torques.
 """
 
 from __future__ import annotations

@@ -39,7 +39,11 @@ class JudgedConfig:
 
     @classmethod
     def judge(cls, config: RackConfig, budgets: Mapping[str, Budget] | None = None) -> JudgedConfig:
-        """Wire a config and judge it by `budgets`, or by its own budgets. Raises `ConfigError`."""
+        """Resolve a config and judge it by `budgets`, or by its own budgets if they are None.
+
+        Raises:
+            ConfigError: If the config is invalid.
+        """
         layout = resolve(config).layout
         timing = build_rack_timing(config, layout, budgets)
         return cls(config, layout, timing, tuple(judge_rack(timing)))
@@ -95,13 +99,13 @@ class JudgedConfig:
         return own or {v.key for v in self.failures if v.equation == LOAD and v.subject in cores}
 
     def cures_board(self, board: str, before: JudgedConfig) -> bool:
-        """Return True if no failure of a board in `before` is left and no new one has appeared."""
+        """Return True if all failures of `board` in `before` are gone and none was added."""
         failing = {verdict.key for verdict in self.failures}
         old = {verdict.key for verdict in before.failures}
         return failing < old and not failing & before.find_failures(board)
 
     def is_sound(self, changed: RackTiming, board: str) -> bool:
-        """Return True if one changed board satisfies its equations without slowing the system.
+        """Return True if a changed board meets its equations and adds no failure of the system.
 
         This check is quick and ignores the effect on other tasks of the core.
         """
@@ -155,7 +159,7 @@ class Change:
 
     @property
     def text(self) -> str:
-        """The change with its numbers in one line."""
+        """Description of the change in one line."""
         return f"board '{self.board}': {', '.join(self._list_parts())}"
 
     def to_document(self) -> Document:

@@ -1,8 +1,8 @@
 """The response of the whole system, measured and compared with its bounds (eqs 3.2 and 3.3).
 
-Every message carries the tick of the oldest information that it rests on. A command can therefore
-be followed from the release of the highest level to the cycle of the lowest level that acts on it,
-and a status back up.
+Every message carries the tick of the oldest information on which it depends. A command can
+therefore be followed from the release of the highest level to the cycle of the lowest level that
+acts on it, and a status back up.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ def measure_system_response(recording: Recording) -> Document | None:
 
     The main figures belong to the chains with the longest response; `others` contains the same
     figures for all other chains. `beyond` lists the responses that exceed their bound, with the
-    delays that the run shows. `unseen` counts responses that cannot be measured because the
-    recording lacks messages. `crosses_racks` is true if the rack imports messages of others, which
-    the bounds do not cover.
+    causes of delay that the run shows. `unseen` counts responses that cannot be measured because
+    the recording lacks messages. `crosses_racks` is true if the rack imports messages of others,
+    which the bounds do not cover.
 
     Returns:
         The response as plain data. None without a hierarchy.
@@ -112,8 +112,8 @@ def _measure_chain(
 ) -> tuple[np.ndarray, list[Document], int]:
     """Measure the responses along one chain.
 
-    The worst case is information that just misses a release whose message passed the whole chain.
-    It waits for the next release that does.
+    The worst case is information that arrives just after a release whose message passed the whole
+    chain. It has to wait for the next such release.
 
     Args:
         recording: Recording of the run.
@@ -122,7 +122,7 @@ def _measure_chain(
         bound_ms: Bound of the response, ms.
 
     Returns:
-        The responses, ms, those beyond the bound, and the number that could not be measured.
+        The responses in ms, those beyond the bound, and the number that could not be measured.
     """
     layout = recording.layout
     mailbox = boxes[-1].name
@@ -130,8 +130,8 @@ def _measure_chain(
     tick_ms = layout.clock_ns * 1e-6
     basis = recording.read_signal(mailbox, "basis")
     visible_at = recording.read_signal(mailbox, "visible_at")
-    # The first messages rest only on their own ticks, because no information had arrived when they
-    # were written. They do not count.
+    # The first messages depend only on their own ticks, because no information had arrived when
+    # they were written. They do not count.
     first_basis = max(int(recording.read_signal(box.name, "visible_at")[0]) for box in boxes)
     valid_rows = np.flatnonzero(basis >= first_basis)
     arrived, at = np.unique(basis[valid_rows], return_index=True)

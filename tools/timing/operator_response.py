@@ -1,7 +1,8 @@
 """The response of a recorded run to its operator.
 
-It lasts from giving a command to the torque that rests on it. Causality is measured, not inferred:
-every command and status carries the serial of the newest operator command on which it rests.
+It lasts from giving a command to the first torque that depends on it. Causality is measured, not
+inferred: every command and status carries the serial of the newest operator command on which it
+depends.
 """
 
 from __future__ import annotations
@@ -56,9 +57,9 @@ class AnsweredCommand:
         what: Name of the operation.
         given: Tick at which it was given.
         sampled: Release at which the level reads it.
-        predicted: Predicted release of the cycle whose torque rests on it.
-        acts: Measured release of this cycle. None if no cycle rests on this very command, because
-            it was refused, a newer one overtook it, or the run ended first.
+        predicted: Predicted release of the first cycle whose torque depends on it.
+        acts: Measured release of this cycle. None if no cycle depends on this very command,
+            because it was refused, a newer one overtook it, or the run ended first.
         fate: Outcome of the command.
         wall_ms: Response by the wall clock, from giving the command to writing the status of that
             cycle, ms. None in lockstep.
@@ -77,7 +78,7 @@ class AnsweredCommand:
 
 @dataclass(frozen=True)
 class OperatorResponse:
-    """The response of a run.
+    """The response of a run to its operator commands.
 
     Attributes:
         tick_ms: Simulated time of a tick, ms.
@@ -93,11 +94,11 @@ class OperatorResponse:
 
     @property
     def measured_commands(self) -> list[AnsweredCommand]:
-        """Commands on which a torque rests."""
+        """Commands on which a torque depends."""
         return [command for command in self.commands if command.acts is not None]
 
     def compute_response_ticks(self, command: AnsweredCommand) -> int:
-        """Return the response to one of the measured commands, ticks."""
+        """Return the response, in ticks, to one of the measured commands."""
         assert command.acts is not None, "it was acted on"
         return self.paths[command.level].compute_response(command.given, command.acts)
 
@@ -105,11 +106,13 @@ class OperatorResponse:
     def commands_beyond_bound(self) -> list[AnsweredCommand]:
         """Commands whose response exceeded a bound.
 
-        The bounds are the longest response on the grid, and equation 3.2 from the release on.
+        The bounds are the longest response on the grid, and the bound of equation 3.2, which counts
+        from the release that reads the command.
         """
         return [command for command in self.measured_commands if self._is_beyond_bound(command)]
 
     def _is_beyond_bound(self, command: AnsweredCommand) -> bool:
+        """Return True if the response to a measured command exceeded a bound."""
         path = self.paths[command.level]
         ticks = self.compute_response_ticks(command)
         # R_s of eq. 3.2 begins with the release that reads the command.
@@ -119,7 +122,7 @@ class OperatorResponse:
     def mispredicted_commands(self) -> list[AnsweredCommand]:
         """Commands that took effect at another tick than predicted.
 
-        Only exact paths are compared.
+        Only paths with an exact prediction are compared.
         """
         exact = [c for c in self.measured_commands if self.paths[c.level].is_exact]
         return [command for command in exact if command.acts != command.predicted]
@@ -130,11 +133,11 @@ class OperatorResponse:
         return not self.commands_beyond_bound and not (self.lockstep and self.mispredicted_commands)
 
     def build_rows(self) -> list[Document]:
-        """Return the figures of every level that was commanded, ms of simulated time."""
+        """Return the figures of every level that was commanded, in ms of simulated time."""
         return [self._build_row(level, path) for level, path in self.paths.items()]
 
     def _build_row(self, level: str, path: CommandPath) -> Document:
-        """Return the figures of one level, ms of simulated time."""
+        """Return the figures of one level, in ms of simulated time."""
         commands = [c for c in self.measured_commands if c.level == level]
         ms = np.array([self.compute_response_ticks(c) for c in commands]) * self.tick_ms
         waits_ms = np.array([c.sampled - c.given for c in commands]) * self.tick_ms
@@ -225,7 +228,7 @@ def _find_answers(
 ) -> Iterator[AnsweredCommand]:
     """Yield the commands given to a level.
 
-    Each has the first cycle of the lowest level that rests on it, if there is one.
+    Each has the first cycle of the lowest level that depends on it, if there is one.
 
     Args:
         recording: Recording of the run.
@@ -234,7 +237,7 @@ def _find_answers(
         lockstep: Whether the run was in lockstep.
     """
     box = f"{level}.operator"
-    # A clock that died while giving a command has given it twice. The first one counts.
+    # A clock that died while giving a command may have given it twice. The first one counts.
     serials, rows = np.unique(recording.read_signal(box, "id"), return_index=True)
     whats, given, visible, stamps = (
         recording.read_signal(box, n)[rows] for n in ("what", "tick", "visible_at", "stamp_ns")
@@ -334,6 +337,7 @@ def plot_response(response: OperatorResponse, folder: Path) -> list[Path]:
 
 
 def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
+    """Draw the histogram of a level's responses, with its bounds."""
     from matplotlib.ticker import MaxNLocator
 
     path = response.paths[level]

@@ -85,7 +85,7 @@ class Repair:
 def find_repair(rack: JudgedConfig) -> Repair:
     """Find the changes that make a rack fit.
 
-    They are found for one board and then, with the cheapest of them applied, for the next.
+    One board is handled at a time. Its cheapest change is applied before the next board is handled.
     """
     steps: list[tuple[Change, ...]] = []
     while rack.failures:
@@ -105,19 +105,22 @@ def find_repair(rack: JudgedConfig) -> Repair:
 
 
 def _list_failing_boards(rack: JudgedConfig) -> list[str]:
-    """Return the boards with failures, beginning with the boards for which others wait."""
+    """Return the boards with failures, beginning with those whose own tasks fail.
+
+    Boards of higher priority precede those of lower priority.
+    """
     failing = [name for name in rack.timing.levels if rack.find_failures(name)]
     own = {verdict.subject.partition(".")[0] for verdict in rack.failures}
-    # An overloaded core affects all its boards. Boards with failing tasks come first.
+    # An overloaded core affects all its boards.
     return sorted(failing, key=lambda name: (name not in own, -rack.config.board[name].priority))
 
 
 def find_changes(rack: JudgedConfig, board: str) -> list[Change]:
     """Return the smallest change of each kind that makes a board fit, sorted by `Change.cost`.
 
-    Another priority, or a core already in use, costs nothing. The next are a slot and a new core,
-    then older plans and longer cycles, of the board or of one that shares its core, by their
-    factor. If none of these helps alone, moving the planner and lengthening the cycle are combined.
+    Priorities and cores already in use are cheapest, then new slots and cores, then older plans and
+    longer cycles by their factor. The cycle may be that of another board on the same core. If no
+    single change helps, another place for the planner is combined with a longer cycle.
     """
     changes = [*_find_own_changes(rack, board), *_find_changes_of_others(rack, board)]
     if not changes:
@@ -170,7 +173,7 @@ def _list_priorities(rack: JudgedConfig, board: str) -> Iterator[Settings]:
 def _find_changes_of_others(rack: JudgedConfig, board: str) -> Iterator[Change]:
     """Yield the cheapest change of each board that shares a core with this one.
 
-    It is another core, for the board or only for its loose planner, or a longer cycle.
+    The change is another core, for the board or only for its loose planner, or a longer cycle.
     """
     timing = rack.timing
     cores = timing.find_cores(board)
@@ -205,7 +208,7 @@ def _list_longer_cycles(
 ) -> list[Settings]:
     """Return settings with longer cycles for a board.
 
-    With a limit on the age of plans, a plan may then get fewer cycles.
+    If the age of plans is limited, a longer cycle may leave fewer cycles for a plan.
 
     Args:
         rack: Rack to change.
@@ -245,7 +248,7 @@ def _list_planner_places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
 
 
 def _list_plan_cycles(level: LevelTiming) -> range:
-    """Return the longer times that a plan may take, cycles. Empty without a planner."""
+    """Return the larger numbers of cycles that a plan may take. Empty without a planner."""
     if level.within_cycles is None:
         return range(0)
     longest = min(level.within_cycles * MAX_FACTOR, MAX_CYCLES)
@@ -257,8 +260,8 @@ def _list_plan_cycles(level: LevelTiming) -> range:
 def _list_other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
     """Yield the cores to which a task could move.
 
-    Cores in use come first, the least loaded one at the beginning, then an unused one. The cores of
-    a board without a budget are left out, because their free time is unknown.
+    Cores in use come first, in the order of their load, then an unused one. The cores of a board
+    without a budget are left out, because their free time is unknown.
     """
     timing = rack.timing
     used = set(timing.cores.values())
@@ -274,34 +277,39 @@ def _list_other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
 
 
 def _try_change(
-    rack: JudgedConfig, board: str, settings: Settings, cures: str | None
+    rack: JudgedConfig, board: str, settings: Settings, target: str | None
 ) -> Change | None:
-    """Return the change of a board if it cures that board, or the board `cures` if given."""
+    """Return the change of a board if it removes the failures of the board `target`.
+
+    If `target` is None, it must remove the failures of the changed board itself.
+    """
     change = rack.try_change(board, settings)
-    return change if change is not None and change.after.cures_board(cures or board, rack) else None
+    return (
+        change if change is not None and change.after.cures_board(target or board, rack) else None
+    )
 
 
 def _try_each(
-    rack: JudgedConfig, board: str, tried: Iterable[Settings], cures: str | None = None
+    rack: JudgedConfig, board: str, tried: Iterable[Settings], target: str | None = None
 ) -> Change | None:
-    """Return the first change that works, trying all of them in order."""
+    """Return the first change that works, as `_try_change` decides."""
     return next(
-        (c for settings in tried if (c := _try_change(rack, board, settings, cures)) is not None),
+        (c for settings in tried if (c := _try_change(rack, board, settings, target)) is not None),
         None,
     )
 
 
 def _search_first(
-    rack: JudgedConfig, board: str, tried: Sequence[Settings], cures: str | None = None
+    rack: JudgedConfig, board: str, tried: Sequence[Settings], target: str | None = None
 ) -> Change | None:
-    """Return the first change that works, in few attempts; see `search_first`."""
-    return search_first(tried, lambda settings: _try_change(rack, board, settings, cures))
+    """Return the first change that works, as `_try_change` decides; see `search_first`."""
+    return search_first(tried, lambda settings: _try_change(rack, board, settings, target))
 
 
 def search_first(items: Sequence[T], attempt: Callable[[T], R | None]) -> R | None:
-    """Return the result of `attempt` for the first item for which it has one.
+    """Return the result of `attempt` for the first item that works.
 
-    The search needs few attempts, because all items after one that works must also work.
+    The search needs few attempts. It requires that all items after one that works also work.
 
     Args:
         items: Items to try.

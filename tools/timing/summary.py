@@ -1,6 +1,6 @@
 """Summary of a check.
 
-It tells whether the rack fits, where it is tightest, how soon it responds, the abilities of its
+It tells whether the rack fits, where it is tightest, how fast it responds, the abilities of its
 arm, and the changes that would make it fit.
 """
 
@@ -89,7 +89,7 @@ def _format_verdict(forecast: Forecast, measuring: str) -> Iterator[str]:
 
 
 def find_tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
-    """Yield the verdict whose right side has the smallest fraction left.
+    """Yield a line about the verdict with the smallest margin relative to its right side.
 
     Equalities are left out because they have no margin, and the response of the system because it
     is exact.

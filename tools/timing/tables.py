@@ -109,11 +109,11 @@ def _format_frame_numbers(frames: Sequence[int], count: int) -> str:
 
 
 def build_level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> TextTable:
-    """Build a table with a row per level: its cycle, the parts of it, and the residual, ms.
+    """Build a table with a row per level: its cycle, the parts of it, and the residual, in ms.
 
     Args:
-        levels: Levels, each with a word about it.
-        about: Heading of the column of these words.
+        levels: Levels, each with a word for the first column after its name.
+        about: Heading of this column.
     """
     rows: Iterable[Row] = (
         {

@@ -2,7 +2,7 @@
 
 All mistakes are reported at once. A rule skips everything that depends on a broken table, because
 the mistakes of that table are already reported. `rack.boards.config.injections` and
-`rack.boards.config.commands` check faults and commands, which may also come while a rack runs.
+`rack.boards.config.commands` check faults and commands, which can also be issued to a running rack.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ def load_network_rules(config: RackConfig) -> ModuleType | None:
 
 
 def _check_network(wiring: Wiring) -> Mistakes:
+    """Check the table `[adapter.lan]` of a rack that has one."""
     if (rules := load_network_rules(wiring.config)) is not None:
         yield from rules.check_network(wiring, wiring.config.adapter.lan)
 

@@ -59,7 +59,14 @@ def check_hosts(wiring: Wiring) -> Mistakes:
 def _check_neighbours(
     place: str, names: Sequence[str], boards: Sequence[str], noun: str
 ) -> Mistakes:
-    """Check that the neighbours listed at a place exist; `noun` says in a mistake what they are."""
+    """Check that the neighbours of a board exist and that none is listed twice.
+
+    Args:
+        place: Place of the neighbours in the config.
+        names: The listed neighbours.
+        boards: Boards that may be listed.
+        noun: Noun for a neighbour in the text of a mistake, such as "other board".
+    """
     for name in names:
         if name not in boards:
             yield Mistake(
@@ -69,6 +76,7 @@ def _check_neighbours(
 
 
 def _check_name(place: str, name: str) -> Mistakes:
+    """Check the name of a board or host board."""
     if not BOARD_NAME.fullmatch(name) or name in RESERVED:
         why = f"valid: at most 31 of a-z, 0-9 and _, except {', '.join(RESERVED)}"
         yield Mistake(place, None, f"invalid name for a board; {why}")
@@ -109,7 +117,10 @@ def _check_planner(place: str, board: BoardConfig) -> Mistakes:
 
 
 def check_circles(wiring: Wiring) -> Mistakes:
-    """Report a circle among the levels, which would have no highest or lowest level."""
+    """Check that no level is above itself, directly or through other levels.
+
+    A circle of levels would have no highest or lowest level.
+    """
     config = wiring.config
     links = list(config.list_links())
     try:
@@ -179,7 +190,7 @@ def check_record(wiring: Wiring) -> Mistakes:
 
 
 LONGEST_MAJOR = 10_000
-"""Longest major frame, ticks. The timing model simulates two major frames."""
+"""Longest major frame in ticks. The timing model simulates two major frames."""
 
 
 def check_clock(wiring: Wiring) -> Mistakes:
@@ -204,7 +215,7 @@ def check_clock(wiring: Wiring) -> Mistakes:
 
 
 def check_rates(wiring: Wiring) -> Mistakes:
-    """Check that each board's period is given once, is a multiple of ticks, and is not too long."""
+    """Check that each board has one period, in whole ticks and not too long, and a valid phase."""
     for name, board in wiring.config.board.items():
         place = f"board.{name}.rate_hz"
         if (board.rate_hz is None) == (board.every is None):
@@ -273,6 +284,7 @@ def check_schedule(wiring: Wiring) -> Mistakes:
 
 
 def _check_frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
+    """Check that the frames are not too long and that the minor frame divides the major frame."""
     tick_ms = clock_ns * 1e-6
     minor, major = compute_frames(table, clock_ns)
     if minor < 1 or abs(minor * tick_ms - table.minor_ms) > 1e-6 * tick_ms:
@@ -294,7 +306,7 @@ def _check_frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
 
 
 def _format_nearest(value: float, step: float) -> str:
-    """Return the multiples of `step` next to a value that is not one, as text."""
+    """Return the multiples of `step` just below and above `value`, without zero, as text."""
     below = int(value / step)
     return " or ".join(f"{number * step:.12g}" for number in (below, below + 1) if number)
 

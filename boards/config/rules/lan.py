@@ -116,7 +116,7 @@ def _check_rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -
     Args:
         place: Place of the entry in the config.
         entry: The exchange.
-        cycle_ns: Period of the adapter's board, ns of simulated time.
+        cycle_ns: Period of the adapter's board in ns of simulated time.
     """
     grid = ("of the adapter", "cycle")
     try:
@@ -137,7 +137,7 @@ def _check_rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -
 def _check_priority(config: RackConfig, table: LanConfig) -> Mistakes:
     """Check that the adapter has a higher priority than real-time boards on its core.
 
-    They could delay its signs of life, and other racks would take this one for lost.
+    They could delay its heartbeats, and other racks would then consider this rack lost.
     """
     others = [
         place for place in config.list_tasks() if place.core == table.core and place.board != LAN
@@ -156,7 +156,10 @@ def _check_priority(config: RackConfig, table: LanConfig) -> Mistakes:
 
 
 def _explain_export(wiring: Wiring, source: str) -> Iterator[str]:
-    """Yield why a mailbox cannot be exported. The rule for queues reports exported queues."""
+    """Yield the reason why a mailbox cannot be exported. Nothing if it can.
+
+    Exported queues are reported by the rule for queues instead.
+    """
     board = source.partition(".")[0]
     if board == LAN:
         yield "the adapter itself writes it; only mailboxes of levels can be exported"
@@ -231,6 +234,13 @@ def _list_open_endpoints(table: LanTable) -> list[str]:
 
 
 def _explain_endpoint(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
+    """Return why an endpoint is not protected well enough. Empty if it is.
+
+    Args:
+        endpoint: The endpoint.
+        table: The table `[adapter.lan]`.
+        connects: Whether the rack connects to the endpoint instead of listening on it.
+    """
     if endpoint.has_tls and connects and ":" in endpoint.host:
         return (
             "zenoh does not check certificates of IPv6 addresses; use a host name or an IPv4"

@@ -74,12 +74,12 @@ def check_memory(layout: Layout) -> Mistakes:
 
 
 def check_neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mistakes:
-    """Let each level check the boards above and below it.
+    """Check that each level accepts the boards above and below it.
 
     Args:
         wiring: The wiring.
-        contexts: Contexts of the levels, by board. Boards with mistakes have none, and neither
-            they nor their neighbours are checked.
+        contexts: Contexts of the levels, by board. Boards with mistakes have none, and neither they
+            nor their neighbours are checked.
     """
     for ports in wiring.tasks:
         board = wiring.config.board[ports.place.board]
@@ -143,7 +143,7 @@ def check_cell(wiring: Wiring) -> Mistakes:
             reasons = [str(error)]
     from rack.levels.robot.lookup import find_unknown_names
 
-    # List all names that the model lacks instead. If the model cannot be read, none are known.
+    # Report all names that the model lacks instead, if the model can be read.
     with suppress(RobotError):
         reasons = [*find_unknown_names(robot_table, scene_table)] or reasons
     for reason in reasons:

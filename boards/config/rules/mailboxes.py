@@ -228,7 +228,7 @@ def check_queues(wiring: Wiring) -> Mistakes:
 
 
 def _check_queue(wiring: Wiring, mailbox: str) -> Mistakes:
-    """Check that exactly one port reads a queue, and that its reader's position has a free name."""
+    """Check that exactly one port reads a queue, and that its position mailbox has a free name."""
     if get_position_mailbox(mailbox) in wiring.writers:
         why = (
             f"the reader of the queue '{mailbox}' writes its position under this name; rename the"

@@ -32,7 +32,7 @@ BY_AXIS = [0, 3, 1, 4, 2, 5]
 
 
 class ContactWrench:
-    """The wrench of a contact, from samples of the wrist sensor and the motion of the arm.
+    """Computes the wrench of a contact from samples of the wrist sensor and the arm's motion.
 
     Attributes:
         raw: Sample in the frame of the sensor, (6,), N, N m.
@@ -104,10 +104,11 @@ class ForceArmParams(ArmParams):
 class ForceArmExecutor(WristLevel, ArmExecutor):
     """Writes the contact wrench in every cycle, and stops the arm when it is too strong.
 
-    The limits are `[robot.wrist]` most_*. A contact beyond them stops the arm while it lasts and
-    for `retry` longer. After `patience` the fault is latched, as other faults are. With brakes the
-    arm springs back a little; an arm that holds keeps pressing. A sensor at the end of its range
-    counts as beyond the limits, because the contact is unknown. A held object counts as contact.
+    The limits are `most_force` and `most_torque` in `[robot.wrist]`. A contact beyond them stops
+    the arm while it lasts and for `retry` longer. After `patience` the fault is latched, as other
+    faults are. With brakes the arm springs back a little; an arm that holds keeps pressing. A
+    sensor at the end of its range counts as beyond the limits, because the contact is unknown. A
+    held object counts as contact.
 
     Weight and inertia of the tool are subtracted. The acceleration for this comes from the
     velocities of the joints or, with coarse encoders, from the set points. Without the subtraction,
@@ -123,7 +124,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        assert self.cell.wrist is not None, "`misfits` refuses an arm without a sensor"
+        assert self.cell.wrist is not None, "`find_mismatches` refuses an arm without a sensor"
         self._most = self.cell.wrist.contact_limits
         self._on_limit = Reaction[self.settings.on_force_limit.upper()]
         self.contact = ContactWrench(self.cell, self.cell.wrist, self.arm.dynamics)
@@ -145,7 +146,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
             )
 
     def process(self, tick: int) -> None:
-        """Do the cycle of an arm, and write the wrench."""
+        """Run the cycle of an arm, and write the wrench of the contact."""
         if self._since is None and self.felt.has_message:
             self._exceeded = self.felt.message.exceeded
         super().process(tick)
@@ -173,12 +174,12 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     @property
     def _velocity(self) -> Array:
-        """Velocities from whose change the acceleration is computed, (joints,), rad/s."""
+        """Velocities from which the acceleration is computed, (joints,), rad/s."""
         velocity: Array = self.sensors.velocity if self._exact else self._wanted[1]
         return velocity
 
     def _check_limits(self, tick: int) -> None:
-        """Stop the arm if the contact is beyond a limit, or not known to be within it."""
+        """Stop the arm if the contact is beyond a limit, or may be because it is unknown."""
         contact = self.contact
         if contact.saturated:
             finding = Finding(Alarm.FORCE_LIMIT, -1, norm(contact.raw[:3]))
@@ -193,13 +194,19 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
                 return
 
     def _stop_arm(self, finding: Finding, text: str, tick: int) -> None:
-        """Count the cycle, and register the contact as the cause of a stop."""
+        """Register a contact as the cause of a stop, and count the cycle.
+
+        Args:
+            finding: Finding to report.
+            text: Description of the contact.
+            tick: Tick of the cycle.
+        """
         self._exceeded += 1
         cause = Cause(Error.FORCE, text, value=finding.value)
         self.stopping.register_blow(cause, finding, tick, self._on_limit)
 
     def on_restored(self) -> None:
-        """Continue from the restored state."""
+        """Compute the next acceleration from the velocities of the restored state."""
         self._before[:] = self._velocity
         self._since = self.arm.tick
 

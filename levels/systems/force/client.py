@@ -1,4 +1,4 @@
-"""A client of a server of force and motion, on the host side.
+"""A client of the force and motion server, for programs on a host board.
 
 It offers these calls in addition to the calls of `Motions`. Task frames and contacts have names in
 `[task]`, which is checked before the launch.
@@ -9,9 +9,9 @@ It offers these calls in addition to the calls of `Motions`. Task frames and con
     free()                         motion alone, without guards
     wrench(), mode()               wrench of the tool, N, N m, by axis; mode of the server
 
-A guard that ends a request is used up: `end_of(request)` is GUARDED. Calls that wait give the
-server its sign of life. A program that makes no call for longer than `silence` is lost to the
-server.
+A guard that has ended a request is removed; `end_of(request)` is then GUARDED. Calls that wait also
+send signs of life to the server. If a program makes no call for longer than `silence`, the server
+treats it as lost.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ MAX_COSINE = 1e-3
 
 
 class FrameConfig(Table):
-    """`[task.frame.<name>]`: a task frame by two of its axes, in the world frame, of any length."""
+    """`[task.frame.<name>]`: a task frame, given by two of its axes in the world frame.
+
+    The vectors may have any length.
+    """
 
     x: Vector
     """its x axis"""
@@ -48,7 +51,7 @@ class FrameConfig(Table):
     """its z axis, at a right angle to x"""
 
     def find_objection(self) -> str:
-        """Return why the axes do not define a frame, or an empty text."""
+        """Return why the axes define no frame, or an empty text if they do."""
         lengths = norm(self.x) * norm(self.z)
         if not lengths > 0.0:
             return "an axis of length 0: no frame"
@@ -84,7 +87,7 @@ class ContactConfig(Table):
 
 
 class ForceProgram(Program):
-    """`[task]` of a client of a server of force and motion."""
+    """`[task]` of a client that requests forces and motions from a `ForceServer`."""
 
     frame: dict[str, FrameConfig] = {}
     """task frames, by name"""
@@ -103,7 +106,7 @@ class ForceProgram(Program):
                 yield f"contact.{name}", contact.model_dump(exclude_defaults=True), reason
 
     def find_objection(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
-        """Return why a contact is impossible, or an empty text."""
+        """Return why a contact is impossible, or an empty text if it is possible."""
         if contact.frame not in self.frame:
             return (
                 f"frame '{contact.frame}' is not in [task.frame]; valid values:"
@@ -124,7 +127,7 @@ class ForceProgram(Program):
         )
 
     def build_contact(self, contact: ContactConfig) -> WantedContact:
-        """Return a contact as the numbers of a request."""
+        """Convert a contact of the config to the values of a request."""
         return WantedContact(
             frame=self.frame[contact.frame].quaternion,
             selected=np.array([name in contact.wrench for name in AXIS_NAMES]),
@@ -135,14 +138,14 @@ class ForceProgram(Program):
 
 
 def to_vector(values: Mapping[Axis, float]) -> Array:
-    """Return values by axis as a vector, (6,), with 0 for axes without a value."""
+    """Convert values by axis to a vector, (6,), with 0 for axes without a value."""
     return np.array([values.get(name, 0.0) for name in AXIS_NAMES])
 
 
 class ForceMotions(Motions):
-    """Requests for forces and motions as calls.
+    """Calls that request forces and motions from the server.
 
-    A call raises `LevelError` at once for a contact that is impossible.
+    A call raises `LevelError` at once if its contact is impossible.
     """
 
     def __init__(
@@ -159,9 +162,17 @@ class ForceMotions(Motions):
         super().__init__(bus, motion, requests, context)
 
     def comply(self, contact: str, **changes: Any) -> int:
-        """Make axes of a contact axes of force, once the arm rests.
+        """Request force control on those axes of a contact that have a wrench.
 
-        The request is done when the forces are as wanted. Keywords change entries of the contact.
+        It begins once the arm is at rest. The request is done when the forces have settled at the
+        wanted values.
+
+        Args:
+            contact: Name of the contact.
+            **changes: Entries of the contact to replace.
+
+        Returns:
+            Number of the request.
         """
         wanted = self._read_contact("comply", contact, changes)
         if not wanted.selected.any():
@@ -173,9 +184,14 @@ class ForceMotions(Motions):
         return self._queue_request(kind=MotionKind.COMPLY, **fields)
 
     def guard(self, contact: str, **changes: Any) -> int:
-        """Guard axes: the next wrench beyond a limit ends the motion under way.
+        """Request guards on axes: a wrench beyond the limit of an axis ends the motion under way.
 
-        Keywords change entries of the contact.
+        Args:
+            contact: Name of the contact that contains the limits.
+            **changes: Entries of the contact to replace.
+
+        Returns:
+            Number of the request.
         """
         wanted = self._read_contact("guard", contact, changes)
         if not wanted.guard.any():
@@ -183,7 +199,11 @@ class ForceMotions(Motions):
         return self._queue_request(kind=MotionKind.GUARD, frame=wanted.frame, guard=wanted.guard)
 
     def free(self) -> int:
-        """End compliance and guards. The request is done when the arm rests where it is."""
+        """Request the end of compliance and guards. It is done when the arm is at rest.
+
+        Returns:
+            Number of the request.
+        """
         return self._queue_request(kind=MotionKind.COMPLY)
 
     @property
@@ -192,22 +212,22 @@ class ForceMotions(Motions):
         return self._server.read().message
 
     def wrench(self) -> Mapping[str, float]:
-        """Return the wrench of the tool on the surroundings, N, N m, by axis of the task frame."""
+        """Return the wrench of the tool on the surroundings by axis, in N and N m."""
         values = self._status.wrench
         return {
             name: round(float(value), 3) for name, value in zip(AXIS_NAMES, values, strict=True)
         }
 
     def mode(self) -> Mode:
-        """Return the mode of the server."""
+        """Return the present mode of the server."""
         return Mode(self._status.mode)
 
     def where(self) -> list[float]:
-        """Return the sensed position of the tool, m."""
+        """Return the sensed position of the tool, in m."""
         return [round(float(x), 4) for x in self._status.place]
 
     def _read_contact(self, call: str, name: str, changes: Mapping[str, Any]) -> WantedContact:
-        """Return a contact of the program with changes.
+        """Return a contact of the program, with some entries replaced.
 
         Args:
             call: Name of the call, for messages.
@@ -236,7 +256,7 @@ class ForceMotions(Motions):
         return self._program.build_contact(changed)
 
     def _wait_and_resend(self) -> None:
-        """Send a sign of life if one is due, besides what the base class does."""
+        """Wait as the base class does, and send a sign of life if one is due."""
         if self._bus.tick - self._signed >= self._sign_ticks:
             self._signed = self._bus.tick
             self._send_request({"id": 0})

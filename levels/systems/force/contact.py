@@ -27,9 +27,9 @@ SAME = 1e-9
 
 
 class WantedContact(NamedTuple):
-    """The contact that a request asks for. The last four are (6,), by axis.
+    """The contact that a request asks for; see `ServerRequest`.
 
-    See `ServerRequest`.
+    All fields but `frame` have one value per axis, (6,).
     """
 
     frame: Array  # (4,)
@@ -40,21 +40,23 @@ class WantedContact(NamedTuple):
 
     @classmethod
     def from_record(cls, record: Any) -> Self:
-        """Return the contact of the record of a request."""
+        """Read the contact from the record of a request."""
         wanted = cls(*(record[name] for name in cls._fields))
         return wanted._replace(selected=wanted.selected.astype(bool))
 
 
 class Contact:
-    """The contact in force: the content of a server's `Compliance`.
+    """The contact that a server commands: the content of its `Compliance` message.
+
+    On an axis of force the wrench is controlled, on an axis of motion the arm follows the motion.
 
     Attributes:
-        id: Number that rises with every change.
+        id: Number that increases with every change.
         frame: Orientation of the task frame, as w, x, y, z.
-        selected: Axes of force.
-        wrench: Wanted wrench of the tool, N, N m.
-        speed: Largest velocity on axes of force, m/s, rad/s.
-        guard: Wrench that ends a motion, N, N m, or 0.
+        selected: True for axes of force, (6,).
+        wrench: Wanted wrench of the tool, (6,), N, N m.
+        speed: Largest velocity on axes of force, (6,), m/s, rad/s.
+        guard: Wrench that ends a motion, (6,), N, N m. 0 for axes without a guard.
     """
 
     def __init__(self) -> None:
@@ -69,7 +71,10 @@ class Contact:
         return bool(self.selected.any())
 
     def set_force_axes(self, wanted: WantedContact) -> bool:
-        """Replace the axes of force, and drop the guards if the frame is another one.
+        """Replace the axes of force. If the task frame changes, remove the guards too.
+
+        Args:
+            wanted: Contact with the new axes.
 
         Returns:
             True if the motion must restart from rest.
@@ -95,19 +100,19 @@ class Contact:
         self.guard[:] = guard
 
     def clear_wrench(self) -> None:
-        """Set the wanted forces to zero; the axes of force remain."""
+        """Set the wanted forces to zero without changing the axes of force."""
         self.id += 1
         self.wrench[:] = 0.0
 
     def release_axes(self) -> None:
-        """Make all axes axes of motion without guards."""
+        """Turn all axes into axes of motion, and remove all guards."""
         self.id += 1
         self.selected[:] = False
         self.wrench[:] = 0.0
         self.guard[:] = 0.0
 
     def find_objection(self, frame: Array, guard: Array) -> str:
-        """Return why guards in a frame are impossible at present, or an empty text."""
+        """Return why guards in a frame are impossible at present. Empty if they are possible."""
         if self.is_compliant and guard.any() and not self._is_frame(frame):
             return (
                 "the guard's frame is not that of the axes of force; permitted while complying: the"
@@ -127,14 +132,14 @@ class Contact:
             setattr(compliance, name, getattr(self, name))
 
     def restore_contact(self, compliance: Compliance) -> None:
-        """Continue from the last message after a restart."""
+        """Restore the contact from the last message after a restart."""
         self.id = compliance.id
         for name in WantedContact._fields:
             getattr(self, name)[:] = getattr(compliance, name)
 
 
 def find_misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) -> str:
-    """Return why a task frame, or a wrench in it, is impossible, or an empty text.
+    """Return why a task frame or a wrench in it is impossible. Empty if both are possible.
 
     Args:
         frame: Orientation of the frame, as w, x, y, z.
@@ -161,7 +166,7 @@ class WristLevel(Executor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield an arm without a wrist sensor, and what the base class yields."""
+        """Yield a mismatch if the arm has no wrist sensor, and those of the base class."""
         yield from super().find_mismatches(context, above, below)
         if context.robot.wrist is None:
             yield (

@@ -25,7 +25,7 @@ from rack.levels.systems.trajectory.boards import JointBoards
 
 LEAD_CYCLES = 2
 """Cycles from the release that computes a reference to the tick at which it is due, so that the
-boards below have it in time."""
+boards below receive it in time."""
 FORWARDED_FIELDS = ("opening", "force", "payload_mass", "payload_offset", "operator")
 """Fields of a reference that are passed down unchanged."""
 MAX_WRENCH_AGE_CYCLES = 2
@@ -35,7 +35,10 @@ NO_FORCE = np.zeros((2, AXES))
 
 
 class ComplianceWatch:
-    """Judges the command in force against the newest wrench in every cycle.
+    """Checks the commanded contact against the newest wrench in every cycle.
+
+    A guard is struck when the wrench on its axis exceeds the limit; that ends the motion, once for
+    each command.
 
     Attributes:
         task: Axes of force, or None if there are none.
@@ -48,7 +51,12 @@ class ComplianceWatch:
     """
 
     def __init__(self, most: tuple[float, float], every: int) -> None:
-        """Limit contacts to `most`, N and N m. A cycle takes `every` ticks."""
+        """Watch the contact of an arm.
+
+        Args:
+            most: Limits on a contact, N and N m.
+            every: Ticks from cycle to cycle.
+        """
         self._most = most
         self._oldest = MAX_WRENCH_AGE_CYCLES * every
         self.task: ForceTask | None = None
@@ -60,7 +68,13 @@ class ComplianceWatch:
         self.reason = ""
 
     def restore_guard(self, last: Reading[ForceStatus]) -> None:
-        """Continue after a restart from the last `ForceStatus`, because a guard acts only once."""
+        """Restore the guard that was struck last, after a restart.
+
+        A guard must not end the motion a second time.
+
+        Args:
+            last: Last `ForceStatus` of this board.
+        """
         if last.has_message:
             self.struck = last.message.struck
             self.axis = last.message.axis
@@ -72,7 +86,7 @@ class ComplianceWatch:
         above_is_lost: bool,
         tick: int,
     ) -> None:
-        """Judge command and wrench of one cycle.
+        """Check command and wrench of one cycle, and set the attributes accordingly.
 
         Args:
             compliance: Command and its verdict.
@@ -102,12 +116,12 @@ class ComplianceWatch:
                 self._check_guards(wanted)
 
     def _require_rest(self, reason: str) -> None:
-        """Require that the motion ends."""
+        """Let the motion end, for `reason`."""
         self.rests = True
         self.reason = reason
 
     def _explain_blindness(self, wrench: Reading[Wrench], tick: int) -> str:
-        """Return why the contact is not known, or an empty text."""
+        """Return why the present contact is unknown, or an empty text if it is known."""
         if not wrench.has_message or wrench.is_lost:
             return "no wrench from the board of the arm: waiting for it"
         if tick - self.sensed > self._oldest:
@@ -115,7 +129,14 @@ class ComplianceWatch:
         return "the wrist sensor is at the end of its range" if wrench.message.saturated else ""
 
     def _take_force_axes(self, compliance: Compliance, rotation: Array) -> None:
-        """Set the axes of force. While the motion must end, they rest."""
+        """Set `task` to the axes of force of a command.
+
+        If the motion must end, these axes come to rest too.
+
+        Args:
+            compliance: Command.
+            rotation: Task frame in the world, (3, 3).
+        """
         selected = compliance.selected.astype(bool)
         if selected.any():
             wanted = self._limit_wrench(np.where(selected, compliance.wrench, 0.0))
@@ -123,7 +144,7 @@ class ComplianceWatch:
             self.task = ForceTask(rotation, selected, wanted, exerted, compliance.speed)
 
     def _limit_wrench(self, wanted: Array) -> Array:
-        """Return the wanted wrench, reduced to the arm's limits on contacts."""
+        """Return the wanted wrench, reduced to the arm's limits. If reduced, set `reason`."""
         for (half, name, unit), limit in zip(HALVES, self._most, strict=True):
             size = norm(wanted[half])
             if size > limit:
@@ -136,7 +157,7 @@ class ComplianceWatch:
         return wanted
 
     def _check_guards(self, compliance: Compliance) -> None:
-        """End the motion if a guard is struck, once for each command."""
+        """End the motion if the wrench exceeds a guard, once for each command."""
         beyond: Mask = (compliance.guard > 0.0) & (np.abs(self.felt) > compliance.guard)
         if beyond.any() and self.struck != compliance.id:
             self.struck = compliance.id
@@ -148,7 +169,7 @@ class ComplianceWatch:
 
 
 def find_objection(compliance: Compliance) -> str:
-    """Return why a command is impossible, or an empty text."""
+    """Return why a command is invalid, or an empty text if it is valid."""
     numbers = np.concatenate(
         (compliance.frame, compliance.wrench, compliance.speed, compliance.guard)
     )
@@ -170,15 +191,16 @@ def compute_rotation(quaternion: Array) -> Array:
 
 
 class HybridExecutor(WristLevel):
-    """Passes the references of the level above down, and adds motion for forces.
+    """Passes the references of the level above down, and adds the motion that controls forces.
 
-    References become due `LEAD_CYCLES` later. A guard that is struck ends the motion: the arm ramps
-    to rest and holds until the level above has another command, while axes of force keep their
-    forces. Without a fresh wrench, or while the level above is lost, all axes rest.
+    References become due `LEAD_CYCLES` cycles later. A guard that is struck ends the motion: the
+    arm ramps to rest and holds until the level above sends another command, while the forces on
+    axes of force are maintained. Without a fresh wrench, or while the level above is lost, all axes
+    come to rest.
 
-    After that, after braking, and after a restart of this board, references must begin where
-    `status` reports that the arm is held. When axes cease to be axes of force during a motion, the
-    references are followed with the difference that force control has left.
+    After such a stop, after braking, and after a restart of this board, references must begin where
+    `status` reports that the arm is held. When axes of force become axes of motion again during a
+    motion, the references are followed with the offset that force control has caused.
     """
 
     above = Input(JointReference, "above.command")
@@ -196,7 +218,7 @@ class HybridExecutor(WristLevel):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         cell = build_level_cell(context)
-        assert cell.wrist is not None, "`misfits` refuses an arm without a sensor"
+        assert cell.wrist is not None, "`find_mismatches` refuses an arm without a sensor"
         self._watch = ComplianceWatch(cell.wrist.contact_limits, context.every)
         self._law = HybridLaw(cell, self.settings)
         self._reference = Reference(cell.bounds, cell.limits, context.tick_s)
@@ -208,7 +230,7 @@ class HybridExecutor(WristLevel):
         self._tick: int | None = None  # tick of the last cycle
 
     def process(self, tick: int) -> None:
-        """Do one cycle: follow references and forces, and report."""
+        """Run one cycle: follow references and forces, and report."""
         if self._tick is None:
             self._watch.restore_guard(self.last_force)
             self._tick = tick - self.context.every
@@ -244,13 +266,13 @@ class HybridExecutor(WristLevel):
         force.reason = watch.reason
 
     def _begin_at_rest(self, position: Array, tick: int) -> None:
-        """Start at rest at `position`, without a difference from the motion."""
+        """Start at rest at `position`, with no offset from the references."""
         self._law.reset_offset()
         self._target = position.copy()
         self._reference.start(position, self._still, tick)
 
     def _write_reference(self, command: JointReference, tick: int, passed_s: float) -> None:
-        """Write the reference that is due two cycles later."""
+        """Write the reference that is due `LEAD_CYCLES` cycles later."""
         watch = self._watch
         reference = self._reference
         motion = reference.ramp_to_rest(tick) if watch.rests else reference.compute_motion(tick)
@@ -270,7 +292,7 @@ class HybridExecutor(WristLevel):
             self._begin_at_rest(self._target, tick)
 
     def _write_status(self, status: JointStatus) -> None:
-        """Report the boards below as one, with this level's set points."""
+        """Report the boards below as one board, with the set points of this level."""
         values = [reading.message for reading in self.statuses.values()]
         status.position = values[0].position
         status.torque[:] = sum(v.torque for v in values)

@@ -5,9 +5,8 @@ proportional to the force error. Raibert and Craig ("Hybrid position/force contr
 1981) split the axes in this way; they command torques, but velocities suit joints with position
 servos. The wanted force is fed forward as J^T F.
 
-The law works with the difference dq between its joint positions and the level above's.
-When no axis is of force, dq stays constant, so the motion continues without a step at another
-place.
+The law works with the offset dq of its joint positions from those of the level above. When no axis
+is an axis of force, dq stays constant, so the motion continues without a step, shifted by dq.
 """
 
 from __future__ import annotations
@@ -89,7 +88,7 @@ class ToolKinematics:
         self._whole = np.zeros((AXES, cell.model.nv))
 
     def evaluate_at(self, position: Array, velocity: Array, payload: Payload | None = None) -> None:
-        """Evaluate a state.
+        """Compute the pose, the Jacobian and the equation of motion at a state.
 
         Args:
             position: (joints,), rad.
@@ -128,13 +127,13 @@ class HybridLaw:
         self.offset = np.zeros(3)
 
     def reset_offset(self) -> None:
-        """Start at rest without a difference from the motion."""
+        """Restart at rest, with no offset from the motion of the level above."""
         for numbers in (self._by_joint, self._by_axis, self.offset):
             numbers[:] = 0.0
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the difference from the motion does not change."""
+        """True if the offset from the motion of the level above does not change."""
         return not self._speed.any()
 
     def step(
@@ -144,7 +143,7 @@ class HybridLaw:
 
         Args:
             motion: Motion of the level above.
-            task: Axes of force, or None if all axes are of motion.
+            task: Axes of force, or None if all axes are axes of motion.
             passed_s: Time since the last cycle.
             payload: Payload at the tool.
         """
@@ -179,7 +178,7 @@ class HybridLaw:
         )
 
     def _compute_velocity(self, motion: Motion, task: ForceTask, passed_s: float) -> Array:
-        """Return the joint velocities that follow the motion and the wanted force, rad/s."""
+        """Return the joint velocities that follow the motion and the wanted force, in rad/s."""
         self._there.evaluate_at(motion.position + self._base, motion.velocity)
         self._here.evaluate_at(motion.position + self._away, motion.velocity + self._speed)
         motion_pose = self._there.pose
@@ -212,9 +211,10 @@ class HybridLaw:
         passed_s: float,
         payload: Payload,
     ) -> tuple[Array, Array]:
-        """Return inertia, kg m2, and load, N m, of the joints at the commanded state.
+        """Return the inertia and the load of the joints at the commanded state, in kg m2 and N m.
 
-        The force that is fed forward follows the wanted force with the bandwidth of the loop.
+        The load includes the wanted force, which is fed forward with the bandwidth of the force
+        loop.
         """
         self._here.evaluate_at(position, velocity, payload)
         forward = (
@@ -228,9 +228,11 @@ class HybridLaw:
 
 
 def rotate_halves(rotation: Array, vector: Array) -> Array:
-    """Rotate both halves of a vector.
+    """Rotate both halves of a vector, such as force and torque.
 
-    The vector is (6,), the rotation matrix (3, 3).
+    Args:
+        rotation: Rotation matrix, (3, 3).
+        vector: Vector, (6,).
     """
     rotation = np.ascontiguousarray(rotation)
     return np.concatenate(
@@ -241,7 +243,12 @@ def rotate_halves(rotation: Array, vector: Array) -> Array:
 def solve_damped(jacobian: Array, twist: Array) -> Array:
     """Return the joint velocities J^T (J J^T + d)^-1 `twist`, finite near singularities.
 
-    The twist is (6,), m/s, rad/s. See `DAMPING` for d.
+    Args:
+        jacobian: J, (6, joints).
+        twist: Velocity of the tool, (6,), m/s, rad/s.
+
+    Returns:
+        Velocities, (joints,), rad/s. See `DAMPING` for d.
     """
     square = gram(np.ascontiguousarray(jacobian.T))
     square.flat[:: AXES + 1] += DAMPING

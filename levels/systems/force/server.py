@@ -1,4 +1,4 @@
-"""The executor of a server of force and motion.
+"""The executor of a force and motion server.
 
 It carries out the requests of a client: motions, as a trajectory level does, COMPLY and GUARD. When
 the client is lost, it brings the arm to a safe state.
@@ -62,10 +62,10 @@ class ServerParams(TrajectoryParams):
 
 
 class ServerWork(RequestWork):
-    """Begins and ends compliance, and judges contacts: see `ServerRequest`.
+    """Carries out requests, including COMPLY and GUARD, and checks contacts.
 
-    When axes cease to be axes of force, or other axes become so, motion restarts from where the arm
-    is: the boards below come to rest and hold, and get into step again.
+    See `ServerRequest`. When present axes of force change or end, motion restarts from where the
+    arm is: the boards below come to rest and hold, and then get into step again.
     """
 
     boards: JointBoards
@@ -84,7 +84,12 @@ class ServerWork(RequestWork):
         self._off_s = 0.0  # time since forces were settled
 
     def step(self, time_s: float, hold: bool) -> None:
-        """Advance to the sample at `time_s`, and judge the contact. With `hold`, ramp to rest."""
+        """Advance the motion to a sample, and check the contact.
+
+        Args:
+            time_s: Time of the sample.
+            hold: The motion must ramp to rest.
+        """
         super().step(time_s, hold)
         if self.contact.is_compliant:
             self._judge_forces()
@@ -92,7 +97,7 @@ class ServerWork(RequestWork):
             self._on_s = self._off_s = 0.0
 
     def strike_guard(self, axis: int) -> None:
-        """End the request under way, because a guard was struck."""
+        """End the request under way, because the guard of `axis` was struck. Remove all guards."""
         current = self.agenda.current
         if current is not None and current.kind != MotionKind.CANCEL:
             self.guarded = current.id
@@ -113,7 +118,7 @@ class ServerWork(RequestWork):
         self.motion.ramp_to_rest()
 
     def end_compliance(self) -> None:
-        """End compliance and guards."""
+        """End compliance, remove all guards, and restart the motion if there was compliance."""
         complied = self.contact.is_compliant
         self.contact.release_axes()
         if complied:
@@ -125,7 +130,7 @@ class ServerWork(RequestWork):
         force = self.force
         if force is None:
             return np.where(contact.selected, np.inf, 0.0)
-        # The tool exerts the opposite of what it feels.
+        # The tool exerts the opposite of the wrench that acts on it.
         error = np.abs(contact.wrench + force.wrench)
         tolerated = self._params.tolerance * np.maximum(
             np.abs(contact.wrench), MIN_TOLERATED_WRENCH
@@ -140,7 +145,7 @@ class ServerWork(RequestWork):
         return params
 
     def _judge_forces(self) -> None:
-        """Count how long forces have been as wanted. End compliance if they do not settle."""
+        """Count how long forces have been within tolerance. End compliance if they never settle."""
         errors = self.compute_force_errors()
         current = self.agenda.current
         params = self._params
@@ -162,13 +167,13 @@ class ServerWork(RequestWork):
             self.end_compliance()
 
     def _restart_motion(self, reason: str) -> None:
-        """Restart the motion from where the boards below come to rest."""
+        """Restart the motion, for `reason`, from where the boards below come to rest."""
         self.agenda.goal = None  # the arm is not at the goal of a request
         self.boards.leave_step(reason)
         self.interrupt_motion()
 
     def _find_request_error(self, request: MotionRequest) -> str:
-        """Return why a request is impossible, or an empty text."""
+        """Return why a request is impossible, or an empty text if it is possible."""
         wanted = WantedContact.from_record(request.record)
         frame = wanted.frame
         if request.kind == MotionKind.COMPLY:
@@ -179,7 +184,7 @@ class ServerWork(RequestWork):
         return super()._find_request_error(request)
 
     def _start_at_rest(self, request: MotionRequest) -> None:
-        """Start a request: set guards or axes of force, or begin a motion."""
+        """Start a request with the arm at rest: set guards or axes of force, or begin a motion."""
         wanted = WantedContact.from_record(request.record)
         if request.kind == MotionKind.GUARD:
             self.contact.set_guards(wanted.frame, wanted.guard)
@@ -195,7 +200,7 @@ class ServerWork(RequestWork):
             super()._start_at_rest(request)
 
     def _is_done(self, current: MotionRequest) -> bool:
-        """Return True if the current request is done. A COMPLY needs settled forces and rest."""
+        """Return True if the current request is done. COMPLY requires settled forces and rest."""
         if current.kind != MotionKind.COMPLY:
             return super()._is_done(current)
         return self.motion.is_settled and (
@@ -203,18 +208,19 @@ class ServerWork(RequestWork):
         )
 
     def _compute_duration_s(self, request: MotionRequest) -> float:
-        """Return the expected duration of a request, s."""
+        """Return the expected duration of a request, in s."""
         if request.kind == MotionKind.COMPLY and self.contact.is_compliant:
             return self._params.settle
         return super()._compute_duration_s(request)
 
 
 class ForceServer(WristLevel, TrajectoryExecutor):
-    """A trajectory level above hybrid control, which can make axes of a task frame axes of force.
+    """A trajectory level above hybrid control, which can turn axes into axes of force.
 
-    A client that falls silent while requests are left, or while axes are of force, is lost. Its
-    requests are CANCELLED, and the arm comes to rest on the axes of motion. Forces are held for
-    `hold`, then go to zero, and the arm holds its position. Requests are REFUSED until a CANCEL.
+    A client counts as lost if it falls silent while requests are pending or some axes are axes of
+    force. Its requests are CANCELLED, and the arm comes to rest on the axes of motion. Forces are
+    held for `hold`, then reduced to zero, and the arm holds its position. Requests are REFUSED
+    until a CANCEL.
     """
 
     requests = Input(ServerRequest, "above.requests")
@@ -234,7 +240,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         super().__init__(context)
         self._work.boards = self._boards
         wrist = context.robot.wrist
-        assert wrist is not None, "`misfits` refuses an arm without a sensor"
+        assert wrist is not None, "`find_mismatches` refuses an arm without a sensor"
         self._work.most = wrist.most_force, wrist.most_torque
         self._now = 0  # tick of this cycle
         self._heard = -1  # tick of the client's last sign of life, or -1 before the first cycle
@@ -243,7 +249,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         self._sensed = np.array(context.robot.home)  # (joints,), rad
 
     def process(self, tick: int) -> None:
-        """Do one cycle: take requests, check client and contact, continue the motion."""
+        """Run one cycle: take requests, check client and contact, continue the motion."""
         self._now = tick
         if self._heard < 0 or self.requests.is_new:
             self._heard = tick
@@ -276,7 +282,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         for below in self.boards.values():
             if below.has_message:
                 self._sensed = below.message.position
-        # Use the newest status of the contact. A guard that was struck ends the present request.
+        # Use the force status that answers the present contact. A struck guard ends the request.
         status = self.force.message
         work = self._work
         answers = (
@@ -291,7 +297,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         self._watch_client()
 
     def _watch_client(self) -> None:
-        """React to a client that is lost: hold, then release forces, then hold the position."""
+        """React to the loss of the client: hold forces, release them, then hold the position."""
         work = self._work
         params = self.settings
         agenda = self._agenda
@@ -314,18 +320,18 @@ class ForceServer(WristLevel, TrajectoryExecutor):
                 self._enter_mode(Mode.RELEASED, "forces released, the position is held")
 
     def _enter_mode(self, mode: Mode, description: str) -> None:
-        """Enter a mode without a client; `description` describes it in the reason."""
+        """Enter a mode without a client. The reason in the status contains `description`."""
         self._without = mode
         self._since = self._now
         silent = f"no sign of life from the client for {self.settings.silence:g} s"
         self._agenda.reason = f"{silent}: {description}; cancel, then go on"
 
     def _compute_passed_s(self, tick: int) -> float:
-        """Return the time since `tick`, s."""
+        """Return the time since `tick`, in s."""
         return (self._now - tick) * self.context.tick_s
 
     def _write_server_status(self, status: ServerStatus) -> None:
-        """Fill the fields that a server's status has in addition to a trajectory level's."""
+        """Fill the fields of the status that a trajectory level's status does not have."""
         work = self._work
         force = work.force
         status.mode = self.mode

@@ -1,4 +1,4 @@
-"""The executor of the board that drives a hand: it passes tensions to the valves or closes them."""
+"""Executor of the board that drives a hand. It applies commanded tensions or closes the valves."""
 
 from __future__ import annotations
 
@@ -64,16 +64,16 @@ class HandExecutor(Executor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         cell = build_level_cell(context)
-        assert cell.hand is not None, "`misfits` refuses a robot without a hand"
+        assert cell.hand is not None, "`find_mismatches` refuses a robot without a hand"
         self.hand = SimulatedHand(
             cell, context.scene, context.clock_ns, context.every, context.seed
         )
         self.wanted_tensions = Tensions(context, cell.hand, cell.patience)
         self.orders = Orders(self.commands)
-        self._started = False  # the first cycle has begun
+        self._started = False  # whether the first cycle has begun
         # Tick of the first status with closed valves. None while they are open.
         self._closed_at: int | None = 0
-        self._opened = False  # the valves were open before, also before a restart
+        self._opened = False  # whether the valves have ever been open, including before a restart
         self._waiting = ""  # reason for closed valves, empty while they are open
         self._slack = SlackMonitor(cell.hand, context.robot.joints)
         self._torn: dict[int, bool] = {}  # injected faults that tore a tendon, as in `acted`
@@ -82,7 +82,7 @@ class HandExecutor(Executor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield every joint that is not driven by exactly one board above.
+        """Report a missing `[robot.hand]` and joints not driven by exactly one board above.
 
         Args:
             context: Context of this board.
@@ -122,7 +122,7 @@ class HandExecutor(Executor):
         self.hand.tear_tendons(torn)
 
     def process(self, tick: int) -> None:
-        """Advance the hand to `tick`, sense, command the valves, report."""
+        """Advance the hand to `tick`, read its sensors, command the valves and report."""
         hand = self.hand
         # Advance the hand to tick. A restarted board first restores it.
         if not self._started:
@@ -132,7 +132,8 @@ class HandExecutor(Executor):
                 self._opened = True
             self._closed_at = tick
         self.hand.step(tick - self.hand.tick)
-        if self.hand.braked and self._closed_at is None:  # no tensions came in time
+        # The hand closes its valves by itself if no tensions arrive in time.
+        if self.hand.braked and self._closed_at is None:
             self._closed_at = tick
         self.orders.take_commands(self.operator)
         sample = hand.sense()
@@ -171,7 +172,7 @@ class HandExecutor(Executor):
             self.hand.apply_tensions(self.wanted_tensions.tension)
 
     def _fill_status(self, status: HandStatus, sample: HandSample, tick: int) -> None:
-        """Fill the status."""
+        """Fill the status with the sample, the state of the valves and any error."""
         hand = self.hand
         status.tick = tick
         for name, value in sample._asdict().items():
@@ -223,7 +224,7 @@ class SlackMonitor:
         self.note = ""  # text that lists the slack tendons, empty without any
 
     def check_tensions(self, tension: Array, wanted: Array) -> list[Finding]:
-        """Return the findings of a cycle.
+        """Return a finding for each tendon that counts as torn from this cycle on.
 
         Args:
             tension: Sensed tensions, (2, joints), N.
@@ -260,7 +261,7 @@ class Tensions(CommandsAbove):
         self.rests_on = 0  # serial of the newest operator command on which the tensions depend
 
     def merge_commands(self, tensions: Mapping[str, Reading[TensionCommand]]) -> None:
-        """Set `tension` and `rests_on`. Only valid if `find_missing` returned no reason."""
+        """Merge the tensions of all boards. Call this only if `find_missing` returned no reason."""
         self.rests_on = 0
         for board in self.oldest:
             value = tensions[board].message
@@ -268,7 +269,7 @@ class Tensions(CommandsAbove):
             np.copyto(self.tension, value.tension, where=value.driven != 0)
 
     def limit_tensions(self) -> tuple[Finding | None, str]:
-        """Limit `tension` to its range.
+        """Limit `tension` to its range, and reject it if it contains NaN.
 
         Returns:
             The finding if a tension was limited or is NaN, else None; and the reason for rejecting

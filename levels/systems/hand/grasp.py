@@ -1,4 +1,4 @@
-"""The grasp loop, which executes a program of steps from an open hand to an open hand."""
+"""The grasp loop: executes a program of steps that begins and ends with an open hand."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class GraspExecutor(Executor):
     The current step is suspended while a finger does not follow and during an operator's hold; the
     fingers keep their targets and forces in the meantime. A step that fails or is suspended for too
     long ends the program with an error, and the fingers stay as they are. With a planner above, the
-    newest plan defines the posture before a CLOSE step, its points, and the grip after it. After a
-    restart the level continues from its own last messages.
+    newest plan defines the posture before a CLOSE step, the target points of that step, and the
+    grip force after it. After a restart the level continues from its own last messages.
     """
 
     fingers = Inputs(FingerStatus, "below.status")
@@ -100,7 +100,7 @@ class GraspExecutor(Executor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield a robot without a hand, and fingers that are not driven by exactly one board below.
+        """Report a missing hand, fingers not driven by exactly one board, or a missing planner.
 
         Args:
             context: Context of this board.
@@ -159,10 +159,11 @@ class GraspExecutor(Executor):
         self._fill_status(self.status, waits)
 
     def _find_row(self, close: CloseStep) -> int:
+        """Return the row in the world model of the object of a CLOSE step."""
         return self.context.scene.objects.index(close.object)
 
     def _join_posture(self, posture: Posture) -> Array:
-        """Return the joint positions, (joints,), rad, of a posture that is given by finger."""
+        """Convert a posture from positions per finger to joint positions, (joints,), in rad."""
         hand = self.context.robot.hand
         joints = self.context.robot.joints
         assert hand is not None
@@ -172,12 +173,12 @@ class GraspExecutor(Executor):
         return position
 
     def _find_close_step(self) -> CloseStep | None:
-        """Return the newest CLOSE step that has begun, None without one."""
+        """Return the newest CLOSE step that has begun, or None if none has."""
         steps = self._program.step[: self._done + 1]
         return next((step for step in reversed(steps) if isinstance(step, CloseStep)), None)
 
     def _find_waiting_reason(self) -> str:
-        """Return the reason for which the current step is suspended, empty if it continues."""
+        """Return why the current step is suspended, or an empty string if it is not."""
         if self._grasp.fingers.awaited:
             return self._grasp.fingers.awaited
         if self._orders.is_holding:
@@ -193,12 +194,13 @@ class GraspExecutor(Executor):
 
     @staticmethod
     def _find_newest_plan(plans: Mapping[str, Reading[GraspPlan]]) -> GraspPlan:
+        """Return the plan with the highest id."""
         return max((reading.message for reading in plans.values()), key=lambda plan: plan.id)
 
     def _needs_plan(self) -> bool:
-        """Return True if the current step takes its numbers from a plan.
+        """Return True if the current step takes its parameters from a plan.
 
-        This applies to a CLOSE step and to the PRESHAPE step before it.
+        This applies to a CLOSE step and to a PRESHAPE step directly before one.
         """
         kinds = [type(step) for step in self._program.step[self._done : self._done + 2]]
         return kinds[:1] == [CloseStep] or kinds == [PreshapeStep, CloseStep]
@@ -233,7 +235,7 @@ class GraspExecutor(Executor):
         self._work = WORKS[type(step)](grasp, step, self._elapsed_s)
 
     def _adopt_close_step(self, close: CloseStep) -> None:
-        """Grip with the fingers of a CLOSE step from now on."""
+        """Set up the grip for the fingers of a CLOSE step."""
         grasp = self._grasp
         gripping = np.array([name in close.points for name in grasp.names])
         grasp.close = close
@@ -241,7 +243,7 @@ class GraspExecutor(Executor):
         grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)
 
     def _prepare_step(self, index: int) -> Step:
-        """Return a step of the program, completed from the plan, in the frame of the palm."""
+        """Return a step with its plan values filled in and its displacement in the palm frame."""
         step = self._program.step[index]
         plan = self._plan
         if isinstance(step, ShiftStep):
@@ -265,7 +267,7 @@ class GraspExecutor(Executor):
         return step
 
     def _restore_progress(self) -> None:
-        """Restore the state of the program from the level's own last messages, after a restart."""
+        """Restore the progress of the program from the level's last messages after a restart."""
         if not (self.last_status.has_message and self.last_command.has_message):
             return
         status = self.last_status.message
@@ -291,6 +293,7 @@ class GraspExecutor(Executor):
             self._failed = Refused(status.error, status.reason)
 
     def _fill_status(self, status: GraspStatus, waits: str) -> None:
+        """Fill the status. `waits` is the reason why the step is suspended, empty if it is not."""
         grasp = self._grasp
         steps = self._program.step
         status.echo = grasp.target.id

@@ -100,7 +100,7 @@ GRIPPING = (SqueezeStep, ShiftStep, HoldStep, ReleaseStep)
 
 
 class GraspProgram(Program):
-    """Postures and steps."""
+    """Postures and steps of a grasp."""
 
     opposing: str = "thumb"
     """name of the finger that opposes all others"""
@@ -110,9 +110,9 @@ class GraspProgram(Program):
     """steps, executed in order"""
 
     def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
-        """Yield key, value and reason of mistakes in the program.
+        """Yield the key, value and reason of each mistake in the program.
 
-        These are parts that the hand or the scene lacks, and steps in the wrong order.
+        Mistakes are fingers, postures or objects that do not exist, and steps in the wrong order.
         """
         if robot is None or robot.hand is None:
             return
@@ -152,6 +152,7 @@ class GraspProgram(Program):
 
 
 def _check_posture(key: str, posture: Posture, hand: HandConfig) -> Mismatches:
+    """Yield unknown fingers, missing fingers, and fingers with a wrong number of values."""
     names = {finger.name: len(finger.joints) for finger in hand.finger}
     for name, values in posture.items():
         if name not in names:
@@ -173,6 +174,7 @@ def _check_posture(key: str, posture: Posture, hand: HandConfig) -> Mismatches:
 def _check_close_step(
     key: str, step: CloseStep, opposing: str, names: list[str], scene: SceneConfig
 ) -> Mismatches:
+    """Yield an unknown object, unknown fingers, and points that lack an opposed pair."""
     if step.object not in scene.objects:
         yield (
             f"{key}.object",
@@ -195,4 +197,5 @@ def _check_close_step(
 
 
 def _list_names(names: Any) -> str:
+    """Return the names separated by commas, or "none"."""
     return ", ".join(names) or "none"

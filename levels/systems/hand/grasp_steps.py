@@ -1,8 +1,8 @@
-"""Execution of the steps of a grasp: from the sensed fingers and object to targets of the fingers.
+"""Execution of grasp steps: computes finger targets from the sensed fingers and object.
 
-A step begins once, and again after a restart of its board: from the current position of the
-fingers, with the time for which it was executed before. `run` returns whether the step is done, and
-raises `Refused` if it has failed.
+After a restart of its board, a step begins again at the current position of the fingers, with the
+time for which it had already run. `run` returns True once the step is done, and raises `Refused` if
+it has failed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from rack.levels.systems.hand.messages import FingerMode, FingerStatus, GraspTar
 from rack.levels.tables import Positive, Table
 
 SLIPPED_PART = 0.2
-"""Fraction of the touch force below which a tip no longer touches."""
+"""Fraction of the touch force below which a tip no longer counts as touching."""
 
 
 class FingersBelow:
@@ -55,9 +55,9 @@ class FingersBelow:
         self.target = np.zeros(joints)  # (joints,), rad: targets of the loops below
         self.tip = np.zeros((count, 3))  # m
         self.force = np.zeros((count, 3))  # N: of the environment on the tips
-        self.awaited = ""  # reason for which a finger does not follow, empty if all do
+        self.awaited = ""  # why a finger does not follow, empty if all do
         self.error = Error.NONE  # error of the hand
-        self.rests_on = 0  # newest operator command on which all boards depend
+        self.rests_on = 0  # serial of the newest operator command that all statuses reflect
 
     def read_statuses(self, statuses: Mapping[str, Reading[FingerStatus]]) -> None:
         """Merge the statuses of all boards."""
@@ -120,7 +120,7 @@ class Grasp:
 
     @property
     def object_position(self) -> Array:
-        """Position of the object, (3,), m."""
+        """Position of the object, (3,), in m: as sensed, or its anchor if it is not sensed."""
         return self.anchor if self.object is None else self.object.position
 
     @property
@@ -150,14 +150,20 @@ class StepWork(ABC):
 
     @abstractmethod
     def run(self, elapsed_s: float) -> bool:
-        """Fill the target for time `elapsed_s` of the step, s; return whether it is done.
+        """Fill `grasp.target` for the current cycle.
+
+        Args:
+            elapsed_s: Time for which the step has run, in s.
+
+        Returns:
+            True if the step is done.
 
         Raises:
             Refused: The step has failed.
         """
 
     def find_progress(self, elapsed_s: float) -> tuple[float, float]:
-        """Return the progress since `resumed_s`, 0 to 1, and its rate, 1/s."""
+        """Return the progress from `resumed_s` to the end, 0 to 1, and its rate in 1/s."""
         part, rate = minimum_jerk(elapsed_s / self.step.seconds)
         before, _ = minimum_jerk(self.resumed_s / self.step.seconds)
         if before >= 1.0:
@@ -166,7 +172,7 @@ class StepWork(ABC):
 
 
 def minimum_jerk(time: float) -> tuple[float, float]:
-    """Return position, 0 to 1, and rate of a minimum-jerk motion at `time`, 0 to 1.
+    """Return position, 0 to 1, and rate of a minimum-jerk motion that lasts from time 0 to 1.
 
     See Flash and Hogan, 1985.
     """
@@ -185,7 +191,7 @@ class PreshapeWork(StepWork):
         self._posture = self.grasp.postures[self.step.posture]
 
     def run(self, elapsed_s: float) -> bool:
-        """Move the joints."""
+        """Move the joints towards the posture."""
         grasp = self.grasp
         target = grasp.target
         part, rate = self.find_progress(elapsed_s)
@@ -212,7 +218,7 @@ class PreshapeWork(StepWork):
 class CloseWork(StepWork):
     """Moves the tips at constant speed towards points in the object until each touches it.
 
-    A tip that touches stays at that place and presses.
+    A tip that touches the object stays there and presses.
     """
 
     step: CloseStep
@@ -229,11 +235,11 @@ class CloseWork(StepWork):
             inside = grasp.object @ Pose(np.array(point), np.array([1.0, 0.0, 0.0, 0.0]))
             self._ways[finger] = inside.position - self._start[finger]
         self._seconds = max(norm(way) for way in self._ways) / step.speed
-        # N: force of the opposing finger.
+        # N: force of the opposing finger at which every finger presses with `step.touch` or more.
         self._touch = step.touch / min(grasp.grip.shares[grasp.grip.fingers])
 
     def run(self, elapsed_s: float) -> bool:
-        """Move the tips."""
+        """Move the tips that do not touch the object yet."""
         grasp = self.grasp
         target = grasp.target
         part = min((elapsed_s - self.resumed_s) / self._seconds, 1.0)
@@ -259,7 +265,7 @@ class CloseWork(StepWork):
         return not missing
 
     def _hold_contact(self, finger: int, force: Array) -> None:
-        """Hold the tip of a finger at its position as a spring, and press with `force`, (3,), N."""
+        """Make a tip act as a spring about its position and press with `force`, (3,), in N."""
         grasp = self.grasp
         target = grasp.target
         target.mode[finger] = FingerMode.FORCE
@@ -276,7 +282,7 @@ class GrippingWork(StepWork):
     """
 
     def set_start(self) -> None:
-        """Start with every finger in contact."""
+        """Assume that every finger is in contact at the start."""
         # (fingers,), s: time without contact.
         self._silent_s = np.zeros(len(self.grasp.names))
 
@@ -319,7 +325,8 @@ class GrippingWork(StepWork):
 class SqueezeWork(GrippingWork):
     """Raises the grip force.
 
-    The object settles between the fingers, and its anchor is its position at the end.
+    The object settles between the fingers. Its position at the end becomes its anchor, which is its
+    target position from then on.
     """
 
     step: SqueezeStep
@@ -352,7 +359,7 @@ class ShiftWork(GrippingWork):
         self._part = 0.0
 
     def run(self, elapsed_s: float) -> bool:
-        """Move the object."""
+        """Shift the anchor and the tips by the progress of this cycle."""
         grasp = self.grasp
         target = grasp.target
         part, rate = self.find_progress(elapsed_s)
@@ -390,7 +397,7 @@ class ReleaseWork(StepWork):
         self._out = grasp.grip.find_outward_directions(grasp.fingers.tip)
 
     def run(self, elapsed_s: float) -> bool:
-        """Reduce the forces, or withdraw the tips."""
+        """Reduce the forces in the first half of the time, and withdraw the tips in the second."""
         grasp = self.grasp
         target = grasp.target
         half = 0.5 * self.step.seconds

@@ -6,7 +6,8 @@ press back along the same line in equal shares. The sum and the moment of these 
 any position of the tips.
 
 The springs at the tips react to weight and pull at once, but yield. An integral of the object's
-distance from its anchor returns it, half at the opposing tip and half at the others. The integral
+displacement from its anchor brings it back, half of the force at the opposing tip and half at the
+others. The integral
 slowly takes over the common load of the springs: the points of all tips follow tips that have crept
 or slipped, while the forces stay the same. Friction bears more with a firmer grip, so the grip
 force rises at once with the sensed load and falls slowly after it.
@@ -72,7 +73,9 @@ class HandGrip:
         self.load = np.zeros(3)  # N: total force of the tips against weight and pull
 
     def adapt_force(self, base: float, sensed: Array) -> None:
-        """Set the grip force to `base`, N, plus a share of the load.
+        """Set the grip force to `base` plus a share of the sensed load.
+
+        The force rises at once, up to `most_grip`, and falls at no more than `FALL_N_S`.
 
         Args:
             base: Grip force without a load, N.
@@ -83,7 +86,7 @@ class HandGrip:
         self.force = max(wanted, self.force - FALL_N_S * self._period_s)
 
     def recover_position(self, away: Array) -> None:
-        """Integrate the displacement `away` of the object from its anchor, (3,), m."""
+        """Integrate the displacement `away`, (3,), in m, of the object from its anchor."""
         self.load -= self._gains.recover * self._period_s * away
         excess = norm(self.load)
         if excess > self._gains.most_load:
@@ -92,8 +95,10 @@ class HandGrip:
     def follow_creep(self, points: Array, tips: Array) -> None:
         """Move the points of the springs towards the tips, all by the same displacement.
 
+        The load is adjusted so that the total force stays the same.
+
         Args:
-            points: Points of the springs, (fingers, 3), m; changed.
+            points: Points of the springs, (fingers, 3), m; modified in place.
             tips: Positions of the tips, (fingers, 3), m.
         """
         stiffness = self.stiffness[:, None]
@@ -103,7 +108,11 @@ class HandGrip:
         self.load -= whole * way
 
     def find_forces(self, tips: Array) -> Array:
-        """Return the forces of the fingers, (fingers, 3), N, for these tips, (fingers, 3), m."""
+        """Return the forces of the fingers on the object, (fingers, 3), in N.
+
+        Args:
+            tips: Positions of the tips, (fingers, 3), m.
+        """
         return np.asarray(
             self.shares[:, None]
             * (0.5 * self.load - self.force * self.find_outward_directions(tips))

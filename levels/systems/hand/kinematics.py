@@ -1,7 +1,8 @@
 """Kinematics of the fingers: tips and Jacobians in the palm's frame, and inverse kinematics.
 
-Evaluated on separate MuJoCo data, like the dynamics of an arm (`rack.levels.robot.dynamics`), so
-that results depend on the joint positions alone. The palm does not move.
+They are evaluated on separate MuJoCo data, like the dynamics of an arm
+(`rack.levels.robot.dynamics`), so that results depend on the joint positions alone. The palm does
+not move.
 """
 
 from __future__ import annotations
@@ -41,17 +42,17 @@ class FingerKinematics:
         self.rotation = d.site_xmat[cell.tool].reshape(3, 3).copy()
 
     def set_position(self, position: Array) -> None:
-        """Evaluate tips and Jacobians at joint positions, (joints,), rad, from now on."""
+        """Set the joint positions, (joints,), in rad, at which tips and Jacobians are evaluated."""
         self._data.qpos[self._cell.qpos] = position
         mujoco.mj_kinematics(self._cell.model, self._data)
         mujoco.mj_comPos(self._cell.model, self._data)
 
     def find_tip(self, finger: int) -> Array:
-        """Return the tip of a finger, (3,), m."""
+        """Return the position of a finger's tip in the frame of the palm, (3,), in m."""
         return self.to_palm_frame(self._data.site_xpos[self._tips[finger]])
 
     def to_palm_frame(self, point: Array) -> Array:
-        """Convert a point from the world to the frame of the palm, (3,), m."""
+        """Convert a point, (3,), in m, from the frame of the world to that of the palm."""
         return transposed_mat_vec(self.rotation, point - self.palm.position)
 
     def find_jacobian(self, finger: int) -> Array:
@@ -66,14 +67,14 @@ class FingerKinematics:
         return rotated
 
     def step_towards(self, finger: int, position: Array, way: Array, homing: Array) -> None:
-        """Make one damped step of inverse kinematics; call `set_position(position)` before.
+        """Make one damped step of inverse kinematics.
 
-        A finger has a redundant joint. Of all joint motions that move the tip by `way`, this step
-        takes the motion nearest to `homing`.
+        Call `set_position(position)` first. A finger has a redundant joint: of all joint motions
+        that move the tip by `way`, this step takes the motion nearest to `homing`.
 
         Args:
             finger: Index of the finger.
-            position: Joint positions, (joints,), rad; the finger's are changed.
+            position: Joint positions, (joints,), rad; those of the finger are modified in place.
             way: Displacement of the tip, (3,), m.
             homing: Preferred joint motion, (joints of the finger,), rad.
         """

@@ -101,11 +101,11 @@ class FingertipLaw:
         self._tips = np.zeros((len(kinematics.joints), 3))  # (fingers, 3), m: sensed
 
     def start(self, position: Array) -> None:
-        """Set targets and posture to `position`, (joints,), rad."""
+        """Set targets and posture to `position`, (joints,), in rad."""
         self.wanted[:] = self._rest[:] = position
 
     def find_tips(self, position: Array) -> Array:
-        """Return the tips of the driven fingers at sensed joint positions.
+        """Return the tip positions of the driven fingers at sensed joint positions.
 
         Args:
             position: Joint positions, (joints,), rad.
@@ -119,12 +119,12 @@ class FingertipLaw:
         return self._tips
 
     def set_targets(self, grasp: GraspTarget, ahead_s: float, out: FingerTarget) -> None:
-        """Fill a `FingerTarget` from a `GraspTarget`; call `find_tips` before.
+        """Fill a `FingerTarget` from a `GraspTarget`. Call `find_tips` first.
 
         Args:
             grasp: The command, which is extrapolated at its velocities.
             ahead_s: Time by which it is extrapolated, s.
-            out: The targets of the driven fingers are set.
+            out: Joint targets; the elements of the driven fingers are set.
         """
         before = self.wanted.copy()
         points = grasp.tip + ahead_s * grasp.tip_velocity
@@ -155,7 +155,7 @@ class FingertipLaw:
             out.velocity[own] = moved[own] / self._period_s
 
     def _approach_points(self, fingers: Sequence[int], points: Array) -> None:
-        """Move the targets of `fingers` towards joint positions at which their tips reach points.
+        """Move the joint targets of `fingers` so that their tips approach the given points.
 
         Args:
             fingers: Indices of the fingers.
@@ -186,11 +186,11 @@ class JointLaw:
     """Computes the torques of some joints of a hand."""
 
     def __init__(self, cell: Cell, driven: Mask, gains: JointGains) -> None:
-        """Drive the joints of the mask `driven`, (joints,)."""
+        """Drive the joints selected by the mask `driven`, (joints,)."""
         self._dynamics = Dynamics(cell)
         self._still = np.zeros(len(driven))
         viscous = cell.model.dof_damping[cell.dof]
-        # In the rows of `set_joint_torques`.
+        # Rows as in the parameter `constants` of `set_joint_torques`.
         self._constants = np.array((self._dynamics.dry, viscous, cell.bounds.torque, driven))
         self._gains = gains.bandwidth**2, 2.0 * gains.damping * gains.bandwidth
         self._ahead = gains.ahead
@@ -200,14 +200,14 @@ class JointLaw:
     def set_torques(
         self, hand: HandStatus, target: FingerTarget, age_s: float, ahead_s: float, out: Array
     ) -> None:
-        """Set the torques `out`.
+        """Compute the joint torques from the newest sample and the targets.
 
         Args:
             hand: Status with the newest sample.
             target: Joint targets.
             age_s: Age of the sample when the torque acts, s.
             ahead_s: Time by which the target is extrapolated, s.
-            out: Torques, (joints,), N m; set.
+            out: Torques, (joints,), N m; filled.
         """
         terms = self._dynamics.terms(hand.position, self._still)
         is_cut = self._set(
@@ -240,7 +240,7 @@ def set_joint_torques(
     weight: Array,
     torque: Array,
 ) -> bool:
-    """Set the torques of the driven joints.
+    """Compute the torques of the driven joints.
 
     Args:
         gains: Stiffness, 1/s2, and damping, 1/s.
@@ -252,7 +252,7 @@ def set_joint_torques(
         spring: Stiffness of the grip, (joints, joints), N m/rad.
         inertia: Inertia matrix, (joints, joints), kg m2.
         weight: Torques that compensate gravity, (joints,), N m.
-        torque: Torques, (joints,), N m; set. 0 for joints of other boards.
+        torque: Torques, (joints,), N m; filled, with 0 for joints of other boards.
 
     Returns:
         True if a torque was limited.
@@ -285,7 +285,8 @@ def set_joint_torques(
 
 
 MOST_LEARNED = 0.1
-"""Largest fraction of an error that one sample corrects, however many were missed before it."""
+"""Largest fraction of an error that one sample corrects, no matter how many were missed
+before it."""
 
 
 class TendonGains(Table):
@@ -306,14 +307,14 @@ class TendonGains(Table):
 class TendonLaw:
     """Computes the tensions for some joints of a hand.
 
-    Corrections of valves are lost in a restart and learned again.
+    The corrections of the valves are not saved. A restarted board learns them again.
     """
 
     def __init__(self, hand: Hand, driven: Mask, gains: TendonGains, context: LevelContext) -> None:
-        """Drive the joints of the mask `driven`, (joints,), in every cycle of a level."""
+        """Drive the joints selected by the mask `driven`, (joints,), in every cycle of a level."""
         joints = len(driven)
         least = np.full(joints, hand.least + gains.margin)
-        # In the rows of `set_tensions`.
+        # Rows as in the parameter `constants` of `set_tensions`.
         self._constants = np.array((hand.arms, least, hand.most, driven))
         self._numbers = (
             hand.rest,
@@ -324,7 +325,7 @@ class TendonLaw:
         self._lag = gains.lag
         self._trim = gains.trim
         self._tick_s = context.tick_s
-        self._valves = np.zeros((3, 2, joints))  # in the rows of `set_tensions`
+        self._valves = np.zeros((3, 2, joints))  # rows as in `set_tensions`
         self._set = set_tensions.load_machine_code()
         self._sampled = 0  # tick of the last sample
         self.clipped = 0  # cycles in which a torque was limited
@@ -337,12 +338,12 @@ class TendonLaw:
         self._sampled = status.tick
 
     def set_tensions(self, status: HandStatus, torque: Array, out: Array) -> None:
-        """Set the tensions `out`.
+        """Compute the tendon tensions from the newest sample and the torques.
 
         Args:
             status: Status with the newest sample.
             torque: Torques to exert, (joints,), N m.
-            out: Tensions, (2, joints), N; set.
+            out: Tensions, (2, joints), N; filled.
         """
         # Closed valves do not follow their commands, so nothing can be learned from them.
         elapsed = 0 if status.holding else status.tick - self._sampled
@@ -369,16 +370,17 @@ def set_tensions(
     torque: Array,
     tension: Array,
 ) -> bool:
-    """Set the tensions of the driven joints.
+    """Compute the tensions of the driven joints.
 
     Args:
         numbers: Mean tension, N; lead; response of a valve in a cycle, 0 to 1; largest trim, N.
         shares: Responses of a valve and of the trim since the last sample, 0 to 1.
         constants: Lever arm, least and largest tension, and mask of the joints, (4, joints).
-        valves: Modelled tensions now and at the sample, and trim, (3, 2, joints), N; changed.
+        valves: Modelled tensions now and at the sample, and trim, (3, 2, joints), N; modified in
+            place.
         sensed: Sensed, then commanded tensions, flexors first, (4 * joints,), N.
         torque: Torques, (joints,), N m.
-        tension: Tensions, (2, joints), N; set. 0 for joints of other boards.
+        tension: Tensions, (2, joints), N; filled, with 0 for joints of other boards.
 
     Returns:
         True if a torque had to be clipped.
@@ -388,8 +390,8 @@ def set_tensions(
     least = constants[1]  # N
     most = constants[2]  # N
     driven = constants[3]  # 1 for the joints of this board
-    reached = valves[0]  # of the model, now
-    expected = valves[1]  # of the model, at the sample
+    reached = valves[0]  # modelled tensions now
+    expected = valves[1]  # modelled tensions at the sample
     trim = valves[2]  # correction
     joints = len(arm)
     clipped = False

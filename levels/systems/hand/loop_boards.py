@@ -54,10 +54,10 @@ class HandLoop(Executor):
     """Base of the loops between the level above and the hand.
 
     A loop follows the newest command, based on the sensed state of the hand. Without a fresh
-    command, and during an operator's hold, the last command stays in force with zero velocities, so
-    that the hand keeps its grip. Commands that are not finite are rejected. A subclass has the
-    ports "above", "command", "status", "hand", "operator" and, unless the hand is directly below,
-    "below".
+    command it keeps following the last one, so that the hand keeps its grip. During an operator's
+    hold the velocities of that command are set to zero. Commands that are not finite are rejected.
+    A subclass has the ports "above", "command", "status", "hand", "operator" and, unless the hand
+    is directly below, "below".
     """
 
     commands = HOLD_COMMANDS
@@ -68,12 +68,12 @@ class HandLoop(Executor):
     command: RelayedCommand
     status: LoopStatus | FingerStatus
     followed: RelayedCommand
-    """The command in force."""
+    """Command that the loop follows: the last one that was accepted."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.cell = build_level_cell(context)
-        assert self.cell.hand is not None, "`misfits` refuses a robot without a hand"
+        assert self.cell.hand is not None, "`find_mismatches` refuses a robot without a hand"
         self.hand_model: Hand = self.cell.hand
         self.orders = Orders(self.commands)
         command = self.inputs["above"].message
@@ -97,7 +97,7 @@ class HandLoop(Executor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield a robot without a hand, and missing neighbours.
+        """Report a missing `[robot.hand]` and a missing board above or below.
 
         Args:
             context: Context of this board.
@@ -116,7 +116,7 @@ class HandLoop(Executor):
 
     @abstractmethod
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Fill the command for `self.followed`, and the status fields specific to the loop.
+        """Compute `self.command` from `self.followed`, and fill the loop's own status fields.
 
         Args:
             hand: Status with the newest sample.
@@ -139,21 +139,21 @@ class HandLoop(Executor):
             self._met = True
             self.start_from(hand.message)
         self._take_command(self.above, tick)
-        kept = self._find_holding_reason(tick)
+        hold_reason = self._find_holding_reason(tick)
         self.follow_command(hand.message, tick)
         self.command.id += 1
         self.command.operator = self.orders.find_basis(self.followed.operator)
-        self._fill_status(self.status, kept)
+        self._fill_status(self.status, hold_reason)
         self.orders.fill_status(self.status, self.followed.operator)
 
     def compute_sample_age_s(self, hand: HandStatus, tick: int) -> float:
-        """Return the age of the sample in a `HandStatus` when the command of this cycle acts, s."""
+        """Return the age, in s, of a sample of the hand when the command of this cycle acts."""
         return float(
             (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
         )
 
     def compute_command_age_s(self, tick: int) -> float:
-        """Return the time by which the command is extrapolated, s.
+        """Return the time, in s, by which the command is extrapolated.
 
         This is the age of the command, but at most a cycle of the level above.
         """
@@ -165,7 +165,8 @@ class HandLoop(Executor):
         self._held = self.orders.is_holding
         if self._held:
             for name in self._numbers:
-                if name.endswith("velocity"):  # the command stays in force at rest
+                # Keep following the command, but at zero velocity.
+                if name.endswith("velocity"):
                     setattr(self.followed, name, 0.0)
             self.orders.report_done()
         elif command.is_new or (released and command.has_message):
@@ -183,7 +184,7 @@ class HandLoop(Executor):
                 self._taken = tick
 
     def _find_holding_reason(self, tick: int) -> str:
-        """Return why the hand does not follow the level above, empty if it does."""
+        """Return why the hand does not follow the level above, or an empty string if it does."""
         hand = self.hand.message
         if self.hand.is_lost or tick - hand.tick > self._oldest:
             return HAND_LOST
@@ -197,17 +198,17 @@ class HandLoop(Executor):
                 return below.message.reason
         return self.orders.format_reason(self.context.board)
 
-    def _fill_status(self, status: LoopStatus | FingerStatus, kept: str) -> None:
-        """Fill the status."""
+    def _fill_status(self, status: LoopStatus | FingerStatus, hold_reason: str) -> None:
+        """Fill the status. `hold_reason` is empty if the hand follows the level above."""
         hand = self.hand.message
         lost = self.commanded and self.above.is_lost
         status.sensed = hand.tick
         status.echo = self.followed.id
-        note = kept or self._rejected
+        note = hold_reason or self._rejected
         if lost and not note:
             note = f"no command from '{self._above}': its last one is kept"
         status.driven = self.driven
-        status.stopped = bool(kept)
+        status.stopped = bool(hold_reason)
         status.holding = lost or not self.commanded
         status.reason = note
         status.error = hand.error
@@ -249,14 +250,14 @@ class FingertipLoop(HandLoop):
         self._law.start(begin.position)
 
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Fill the joint targets."""
+        """Compute the joint targets."""
         set_finger_targets(self, self._law, hand, self.command, self.status, tick)
 
 
 class JointLoop(HandLoop):
     """Moves the joints to their targets. See `JointLaw`.
 
-    Until there are targets it holds the joints in their initial positions.
+    Until targets arrive it holds the joints in their initial positions.
     """
 
     above = Input(FingerTarget, "above.command")
@@ -275,12 +276,12 @@ class JointLoop(HandLoop):
         self._law = JointLaw(self.cell, self.driven, read_params(JointGains, context.params))
 
     def start_from(self, hand: HandStatus) -> None:
-        """Hold the joints in their current positions until there are targets."""
+        """Hold the joints in their current positions until targets arrive."""
         self.followed.position = hand.position
         self.followed.stiff[:] = 1.0
 
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Fill the torques for the newest targets."""
+        """Compute the torques for the newest targets."""
         self._law.set_torques(
             hand,
             self.followed,
@@ -319,7 +320,7 @@ class TendonLoop(HandLoop):
         self._law.start(hand)
 
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Fill the tensions for the newest torques."""
+        """Compute the tensions for the newest torques."""
         command = self.command
         command.driven = self.driven
         command.sampled = min(hand.tick, self.followed.sampled) if self.commanded else -1
@@ -336,9 +337,9 @@ class FingerParams(FingertipGains, JointGains, TendonGains):
 
 
 class FingerExecutor(HandLoop):
-    """Drives the tendons of one finger by the commands of the grasp loop.
+    """Drives the tendons of one finger as commanded by the grasp loop.
 
-    Until there is a command, also after a restart, it holds the finger in its current position.
+    Until a command arrives, also after a restart, it holds the finger in its current position.
     """
 
     above = Input(GraspTarget, "above.command")
@@ -369,7 +370,7 @@ class FingerExecutor(HandLoop):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield a finger that the hand lacks, and the mistakes that `HandLoop` reports.
+        """Report a finger that the hand does not have, and the mistakes that `HandLoop` reports.
 
         Args:
             context: Context of this board.
@@ -390,7 +391,7 @@ class FingerExecutor(HandLoop):
         self._target.stiff[:] = 1.0
 
     def follow_command(self, hand: HandStatus, tick: int) -> None:
-        """Fill the tensions of the finger's tendons."""
+        """Compute the tensions of the finger's tendons."""
         set_finger_targets(self, self._tip, hand, self._target, self.status, tick)
         self._servo.set_torques(
             hand, self._target, self.compute_sample_age_s(hand, tick), 0.0, self._torque
@@ -408,11 +409,11 @@ def set_finger_targets(
     status: FingerStatus,
     tick: int,
 ) -> None:
-    """Fill a `FingerTarget` and a `FingerStatus`.
+    """Compute the joint targets of a loop and fill the status of its fingers.
 
     Args:
-        loop: The loop, with the `GraspTarget` in force.
-        law: Its fingertip law.
+        loop: Loop that follows a `GraspTarget`.
+        law: Fingertip law of the loop.
         hand: Status of the hand.
         target: Joint targets; filled.
         status: Status of the fingers; filled.

@@ -47,7 +47,7 @@ class SimulatedHand(Simulation):
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
     ) -> None:
-        """Start at home.
+        """Start in the home position with closed valves.
 
         Args:
             cell: Cell with a hand.
@@ -73,7 +73,7 @@ class SimulatedHand(Simulation):
         self._acts = acts if (acts >= 0).all() else None
 
     def _set_initial_tensions(self, tension: Array) -> None:
-        """Set controls, valve states and delay lines to steady tensions, (2, joints), N."""
+        """Set controls, valve states and delay lines to steady tensions, (2, joints), in N."""
         model = self.cell.model
         d = self._data
         for actuator, pull in zip(
@@ -109,13 +109,13 @@ class SimulatedHand(Simulation):
         return HandSample(position, velocity, self._steps.seen[-1, 2], tension, in_palm)
 
     def apply_tensions(self, tension: Array) -> None:
-        """Open the valves and let them follow tensions, (2, joints), N, within the limits."""
+        """Open the valves and let them follow `tension`, (2, joints), in N."""
         self.waited = 0
         self.braked = False
         self._data.ctrl[self.hand.actuators] = tension
 
     def tear_tendons(self, torn: Mask) -> None:
-        """Tear the tendons of a mask, (2, joints), and mend all others."""
+        """Tear the tendons selected by the mask `torn`, (2, joints), and mend all others."""
         self._model.actuator_gainprm[self.hand.actuators, 0] = np.where(torn, 0.0, 1.0)
 
     def close_valves(self) -> None:
@@ -156,7 +156,7 @@ class SimulatedHand(Simulation):
 
 
 def _find_carrying_tensions(cell: Cell, data: mujoco.MjData) -> Array:
-    """Return the tensions, (2, joints), N, that carry the hand's weight in its initial position."""
+    """Return the tensions, (2, joints), in N, that carry the hand's weight initially."""
     hand = cell.hand
     assert hand is not None, "it is a hand"
     turn = (data.qfrc_bias - data.qfrc_passive)[cell.dof] / (2.0 * hand.arms)

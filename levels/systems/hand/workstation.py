@@ -41,6 +41,7 @@ STEPS = 60
 STEP_M = 0.02
 """Largest displacement of a tip in such a step."""
 REACHED_M = 0.001
+"""Distance from its target at which a tip has arrived."""
 OUTSIDE_M = 0.2
 """Distance from the object at which rays begin."""
 
@@ -99,7 +100,7 @@ class GraspPlanner:
         self._bases = self._data.xanchor[cell.model.dof_jntid[cell.dof[first]]].copy()
 
     def plan(self, row: int, position: Array, quaternion: Array) -> PlannedGrasp | None:
-        """Return a grasp of an object, None if no line is possible.
+        """Return the best grasp of an object, or None if no line is possible.
 
         Args:
             row: Index of the object in the scene.
@@ -117,7 +118,12 @@ class GraspPlanner:
         return max(grasps, key=lambda grasp: grasp.margin, default=None)
 
     def _plan_along_line(self, row: int, angle: float) -> PlannedGrasp | None:
-        """Return the grasp along a line at `angle`, rad, across the palm, None if impossible."""
+        """Return the grasp along a line across the palm, or None if it is impossible.
+
+        Args:
+            row: Index of the object in the scene.
+            angle: Direction of the line, rad.
+        """
         across, _, out = self._kinematics.rotation.T
         line = math.cos(angle) * across + math.sin(angle) * out
         contact, normal = np.zeros((2, len(self._bases), 3))
@@ -148,7 +154,7 @@ class GraspPlanner:
         )
 
     def _find_contact(self, row: int, base: Array, way: Array) -> Array | None:
-        """Return the point at which a ray from a finger's side meets the object, (3,), m, or None.
+        """Return the point at which a ray first meets the object, (3,), in m; None if it misses.
 
         Args:
             row: Index of the object in the scene.
@@ -180,7 +186,7 @@ class GraspPlanner:
         return np.flatnonzero(self._cell.model.geom_bodyid == self._cell.bodies[row])
 
     def _find_joints(self, tips: Array, start: Array) -> Array | None:
-        """Return joint positions, (joints,), rad, with the tips at given points, or None.
+        """Return joint positions, (joints,), in rad, that place the tips at given points, or None.
 
         Args:
             tips: Points in the world, (fingers, 3), m.
@@ -203,7 +209,7 @@ class GraspPlanner:
         return None
 
     def _has_contact(self, position: Array) -> bool:
-        """Return whether the hand touches anything, including itself, at joint positions."""
+        """Return True if the hand touches itself or another body at the given joint positions."""
         model = self._cell.model
         data = self._data
         data.qpos[self._cell.qpos] = position
@@ -212,7 +218,7 @@ class GraspPlanner:
         return bool((hand & (data.contact.dist < 0.0)).any())
 
     def _find_grip_force(self, row: int) -> float:
-        """Return the force per finger, N, at which friction on both sides bears weight and pull."""
+        """Return the force per finger, in N, at which friction bears the weight and the pull."""
         model = self._cell.model
         body = self._cell.bodies[row]
         friction = float(model.geom_friction[self._list_object_geoms(row), 0].max())
@@ -266,7 +272,11 @@ class Workstation(HostProgram):
             self.plan_grasp()
 
     def plan_grasp(self) -> PlannedGrasp | None:
-        """Plan and send a grasp if one is needed; return the newest grasp, None without one."""
+        """Plan and send a grasp if the object has moved and is not being gripped yet.
+
+        Returns:
+            The newest grasp, or None if there is none.
+        """
         world = self.world.read()
         status = self.grasp.read()
         if (
@@ -302,8 +312,8 @@ class Workstation(HostProgram):
     def read_counts(self, bus: Bus) -> dict[str, dict[str, int]]:
         """Return the cycle counts of every task, read from its control block."""
         counts = {"cycles": Block.CYCLES, "missed": Block.MISSED, "skipped": Block.SKIPPED}
-        blocks = {task: bus.find_address(task) for task in bus.tasks}
+        blocks = {task: bus.address(task) for task in bus.tasks}
         return {
-            task: {name: bus.read_words(address + WORD * word)[0] for name, word in counts.items()}
+            task: {name: bus.words(address + WORD * word)[0] for name, word in counts.items()}
             for task, address in blocks.items()
         }

@@ -1,4 +1,4 @@
-"""Joints that separate boards servo, the arm that they share, and a gateway to a level above."""
+"""Boards that servo the joints of one arm, the board of the arm, and a gateway to a level above."""
 
 from rack.levels.systems.joint_boards.arm_executor import ArmExecutor
 from rack.levels.systems.joint_boards.gateway import JointGateway, NetworkGateway

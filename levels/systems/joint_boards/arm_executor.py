@@ -25,14 +25,14 @@ HELD = "held by the operator; `resume` releases it"
 
 
 class JointTorques(CommandsAbove):
-    """Adds up the `JointTorque`s of the boards above.
+    """Adds up the `JointTorque` messages of the boards above.
 
-    Each is 0 for the joints of other boards.
+    A message is 0 for joints that its board does not drive.
 
     Attributes:
         torque: Torques of all boards, (joints,), N m.
         wanted: Motion that the boards want. Its accelerations are not known.
-        moves: A joint should move.
+        moves: The boards want a joint to move.
         rests_on: Serial of the newest operator's command on which the torques are based.
     """
 
@@ -48,7 +48,7 @@ class JointTorques(CommandsAbove):
 
     @property
     def grip_force(self) -> float:
-        """Force of the gripper, N."""
+        """Force of the gripper, in N."""
         return float(self._sum[-5])
 
     @property
@@ -57,7 +57,7 @@ class JointTorques(CommandsAbove):
         return Payload(float(self._sum[-4]), self._sum[-3:])
 
     def sum_commands(self, commands: Mapping[str, Reading[JointTorque]]) -> None:
-        """Add up the commands of all boards. Only valid while none is `missing`."""
+        """Add up the commands of all boards. Call this only if none of them is missing."""
         self.rests_on = 0
         self._sum[:] = 0.0
         for board in self.oldest:
@@ -72,10 +72,10 @@ class JointTorques(CommandsAbove):
 class ArmExecutor(ArmDriver):
     """Drives an arm with the torques of the boards above: all of its joints, or none.
 
-    While it reports `stopped`, these boards must bring the joints to rest and hold them. An arm
-    that is not at rest after the time that this takes is braked. A board that is lost or late
-    brakes the arm, too. The brakes are released when all boards have seen that the arm was braked;
-    their torques then hold it where it is. See `ArmDriver`.
+    While it reports `stopped`, these boards must bring the joints to rest and hold them. If they do
+    not do so in time, the arm is braked. A board that is lost or late brakes the arm, too. The
+    brakes are released when all boards have seen that the arm was braked; their torques then hold
+    it where it is. See `ArmDriver`.
     """
 
     joint_torques = Inputs(JointTorque, "above.command")
@@ -105,9 +105,9 @@ class ArmExecutor(ArmDriver):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield joints, and the gripper, that not exactly one board above drives.
+        """Yield each joint, and the gripper, unless exactly one board above drives it.
 
-        Yields what `ArmDriver` yields, too.
+        Also yields the mismatches of `ArmDriver`.
         """
         yield from super().find_mismatches(context, above, below)
         everything = context.robot.joints
@@ -129,7 +129,7 @@ class ArmExecutor(ArmDriver):
             yield "above", list(wanted), f"{text}; {_describe_commanders(grips)}"
 
     def process(self, tick: int) -> None:
-        """Do the cycle of an arm, and write its tick to the status."""
+        """Run the cycle of an arm, and write its tick to the status."""
         self.status.tick = tick
         super().process(tick)
 
@@ -139,12 +139,12 @@ class ArmExecutor(ArmDriver):
         self.orders.take_commands(self.operator, self._judge_command)
 
     def _judge_command(self, command: OperatorCommand) -> None:
-        """Obey or refuse a command for the drives, which leaves the one in force unchanged."""
+        """Carry out or refuse a command to the drives. Ignore other commands."""
         if command.what in DRIVE_OPERATIONS and (refusal := self.obey_drive_command(command)):
             self.orders.refuse_newest(refusal)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
-        """Return the motion that the boards above want, or None if not all of them drive it."""
+        """Return the motion that the boards above want, or None if the arm must be braked."""
         if self.arm.braked and self._braked_at is None:
             self._waiting = "braked until the boards above have seen it"
             return None
@@ -169,10 +169,10 @@ class ArmExecutor(ArmDriver):
         return self.joints.wanted
 
     def _is_astray(self) -> bool:
-        """Return True if the boards above want the braked arm elsewhere than where it is.
+        """Return True if the boards above want the braked arm far from where it is.
 
         This happens for two cycles when sensors are trusted again and show another position than
-        was estimated.
+        the estimated one.
         """
         distance = self.joints.wanted.position - self.sensors.position
         joint = int(np.abs(distance).argmax())
@@ -185,7 +185,12 @@ class ArmExecutor(ArmDriver):
         return True
 
     def _must_rest(self, stops: bool, tick: int) -> bool:
-        """Return True if the arm `stops` and the boards above have had time to bring it to rest."""
+        """Return True if the boards above have had enough time to bring the arm to rest.
+
+        Args:
+            stops: The arm must stop.
+            tick: Tick of the cycle.
+        """
         if not stops:
             self._rest_by = None
         elif self._rest_by is None:
@@ -193,14 +198,14 @@ class ArmExecutor(ArmDriver):
         return self._rest_by is not None and tick >= self._rest_by
 
     def brake_arm(self) -> None:
-        """Brake, until the boards above have seen it."""
+        """Engage the brakes, until the boards above have seen the arm braked."""
         if self._braked_at is None:
             self._braked_at = self.arm.tick
         self._rest_by = None
         super().brake_arm()
 
     def compute_efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
-        """Return the torques of the boards above, N m, and their grip force, N."""
+        """Return the torques of the boards above in N m, and their grip force in N."""
         return self.joints.torque, self.joints.grip_force
 
     @property
@@ -214,7 +219,7 @@ class ArmExecutor(ArmDriver):
         return self.payload.mass > 0.0
 
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return how the arm follows the torques from above, for the status."""
+        """Return how the arm follows the torques from above. The status reports it."""
         is_held = self.orders.is_holding
         reason = self.stopping.reason or self._waiting
         if is_held and not reason:
@@ -225,6 +230,6 @@ class ArmExecutor(ArmDriver):
 
 
 def _describe_commanders(boards: Sequence[str]) -> str:
-    """Describe which boards command something."""
+    """Return a text with the boards that command a joint or the gripper."""
     named = ", ".join(f"'{board}'" for board in boards)
     return f"it is commanded by {named or 'none'}"

@@ -38,13 +38,13 @@ class GatewayParams(Table):
 class JointGateway(Executor):
     """Passes references to the boards below after a constant delay, and extrapolates missing ones.
 
-    A reference that is not there in time is extrapolated from the newest one at its velocity. After
-    `missing` of them the arm is left to the boards below, which ramp to rest and hold. When
-    references arrive again, these boards join them. To the level above, the boards below appear as
-    one.
+    A reference that does not arrive in time is extrapolated from the newest one at its velocity.
+    After `missing` extrapolated references it passes none down, so the boards below ramp to rest
+    and hold; when references arrive again, these boards join them. To the level above, the boards
+    below appear as one.
 
     Attributes:
-        latency: Ticks by which references are due later.
+        latency: Ticks that are added to the due tick of a reference.
     """
 
     above = Input(JointReference, "above.command")
@@ -89,15 +89,15 @@ class JointGateway(Executor):
         deliver_arrived(self._up, self.status, tick)
 
     def _take_reference(self, command: Reading[JointReference], tick: int) -> None:
-        """Put a new reference on the link, and receive the one that arrives."""
+        """Put a new reference on the delayed link, and take the one that arrives."""
         if command.is_new:
             self._down.append((tick + self._delay, bytes(command.message.raw)))
         deliver_arrived(self._down, self._newest, tick)
 
     def _extrapolate_reference(self, command: JointReference) -> None:
-        """Extrapolate the next reference, or give up if too many are missing."""
+        """Extrapolate the next reference, or pass none down if too many are missing."""
         newest = self._newest
-        ahead_ticks = self._due + self._period - self.latency - newest.due  # ticks
+        ahead_ticks = self._due + self._period - self.latency - newest.due
         if ahead_ticks > self._missing * self._period:
             self._due = command.due = 0
             self._frozen = True
@@ -111,7 +111,7 @@ class JointGateway(Executor):
         command.acceleration[:] = 0.0
 
     def _merge_statuses(self, statuses: Mapping[str, Reading[JointStatus]]) -> None:
-        """Combine the statuses of the boards below to one."""
+        """Combine the statuses of the boards below into one."""
         merged = self._merged
         values = [reading.message for reading in statuses.values()]
         merged.position[:] = values[0].position
@@ -144,7 +144,7 @@ class JointGateway(Executor):
 
 
 def deliver_arrived(link: Link, message: Message, tick: int) -> None:
-    """Copy the newest message that has arrived by `tick` to `message`, if any.
+    """Copy the newest message that has arrived by `tick`. Without one, `message` is unchanged.
 
     Args:
         link: Link, from which arrived messages are removed.
@@ -173,11 +173,11 @@ class NetworkGatewayParams(GatewayParams):
 
 
 class NetworkGateway(JointGateway):
-    """Follows references of another rack, which become due later by `delay`.
+    """Passes on references of another rack. They become due later by `delay`.
 
-    They must arrive within this time. Their due ticks count on the clock of the other rack, whose
-    time relative to this rack is in its `PeerPresence`. The board is DONE, or in ERROR, when the
-    program of the other rack is, so that it can end the run.
+    References must arrive within this time. Their due ticks count on the clock of the other rack,
+    whose time relative to this rack is in its `PeerPresence`. The board reports DONE or ERROR when
+    the program of the other rack does, so that it can end the run.
     """
 
     above = Input(JointReference, "lan.reference")
@@ -208,7 +208,7 @@ class NetworkGateway(JointGateway):
         self._follow_clock(peer.ahead)
         super().process(tick)
         if peer.presence != Presence.THERE or peer.uncertainty < 0.0:
-            # Its references could not be followed, so its motion must not begin.
+            # The references could not be followed, so the other rack must not begin to move.
             self.status.stopped = True
             self.status.reason = LOST if peer.presence == Presence.LOST else NOT_COMPARED
         elif self._refused:
@@ -221,9 +221,13 @@ class NetworkGateway(JointGateway):
             self.status.reason = program.reason
 
     def _follow_clock(self, ahead_s: float) -> None:
-        """Set the other rack's time while no reference is followed, else only approach it.
+        """Update the time of the other rack relative to this one, because their clocks drift apart.
 
-        The clocks of the two racks drift.
+        While references are followed it only changes in small steps, so that the motion does not
+        jolt.
+
+        Args:
+            ahead_s: Newest time of the other rack relative to this one.
         """
         apart_s = ahead_s - self._their_s
         if not self._due:
@@ -233,11 +237,18 @@ class NetworkGateway(JointGateway):
             self._their_s += step_s if apart_s > 0.0 else -step_s
 
     def _take_reference(self, command: Reading[JointReference], tick: int) -> None:
-        """Pass a new reference on when the boards below need it, with due ticks of this rack."""
+        """Pass a new reference on when the boards below need it, with its due tick on this clock.
+
+        A reference that is due too far away is refused.
+
+        Args:
+            command: Newest reference and its verdict.
+            tick: Tick of the cycle.
+        """
         if command.is_new:
             arrived = self._arrived
             arrived.copy_from(command.message)
-            arrived.operator = 0  # serials of the other rack's operators have no meaning here
+            arrived.operator = 0  # serials of the other rack's operators are unknown here
             self._refused = ""
             if arrived.due:
                 due_s = arrived.due * self._tick_s - self._their_s

@@ -23,7 +23,7 @@ DUE = slice(2, 4)
 class JointLoads:
     """Inertia and load of every joint.
 
-    They are interpolated between references, and computed when there is none.
+    They are interpolated between references, and computed while no reference is followed.
 
     Attributes:
         table: Rows `AT` and `DUE`, (4, joints).
@@ -47,7 +47,7 @@ class JointLoads:
         self._computed_at = np.full(joints, np.nan)
 
     def find_misfit(self, command: JointReference) -> str:
-        """Return the field of a `JointReference` that asks for more than the arm can do, or ""."""
+        """Return the first field of a reference that exceeds the arm's limits, or an empty text."""
         # Written so that NaN is rejected.
         within = {
             "position": (self._low <= command.position) & (command.position <= self._high),
@@ -67,7 +67,7 @@ class JointLoads:
         return bool(mass >= 0.0 and (np.abs(bias) <= self._most).all())
 
     def take_reference(self, command: JointReference, tick: int) -> None:
-        """Start an interval that ends with the loads of a `JointReference` when it is due."""
+        """Begin to interpolate to the loads of a `JointReference`, until it is due."""
         self.table[AT] += self.compute_passed_part(tick) * (self.table[DUE] - self.table[AT])
         self.table[DUE] = command.inertia, command.load
         self._begin = tick
@@ -76,11 +76,15 @@ class JointLoads:
         self._computed_at[:] = np.nan
 
     def compute_passed_part(self, tick: int) -> float:
-        """Return the part of the present interval that has passed, 0 to 1."""
+        """Return the part of the present interval between references that has passed, 0 to 1."""
         return 1.0 if tick >= self._due else (tick - self._begin) / (self._due - self._begin)
 
     def compute_at_rest(self, position: Array) -> None:
-        """Compute the loads of an arm at rest at `position`, (joints,), rad, if it has moved."""
+        """Compute the loads of an arm at rest, if it has moved since they were computed last.
+
+        Args:
+            position: Position of the arm, (joints,), rad.
+        """
         if (np.abs(position - self._computed_at) < MOVED_RAD).all():
             return
         inertia, bias = self._dynamics.terms(position, self._still, self._payload)
@@ -138,7 +142,7 @@ def servo_joints(
         damped = acceleration + damping[j] * (target_velocity - velocity)
         needed = inertia * (damped + stiffness[j] * (target - position)) + load
         needed += dry[j] * math.tanh(target_velocity / FRICTION_SPEED)
-        needed = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # NaN stays
+        needed = np.minimum(np.maximum(needed, -limits[j]), limits[j])  # keeps NaN
         torque[j] = needed
         torque[joints + j] = target
         torque[2 * joints + j] = target_velocity

@@ -110,7 +110,7 @@ class JointServo(Executor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield invalid joints, a board without work, and modifications that do not suit it."""
+        """Yield invalid joints, a board that drives nothing, and unsuitable modifications."""
         params = read_params(JointServoParams, context.params)
         known = context.robot.joints
         named = known if params.joints is None else params.joints
@@ -128,7 +128,7 @@ class JointServo(Executor):
         yield from find_misfits(context)
 
     def process(self, tick: int) -> None:
-        """Interpolate, and compute the torques that act from the next cycle on."""
+        """Run one cycle: compute the torques that act from the next cycle on."""
         arm = self.below.message
         if not self._met and not self._meet_arm(self.below.has_message, arm):
             return
@@ -150,7 +150,7 @@ class JointServo(Executor):
                 if operator.stands
                 else reference.compute_motion(tick)
             )
-        # Use inertia and load of the reference that is followed. Compute them if there is none.
+        # Use the inertia and the load of the reference that is followed, else compute them.
         if stopped or operator.stands or reference.holding:
             self.loads.compute_at_rest(arm.position)
         elif self._offered is not None:
@@ -186,8 +186,8 @@ class JointServo(Executor):
         """Replace the torques just computed with the torques of the modified law.
 
         Args:
-            times: Passed part of the interval, time until the torques act, and age of the sample,
-                s.
+            times: Passed part of the interval, time until the torques act, s, and age of the
+                sample, s.
             wanted: Motion to follow.
             tick: Tick of the cycle.
         """
@@ -208,12 +208,20 @@ class JointServo(Executor):
         np.copyto(command[:joints], modified, where=self._driven)
         np.copyto(shown_status[3 * joints :], modified, where=self._driven)
 
-    def _meet_arm(self, is_there: bool, arm: ArmStatus) -> bool:
-        """Prepare for the first status of the arm. Return False while there is none."""
+    def _meet_arm(self, has_status: bool, arm: ArmStatus) -> bool:
+        """Initialise from the first status of the arm.
+
+        Args:
+            has_status: A status of the arm has arrived.
+            arm: Status of the arm.
+
+        Returns:
+            False if no status has arrived yet.
+        """
         status = self.status
         torque = self.command
-        self._met = is_there
-        if not is_there:
+        self._met = has_status
+        if not has_status:
             torque.sampled = -1
             status.driven = self._driven
             status.holding = True
@@ -229,7 +237,7 @@ class JointServo(Executor):
         return True
 
     def _take_messages(self) -> None:
-        """Process a new command of the operator and a new reference."""
+        """Process a new operator's command and a new reference."""
         if self.operator.is_new:
             self.operator_control.take_commands(self.operator, self.below.message.position)
         if self.above.is_new:
@@ -238,7 +246,7 @@ class JointServo(Executor):
             self._rests_on = command.operator
             self._refused = ""
             if misfit := self.loads.find_misfit(command):
-                # Before the first set point all fields are zero, which is no mistake.
+                # Before the first set point all fields are zero, which is not an error.
                 if command.due:
                     self._refused = f"rejected: a reference whose {misfit} is out of range"
                 return

@@ -58,8 +58,8 @@ class SenderParams(Table):
 class ModificationSender(Executor):
     """Sends an operator's modifications to boards of another rack.
 
-    A command is done when all boards have answered. A restarted board gets all commands of its
-    operator again, in order, and so restores its state.
+    A command is done when all boards have answered. After a restart the sending board receives all
+    commands of its operator again, in order, and so restores its state.
     """
 
     modified = Inputs(ModifiedAnswer, "lan.modified")
@@ -126,7 +126,7 @@ class ModifiedFromAfar(JointServo):
         self._asked: set[str] = set()  # modifications of this board that must be active
 
     def process(self, tick: int) -> None:
-        """Switch modifications as requested, then do the cycle."""
+        """Switch modifications as the other rack requests, then run the cycle."""
         if self.asked.is_new:
             prefix = f"{self.context.board}."
             wanted = {
@@ -139,7 +139,7 @@ class ModifiedFromAfar(JointServo):
                 for name in sorted(wanted ^ self._asked)
                 if (refusal := self._modified.switch_modification(name, name in wanted))
             }
-            # Refused ones are requested in every message, and every answer reports the refusal.
+            # Refused modifications are requested again and again; every answer reports the refusal.
             self._asked = wanted.difference(refused)
             self.modified.echo = self.asked.message.id
             self.modified.error = len(refused)

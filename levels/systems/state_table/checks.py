@@ -115,7 +115,7 @@ def _find_state_flaws(table: StateTable) -> Iterator[str]:
     if table.start not in names:
         return
     reached = [table.start]
-    for state in reached:  # the list grows while it is read
+    for state in reached:  # the list grows during the loop
         nexts = {row.next for row in table.rows[state].values()}
         reached += [name for name in names if name in nexts and name not in reached]
     for state in names:

@@ -87,8 +87,8 @@ class MoveTable(StateTableExecutor):
             "below": BELOW,
             # Whether the objects are sensed.
             "world": ("seen", "unseen"),
-            # The object to pick is there while it rests where it was sensed for the newest `move`.
-            # For a place it is always `there`.
+            # `there`: the object to pick rests where it was sensed for the newest `move`. A place
+            # is always `there`.
             "target": ("there", "displaced", "moving"),
             # Whether the object put down last rests at its place.
             "support": ("there", "elsewhere"),
@@ -104,14 +104,14 @@ class MoveTable(StateTableExecutor):
             HOME: (),
         },
         actions={
-            # Go to a pose relative to the object or place of the command in force.
+            # Go to a pose relative to the object or place of the current command.
             "move": ("pose",),
             "open": (),
             "close": (),
         },
         plan=MovePlanConfig,
     )
-    # Both as read in this cycle.
+    # Status of the level below and world model, as read in this cycle.
     _below_status: JointMoveStatus
     _world: WorldState
 
@@ -133,7 +133,7 @@ class MoveTable(StateTableExecutor):
         return {"object": scene.objects, "place": tuple(plan.place), "pose": (*plan.pose, HOME)}
 
     def restore_state(self) -> None:
-        """Continue with the command that was sent down last."""
+        """Continue after a restart with the command that was sent down last."""
         super().restore_state()
         if self.last_status.has_message and self.last_command.has_message:
             last = self.last_status.message
@@ -172,7 +172,7 @@ class MoveTable(StateTableExecutor):
         return "there" if self._is_at_aim(row) else "displaced"
 
     def _is_at_aim(self, row: int) -> bool:
-        """Return True if an object is where the newest motion aims."""
+        """Return True if an object is at the position at which the newest motion aims."""
         distance = norm(self._world.position[row] - self._command.aim)
         return bool(distance <= self.table.plan.moved)
 
@@ -199,13 +199,13 @@ class MoveTable(StateTableExecutor):
         self._send_command("close", self._command.joints, 1.0)
 
     def _find_tool_goal(self, height: float) -> Pose | None:
-        """Return the goal of the tool for the command in force, with the tool pointing down.
+        """Return the tool's goal pose for the current command, with the tool pointing down.
 
         Args:
             height: Height above the object or place of the command, m.
 
         Returns:
-            The goal. None if the command names neither object nor place, or if none is in force.
+            The goal, or None if the current command names neither an object nor a place.
         """
         if len(self.words) < 2:
             return None
@@ -223,7 +223,7 @@ class MoveTable(StateTableExecutor):
                 command.yaw = compute_yaw(self._world.quaternion[row])
         tool_now = self._ik.compute_tool_pose(command.joints)
         # The gripper must be aligned with the object's faces. Of the four possible turns, take the
-        # one nearest to the present orientation.
+        # one nearest to the current orientation.
         turns = [
             build_pointing_quaternion(DOWN, -(command.yaw + quarter * 0.5 * math.pi))
             for quarter in range(4)
@@ -232,10 +232,10 @@ class MoveTable(StateTableExecutor):
         return min(goals, key=tool_now.compute_angle)
 
     def _solve_joints(self, goal: Pose) -> Array | None:
-        """Return joint positions that reach a pose, rad. None if none are found.
+        """Return joint positions, in rad, that reach a pose, or None if none are found.
 
-        The branch of the arm's present configuration is preferred. At most three descents are
-        tried.
+        Positions near the arm's current configuration are preferred. At most three searches are
+        made.
         """
         joints = self._ik.find_nearby(goal, self._command.joints)
         if joints is None:
@@ -247,7 +247,7 @@ class MoveTable(StateTableExecutor):
         )
 
     def _send_command(self, words: str, joints: Array, speed: float) -> None:
-        """Change the command for the level below and give it a new serial."""
+        """Fill the command for the level below and give it a new serial."""
         self._command.id += 1
         self._command.words = words
         self._command.speed = speed

@@ -109,15 +109,15 @@ def build_vocabulary(
     Args:
         conditions: Possible values of each of the level's own conditions.
         actions: The level's own actions.
-        commands: Commands that the level accepts. With commands, the conditions `command` and `new`
-            and the action `take` are added. None if it accepts none.
+        commands: Commands that the level accepts, or None. If there are any, the conditions
+            `command` and `new` and the action `take` are added.
         plan: Record class of the static plan.
     """
     all_conditions = {**conditions, LATE: YES_NO}
     if not commands:
         return Vocabulary(all_conditions, {}, actions, plan)
-    # `command` is the newest command, from an operator or the level above. `new` tells whether it
-    # still has to be taken by a row.
+    # `command` is the newest command, from an operator or the level above. `new` tells whether
+    # a row still has to take it.
     all_conditions |= {"command": ("none", UNKNOWN, *commands), "new": YES_NO}
     return Vocabulary(all_conditions, commands, {**actions, TAKE: ()}, plan)
 
@@ -138,7 +138,7 @@ class StateTableExecutor(Executor):
     """Base class of levels that are programmed by a state table.
 
     A subclass declares its `vocabulary` and implements `evaluate_conditions`, and `do_<action>` for
-    each of its actions.
+    each of its actions. The current command is the one that a row took last (action `take`).
     """
 
     commands: ClassVar[Commands] = {**OPERATIONS, Operation.DO: ()}
@@ -168,7 +168,7 @@ class StateTableExecutor(Executor):
         self.detail = ""  # reason given by the level below, appended to a row's reason
         self.resting = True  # no motion commanded by this level is under way
         self._newest = WordCommand(False, 0, "")
-        self._taken = self._newest  # command in force
+        self._taken = self._newest  # current command
         self._done_serial = 0  # newest completed command of the level above
         self._hold_reason = ""  # why this level, or the one above, is held; empty if it is not
         # Newest operator command that was answered before the board was restarted.
@@ -194,14 +194,14 @@ class StateTableExecutor(Executor):
 
     @classmethod
     def find_plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
-        """Return one line for every entry of a plan that does not suit the scene."""
+        """Return one line for every entry of a plan that does not match the scene."""
         return []
 
     @classmethod
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield every mistake in every table, and commands that one of the tables does not know.
+        """Yield every mistake in every table, and commands that only some of the tables know.
 
         Args:
             context: Context of this level.
@@ -225,7 +225,8 @@ class StateTableExecutor(Executor):
     ) -> Iterator[tuple[str, str]]:
         """Yield the name of each table that lacks a command of another one, and the reason.
 
-        All tables must know the same commands, because the command in force survives a switch.
+        All tables must know the same commands, because a switch between them does not change the
+        current command.
         """
         commands = {name: cls._list_commands(scene, table) for name, table in tables.items()}
         for name, own_commands in commands.items():
@@ -280,7 +281,7 @@ class StateTableExecutor(Executor):
             self._state_since_tick = None
 
     def process(self, tick: int) -> None:
-        """Run one cycle: read, let one row fire, write."""
+        """Run one cycle: read the inputs, execute the row that fires, and write the outputs."""
         if not self._started:
             self._started = True
             self.restore_state()
@@ -315,12 +316,12 @@ class StateTableExecutor(Executor):
         """Write the outputs of the level, except the fields of `TableStatus`."""
 
     def do_take(self) -> None:
-        """Bring the newest command into force."""
+        """Make the newest command the current one."""
         self._taken = self._newest
 
     @property
     def words(self) -> list[str]:
-        """Words of the command in force."""
+        """Words of the current command."""
         return self._taken.words.split()
 
     @property
@@ -373,12 +374,12 @@ class StateTableExecutor(Executor):
             self._hold_reason = HELD_FROM_ABOVE
 
     def _find_objection(self, words: str) -> str:
-        """Return why the level does not know a command. Empty if it knows it."""
+        """Return why the level does not know a command, or an empty string if it does."""
         lexicon = self.build_lexicon(self.context.scene, self.table.plan)
         return find_objection(words, self.vocabulary.commands, lexicon)
 
     def _accept_operator_command(self, order: OperatorCommand) -> None:
-        """Carry out or refuse an operator's command that is specific to this kind of level."""
+        """Execute or refuse a TABLE or DO command of an operator."""
         if order.what == Operation.TABLE:
             if order.name not in self.tables:
                 self.orders.refuse_newest(
@@ -393,7 +394,7 @@ class StateTableExecutor(Executor):
                 self._newest = WordCommand(True, order.id, order.name)
 
     def _write_status(self, number: int, row: RowConfig) -> None:
-        """Fill the fields of `TableStatus` and, in the command below, the operator's serial.
+        """Fill the fields of `TableStatus`, and the operator's serial in the command sent down.
 
         Args:
             number: Number of the row that fired.

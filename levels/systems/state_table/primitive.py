@@ -1,7 +1,7 @@
 """The primitive level as a state table.
 
-It moves the joints straight from rest to rest and works the gripper. A motion is a smooth stream of
-set points for the boards that servo the joints, two cycles ahead of the arm.
+It moves the joints straight from rest to rest and operates the gripper. A motion is a smooth
+stream of set points for the boards that servo the joints, two cycles ahead of the arm.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MIN_MOTION_RAD = 1e-9
 """A motion shorter than this is not started."""
 MIN_SPEED = 0.01
 GRIP_CYCLES = 6
-"""Cycles after a command for which the gripper counts as moving, until its motion shows."""
+"""Cycles after a command during which the gripper counts as moving, until its motion is sensed."""
 MAX_GRIPPER_REST_M_S = 0.002
 GRIPPER_TOLERANCE_M = 0.001
 """Distance from its open or closed position within which the gripper has reached it.
@@ -80,7 +80,7 @@ class PrimitivePlanConfig(Table):
 
 
 class PrimitiveTable(StateTableExecutor):
-    """Executor that moves the joints along straight lines and works the gripper."""
+    """Executor that moves the joints along straight lines and operates the gripper."""
 
     above = Inputs(JointMove, "above.command", optional=True)
     statuses = Inputs(JointStatus, "below.status")
@@ -94,7 +94,7 @@ class PrimitiveTable(StateTableExecutor):
     preloads = (curves,)
     vocabulary = build_vocabulary(
         conditions={
-            # Whether an operator or the level above holds this one, or its board is lost.
+            # Whether an operator or the level above holds this level, or the board above is lost.
             "hold": YES_NO,
             # `arrived` and `resting` both mean at rest: at the end of the newest motion, or
             # elsewhere. `away` means that the joints do not follow.
@@ -102,7 +102,7 @@ class PrimitiveTable(StateTableExecutor):
             # `empty` means that the gripper has closed on nothing.
             "gripper": ("moving", "open", "empty", "holds"),
         },
-        # Move the joints straight to the commanded positions; work the gripper.
+        # `move` moves the joints straight to the commanded positions.
         commands={"move": (), "open": (), "close": ()},
         actions={"begin": (), "halt": (), "open": (), "close": ()},
         plan=PrimitivePlanConfig,
@@ -132,12 +132,12 @@ class PrimitiveTable(StateTableExecutor):
         self._held_row = -1
         self._target_row = -1  # row of the object that the newest command concerns
         self._due_tick = 0  # tick at which the set point of this cycle is due
-        self._gripper_wait_cycles = 0  # cycles until the gripper's motion must show
+        self._gripper_wait_cycles = 0  # cycles until the gripper's motion must be sensed
 
     def restore_state(self) -> None:
-        """Continue with the gripper as it is.
+        """Restore the state of the gripper and the goal of the newest motion after a restart.
 
-        The motion of the arm starts again from where the boards below hold it.
+        The arm starts again from the position in which the boards below hold it.
         """
         super().restore_state()
         if self.last_status.has_message:
@@ -176,7 +176,7 @@ class PrimitiveTable(StateTableExecutor):
         }
 
     def _update_following(self) -> Array:
-        """Update whether the boards below follow, and return the joint positions, rad."""
+        """Check whether the boards below follow, and return the joint positions in rad."""
         readings = list(self.statuses.values())
         statuses = [reading.message for reading in readings]
         position: Array = statuses[0].position
@@ -200,7 +200,7 @@ class PrimitiveTable(StateTableExecutor):
         return position
 
     def _classify_gripper(self, arm: ArmStatus) -> str:
-        """Return the value of the condition `gripper`."""
+        """Return the value of the condition `gripper`, and update whether something is held."""
         self._gripper_wait_cycles = max(0, self._gripper_wait_cycles - 1)
         if self._gripper_wait_cycles or abs(arm.opening_velocity) > MAX_GRIPPER_REST_M_S:
             return "moving"
@@ -213,9 +213,9 @@ class PrimitiveTable(StateTableExecutor):
         return "holds" if self._held else "empty"
 
     def do_begin(self) -> None:
-        """Start the motion to the joints of the command in force.
+        """Start the motion to the goal of the newest command.
 
-        A motion must start at rest, therefore a moving arm is halted first.
+        A motion must start at rest. If the arm is moving, this only halts it.
         """
         if self._curve is not None:
             self.do_halt()
@@ -242,7 +242,7 @@ class PrimitiveTable(StateTableExecutor):
 
     @property
     def _passed_s(self) -> float:
-        """Time from the start of the curve to the due tick of this cycle's set point, s."""
+        """Time, in s, from the start of the curve to the due tick of this cycle's set point."""
         return (self._due_tick - self._curve_start_tick) * self.context.tick_s
 
     def do_open(self) -> None:
@@ -258,7 +258,7 @@ class PrimitiveTable(StateTableExecutor):
         self._held_row = self._target_row
 
     def write_outputs(self, tick: int) -> None:
-        """Write the set point with its inertia and load, and what a restarted board needs."""
+        """Write the set point with its inertia and load, and the status that a restart needs."""
         command = self.command
         status = self.status
         if self._curve is not None:

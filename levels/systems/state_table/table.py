@@ -49,10 +49,7 @@ MAX_NAME_BYTES = 24
 MAX_PHRASE_BYTES = 64
 """Maximum length of a command or action with its parameters."""
 TAKE = "take"
-"""Action that every level has: the newest command comes into force.
-
-From then on the status answers this command.
-"""
+"""Action that makes the newest command the current one. From then on the status answers it."""
 
 
 Values = tuple[str, ...]
@@ -100,7 +97,7 @@ def _list_words(parameter: str | Values, lexicon: Lexicon) -> Sequence[str]:
 
 
 def find_objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
-    """Return why a phrase is not a valid command or action. Empty if it is valid.
+    """Return why a phrase is not a valid command or action, or an empty string if it is.
 
     Args:
         phrase: Command or action with its parameters.

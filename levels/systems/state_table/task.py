@@ -84,8 +84,8 @@ class TaskTable(StateTableExecutor):
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._steps_done = 0  # steps done
-        self._newest_command = TableCommand.zeros({})  # the newest command sent down
+        self._steps_done = 0
+        self._newest_command = TableCommand.zeros({})  # sent down last
 
     @classmethod
     def find_plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
@@ -101,18 +101,18 @@ class TaskTable(StateTableExecutor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield every mistake in every table, and steps that the level below does not know.
+        """Yield every mistake in every table, and steps whose place the level below lacks.
 
         Args:
             context: Context of this level.
             above: Contexts of the levels above.
             below: Contexts of the levels below, whose tables name the places.
         """
-        own_misfits = [*super().find_mismatches(context, above, below)]
-        yield from own_misfits
+        own_mismatches = [*super().find_mismatches(context, above, below)]
+        yield from own_mismatches
         tables = read_params(StateTableParams, context.params).tables
         for other in below:
-            if own_misfits or [*MoveTable.find_mismatches(other, (), ())]:
+            if own_mismatches or [*MoveTable.find_mismatches(other, (), ())]:
                 continue
             commands = MoveTable.list_operation_names(Operation.DO, other.params, context.scene)
             for name, path in tables.items():
@@ -125,7 +125,7 @@ class TaskTable(StateTableExecutor):
                         yield f"params.tables.{name}", path.name, why
 
     def restore_state(self) -> None:
-        """Continue with the step under way."""
+        """Continue with the current step after a restart."""
         super().restore_state()
         if self.last_status.has_message and self.last_command.has_message:
             self._steps_done = self.last_status.message.action

@@ -19,16 +19,17 @@ MAX_REST_RAD_S = 1e-3
 
 
 class JointBoards:
-    """Decides from the boards' statuses whether all of them are in step with this level.
+    """Decides whether the boards that servo joints are in step with this level.
 
-    When one board is lost, stopped or left alone, all fall out of step: no board gets set points,
-    and each ramps to rest independently. They return to step when all of them hold at rest, and
-    motion continues from these positions.
+    The boards are in step while all of them follow this level's set points. If one board is lost,
+    stopped or holds by itself, all fall out of step: none gets set points, and each ramps its
+    joints to rest. They return to step when all of them hold their joints at rest. Motion then
+    continues from the positions at which the joints are held.
 
     Attributes:
         in_step: Whether the boards follow this level's set points.
         position: Joint positions at which the boards hold the joints, (joints,), rad.
-        wait_reason: Reason for which a level out of step is waiting.
+        wait_reason: Why the level waits while the boards are out of step.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class JointBoards:
         self.wait_reason = "no board servoes a joint"
 
     def update(self, statuses: Mapping[str, Reading[JointStatus]]) -> bool:
-        """Read all statuses. Returns True in the cycle in which the boards come into step."""
+        """Evaluate the statuses. Returns True in the cycle in which the boards come into step."""
         self._cycles_in_step += 1
         for board, reading in statuses.items():
             has_status = reading.is_new and not reading.is_lost
@@ -68,15 +69,15 @@ class JointBoards:
         return True
 
     def leave_step(self, reason: str) -> None:
-        """Fall out of step. The boards bring the joints to rest, where motion restarts later."""
+        """Mark the boards as out of step. `reason` becomes `wait_reason`.
+
+        The boards then bring the joints to rest, and motion later continues from those positions.
+        """
         self.in_step = False
         self.wait_reason = reason
 
     def _find_board_not_following(self, statuses: Mapping[str, Reading[JointStatus]]) -> str:
-        """Return the board that does not follow, with the reason.
-
-        Empty if no board prevents motion.
-        """
+        """Return the name of a board that does not follow with the reason, or an empty string."""
         for board, reading in statuses.items():
             status = reading.message
             silent_cycles = self._silent_cycles[board]
@@ -89,7 +90,11 @@ class JointBoards:
         return ""
 
     def _take_over_hold_positions(self, statuses: Mapping[str, Reading[JointStatus]]) -> bool:
-        """Return True if all boards hold all joints at rest. Takes over the positions they hold."""
+        """Copy the joint positions at which the boards hold the joints to `position`.
+
+        Returns:
+            True if the boards hold all joints at rest. Otherwise `wait_reason` tells why not.
+        """
         is_driven = np.zeros(len(self._joints), dtype=bool)
         for board, reading in statuses.items():
             status = reading.message

@@ -2,9 +2,9 @@
 
     move(joints)                  a straight line in joint space
     line(position, ...)           a straight line of the tool, in the world's frame or a body's
-    stay(seconds), grip(opening)  at rest
-    cancel()                      drop everything; the arm ramps to rest
-    done(), wait()                whether all is done; wait until it is
+    stay(seconds), grip(opening)  stay at the goal; move the gripper
+    cancel()                      drop all requests; the arm ramps to rest
+    done(), wait()                test whether all requests have ended; wait until they have
 
 A call returns as soon as its request is queued, and blocks only while the queue is full. Successive
 motions are blended. A request may be lost with a board that dies while it holds the request; the
@@ -42,7 +42,7 @@ DOWN = (0.0, 1.0, 0.0, 0.0)
 POLL_S = 0.25
 """Longest wait before the status is read again, s."""
 RESEND_DELAY_S = 2.0
-"""Time after which open requests are sent again if none of them is under way, s."""
+"""Time after which open requests are sent again if none of them is being executed, s."""
 WORLD_BODY = -1
 """Body number of a goal in the frame of the world."""
 
@@ -133,7 +133,7 @@ class Motions:
         return self._queue_request(kind=MotionKind.STAY, segment=seconds)
 
     def grip(self, opening: float | None = None, force: float | None = None) -> int:
-        """Move the gripper to an opening, m, with at most `force`, N. The default closes it."""
+        """Move the gripper to `opening`, in m, with at most `force`, in N. By default it closes."""
         if opening is None:
             opening = self._gripper.closed
         if force is None:
@@ -146,12 +146,13 @@ class Motions:
 
     @property
     def _gripper(self) -> GripperConfig:
+        """The gripper of the arm. Raises `LevelError` if it has none."""
         if self._robot.gripper is None:
             raise LevelError("grip: the arm has no gripper")
         return self._robot.gripper
 
     def cancel(self) -> int:
-        """End the motion under way and drop all others. The arm ramps to rest."""
+        """End the current motion and drop all queued ones. The arm ramps to rest."""
         return self._queue_request(kind=MotionKind.CANCEL)
 
     def end_of(self, request: int) -> RequestEnd:
@@ -177,7 +178,7 @@ class Motions:
         return True
 
     def where(self) -> list[float]:
-        """Return the tool position that was commanded last, m."""
+        """Return the tool position that was commanded last, in m."""
         return [round(float(x), 4) for x in self._status.tool]
 
     @property
@@ -209,7 +210,7 @@ class Motions:
         return self._requests.send()
 
     def _wait_and_resend(self) -> None:
-        """Wait for a new status. Send open requests again if none is under way for too long."""
+        """Wait for a new status. Send open requests again if none was executed for too long."""
         self._bus.wait(POLL_S)
         status = self._status
         now = self._bus.time_s
@@ -248,7 +249,7 @@ class CommandEnvironment(HostProgram):
         self._script = read_params(ScriptParams, context.params).script
 
     def run(self, bus: Bus) -> None:
-        """Run the script. Raises `LevelError` if no folder of the path contains it."""
+        """Run the script. Raises `LevelError` if no folder of `sys.path` contains it."""
         paths = [Path(folder) / self._script for folder in sys.path]
         script = next(filter(Path.is_file, paths), None)
         if script is None:

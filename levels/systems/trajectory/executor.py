@@ -45,12 +45,12 @@ it.
 class TrajectoryExecutor(Executor):
     """Carries out motion requests in the order of the queue, and blends them.
 
-    The arm rests at the last goal when the queue is empty. The level needs no board above it: what
-    is queued will be done. While a board below is lost or stopped, or an operator holds the level,
-    the arm rests, and the request under way resumes afterwards. A request that cannot be done ends
-    REFUSED, or FAILED if it was under way: the arm ramps to rest, all others held are CANCELLED,
-    and new ones are REFUSED until a CANCEL [assumed]. After a restart the level continues with the
-    requests in its own last messages.
+    The arm rests at the last goal when the queue is empty. Queued requests are executed even if no
+    board is above the level. While a board below is lost or stopped, or an operator holds the
+    level, the arm rests, and the current request resumes afterwards. A request that cannot be
+    executed ends REFUSED, or FAILED if it had begun: the arm ramps to rest, all other accepted
+    requests are CANCELLED, and new ones are REFUSED until a CANCEL [assumed]. After a restart the
+    level continues with the requests in its own last messages.
     """
 
     requests = Input(MotionRequest, "above.requests")
@@ -114,8 +114,8 @@ class TrajectoryExecutor(Executor):
             self._work.cancel_motion()
         self._check_guard(cycles)
         hold = self._orders.is_holding
-        # Catch up on the samples of missed cycles, to lose no time. After more than a few missed
-        # cycles the boards hold.
+        # Catch up on the samples of missed cycles, so that the motion is not delayed. After more
+        # than a few missed cycles the boards hold.
         for late_cycles in reversed(range(min(cycles, HANDOVER_CYCLES))):
             if self._boards.in_step:
                 due_tick = self._compute_due_tick(tick) - late_cycles * self.context.every
@@ -142,7 +142,7 @@ class TrajectoryExecutor(Executor):
             self._work.grip = command.opening, command.force
 
     def _follow_boards(self) -> None:
-        """Fall out of step with the boards below, or restart from where they hold the arm."""
+        """Interrupt the motion when the boards leave step; restart it where they hold the arm."""
         was_in_step = self._boards.in_step
         if self._boards.update(self.boards):
             self._work.interrupt_motion()
@@ -151,15 +151,16 @@ class TrajectoryExecutor(Executor):
             self._work.interrupt_motion()
 
     def _check_guard(self, cycles: int) -> None:
-        """End the request under way if its guard is struck.
+        """End the current request if its touch guard detects a contact.
 
         Args:
-            cycles: Cycles since the previous call. After missed cycles torques are not comparable.
+            cycles: Cycles since the previous call. The torques are not comparable after missed
+                cycles.
         """
         current = self._agenda.current
         leg = self._motion.leg
-        # Friction changes the torques while the arm breaks away from rest. At half its speed this
-        # is long past.
+        # Friction changes the torques while the arm breaks away from rest. This has decayed once
+        # the arm has reached half its speed.
         is_steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
         if current is None or current.kind != MotionKind.POSE or not current.touch or not is_steady:
             self._guard.clear_window()
@@ -167,9 +168,11 @@ class TrajectoryExecutor(Executor):
             self._work.end_at_guard()
 
     def _compute_due_tick(self, tick: int) -> int:
+        """Return the tick at which the set point of a cycle is due."""
         return tick + LEAD_CYCLES * self.context.every
 
     def _write_reference(self, command: JointReference, tick: int) -> None:
+        """Write the set point with its inertia, load and grip. `due` is 0 while out of step."""
         state = self._motion.state
         command.id = tick // self.context.every + 1
         # Out of step the arm's position is uncertain, and no set point is better than a wrong one.
@@ -182,6 +185,7 @@ class TrajectoryExecutor(Executor):
         command.operator = self._orders.find_basis(self._agenda.rests_on)
 
     def _write_status(self, status: MotionStatus) -> None:
+        """Write the progress of the requests, the reason for waiting and the state of the arm."""
         agenda = self._agenda
         motion = self._motion
         goal = self._work.goal
@@ -211,7 +215,7 @@ class TrajectoryExecutor(Executor):
         self._orders.fill_status(status, agenda.rests_on)
 
     def _find_wait_reason(self) -> str:
-        """Return why motion does not continue. Empty if it does."""
+        """Return why the motion does not continue, or an empty string if it does."""
         if not self._boards.in_step:
             return self._boards.wait_reason
         if self._orders.is_in_force:

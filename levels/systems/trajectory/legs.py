@@ -67,7 +67,7 @@ class WorldView:
         self._model: WorldState | None = None
 
     def update_model(self, world: Reading[WorldState]) -> None:
-        """Take over the newest world model, if it has been sensed."""
+        """Store the newest world model, if it has been sensed."""
         if world.has_message and world.message.revision:
             self._model = world.message
 
@@ -77,7 +77,7 @@ class WorldView:
         return self._model is not None
 
     def find_body_error(self, row: int) -> str:
-        """Return why the world model has no body with this row. Empty if it has one."""
+        """Return why `row` is no body of the world model, or an empty string if it is one."""
         if -1 <= row < len(self._bodies):
             return ""
         return (
@@ -93,8 +93,8 @@ class WorldView:
             time_s: Simulated time of the prediction, s.
 
         Returns:
-            The pose, and the velocity, (3,), m/s. The velocity is zero if the body was not sensed
-            lately.
+            The pose, and the velocity, (3,), m/s. The velocity is zero if the body was last
+            sensed more than `blind_s` ago.
 
         Raises:
             InfeasibleMotion: If no world model has been received.
@@ -155,7 +155,7 @@ class ToolGoal:
         self.pose = self._frame @ self._goal
 
     def compute_deviation(self, position: Array, time_s: float) -> float:
-        """Return the distance of a tool position from the unsmoothed goal at `time_s`, m."""
+        """Return the distance, in m, of a tool position from the unsmoothed goal at `time_s`."""
         return norm(
             (self._sight.predict_frame(self._body, time_s)[0] @ self._goal).position - position
         )
@@ -189,7 +189,7 @@ class ToolGoal:
 
 
 class LegTimes(NamedTuple):
-    """Times that a request asks for, s."""
+    """Times that a request asks for, in s."""
 
     segment: float  # 0 to choose it from the limits
     half_blend: float
@@ -216,7 +216,7 @@ class TimeLaw:
 
     @property
     def nominal_s(self) -> float:
-        """Time at which the goal would be reached at full speed, s.
+        """Time, in s, at which the goal would be reached at full speed.
 
         It is the middle of a blend into another leg.
         """
@@ -224,7 +224,7 @@ class TimeLaw:
 
     @property
     def ends_s(self) -> float:
-        """Time at which the leg comes to rest at its goal, s."""
+        """Time, in s, at which the leg comes to rest at its goal."""
         return self.nominal_s + self.end_blend_half_s
 
     def compute_progress(self, time_s: float) -> float:
@@ -246,7 +246,7 @@ class TimeLaw:
 def _compute_ramp_distance(time_s: float, half_s: float) -> float:
     """Return the distance covered `time_s` after the start of a smooth rise of speed.
 
-    The speed rises from 0 to 1 during twice `half_s`.
+    The speed rises from 0 to 1 within 2 * `half_s`.
     """
     h = time_s / (2.0 * half_s)
     return 2.0 * half_s * h * h * h * (1.0 - 0.5 * h)
@@ -263,7 +263,7 @@ class JointLeg:
         self.law = build_time_law(times, np.abs(self._way), np.zeros(len(goal)), limits)
 
     def compute_position(self, time_s: float) -> Array:
-        """Return the joint positions `time_s` after the start, (joints,), rad."""
+        """Return the joint positions, (joints,), in rad, at `time_s` after the start."""
         return np.asarray(self._start + self.law.compute_progress(time_s) * self._way)
 
 
@@ -302,7 +302,7 @@ class ToolLeg:
         self.law = build_time_law(times, speed, bend, limits)
 
     def compute_position(self, time_s: float) -> Array:
-        """Return the joint positions `time_s` after the start, (joints,), rad.
+        """Return the joint positions, (joints,), in rad, at `time_s` after the start.
 
         Raises:
             InfeasibleMotion: If the pose has no joint positions.
@@ -329,9 +329,10 @@ class ToolLeg:
         return joints
 
     def _sample_derivatives(self, start: Array, goal: Pose) -> tuple[Array, Array]:
-        """Return the largest first and second derivatives of the joints by the progress.
+        """Return the largest first and second derivatives of the joints along the path.
 
-        Both have shape (joints,) and are taken from a number of poses of the path.
+        Both have shape (joints,). They are taken with respect to the progress, at a number of
+        poses.
         """
         distance = norm(goal.position - self._from.position)
         turn = self._from.compute_angle(goal)
@@ -361,7 +362,8 @@ def build_time_law(times: LegTimes, speed: Array, curvature: Array, limits: Limi
 
     Args:
         times: Times that the request asks for.
-        speed: Largest first derivative of the joint positions by the progress, (joints,), rad.
+        speed: Largest first derivative of the joint positions with respect to the progress,
+            (joints,), rad.
         curvature: Largest second derivative, (joints,), rad.
         limits: Velocity and acceleration limits of the joints.
     """
@@ -380,7 +382,7 @@ def build_time_law(times: LegTimes, speed: Array, curvature: Array, limits: Limi
 
 
 class RampToRest:
-    """Independent ramp of every joint to rest.
+    """A ramp of every joint to rest, independent of the other joints.
 
     It starts with the given position, velocity and acceleration.
 
@@ -408,7 +410,7 @@ class RampToRest:
         self.end = self.compute_position(self.ends_s)
 
     def compute_position(self, time_s: float) -> Array:
-        """Return the joint positions `time_s` after the start, (joints,), rad."""
+        """Return the joint positions, (joints,), in rad, at `time_s` after the start."""
         t = self._time_s
         h = np.minimum(time_s / t, 1.0)
         by_velocity = h - h * h * h * (1.0 - 0.5 * h)

@@ -38,13 +38,13 @@ MAX_REST_RAD = 1e-7
 
 
 class SampledMotion:
-    """Begins, blends and stops legs.
+    """Begins, blends and stops legs, which are motions from rest to rest.
 
     Position and velocity are continuous, and every joint stays within its limits.
 
     Attributes:
-        leg: Leg under way or completed. None if the arm is stopping, or has stopped elsewhere.
-        time_s: Time of the present sample, s.
+        leg: Current or completed leg. None if the arm is stopping, or has stopped elsewhere.
+        time_s: Time of the current sample, s.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class SampledMotion:
         self.rest_at(rest)
 
     def rest_at(self, position: Array) -> None:
-        """Rest at joint positions, (joints,), rad, and drop the leg."""
+        """Rest at `position`, (joints,), in rad, without a leg."""
         self.leg = None
         self._ramp = None
         self._rest = np.array(position)
@@ -98,7 +98,7 @@ class SampledMotion:
 
     @property
     def state(self) -> JointSetPoint:
-        """Position, velocity and acceleration of the present sample."""
+        """Position, velocity and acceleration of the current sample."""
         before, present, after = self._samples
         h = self._period_s
         return JointSetPoint(
@@ -107,7 +107,7 @@ class SampledMotion:
 
     @property
     def leg_s(self) -> float:
-        """Time since the leg began, s."""
+        """Time, in s, since the leg began."""
         return self.time_s - self._leg_start_s
 
     @property
@@ -119,7 +119,7 @@ class SampledMotion:
 
     @property
     def is_resting(self) -> bool:
-        """Whether the present sample is at rest."""
+        """Whether the current sample is at rest."""
         before, present, after = self._samples
         return bool(
             (np.abs(after - before) < MAX_REST_RAD).all()
@@ -127,20 +127,21 @@ class SampledMotion:
         )
 
     def ramp_to_rest(self) -> None:
-        """Ramp to rest from the present sample."""
+        """Ramp to rest from the current sample."""
         self._ramp_to_rest_from(self.state)
 
     def _ramp_to_rest_from(self, state: JointSetPoint) -> None:
+        """Drop the leg and ramp to rest from the sample `state`."""
         self._start_ramp_to_rest(state, STOP_ACCELERATION_FRACTION)
         self.leg = None
         self._evaluate_next_sample()
 
     def begin_leg(self, make: Callable[[Array], Leg], half_blend_s: float) -> None:
-        """Begin a leg while the motion so far slows down.
+        """Begin a leg while the previous motion slows down.
 
         Args:
-            make: Builds the leg from the joint positions at which the motion so far will end.
-            half_blend_s: Half the time in which the motion so far slows down, s.
+            make: Builds the leg from the joint positions at which the previous motion will end.
+            half_blend_s: Half the time in which the previous motion slows down, s.
 
         Raises:
             InfeasibleMotion: If `make` raises it. The arm is then ramping to rest.
@@ -160,7 +161,7 @@ class SampledMotion:
     def _start_ramp_to_rest(
         self, state: JointSetPoint, fraction: float, least_s: float = 0.0
     ) -> None:
-        """Let the present motion decay to rest.
+        """Start a ramp from the current motion to rest.
 
         Args:
             state: Sample from which the ramp starts.
@@ -173,12 +174,16 @@ class SampledMotion:
         self._rest = self._ramp.end
 
     def _evaluate_next_sample(self) -> None:
-        """Evaluate the next sample, again if the motion has changed."""
+        """Evaluate the next sample. Call this again after a change of the motion."""
         before, present, _ = self._samples
         self._samples = before, present, self._compute_position(self.time_s + self._period_s)
 
     def _compute_position(self, time_s: float) -> Array:
-        """Return the joint positions at `time_s`. Raises `InfeasibleMotion`."""
+        """Return the joint positions at `time_s`: the leg and the decaying previous motion.
+
+        Raises:
+            InfeasibleMotion: If the leg has no joint positions at that time.
+        """
         position = (
             self._rest
             if self.leg is None
@@ -192,7 +197,7 @@ class SampledMotion:
         )
 
     def _check_limits(self) -> None:
-        """Raise `InfeasibleMotion` if the present sample exceeds a limit.
+        """Raise `InfeasibleMotion` if the current sample exceeds a limit.
 
         This happens, for example, when a live goal is too fast for the arm.
         """

@@ -81,6 +81,7 @@ class MoveStep(MotionStep):
 
     @model_validator(mode="after")
     def _check_one_goal(self) -> MoveStep:
+        """Require either `position` or `joints`, and a `quaternion` only with `position`."""
         if (self.position is None) == (self.joints is None):
             raise ValueError("a move has either position or joints")
         if self.quaternion is not None and (self.position is None or not any(self.quaternion)):
@@ -107,6 +108,7 @@ class LineStep(MotionStep):
 
     @model_validator(mode="after")
     def _check_live_goal(self) -> LineStep:
+        """Require a body for a live goal, and a quaternion that is not all zero."""
         if self.live and self.body is None:
             raise ValueError("a live goal needs a body that it follows")
         if self.quaternion is not None and not any(self.quaternion):
@@ -157,7 +159,7 @@ class MotionProgram(Program):
     """steps, in the order of execution"""
 
     def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
-        """Yield key, value and reason of every entry that does not suit the arm or the scene."""
+        """Yield key, value and reason of every entry that does not match the arm or the scene."""
         if robot is None:
             return
         for k, step in enumerate(self.step):
@@ -194,7 +196,7 @@ class PlanningParams(Table):
 class RequestExecutor(Executor):
     """Reports the progress of the program and the error that ended it.
 
-    It obeys no operator, because the trajectory level does.
+    It takes no operator commands, because the trajectory level takes them.
     """
 
     below = Input(MotionStatus, "below.status")
@@ -261,7 +263,8 @@ class RequestPlanner(Planner):
     def wanted(self, tick: int) -> bool:
         """Return True if a step may be planned now.
 
-        Notes what the level below has taken and begun.
+        It also records which requests the level below has taken and begun, and schedules a request
+        that was lost to be sent again.
         """
         below = self.below.message
         if not self.below.has_message or below.error:
@@ -296,7 +299,7 @@ class RequestPlanner(Planner):
 
         Args:
             done: Newest request ended by the level below.
-            tick: Present tick; a cancel step has a delay.
+            tick: Current tick, for the delay of a cancel step.
         """
         sent = self._sent
         if sent >= len(self._steps) or sent - done >= self._max_open_requests:

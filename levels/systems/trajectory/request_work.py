@@ -54,11 +54,11 @@ class MotionTools(NamedTuple):
 class RequestWork:
     """Begins, blends and ends requests.
 
-    Interrupted motion continues from where the arm has come to rest.
+    An interrupted motion resumes from the position at which the arm has come to rest.
 
     Attributes:
-        goal: Goal of the tool leg under way or completed. None for a leg in joint space.
-        passed_s: Time that the request under way has stayed or gripped, s.
+        goal: Goal of the current or completed tool leg. None for a leg in joint space.
+        passed_s: Time for which the current STAY or GRIP request has run, s.
         grip: Opening, m, and force, N, of the last GRIP.
     """
 
@@ -76,37 +76,37 @@ class RequestWork:
         """Continue a request after a restart of the level.
 
         Args:
-            passed_s: Time that the request had stayed or gripped, s.
-            progress: Fraction of its time that had passed.
+            passed_s: Time for which a STAY or GRIP request had run, s.
+            progress: Fraction of the request's time that had passed.
         """
         self.passed_s = passed_s
         self._remaining_fraction = 1.0 - progress
 
     def interrupt_motion(self) -> None:
-        """Note that the arm has been brought to rest away from the goal."""
+        """Record that the motion was interrupted, and what fraction of it remains."""
         if not self._is_interrupted:
             self._remaining_fraction = 1.0 - self.progress
         self._is_interrupted = True
         self.goal = None
 
     def cancel_motion(self) -> None:
-        """Ramp to rest. The CANCEL is then the only request under way."""
+        """Ramp to rest without resuming the motion later."""
         self._remaining_fraction = 1.0
         self._is_interrupted = False
         self.goal = None
         self.motion.ramp_to_rest()
 
     def end_at_guard(self) -> None:
-        """End the request under way as GUARDED.
+        """End the current request as GUARDED.
 
-        The arm ramps to rest, from where the next request continues.
+        The arm ramps to rest, and the next request starts from there.
         """
         self.agenda.end_first(RequestEnd.GUARDED)
         self.agenda.goal = None  # the arm has not reached it
         self.cancel_motion()
 
     def step(self, time_s: float, hold: bool) -> None:
-        """Advance to the sample at `time_s`. With `hold`, ramp to rest and begin nothing."""
+        """Advance to the sample at `time_s`. With `hold`, ramp to rest and begin no request."""
         motion = self.motion
         agenda = self.agenda
         try:
@@ -129,7 +129,7 @@ class RequestWork:
 
     @property
     def progress(self) -> float:
-        """Fraction of the time of the request under way that has passed, 0 to 1."""
+        """Fraction of the current request's time that has passed, 0 to 1."""
         current = self.agenda.current
         leg = self.motion.leg
         if current is None:
@@ -142,7 +142,7 @@ class RequestWork:
         return 1.0 - self._remaining_fraction * (1.0 - min(self.motion.leg_s / leg.law.ends_s, 1.0))
 
     def _fail_request(self, outcome: RequestEnd, reason: str, code: Error) -> None:
-        """End the request under way with an error and cancel the others.
+        """End the current request with an error and cancel the others.
 
         Args:
             outcome: REFUSED or FAILED.
@@ -170,7 +170,7 @@ class RequestWork:
             self._begin_leg(goal, 0.0, segment_s)
 
     def _is_done(self, current: MotionRequest) -> bool:
-        """Return True if a request has ended. Counts the time that it stays or grips."""
+        """Return True if the current request is done. Advances the time of STAY and GRIP."""
         if not self.motion.is_settled:
             return False
         if current.kind in MOVING_KINDS or current.kind == MotionKind.CANCEL:
@@ -179,7 +179,7 @@ class RequestWork:
         return self.passed_s >= self._compute_duration_s(current)
 
     def _compute_duration_s(self, request: MotionRequest) -> float:
-        """Return the time that a request without motion lasts, s."""
+        """Return the duration, in s, of a request that does not move the arm."""
         if request.kind == MotionKind.GRIP and not request.segment:
             return self._tools.params.gripping
         return request.segment
@@ -187,7 +187,7 @@ class RequestWork:
     def _begin_when_due(self, request: MotionRequest) -> None:
         """Begin a request if it is due.
 
-        It is due when no other is under way, or when the leg under way must be blended into it.
+        It is due when no other request is active, or when the current leg must be blended into it.
         """
         current = self.agenda.current
         leg = self.motion.leg
@@ -221,11 +221,15 @@ class RequestWork:
         return remaining_s if remaining_s < half_s + self._tools.period_s else None
 
     def _can_begin(self, request: MotionRequest) -> bool:
-        """Return False while a goal in the frame of a body awaits the world model."""
+        """Return False if the goal is in the frame of a body and no world model has arrived."""
         return request.kind not in MOVING_KINDS or request.body < 0 or self._tools.sight.has_model
 
     def _begin_next_request(self, half_s: float) -> None:
-        """Begin the next request, blended over twice `half_s`, s. An impossible one is refused."""
+        """Begin the next request, or refuse it if it cannot be executed.
+
+        Args:
+            half_s: Half the duration of the blend into the request, s. 0 to start from rest.
+        """
         request = self.agenda.begin_next()
         self.passed_s = 0.0
         self._remaining_fraction = 1.0
@@ -238,7 +242,7 @@ class RequestWork:
             self._start_at_rest(request)
 
     def _find_request_error(self, request: MotionRequest) -> str:
-        """Return why a request cannot be carried out. Empty if it may be possible."""
+        """Return why a request cannot be executed, or an empty string if it may be possible."""
         tools = self._tools
         return find_request_error(request, tools.limits.position) or tools.sight.find_body_error(
             request.body
@@ -250,11 +254,11 @@ class RequestWork:
             self.grip = request.opening, request.force
 
     def _begin_leg(self, request: MotionRequest, half_s: float, segment_s: float) -> None:
-        """Begin the leg to the goal of a request. If none can be made, the request is refused.
+        """Begin the leg to the goal of a request, or refuse the request if no leg is possible.
 
         Args:
             request: Request of kind JOINTS or POSE.
-            half_s: Half the time in which the motion so far slows down, s.
+            half_s: Half the time in which the previous motion slows down, s.
             segment_s: Time of the segment, s. 0 to choose it from the limits.
         """
         tools = self._tools

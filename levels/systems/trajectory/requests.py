@@ -70,17 +70,17 @@ def find_request_error(request: MotionRequest, ranges: Array) -> str:
 
 
 class Agenda:
-    """The requests that were taken and have not ended, and how the last ones ended.
+    """Accepted requests that have not ended, and the outcomes of the last ones that have.
 
     After an error all requests are dropped, and new ones are refused until a CANCEL. While a
-    request of the sequence is missing, later ones are ignored. The sender sees in `taken` where to
-    continue, or sends a CANCEL.
+    request of the sequence is missing, later ones are ignored. The sender continues after
+    `taken`, or sends a CANCEL.
 
     Attributes:
         held: Requests that have not ended, oldest first.
-        goal: Request at whose goal the arm is, or to which it moves. None if there is none.
+        goal: Request whose goal the arm has reached or is moving to. None if there is none.
         taken: Newest request taken.
-        rests_on: Newest operator command on which a request rests.
+        rests_on: Serial of the newest operator command on which a request depends.
         error: Error that stopped the requests.
         reason: Reason for the error.
     """
@@ -99,7 +99,7 @@ class Agenda:
 
     @property
     def current(self) -> MotionRequest | None:
-        """Request under way. None if there is none."""
+        """The request that has begun. None if there is none."""
         return self.held[0] if self.has_begun else None
 
     @property
@@ -153,7 +153,7 @@ class Agenda:
         return False
 
     def begin_next(self) -> MotionRequest:
-        """Begin the next request. The one under way ends DONE."""
+        """Begin the next request and return it. The current request, if any, ends DONE."""
         if self.has_begun:
             self.end_first(RequestEnd.DONE)
         self.has_begun = True
@@ -163,12 +163,12 @@ class Agenda:
         return request
 
     def end_first(self, outcome: RequestEnd) -> None:
-        """End the first request with the given outcome."""
+        """End the oldest request with the given outcome."""
         self._record_end(self.held.pop(0), outcome)
         self.has_begun = False
 
     def fail_first(self, outcome: RequestEnd, code: Error, reason: str) -> None:
-        """Fail the first request, cancel the others, and refuse new ones from now on.
+        """Fail the oldest request, cancel the others, and refuse new ones from now on.
 
         Args:
             outcome: REFUSED or FAILED.
@@ -195,7 +195,7 @@ class Agenda:
         self._ended.appendleft((request.id, outcome))
 
     def fill_status(self, status: MotionStatus) -> None:
-        """Fill the ids, outcomes and error of a `MotionStatus`."""
+        """Fill the ids and outcomes of a `MotionStatus`."""
         current = self.current
         status.taken = self.taken
         status.current = current.id if current is not None else 0

@@ -177,7 +177,7 @@ def text_of(events: Sequence[Event], kind: str) -> str:
     [
         (
             ("prlimit", "--nofile=8"),
-            r"Too many open files: at most 8 open files are permitted \(ulimit -n\)",
+            r"Too many open files: the limit is 8 open files \(ulimit -n\)",
         ),
         (
             ("prlimit", "--nofile=20"),
@@ -186,7 +186,7 @@ def text_of(events: Sequence[Event], kind: str) -> str:
         (
             ("prlimit", "--nproc=2", *as_user(TWO_MAY)),
             (
-                r"board 'wave' cannot be forked: Resource .* at most 2 processes are permitted .*;"
+                r"board 'wave' cannot be forked: Resource .* the limit is 2 processes .*;"
                 r" the rack needs 6"
             ),
         ),

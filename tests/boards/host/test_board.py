@@ -202,7 +202,7 @@ def test_a_board_has_one_process_and_an_external_one_may_change(config: MakeConf
         assert (program.sum.read().message.sum, program.numbers.sent) == (5.0, 2)
         with pytest.raises(AttributeError, match="no field 'valu'; did you mean 'value'"):
             program.numbers.message.valu = 1  # type: ignore[attr-defined]
-        second.declare_done()
+        second.finish()
         assert end_of(rack).cause == "task done"
         assert second.is_over
         assert not second.wait(60.0)

@@ -100,17 +100,17 @@ def test_the_crates_memory_is_read_by_bus_addresses(make_site: MakeSite, open_bu
     bus = open_bus(site)
     assert bus.tasks == ["bridge", "adder"]
     site.segment.get_block("adder")[Block.CYCLES] = 77
-    address = bus.find_address("adder")
-    assert bus.read_words(address + WORD * Block.CYCLES) == [77]
-    assert bus.read_words(address, 3) == list(site.segment.get_block("adder")[:3])
-    assert bus.find_address("adder.status") == site.segment.map.mailboxes["adder.status"]
+    address = bus.address("adder")
+    assert bus.words(address + WORD * Block.CYCLES) == [77]
+    assert bus.words(address, 3) == list(site.segment.get_block("adder")[:3])
+    assert bus.address("adder.status") == site.segment.map.mailboxes["adder.status"]
     size = site.segment.map.size
-    assert len(bus.read_words(size - WORD)) == 1
+    assert len(bus.words(size - WORD)) == 1
     for wrong, count in ((size - WORD, 2), (size, 1), (-WORD, 1), (4, 1), (0, 0)):
         with pytest.raises(ValueError, match="the bus has 0 to"):
-            bus.read_words(wrong, count)
+            bus.words(wrong, count)
     with pytest.raises(LookupError, match="nothing on the bus is called 'x'; known: "):
-        bus.find_address("x")
+        bus.address("x")
 
 
 def test_in_real_time_a_program_waits_for_a_message_or_its_timeout(
@@ -129,7 +129,7 @@ def test_in_real_time_a_program_waits_for_a_message_or_its_timeout(
     with in_thread(semaphore.release):
         assert bus.wait(BOUND_S)
     bus.await_turn()
-    bus.declare_done()
+    bus.finish()
     assert site.host[Block.STATE] == TaskState.ENDED
     assert get_done_semaphore(site.segment, "program").value == 0
 
@@ -162,7 +162,7 @@ def test_in_lockstep_a_programs_time_is_the_tick_of_its_turn(
             site.host[Block.RELEASED] = 12
             wake.release()
     assert seen == [(True, 12)] * 3
-    bus.declare_done()
+    bus.finish()
     assert (done.value, site.host[Block.DONE]) == (1, 12)
 
 

@@ -25,7 +25,7 @@ class StubCopier:
     def __init__(self) -> None:
         self.ticks: list[int] = []
 
-    def copy(self, tick: int, memory: int) -> None:
+    def fork_copy(self, tick: int, memory: int) -> None:
         """Take time."""
         compute_until(process_time_ns() + COST_NS)
         self.ticks.append(tick)

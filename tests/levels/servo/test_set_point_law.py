@@ -158,7 +158,7 @@ def test_set_points_are_for_the_end_of_the_cycle(tmp_path: Path, interface: Inte
     [
         ("rccl", [], 'board.arm.executor = "ArmExecutor": it gives torques'),
         ("penn", [], 'board.arm.executor = "ForceArmExecutor": it gives torques'),
-        ("hic", [], 'robot.interface = "position": tendons of a hand take tensions'),
+        ("hic", [], 'robot.interface = "position": tendons of a hand need tensions'),
         (
             "k1607",
             ["board.servo.params.arm='tests.levels.arm.test_own_arm:IdealArm'"],

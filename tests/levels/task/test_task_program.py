@@ -47,7 +47,7 @@ def test_actions_of_every_kind_are_read() -> None:
 @pytest.mark.parametrize(
     ("action", "line"),
     [
-        ({"do": "fly"}, 'task.action[0].do = "fly": permitted: transfer, goto, home'),
+        ({"do": "fly"}, 'task.action[0].do = "fly": valid values: transfer, goto, home'),
         ({"object": "peg"}, "task.action[0].do: missing; it selects the kind of table"),
         (
             {"do": "transfer", "object": "cup", "to": [0.5, 0.3, 0.5]},
@@ -55,7 +55,7 @@ def test_actions_of_every_kind_are_read() -> None:
         ),
         (
             {"do": "transfer", "object": "peg"},
-            "task.action[0].to: missing; final position of the object's origin, m",
+            "task.action[0].to: missing; final position of the object's origin [m]",
         ),
         (
             {"do": "home", "by": 0},

@@ -19,9 +19,16 @@ BOARD_PRIORITY = 80
 
 
 class Chain(NamedTuple):
-    """A rack of `boards` boards at the clock's `rate_hz`.
+    """A rack whose boards pass a message along, one cycle at every tick of the clock.
 
-    The clock is on the first core. The boards begin at the last core.
+    The clock runs on the first core. The boards are distributed over the cores from the last one
+    on.
+
+    Attributes:
+        boards: Number of boards.
+        rate_hz: Rate of the clock, Hz.
+        mode: Clock mode.
+        wake: How tasks wait for their cycles.
     """
 
     boards: int

@@ -88,7 +88,7 @@ class CycleCosts(Comparison):
         return {**super().to_document(), "parts_unit": "us", "parts": parts}
 
     def format_blocks(self) -> Blocks:
-        """Yield both tables for the terminal."""
+        """Yield the table of parts and the table of whole cycles for the terminal."""
         yield "Parts of a board's cycle, processor time, us, median"
         yield TextTable(
             [
@@ -114,7 +114,7 @@ def measure_cycles(
         seconds: Simulated time of each run, s.
         rounds: Number of runs of each rack.
         progress: Shows each run.
-        share: Whether to run even on cores that another rack's real-time boards hold.
+        share: Whether to run even on cores that another rack's real-time boards use.
 
     Returns:
         Costs of all cycles.
@@ -203,9 +203,9 @@ def compute_costs(
 
 
 def compute_parts(cycles: Cycles) -> dict[str, np.ndarray]:
-    """Return the processor time of each part of the judged cycles, us, shape (n,).
+    """Return the processor time of each part of the judged cycles, (n,), in us.
 
-    The first cycle is left out.
+    Cycles of the start-up and stalled cycles are not judged. The first cycle is left out.
     """
     rows = cycles.rows
     rest_ns = (rows["processor_ns"] - cycles.used_ns)[1:]

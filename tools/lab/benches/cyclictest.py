@@ -2,7 +2,7 @@
 
 The program sleeps until the points of a time grid. No board can wake up earlier, so its lateness is
 the reference for the lateness of every board. It also shows which deadlines the machine itself
-breaks: under a hypervisor a core can be unavailable for milliseconds.
+misses: under a hypervisor a core can be unavailable for milliseconds.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class WakeGrid(NamedTuple):
 
 
 def find_missing_cyclictest() -> tuple[Absent, ...]:
-    """Report why `cyclictest` cannot run. Empty if it can."""
+    """Return `cyclictest` as `Absent` if it cannot run here, or an empty tuple if it can."""
     if shutil.which(CYCLICTEST) is None:
         return (Absent(CYCLICTEST, f"no program '{CYCLICTEST}'", "apt-get install rt-tests"),)
     if not is_fifo_permitted():
@@ -61,7 +61,7 @@ def is_fifo_permitted() -> bool:
 
 
 def run_cyclictest(grid: WakeGrid) -> np.ndarray:
-    """Run `cyclictest` and return the lateness of every wake, us, shape (n,), smallest first.
+    """Run `cyclictest` and return the lateness of every wake-up, (n,), in us, ascending.
 
     Idle cores are left as they are (`--laptop`), as a rack leaves them by default.
 

@@ -106,7 +106,7 @@ class Absent:
 
 
 def find_missing_package(who: str, module: str) -> tuple[Absent, ...]:
-    """Report a contestant whose Python module cannot be imported. Empty if it can be."""
+    """Return a contestant as `Absent` if its module cannot be imported, else an empty tuple."""
     try:
         import_module(module)
     except ImportError as error:
@@ -123,7 +123,7 @@ def run_program(
 ) -> subprocess.CompletedProcess[str]:
     """Run a program to its end.
 
-    The program is ended, gently if possible, if it takes too long or this process is interrupted.
+    If it takes too long or this process is interrupted, it is terminated, and killed if necessary.
 
     Args:
         label: Name of the program in error messages.
@@ -162,7 +162,7 @@ def run_program(
 def stay_on_core(core: int, priority: int = 0) -> Iterator[None]:
     """Keep the calling process on a core while the context lasts.
 
-    It also takes the real-time priority if this is permitted.
+    The process also gets the real-time priority if this is permitted.
     """
     cores = os.sched_getaffinity(0)
     try:
@@ -206,7 +206,7 @@ class Comparison:
     conclusion: str = ""
 
     def find_sample(self, case: str, who: str) -> Sample | None:
-        """Return one sample. None if the contestant was not measured in this case."""
+        """Return one sample, or None if the contestant was not measured in this case."""
         return self._samples.get((case, who))
 
     def compute_ratio(self, sample: Sample, figure: str = "median") -> float | None:
@@ -226,6 +226,7 @@ class Comparison:
 
     @cached_property
     def _samples(self) -> dict[tuple[str, str], Sample]:
+        """Samples by case and contestant."""
         return {(sample.case, sample.who): sample for sample in self.samples}
 
     def to_document(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Times for which a user waits: launches, short commands, and reactions to a killed board."""
+"""Times that a user waits: launches, short commands, and reactions to a killed board."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def measure_launches(
         rounds: Rounds of launches and commands.
         kills: Kills of the board that drives the arm.
         against: Another checkout, launched alternately. None if there is none.
-        share: Whether to run racks even on cores that another one holds.
+        share: Whether to run racks even on cores that another one uses.
         progress: Shows both parts.
 
     Raises:
@@ -104,13 +104,13 @@ def _measure_commands(
 
 
 def measure_launch_s(rack: RackCommand, config: str, folder: Path, share: bool) -> float:
-    """Return the time from the start of `rack run` to the first cycle of the fastest level, s.
+    """Return the time, in s, from the start of `rack run` to the fastest level's first cycle.
 
     Args:
         rack: Command to launch with.
         config: Config of the rack, by name or path.
         folder: Folder for temporary files.
-        share: Whether to run even on cores that another rack holds.
+        share: Whether to run even on cores that another rack uses.
     """
     with tempfile.TemporaryDirectory(dir=folder) as run_folder:
         start_ns = time.monotonic_ns()
@@ -119,13 +119,13 @@ def measure_launch_s(rack: RackCommand, config: str, folder: Path, share: bool) 
 
 
 def make_brief_run(rack: RackCommand, config: str, out: Path, share: bool) -> Path:
-    """Make a run of which only the launch is used, and return its folder.
+    """Record a short run of which only the launch is used, and return its folder.
 
     Args:
         rack: Command to run.
         config: Config of the rack, by name or path.
         out: Folder of the run.
-        share: Whether to run even on cores that another rack holds.
+        share: Whether to run even on cores that another rack uses.
     """
     options = ["--set", f"name=bench-run-{os.getpid()}", "--seconds", f"{RUN_S}", "--json"]
     # Missed cycles must not fail the run. Earlier checkouts do not have this key.
@@ -141,7 +141,7 @@ def find_fastest_board(config: RackConfig) -> str:
 
 
 def find_first_cycle_ns(run: Path, task: str) -> int:
-    """Return the CLOCK_MONOTONIC time at which the first recorded cycle of a task started, ns.
+    """Return when the first recorded cycle of a task started, in ns of CLOCK_MONOTONIC.
 
     The file is read directly, because another checkout may write other columns.
 
@@ -156,25 +156,25 @@ def find_first_cycle_ns(run: Path, task: str) -> int:
 
 
 def _measure_command_s(rack: RackCommand, arguments: tuple[object, ...]) -> float:
-    """Return the time that a command takes, s."""
+    """Return the time, in s, that a command takes."""
     start_s = time.monotonic()
     rack.run(*arguments, bound_s=COMMAND_TIMEOUT_S)
     return time.monotonic() - start_s
 
 
 def measure_kills(name: str, count: int, share: bool = True) -> list[Sample]:
-    """Kill the board that drives the arm repeatedly, at random phases of its cycle.
+    """Repeatedly kill the board that drives the arm, at random phases of its cycle.
 
     Args:
         name: Config of the rack, by name or path.
         count: Number of kills.
-        share: Whether to run even on cores that another rack holds.
+        share: Whether to run even on cores that another rack uses.
 
     Returns:
         Times to detection and to engaged brakes, ms.
 
     Raises:
-        Failure: If the rack has no arm, or no kill had a reaction.
+        Failure: If the rack has no arm, or did not react to any kill.
     """
     config = load(name, [f"name=bench-kill-{os.getpid()}", "supervision.restarts=10000"])
     if config.robot is None:

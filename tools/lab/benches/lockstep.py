@@ -45,7 +45,7 @@ class BareRun:
         processor_s: Processor time of all ticks, s.
         serials: Serial of the newest message of each mailbox that was visible before the end.
             Mailboxes without a message are left out.
-        last: The message with that serial.
+        last: Newest visible message of each of these mailboxes.
     """
 
     ticks: int
@@ -89,7 +89,7 @@ def measure_lockstep(
 
 
 def build_comparison(samples: Sequence[Sample], baseline: str) -> Comparison:
-    """Compare samples with one contestant, and conclude with simulated seconds per second."""
+    """Compare samples with one contestant. The conclusion gives simulated seconds per second."""
     speeds = [f"{one.case} {format_value(1e3 / one.median)} ({one.who})" for one in samples]
     return Comparison(
         name="lockstep",
@@ -101,7 +101,7 @@ def build_comparison(samples: Sequence[Sample], baseline: str) -> Comparison:
 
 
 def _run_rack(command: RackCommand, rack: str, options: Sequence[object]) -> float:
-    """Run a rack by a command, and return the time of a simulated second, ms."""
+    """Run a rack with a command, and return the time per simulated second in ms."""
     result = json.loads(
         command.run(
             "run", rack, "--lockstep", "--no-record", "--json", *options, bound_s=RUN_TIMEOUT_S
@@ -111,12 +111,12 @@ def _run_rack(command: RackCommand, rack: str, options: Sequence[object]) -> flo
 
 
 def _run_bare(rack: str, ticks: int) -> float:
-    """Run the levels without a rack, and return the time of a simulated second, ms."""
+    """Run the levels without a rack, and return the time per simulated second in ms."""
     return _compute_ms_per_second(rack, _run_bare_apart(rack, ticks).processor_s, ticks)
 
 
 def _compute_ms_per_second(rack: str, run_s: float, ticks: int) -> float:
-    """Convert the time of a run, s, to the time of a simulated second, ms."""
+    """Convert the time of a run, in s, to the time per simulated second, in ms."""
     return run_s / ticks * 1e12 / load(rack).clock_ns
 
 

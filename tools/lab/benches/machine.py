@@ -3,7 +3,7 @@
 Only the fastest board of the rack changes its rate, and the clock follows it. Every other board
 keeps the cycle time that is closest to its normal one. `cyclictest` sleeps to the same grid on the
 same core in the same minutes. If the machine wakes `cyclictest` a cycle late, for example because a
-hypervisor takes the core away, it breaks deadlines that no program could keep.
+hypervisor takes the core away, deadlines are missed that no program could keep.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ AWAKE_SUFFIX = ", idle cores awake"
 
 
 def change_rate(config: RackConfig, rate_hz: float) -> RackConfig:
-    """Return a rack whose fastest board cycles at `rate_hz`, at every tick.
+    """Return a config whose fastest board runs at `rate_hz`, once per tick.
 
     The other boards keep their cycle times, and plans of the fastest board keep their time limit.
 
@@ -101,6 +101,9 @@ def change_rate(config: RackConfig, rate_hz: float) -> RackConfig:
 class RateFigures:
     """Results of all runs at one rate.
 
+    The rate is held if no run failed, and if neither the late wakes of the machine nor the further
+    missed cycles of the rack exceed `MAX_LATE_SHARE`.
+
     Attributes:
         rate_hz: The rate.
         cycles: Number of cycles of the rack's fastest board that were due.
@@ -117,7 +120,7 @@ class RateFigures:
 
     @property
     def reason(self) -> str:
-        """Reason for which the rate is not held. Empty if it is held."""
+        """Why the rate is not held. Empty if it is held."""
         late = self.late or 0.0
         if self.failure or late > MAX_LATE_SHARE:
             return self.failure or "the machine is late"
@@ -145,10 +148,7 @@ class MachineComparison(Comparison):
 
     @property
     def highest_hz(self) -> float | None:
-        """Highest rate that is held together with all lower ones.
-
-        None if the lowest is not held.
-        """
+        """Highest rate that is held together with all lower ones, or None if the lowest is not."""
         held_rates = takewhile(lambda rate: not rate.reason, self.rates)
         return max((rate.rate_hz for rate in held_rates), default=None)
 
@@ -159,7 +159,7 @@ class MachineComparison(Comparison):
 
     @property
     def verdict_lines(self) -> Iterator[str]:
-        """Lines that tell up to which rate the machine is fit, and why not beyond."""
+        """Lines with the highest rate for which the machine is fit, and the result of each rate."""
         highest = self.highest_hz
         if not self.is_fifo:
             yield "not fit for real time: SCHED_FIFO is refused (see `ulimit -r`)"
@@ -323,9 +323,10 @@ def _run_cyclictest(grid: WakeGrid) -> RackRun:
 def compare_idle_cores(samples: Sequence[Sample], who: str) -> str:
     """Return which value of `clock.idle_cores` suits this machine, with the figures.
 
-    The setting with fewer lost wake-ups wins if the counts differ by more than two standard
-    deviations of chance. Otherwise the better worst wake-up decides, because it shows first when a
-    host takes the core away.
+    A wake-up is lost if it is late by a period or more. The setting with fewer lost wake-ups wins
+    if the difference exceeds two standard deviations of chance. Otherwise the setting with the
+    smaller worst lateness wins, because the worst lateness is the first sign that a host takes the
+    core away.
 
     Args:
         samples: Lateness of all contestants.

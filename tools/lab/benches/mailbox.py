@@ -1,4 +1,4 @@
-"""Time to write and read a message: our protocols and other transports on the same machine.
+"""Time to write and read a message, for the protocols of rack and for other transports.
 
 In each exchange a message gets a number and is sent, and every reader receives it into local
 fields. Filling and reading the fields costs the same for every contestant and is not measured. All
@@ -67,7 +67,7 @@ class Case(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the case for people."""
+        """Human-readable name of the case."""
         return f"{self.size}, {format_count(self.readers, 'reader')}"
 
     @property
@@ -140,7 +140,7 @@ def _measure_case(case: Case, peers: Sequence[Peer], rounds: int) -> list[Sample
 
 
 def build_exchange(name: str, transport: Transport, lengths: dict[str, int]) -> Callable[[], float]:
-    """Build a function that makes many exchanges and returns the time of one, us.
+    """Build a function that makes many exchanges and returns the mean time of one, in us.
 
     Args:
         name: Name of the contestant.
@@ -156,6 +156,7 @@ def build_exchange(name: str, transport: Transport, lengths: dict[str, int]) -> 
     ticks = count(1)
 
     def measure_us(calls: int) -> float:
+        """Return the mean time, in us, of `calls` exchanges."""
         start_ns = time.perf_counter_ns()
         for tick in islice(ticks, calls):
             message.id = tick
@@ -176,7 +177,7 @@ def build_exchange(name: str, transport: Transport, lengths: dict[str, int]) -> 
 
 @contextmanager
 def _open_mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
-    """Open a mailbox of ours in a separate segment."""
+    """Open a mailbox of the backplane in a separate segment."""
     rack = f"bench-{os.getpid()}-{protocol}"
     layout = _build_layout(rack, protocol, case)
     with ExitStack() as names:
@@ -218,6 +219,7 @@ def _build_reader(segment: Segment, box: MailboxSpec, task: str) -> Callable[[in
 
 
 def _build_layout(rack: str, protocol: Protocol, case: Case) -> Layout:
+    """Return the layout of a segment with one mailbox, its writer and its readers."""
     readers = tuple(f"reader{number}" for number in range(case.readers))
     tasks = tuple(
         TaskSpec(n, n, "executor", 2 + i, 0, 0, 1, 1, 4) for i, n in enumerate(("writer", *readers))

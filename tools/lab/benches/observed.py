@@ -21,7 +21,7 @@ The peers are not measured at their start either.
 """
 
 
-class RecordedRun(NamedTuple):
+class ObservedRun(NamedTuple):
     """Result of a run, and its recording."""
 
     result: RunResult
@@ -44,21 +44,21 @@ def record_rack(
     seconds: float | None,
     folder: Path,
     share: bool = True,
-) -> RecordedRun:
+) -> ObservedRun:
     """Run a rack as `run_rack` does, without display, and record it.
 
     Args:
         config: Rack to run.
         seconds: Time of the run, s. None to run until a board ends it.
         folder: Folder of the run.
-        share: Whether to run even on cores that another rack holds.
+        share: Whether to run even on cores that another rack uses.
     """
     result = run_rack(config, seconds, folder, Display(), share=share)
-    return RecordedRun(result, Recording(folder))
+    return ObservedRun(result, Recording(folder))
 
 
 def remove_run_end(config: RackConfig) -> RackConfig:
-    """Return a rack in which no board ends the run."""
+    """Return a config in which no board ends the run."""
     boards = {
         name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()
     }
@@ -66,12 +66,12 @@ def remove_run_end(config: RackConfig) -> RackConfig:
 
 
 def add_commands(config: RackConfig, commands: Sequence[CommandConfig]) -> RackConfig:
-    """Return a rack with additional operator commands, which follow the existing ones."""
+    """Return a config with additional operator commands, which follow the existing ones."""
     return config.model_copy(update={"command": (*config.command, *commands)})
 
 
 def compute_lateness_us(recording: Recording, task: str) -> np.ndarray:
-    """Return how late each cycle started, us, shape (n,), without the start of the run.
+    """Return the lateness of each cycle, (n,), in us, without the start of the run.
 
     After skipped releases the lateness counts from the first skipped one, as for any program that
     oversleeps grid points.

@@ -23,8 +23,8 @@ SERVO_BOARD = "servo"
 def replay_physics(folder: Path, ticks: int) -> list[float]:
     """Replay the longest stretch of a run in which motors moved the arm and no cycle was missed.
 
-    Call it by `run_in_board_environment`, because only that environment reproduces the physics of
-    boards.
+    Call it through `run_in_board_environment`, because only that environment reproduces the
+    physics of boards.
 
     Args:
         folder: Folder of the run.

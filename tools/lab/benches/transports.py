@@ -1,4 +1,4 @@
-"""Transports that bring a message from one task to others, for comparison with our mailboxes.
+"""Transports of messages between tasks, for comparison with the mailboxes of rack.
 
 All are used from Python in their fastest form. The sender fills numpy views of a local message and
 hands over its bytes, and every reader gets the bytes into its local message. Nothing listens on a
@@ -43,7 +43,7 @@ class Transport(NamedTuple):
 
 
 class Peer(NamedTuple):
-    """A contestant.
+    """A transport that is compared with the mailboxes of rack.
 
     Attributes:
         name: Name in tables.

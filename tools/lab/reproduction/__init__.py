@@ -1,1 +1,1 @@
-"""Reproduction of the paper: stored experiments, the claims that rest on them, and one page."""
+"""Reproduction of the paper: stored experiments, the claims that depend on them, and one page."""

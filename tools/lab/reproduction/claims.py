@@ -80,13 +80,13 @@ def _build_system_claim(
     judge: Callable[..., ClaimVerdict] = rules.judge_links,
     rack: str = "",
 ) -> PaperClaim:
-    """Build a claim on one of the paper's systems, judged by the messages between its sides.
+    """Build a claim on one of the paper's systems, judged by the messages between its parts.
 
     Args:
         name: Anchor of the claim.
         title: Heading.
         quote: Sentence of the paper.
-        rates_hz: Rate of each mailbox between the sides, Hz.
+        rates_hz: Rate of each mailbox between the parts, Hz.
         judge: Rule of the claim.
         rack: Rack that models the system. Empty if it has the name of the claim.
     """
@@ -542,7 +542,7 @@ SECTIONS = (
                 " force and motion server.",
                 {"coordinator.requests": 1, "bridge.requests": 1},
             ),
-            # The servo rack begins later. It and the network pass four messages of five.
+            # The servo rack starts later. It and the network pass on four of five messages.
             _build_system_claim(
                 "brown",
                 "Brown: servo systems on a network",

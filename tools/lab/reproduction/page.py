@@ -141,7 +141,7 @@ LABELS = {
     Ruling.FAILS: "✗ does not hold here",
     Ruling.UNMADE: "… not run yet",
 }
-"""Sign and name of each ruling."""
+"""Symbol and label of each ruling."""
 
 
 def render_markdown(page: Page) -> str:
@@ -155,6 +155,7 @@ def render_html(markdown: str) -> str:
 
 
 def _render_template(template: str, **values: Any) -> str:
+    """Render a template of this folder."""
     loader = FileSystemLoader(Path(__file__).parent)
     environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return environment.get_template(template).render(values)

@@ -24,7 +24,7 @@ def predict_equation(number: str, config: str, settings: tuple[str, ...]) -> tup
 
 
 def _predict_for_config(number: str, config: str, settings: tuple[str, ...]) -> Evidence:
-    """Return both sides of an equation by the budgets of a config, or why it is refused."""
+    """Return both sides of an equation from the budgets of a config, or why it is refused."""
     source = " ".join(("rack check", config, *(f"--set {setting}" for setting in settings)))
     try:
         rack = load(config, settings)
@@ -42,7 +42,7 @@ def predict_figure(figure: FigureRack) -> tuple[Evidence, ...]:
 
 
 def predict_sweep() -> tuple[Evidence, ...]:
-    """Return the paper's statements on figure 2's planner for every permitted X."""
+    """Return checks of the paper's statements on figure 2's planner for every permitted X."""
     checks = (check for process_ms in PAPER_X_MS for check in check_planning(process_ms))
     return (Evidence(FIG2.config, tuple(checks)),)
 

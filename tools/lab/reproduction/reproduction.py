@@ -1,4 +1,4 @@
-"""The whole reproduction: select and make the missing experiments, and write the page."""
+"""The whole reproduction: select and run the missing experiments, and write the page."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def reproduce_paper(
     progress: Progress,
     again: bool = False,
 ) -> Page:
-    """Make the missing experiments of some sections, and write the page of all sections.
+    """Run the missing experiments of some sections, and write the page of all sections.
 
     Args:
-        wanted: Sections whose experiments are made.
+        wanted: Sections whose experiments are run.
         workshop: Folder and settings for the experiments.
         progress: Shows each experiment.
         again: Whether finished experiments of these sections are repeated.

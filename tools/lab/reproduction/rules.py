@@ -106,7 +106,7 @@ def judge_speedup(on_one: FigureRun, on_two: FigureRun) -> ClaimVerdict:
 
 
 def judge_growth(chains: Chains) -> ClaimVerdict:
-    """Count missed cycles after boards were added, which must not burden the others."""
+    """Count the missed cycles of a chain of boards after more boards were added."""
     grown = chains.grown
     on_time = compare_value("messages_on_time", grown.took.get(grown.boards, 0), ">=", 1)
     return rule_on_strays("cycles_missed", grown.missed, grown.due, on_time)
@@ -124,7 +124,7 @@ def judge_pipeline(chains: Chains) -> ClaimVerdict:
     early = sum(count for took, count in realtime_counts.items() if took < LEVELS)
     late = arrived - early - realtime_counts.get(LEVELS, 0)
     lockstep_off = sent - lockstep_counts.get(LEVELS, 0)
-    # Each level may miss a stray share of its cycles.
+    # Each level may miss a small share of its cycles.
     share = compare_value(
         "realtime_messages_late_share", late / max(arrived, 1), "<=", LEVELS * MAX_STRAY_SHARE
     )
@@ -186,7 +186,7 @@ def judge_losses(*runs: LossesRun) -> ClaimVerdict:
 
 
 def judge_goto(runs: GotoRuns) -> ClaimVerdict:
-    """Compare the time at which A was done with the promised time, s."""
+    """Check that A is done by its deadline, and that too early a deadline moves nothing."""
     early, met = runs.early, runs.met
     begun = early.moved + (early.done_s is not None)
     done_s = inf if met.done_s is None else met.done_s
@@ -209,7 +209,7 @@ def check_equations(verdicts: Iterable[EquationVerdict]) -> list[Check]:
 def judge_equation(number: str, run: NasremRun) -> ClaimVerdict:
     """Compare both sides of an equation in the worst cycle of every subject.
 
-    Within bounds it holds in 99 of 100 cycles.
+    The claim holds within bounds if the equation holds in 99 of 100 cycles.
     """
     verdicts = [each for each in run.verdicts if each.measured.equation == number]
     return rule_on(
@@ -220,9 +220,10 @@ def judge_equation(number: str, run: NasremRun) -> ClaimVerdict:
 
 
 def judge_sum(run: NasremRun) -> ClaimVerdict:
-    """Compare the longest responses with the sum of equation 3.3, ms.
+    """Compare the longest responses with the sum of equation 3.3, in ms.
 
-    Within bounds the sum includes waits, and responses may be prolonged by missed cycles.
+    The claim holds within bounds if every response beyond the grid's bound was delayed by a missed
+    cycle.
     """
     assert run.response is not None, "it is a hierarchy"
     ways = run.response.ways
@@ -275,14 +276,14 @@ def judge_loose_coupling(normal: NetworkRun, slower: NetworkRun) -> ClaimVerdict
 
 
 def judge_waits(waits: Waits) -> ClaimVerdict:
-    """Compare the lateness of cycles after polling and after blocking, us."""
+    """Compare the lateness, in us, of cycles after polling and after blocking."""
     return rule_on(
         compare_value("polling_late_median_us", waits.polling_us, "<", waits.blocking_us)
     )
 
 
 def judge_update(run: FigureRun) -> ClaimVerdict:
-    """Count the plan updates that were preempted, of those in which the executor was released."""
+    """Count the preempted plan updates among those during which the executor was released."""
     return rule_on_strays("updates_preempted", run.preempted, run.met)
 
 
@@ -305,7 +306,7 @@ def _compare_late_share(run: FigureRun, sign: str, name: str = "late_share") -> 
 
 
 def _check_undisturbed(run: FigureRun) -> list[Check]:
-    """Return the condition under which a run can show a figure.
+    """Return the check that a run must pass to count as a run of a figure.
 
     An executor is late in almost all cycles or in almost none. Anything between is a disturbance.
     """
@@ -342,7 +343,7 @@ def check_planning(process_ms: float) -> tuple[Check, Check]:
     The planner runs at least `MIN_PLAN_MS` in each cycle, and plans within the permitted cycles.
 
     Args:
-        process_ms: X, ms.
+        process_ms: X, the processor time of the executor in a cycle, ms.
     """
     config = load(FIG2.config, build_settings(FIG2.config, process_ms))
     level = build_rack_timing(config, resolve_layout(config)).build_level(LEVEL)
@@ -358,7 +359,7 @@ def check_planning(process_ms: float) -> tuple[Check, Check]:
 
 
 def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
-    """Compare two sentences of the paper with each other, by computation and in two runs."""
+    """Check that two sentences of the paper contradict each other, by computation and in runs."""
     count = sum(bool(describe_unmet(check_planning(process_ms))) for process_ms in PAPER_X_MS)
     return rule_on(
         compare_value("contradicting_X", count, ">=", 1),
@@ -400,7 +401,7 @@ def judge_levels(run: NasremRun) -> ClaimVerdict:
 
 
 def judge_switch(run: SwitchRun) -> ClaimVerdict:
-    """Compare this machine's context switch with the paper's and with the config's, us."""
+    """Compare the context switch time with the paper's and with the config's, in us."""
     return rule_on(
         compare_value("switch_median_us", run.switch_us["p50"], "<=", PAPER_US),
         compare_value("switch_p99_us", run.switch_us["p99"], "<=", run.assumed_us),
@@ -424,6 +425,7 @@ def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
     ]
 
     def missed_share(group: str) -> float:
+        """Return the fraction of a group's cycles that were missed or skipped."""
         group_tasks = [task for name, task in tasks if name == group]
         bad = sum(task.missed + task.skipped for task in group_tasks)
         return bad / max(sum(task.cycles for task in group_tasks), 1)
@@ -438,9 +440,9 @@ def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
 
 
 def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimVerdict:
-    """Compare the responses in whole tasks of some systems with their bounds, ms.
+    """Compare the responses in whole tasks of some systems with their bounds, in ms.
 
-    Within bounds they may be prolonged by missed cycles.
+    The claim holds within bounds if every longer response was delayed by a missed cycle.
 
     Args:
         names: Names of the systems.
@@ -480,12 +482,12 @@ def judge_layers(names: Iterable[str]) -> ClaimVerdict:
 def judge_links(
     rates_hz: Mapping[str, int], run: TaskRun, ideal: Sequence[Check] = ()
 ) -> ClaimVerdict:
-    """Compare the messages between the sides of a system with the number that its rates demand.
+    """Compare the messages between the parts of a system with the number that the rates imply.
 
     Args:
-        rates_hz: Rate of each mailbox, Hz. 1 demands at least one message.
+        rates_hz: Rate of each mailbox, Hz. 1 requires at least one message.
         run: Whole task of the system.
-        ideal: Further comparisons for the claim to hold. Without them it holds within bounds.
+        ideal: Further comparisons. If one fails, the claim holds only within bounds.
     """
     min_counts = {
         box: (1.0 - MAX_STRAY_SHARE) * rate_hz * run.lasted_s if rate_hz > 1 else 1
@@ -514,7 +516,7 @@ def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
 def judge_predictable(run: ResponseRun) -> ClaimVerdict:
     """Compare responses with the predicted tick and with equations 3.2 and 3.3.
 
-    Within bounds the longest response that the grid permits replaces the sum of equation 3.3.
+    The claim holds within bounds if only the sum of equation 3.3 is exceeded.
     """
     realtime = run.realtime
     upper_checks, sum_checks = (

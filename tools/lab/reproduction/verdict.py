@@ -55,7 +55,7 @@ class Check:
 
 
 def compare_value(name: str, measured: float, sign: str, demanded: float) -> Check:
-    """Compare a measured value with a demanded one.
+    """Compare a measured value with a required one.
 
     Args:
         name: Name of the quantity, with its unit if it has one.
@@ -95,8 +95,8 @@ def rule_on(
     """Rule on a claim by comparisons alone.
 
     Args:
-        always: Comparisons that the claim demands on every machine.
-        ideal: Further comparisons, which disturbances of this machine may spoil.
+        always: Comparisons that the claim requires on every machine.
+        ideal: Further comparisons, which may fail because of disturbances of this machine.
         here: Comparisons that replace the ideal ones for the claim to hold within bounds.
         needs: Conditions without which a run cannot test the claim.
         holding: Ruling if the claim is met.
@@ -116,7 +116,9 @@ def rule_on(
 
 
 def rule_on_strays(name: str, bad: int, due: int, *needs: Check) -> ClaimVerdict:
-    """Rule on an event that must not happen. A stray share is tolerated within bounds.
+    """Rule on an event that must not happen.
+
+    The claim holds within bounds if the event happened in at most `MAX_STRAY_SHARE` of all cases.
 
     Args:
         name: Name of the event.

@@ -44,13 +44,13 @@ COUPLING_MEANINGS = {
 
 @dataclass(frozen=True)
 class Region:
-    """A region of implementation.
+    """A region of the figure: a range of cycle times and its kind of implementation.
 
     Attributes:
         name: Short name.
         to_s: Longest cycle, s.
         words: Name in the figure.
-        asks: Place that the figure demands for a planner.
+        asks: Place that the figure assigns to a planner.
     """
 
     name: str
@@ -115,12 +115,12 @@ def place_levels(config: RackConfig) -> list[PlacedLevel]:
 
 
 def merge_levels(levels: Sequence[PlacedLevel]) -> list[PlacedLevel]:
-    """Merge levels at the same place in the figure, because boards per joint need only one line."""
+    """Merge levels at the same place in the figure, such as boards of joints, into one line."""
     return [PlacedLevel(**row) for row in merge_rows(map(vars, levels), "level")]
 
 
 def find_region(cycle_s: float) -> Region:
-    """Return the region of a cycle."""
+    """Return the region that contains a cycle time."""
     return next(
         r for r in REGIONS if cycle_s < r.to_s or (cycle_s == r.to_s and r is not REGIONS[0])
     )
@@ -150,7 +150,7 @@ def build_document(config: RackConfig) -> Document:
 
 
 def format_duration(cycle_s: float) -> str:
-    """Format a cycle with a suitable unit."""
+    """Format a cycle time with a suitable unit."""
     if cycle_s >= 60.0:
         return f"{cycle_s / 60.0:g} min"
     return f"{cycle_s:g} s" if cycle_s >= 1.0 else f"{cycle_s * 1e3:g} ms"
@@ -173,6 +173,7 @@ def save_picture(config: RackConfig, stem: Path) -> list[Path]:
 
 
 def _draw_regions(axes: Axes) -> None:
+    """Draw the regions and the axis of cycle times."""
     starts = [SHORTEST_S, *(region.to_s for region in REGIONS[:-1])]
     ends = [*(region.to_s for region in REGIONS[:-1]), LONGEST_S]
     for region, start, end, colour in zip(REGIONS, starts, ends, REGION_COLOURS, strict=True):
@@ -190,6 +191,7 @@ def _draw_regions(axes: Axes) -> None:
 
 
 def _draw_levels(axes: Axes, levels: Sequence[PlacedLevel]) -> None:
+    """Draw a marker and a label for each level, and the entries of the legend."""
     for row, level in enumerate(levels):
         marker, face = MARKERS[level.coupling]
         (point,) = axes.plot(
@@ -211,7 +213,7 @@ def _draw_levels(axes: Axes, levels: Sequence[PlacedLevel]) -> None:
 
 
 def _format_remark(region: Region, coupling: str) -> str:
-    """Return a remark on a coupling in a region."""
+    """Return a comparison of a coupling with the one that the figure gives for a region."""
     if coupling == "none":
         return "no planner to couple"
     actual = f"coupled {coupling}ly"

@@ -24,7 +24,7 @@ NO_BUDGET = (
 
 @dataclass(frozen=True)
 class Subject:
-    """The config, or the run, of which a chart is made.
+    """The config or the run that a chart shows.
 
     Attributes:
         config: Config of the rack.
@@ -108,12 +108,12 @@ def build_gantt(
 
     Args:
         subject: Config or run.
-        options: Window for which the user asks.
+        options: Window that the user asked for.
         process_ns: Times of X in the schedule by board, ns, cycle by cycle.
         progress: Receives the fraction of a run that has been read.
 
     Raises:
-        Failure: If the subject has no chart, or not in this window.
+        Failure: If the subject has no chart, or none in this window.
     """
     name = subject.config.name
     run = subject.run

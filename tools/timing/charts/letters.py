@@ -64,7 +64,7 @@ def format_panel(panel: Panel, column_ns: int) -> Iterator[str]:
 
 
 def choose_column_ns(window_ns: int, shortest_ns: int | None) -> int:
-    """Return the time of a column, ns: 1, 2 or 5 times a power of ten.
+    """Return the width of a column, in ns: 1, 2 or 5 times a power of ten.
 
     If `shortest_ns` is given and long enough, a column is no longer than that.
     """
@@ -77,7 +77,7 @@ def choose_column_ns(window_ns: int, shortest_ns: int | None) -> int:
 
 
 def _format_lane(chart: Chart, lane: Lane, column_ns: int) -> str:
-    """Return the letters of a lane, in each column the unit function that took most of it."""
+    """Return a letter for each column of a lane: the unit function that took most of it."""
     columns = -(-(chart.end_ns - chart.start_ns) // column_ns)
     shares: list[Counter[str]] = [Counter() for _ in range(columns)]
     for span in (span for span in chart.spans if span.core == lane.core):
@@ -116,9 +116,9 @@ def format_label_row(labels: Iterable[tuple[int, str]]) -> str:
 def choose_frame_labels(
     panel: Panel, character_ns: int, prefix: str = "|"
 ) -> list[tuple[int, int]]:
-    """Return numbers and starts of the minor frames to be labelled, ns.
+    """Return the number and the start, in ns, of each minor frame to be labelled.
 
-    Their distance is sufficient for the labels.
+    These frames are far enough apart for their labels.
 
     Args:
         panel: Panel with minor frames.
@@ -133,7 +133,7 @@ def choose_frame_labels(
 
 
 def choose_label_times(panel: Panel, column_ns: int) -> range:
-    """Return the times to write along the axis, ns, with sufficient distance for the numbers."""
+    """Return the times, in ns, to write along the axis, far enough apart for the numbers."""
     chart = panel.chart
     columns = 0
     widest = LABEL_COLUMNS
@@ -146,7 +146,7 @@ def choose_label_times(panel: Panel, column_ns: int) -> range:
 
 
 def choose_label_step(panel: Panel, narrowest_ns: int) -> int:
-    """Return the time between two labels of the axis, ns.
+    """Return the time between two labels of the axis, in ns.
 
     It is the cycle of a lane, unless all cycles are too short or too long.
     """
@@ -186,7 +186,7 @@ def _format_counts(name: str, counts: Counter[str], kind: str) -> Iterator[str]:
 
 
 def _shorten_pattern(pattern: str) -> str:
-    """Shorten a pattern: long rows of equal cycles are written once."""
+    """Shorten a pattern by writing equal successive cycles once, with their number."""
     runs = [(cycle, len(list(equal))) for cycle, equal in groupby(pattern.split(" | "))]
     return " | ".join(
         " | ".join([cycle] * n) if n <= MAX_WRITTEN_CYCLES else f"({cycle}) x {n}"

@@ -38,7 +38,7 @@ BLOCK_NS = 1_000_000_000
 
 
 class TracedRun:
-    """A recorded run in terms of the timing model. Times are ns of the wall clock since tick 0.
+    """A recorded run in terms of the timing model. Times are in ns of the wall clock since tick 0.
 
     Raises:
         ConfigError: If a file named by the config of the run is missing.
@@ -91,7 +91,7 @@ class TracedRun:
         return Panel("measured", self.build_chart(start_ns, end_ns), lanes, counted, counts)
 
     def _compute_medians(self, lane: Lane) -> dict[Unit, int]:
-        """Return the median time of each unit function of a lane, including preemption, ns."""
+        """Return the median time, in ns, of each unit function of a lane, including preemption."""
         medians_ns = {}
         for task in (task for task in self.tasks if task.name in lane.tasks):
             rows, _ = self._records[task.name]
@@ -100,7 +100,7 @@ class TracedRun:
         return medians_ns
 
     def find_middle_ns(self, task: TimedTask) -> int:
-        """Return the first release of a task, or of its plans, in the second half of the run, ns.
+        """Return the first release, in ns, of a task or its plans in the second half of the run.
 
         0 if there is none.
         """
@@ -110,7 +110,7 @@ class TracedRun:
 
     @cached_property
     def end_ns(self) -> int:
-        """End of the last traced cycle, ns."""
+        """End of the last traced cycle, in ns."""
         traces = self.recording.cycles.items()
         layout = self.recording.layout
         end_ticks = [
@@ -152,9 +152,9 @@ class TracedRun:
 
     @cached_property
     def _records(self) -> dict[str, tuple[np.ndarray, int]]:
-        """Trace records and longest response of every task, ns.
+        """Trace records of every task, and its longest response in ns.
 
-        A planner has only those of plans.
+        Of a planner, only the records of plans are included.
         """
         records = {}
         for task in self.tasks:
@@ -166,7 +166,7 @@ class TracedRun:
 
 @dataclass(frozen=True)
 class _TaskTrace:
-    """Trace of one task, with the length of a tick on the wall clock, ns."""
+    """Trace of one task, with the length of a tick on the wall clock in ns."""
 
     task: TimedTask
     rows: np.ndarray
@@ -207,8 +207,8 @@ class _TaskTrace:
         )
 
     def _compute_times(self, stamp: str) -> list[int]:
+        """Return a time stamp of all records, in ns since tick 0."""
         # Compute times from the release, because the origin of the machine's clock is arbitrary.
-        """Return the times of a stamp in all records, ns since tick 0."""
         times_ns: list[int] = (
             self.rows["tick"] * self.tick_ns + self.rows[stamp] - self.rows["release_ns"]
         ).tolist()

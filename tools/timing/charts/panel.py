@@ -1,4 +1,4 @@
-"""A chart with its lanes, late jobs and patterns, of a schedule or as measured.
+"""Panel of a Gantt chart, with the lanes, late jobs and patterns of a schedule or of a run.
 
 It also has functions for sets of stretches.
 """
@@ -19,7 +19,10 @@ NS_PER_MS = 1_000_000
 
 @dataclass(frozen=True)
 class JobCount:
-    """Number of jobs of a task and of late ones. The skipped ones among them never began."""
+    """Numbers of jobs, late jobs and skipped jobs of a task.
+
+    A skipped job never began. It also counts as late.
+    """
 
     jobs: int = 0
     late: int = 0
@@ -32,8 +35,8 @@ class JobCount:
         Args:
             chart: Chart that contains the jobs.
             task: Task to count.
-            start_ns: Start of the time, ns.
-            end_ns: End of the time, ns, not included.
+            start_ns: Start of the interval, ns.
+            end_ns: End of the interval, ns, not included.
         """
         releases = [job.release_ns for job in chart.jobs if job.task == task]
         late = [job for job in chart.list_late_jobs(task) if start_ns <= job.release_ns < end_ns]
@@ -69,7 +72,7 @@ class Panel:
 
     @property
     def frames(self) -> dict[int, int]:
-        """Start of every minor frame that begins in the window, ns, by its number in the run."""
+        """Start, in ns, of each minor frame that begins in the window, by its number in the run."""
         if not self.frame_ns:
             return {}
         numbers = range(
@@ -135,7 +138,7 @@ class Panel:
 
 
 def _convert_to_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
-    """Return some times of an entry by name, in ms."""
+    """Return the times of an entry that have these names, in ms."""
     times = {name: getattr(entry, f"{name}_ns") for name in names}
     return {
         f"{name}_ms": None if time_ns is None else time_ns / NS_PER_MS

@@ -130,7 +130,7 @@ class Patterns(NamedTuple):
 
 @dataclass(frozen=True)
 class PatternDetail:
-    """Longest stretches that patterns leave out, ns.
+    """Longest stretches that patterns leave out, in ns.
 
     Attributes:
         short_ns: Stretches of each unit function.
@@ -142,7 +142,7 @@ class PatternDetail:
 
     @classmethod
     def from_medians(cls, lane: Lane, median_ns: Mapping[Unit, int]) -> PatternDetail:
-        """Return the detail for measured patterns, by the medians of the lane's functions, ns."""
+        """Derive the limits for measured patterns from the median times of the unit functions."""
         longest = round(MAX_REMNANT_CYCLE_FRACTION * lane.cycle_ns)
         short = {
             unit: min(longest, round(MAX_REMNANT_MEDIAN_FRACTION * median))
@@ -189,7 +189,7 @@ def _list_plans_and_cycles(
 ) -> Iterator[tuple[int, int, bool]]:
     """Yield the plans, and the cycles without a plan, that begin within a stretch.
 
-    Each is a tuple of its start, ns, its number of cycles, and whether it is a plan.
+    Each is a tuple of its start in ns, its number of cycles, and whether it is a plan.
     """
     slices = lane.slice_ns // lane.cycle_ns
     plans = {job.release_ns for job in chart.jobs if lane.planner and job.task == lane.planner}

@@ -134,6 +134,7 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
 
 
 def _draw_lane(axes: Axes, panel: Panel, lane: Lane, row: int) -> None:
+    """Draw the spans, idle stretches, cycle starts and late jobs of a lane in a row."""
     chart = panel.chart
     low = row - BAR_HEIGHT / 2
     window_ns = chart.end_ns - chart.start_ns

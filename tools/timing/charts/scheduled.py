@@ -28,7 +28,7 @@ E = TypeVar("E", Chart, Span, Job)
 
 
 class Schedule:
-    """The schedule of the tasks with a budget. At least one task must have one.
+    """The simulated schedule of all tasks that have a budget. At least one task must have one.
 
     Attributes:
         tasks: Tasks with their cores and priorities.
@@ -73,7 +73,7 @@ class Schedule:
 
     @property
     def shortest_ns(self) -> int:
-        """Shortest part of any task, ns."""
+        """Duration, in ns, of the shortest part of any task."""
         return min((part.time_ns for task in self.tasks for part in task.parts), default=1)
 
     def build_panel(self, start_ns: int, end_ns: int) -> Panel:
@@ -120,7 +120,7 @@ class Schedule:
         )
 
     def _build_variants(self, board: str, times_ns: Sequence[int]) -> list[tuple[Part, ...]]:
-        """Return the parts of an executor's cycle for each time of X, ns."""
+        """Return the parts of an executor's cycle for each time of X in `times_ns`."""
         executors = {task.name: task for task in self.tasks if task.role == "executor"}
         if board not in executors:
             raise Failure(
@@ -137,7 +137,7 @@ def _shift_chart(chart: Chart, by_ns: int) -> Chart:
     """Return a chart with all times increased by `by_ns`."""
 
     def shift(entry: E) -> E:
-        """Return a chart, span or job with all its times later."""
+        """Return a chart, span or job with all its times increased by `by_ns`."""
         times = {name: time for name, time in vars(entry).items() if name.endswith("_ns")}
         shifted = {name: time + by_ns for name, time in times.items() if time is not None}
         return replace(entry, **shifted)

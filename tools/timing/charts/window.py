@@ -20,7 +20,7 @@ MAX_CYCLES = 2000
 
 @dataclass(frozen=True)
 class WindowOptions:
-    """Window for which the user asks, ns. None for an end that is not given."""
+    """Window that the user asked for, in ns. None for a limit that is not given."""
 
     from_ns: int | None = None
     to_ns: int | None = None
@@ -28,10 +28,10 @@ class WindowOptions:
     def choose_window(
         self, task: TimedTask, extent_ns: int | None, start_ns: int, length_ns: int | None = None
     ) -> tuple[int, int]:
-        """Return the start and end of the window, ns.
+        """Return the start and the end of the window, in ns.
 
         Args:
-            task: Task whose cycles count. The default window shows two of its plans.
+            task: Task whose cycles limit the window. The default window shows two of its plans.
             extent_ns: Length of the run, ns. None for a schedule, which has no end.
             start_ns: Default start, ns.
             length_ns: Default length, ns. None for two plans of the task.

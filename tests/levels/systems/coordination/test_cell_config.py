@@ -85,7 +85,7 @@ def mistakes(folder: Path, *changes: tuple[str, str]) -> str:
         (
             'do = "home", by = 30.0',
             'do = "fly"',
-            'task.step[1].do[0].do = "fly": permitted: transfer, goto, home',
+            'task.step[1].do[0].do = "fly": valid values: transfer, goto, home',
         ),
         ('arm = "k1607", ', "", "task.step[0].do[1].arm: missing; arm that does it"),
         ("lan.k1607", "lan.other", "lan.other"),

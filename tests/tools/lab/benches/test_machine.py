@@ -24,7 +24,7 @@ from rack.tools.lab.benches.machine import (
     compare_idle_cores,
     measure_machine,
 )
-from rack.tools.lab.benches.observed import RecordedRun, record_rack
+from rack.tools.lab.benches.observed import ObservedRun, record_rack
 from tests.boards.conftest import PLAIN
 from tests.tools.lab.benches import peers
 
@@ -120,7 +120,7 @@ def test_the_rack_is_compared_with_cyclictest_and_with_idle_cores_awake(
 
     def record_and_note_latency(
         config: RackConfig, seconds: float | None, folder: Path, share: bool = True
-    ) -> RecordedRun:
+    ) -> ObservedRun:
         fds = [one.readlink() for one in Path("/proc/self/fd").iterdir() if one.is_symlink()]
         held.append(device in fds)
         return record_rack(config, seconds, folder, share)

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rack.boards.config.schema import RackConfig
-from rack.tools.lab.benches.observed import RecordedRun
+from rack.tools.lab.benches.observed import ObservedRun
 from rack.tools.lab.reproduction.experiments.experiment import Workshop
 
 CHAIN = "chain"
@@ -58,7 +58,7 @@ class BreakingWorkshop(Workshop):
             faults = self._written(f"script-{faults}", self._scripts[faults])
         return super().load_config(name, settings, faults)
 
-    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> RecordedRun:
+    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> ObservedRun:
         """Run a rack for no longer than permitted."""
         return super().run(label, config, min(seconds or self._most_s, self._most_s))
 

@@ -31,7 +31,7 @@ from rack.boards.crate.clean import remove_dead_rack
 from rack.tools.console.answer import Failure, write_json
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.lab.benches.cyclictest import is_fifo_permitted
-from rack.tools.lab.benches.observed import UNVIEWED_SETTINGS, RecordedRun, record_rack
+from rack.tools.lab.benches.observed import UNVIEWED_SETTINGS, ObservedRun, record_rack
 
 # Subfolders for the results of experiments and for the recordings of their runs.
 RESULTS_FOLDER = "parts"
@@ -62,7 +62,7 @@ class Workshop:
 
     Attributes:
         folder: Absolute path of the folder.
-        share: Whether racks may run on cores that another rack holds.
+        share: Whether racks may run on cores that another rack uses.
     """
 
     def __init__(self, folder: Path, share: bool) -> None:
@@ -71,7 +71,7 @@ class Workshop:
 
     @property
     def rack(self) -> str:
-        """Name of its racks in shared memory. Only one of them runs at a time."""
+        """Name of the experiments' racks in shared memory. Only one of them runs at a time."""
         return f"{RACK_PREFIX}-{os.getpid()}"
 
     def prepare(self) -> None:
@@ -108,7 +108,7 @@ class Workshop:
         """
         return name
 
-    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> RecordedRun:
+    def run(self, label: str, config: RackConfig, seconds: float | None = None) -> ObservedRun:
         """Run a rack and record it in the folder.
 
         A recording of an earlier run with this label is replaced.
@@ -152,7 +152,7 @@ class Experiment(Generic[Found]):
     cores: int = 1
 
     def measure_if_possible(self, workshop: Workshop) -> Found:
-        """Run the experiment. Raises `RequirementMissing` if this machine does not suffice."""
+        """Run the experiment. Raises `RequirementMissing` if this machine cannot run it."""
         if self.cores and not is_fifo_permitted():
             raise RequirementMissing(NO_FIFO_REASON)
         if (available := len(os.sched_getaffinity(0))) < self.cores:
@@ -171,7 +171,7 @@ class Experiment(Generic[Found]):
 
 
 def describe_dependencies() -> Document:
-    """Describe everything on which a result depends at present."""
+    """Describe everything on which a result that is made now depends."""
     return {"program": compute_program_checksum(), "machine": describe_machine()}
 
 
@@ -215,7 +215,7 @@ def make_and_store(experiment: Experiment[Any], workshop: Workshop) -> StoredRes
     except RequirementMissing as reason:
         missing = str(reason)
     if INTERRUPT.number:
-        # After a signal the run has ended in order, but too early.
+        # A signal ends the run in good order, but too early for a result.
         INTERRUPT.end_process()
     took_s = round(time.monotonic() - start_s, 1)
     result = StoredResult(data, took_s, time.strftime("%Y-%m-%d %H:%M:%S"), missing, dependencies)

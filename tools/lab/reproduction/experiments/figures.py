@@ -1,4 +1,7 @@
-"""Figures 2 to 4 of the paper, run by real processes and computed for every X."""
+"""Figures 2 to 4 of the paper: run by real processes, and computed for every X.
+
+X is the processor time that the executor takes in each cycle.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +62,7 @@ class FigureRack:
 
     @property
     def experiment(self) -> Experiment[FigureRun]:
-        """Experiment that runs the figure by real processes."""
+        """Experiment that runs the figure with real processes."""
         return Experiment(
             self.label,
             f"{self.label} by real processes",
@@ -71,11 +74,11 @@ class FigureRack:
 
     @property
     def window_ns(self) -> int:
-        """Time that the charts show, ns."""
+        """Length of the charts, in ns."""
         return self.cycles * self.rack.find_period(LEVEL) * self.rack.clock_ns
 
     def build_panel(self) -> Panel:
-        """Compute the scheduled panel from the first cycle on."""
+        """Compute the schedule of the figure as a panel that begins with the first cycle."""
         return self.schedule.build_panel(0, self.window_ns)
 
     def format_letters(self, panel: Panel) -> str:
@@ -91,7 +94,7 @@ def build_settings(name: str, process_ms: float) -> tuple[str, ...]:
 
     Args:
         name: Name of the config.
-        process_ms: X, ms.
+        process_ms: X, the processor time of the executor in a cycle, ms.
     """
     board = load(name).board[LEVEL]
     assert board.budget is not None, "every figure has a budget"
@@ -104,6 +107,7 @@ def build_settings(name: str, process_ms: float) -> tuple[str, ...]:
 
 
 def _build_figure_with_x(name: str, cycles: int, process_ms: float) -> FigureRack:
+    """Build a variant of a figure in which X is `process_ms`."""
     label = f"{name}-x{process_ms:g}"
     return FigureRack(name, cycles, label, build_settings(name, process_ms))
 
@@ -160,7 +164,7 @@ class FigureRun(ChartedRecord):
 
 
 def _measure_figure(figure: FigureRack, workshop: Workshop) -> FigureRun:
-    """Run a figure and draw the middle of the run."""
+    """Run a figure, and return its counts and a chart of the middle of the run."""
     run = _find_least_disturbed_run(figure, workshop)
     start_ns = run.find_middle_ns(next(task for task in run.tasks if task.name == PLANNER))
     executor = run.recording.read_trace(LEVEL)
@@ -183,8 +187,8 @@ def _count_updates_around(updates: np.ndarray, times_ns: np.ndarray) -> int:
 def _find_least_disturbed_run(figure: FigureRack, workshop: Workshop) -> TracedRun:
     """Return the run with the fewest late cycles of the executor.
 
-    Other programs may take cores away, therefore a run with late cycles is repeated. An executor
-    that is late by its own schedule runs only once.
+    Other programs may take cores away, therefore a run with late cycles is repeated. A figure
+    whose schedule already makes the executor late runs only once.
     """
     runs: list[tuple[int, TracedRun]] = []
     is_late_by_schedule = bool(figure.build_panel().chart.list_late_jobs(LEVEL))

@@ -1,7 +1,7 @@
 """Experiments with NASREM.
 
-They are its whole task in real time with every equation applied to the run, the same messages in
-lockstep and in real time, losses and the times to recover from them, and moves by a promised time.
+They apply every equation to a run of its whole task in real time, compare messages in lockstep and
+in real time, measure the recovery from losses, and test moves that have a deadline.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rack.boards.timing.trace_times import compute_gaps_ns, count_misses_and_ski
 from rack.boards.timing.verdicts import EquationVerdict
 from rack.tools.console.answer import Failure
 from rack.tools.faults.judge import Judgement, report_faults
-from rack.tools.lab.benches.observed import RecordedRun
+from rack.tools.lab.benches.observed import ObservedRun
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 from rack.tools.lab.reproduction.experiments.tasks import TaskRun, summarize_task
 from rack.tools.recording.cycles import Cycles
@@ -41,7 +41,7 @@ MAX_ATTEMPTS = 3
 HEIGHT_ABOVE_M = 0.12
 """Height of A above the place to which the rack's program takes its first object, m."""
 TOO_EARLY_FRACTION = 0.5
-"""Fraction of the time in soft time that is demanded first."""
+"""First deadline of GOTO A, as a fraction of the time that it takes without a deadline."""
 GOTO_S = 32.0
 
 
@@ -92,6 +92,7 @@ class NasremRun(TaskRun):
 
 
 def _measure_task(workshop: Workshop) -> NasremRun:
+    """Run the whole task in real time and apply every equation to the run."""
     result, recording = workshop.run(NAME, workshop.load_config(NAME))
     analysis = Analysis.from_recording(recording)
     failing = {pair.measured.key for pair in analysis.mostly if pair.measured and pair.is_failed}
@@ -172,11 +173,12 @@ DETERMINISM = Experiment(
 )
 
 
-def _record_run(workshop: Workshop, label: str, mode: str) -> RecordedRun:
+def _record_run(workshop: Workshop, label: str, mode: str) -> ObservedRun:
+    """Run and record the rack for `COMPARED_S` in a clock mode."""
     return workshop.run(label, workshop.load_config(NAME, [f"clock.mode={mode}"]), COMPARED_S)
 
 
-def _compare_run(run: RecordedRun, reference: Recording | None) -> ComparedRun:
+def _compare_run(run: ObservedRun, reference: Recording | None) -> ComparedRun:
     """Return the digest of a run, and its first difference from a reference."""
     result, recording = run
     return ComparedRun(
@@ -221,7 +223,7 @@ class GotoRun:
     """A run of GOTO A, GOTO B.
 
     Attributes:
-        by_s: Time by which A was demanded, s. None for soft time.
+        by_s: Deadline of A, s. None for no deadline.
         done_s: End of the cycle in which the task level reported A done, s. None if it never did.
         earliest_s: Earliest possible time that a refusal named, s. None without a refusal.
         moved: Whether the arm made a move.
@@ -235,19 +237,19 @@ class GotoRun:
 
 @dataclass(frozen=True)
 class GotoRuns:
-    """Runs of A by a time that is too early, and by one that can be met."""
+    """Runs of GOTO A with a deadline that is too early, and with one that can be met."""
 
     early: GotoRun
     met: GotoRun
 
 
 def _measure_goto(workshop: Workshop) -> GotoRuns:
-    """Run GOTO A in soft time, by a time that is too early, and by a possible time."""
+    """Run GOTO A without a deadline, with one that is too early, and with a possible one."""
     soft = _run_goto(workshop, "goto", None)
     if soft.done_s is None:
         raise Failure("goto without a time was not done")
     early = _run_goto(workshop, "goto-too-early", round(TOO_EARLY_FRACTION * soft.done_s, 2))
-    # Without a refusal, demand the time of the first run.
+    # Without a refusal, use the time of the first run as the deadline.
     by_s = ceil((early.earliest_s or soft.done_s) * 10) / 10
     return GotoRuns(early, _run_goto(workshop, "goto-by", by_s))
 
@@ -258,12 +260,12 @@ DEADLINE = Experiment("goto", "goto in soft time, and by a time", GOTO_S, GotoRu
 def _run_goto(workshop: Workshop, label: str, by_s: float | None) -> GotoRun:
     """Run GOTO A, GOTO B.
 
-    A is above the goal of the first object that the program moves. B is the start.
+    A is above the goal of the first object that the program moves. B is the start position.
 
     Args:
         workshop: Folder and settings of the run.
         label: Name of the recording.
-        by_s: Time by which A is demanded, s. None for soft time.
+        by_s: Deadline of A, s. None for no deadline.
     """
     x, y, z = next(action["to"] for action in load(NAME).task["action"] if "to" in action)
     by = "" if by_s is None else f", by = {by_s!r}"

@@ -31,7 +31,7 @@ class Partition:
     cores: int
 
     def apply_to(self, config: RackConfig) -> RackConfig:
-        """Return the rack in this partition, in real time.
+        """Return the config of the rack in this partition, in real time.
 
         A loose planner gets a separate board on the next core, or on the same core if there is only
         one.
@@ -50,6 +50,7 @@ class Partition:
         return resolve(load_text(changed.to_toml_text())).config
 
     def _place_board(self, board: BoardConfig, free_slots: Iterator[int]) -> BoardConfig:
+        """Return a board on its core, with its planner coupled as in this partition."""
         core = board.core % self.cores
         changes: dict[str, object] = {"core": core, "planner_slot": None, "planner_core": None}
         if board.planner is not None:
@@ -91,6 +92,7 @@ class PartitionFigures:
 
 
 def _measure_partitions(workshop: Workshop) -> tuple[PartitionFigures, ...]:
+    """Run the rack in every partition."""
     config = workshop.load_config(NAME)
     # Check all configs before the first rack runs.
     racks = [(partition, partition.apply_to(config)) for partition in PARTITIONS]

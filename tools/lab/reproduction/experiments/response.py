@@ -1,7 +1,7 @@
 """Response of a rack to its operator: holds and resumes at randomly drawn ticks.
 
 A second lockstep run without one of the commands, the twin, checks the serials on which the
-measurement rests. Up to the tick at which the torque first rests on that command, both runs are
+measurement depends. Up to the tick at which the torque first depends on that command, both runs are
 equal bit for bit. If the command was a hold of a moving arm, they differ from exactly that tick on.
 """
 
@@ -62,6 +62,7 @@ class ResponseRun(ChartedRecord):
 
 
 def _measure_response(workshop: Workshop) -> ResponseRun:
+    """Run the rack in both clock modes and once without the hold of a moving arm."""
     run, lockstep = run_with_commands(workshop, "lockstep")
     _, realtime = run_with_commands(workshop, "realtime")
     predicted = next((c.predicted for c in lockstep.commands if c.given == MOVING_HOLD_TICK), None)

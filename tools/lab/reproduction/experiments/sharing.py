@@ -15,7 +15,7 @@ from rack.backplane.layout import Wake
 from rack.boards.config import load_text
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.chain import Chain
-from rack.tools.lab.benches.observed import RecordedRun, compute_lateness_us, count_cycles
+from rack.tools.lab.benches.observed import ObservedRun, compute_lateness_us, count_cycles
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 LEVELS = 5
@@ -55,6 +55,7 @@ class Chains:
 
 
 def _measure_chains(workshop: Workshop) -> Chains:
+    """Run the pipeline in lockstep, in real time, with locks, and with more boards."""
     return Chains(
         lockstep=_measure_chain("chain-lockstep", workshop, Chain(LEVELS, RATE_HZ, "lockstep")),
         realtime=_measure_chain("chain-realtime", workshop, Chain(LEVELS, RATE_HZ)),
@@ -75,7 +76,8 @@ def _measure_chain(label: str, workshop: Workshop, chain: Chain, protocol: str =
     return ChainRun(chain.boards, due, missed, dict(sorted(took.items())))
 
 
-def _run_chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> RecordedRun:
+def _run_chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> ObservedRun:
+    """Run and record a chain of boards. `protocol` is TOML text that is added to its config."""
     config = load_text(workshop.find_source(chain.format_config() + protocol))
     return workshop.run(label, config.model_copy(update={"name": workshop.rack}), SECONDS)
 
@@ -92,17 +94,19 @@ CHAINS = Experiment(
 
 @dataclass(frozen=True)
 class Waits:
-    """Median lateness of the cycles of an empty board that blocks, and of one that polls, us."""
+    """Median lateness, in us, of the cycles of an empty board that blocks and of one that polls."""
 
     blocking_us: float
     polling_us: float
 
 
 def _measure_waits(workshop: Workshop) -> Waits:
+    """Measure an empty board that blocks, and one that polls."""
     return Waits(_measure_median_us(workshop, "signal"), _measure_median_us(workshop, "poll"))
 
 
 def _measure_median_us(workshop: Workshop, wake: Wake) -> float:
+    """Return the median lateness, in us, of an empty board that waits as `wake` says."""
     chain = Chain(1, RATE_HZ, wake=wake)
     late_us = compute_lateness_us(
         _run_chain(f"waits-{wake}", workshop, chain).recording, chain.names[0]

@@ -22,6 +22,7 @@ class Storage:
 
     @cached_property
     def _file(self) -> IO[bytes]:
+        """The file, which is created at the first use."""
         return tempfile.TemporaryFile()
 
     def store_block(self) -> None:
@@ -31,7 +32,7 @@ class Storage:
 
 
 class StoringPlanner(FigurePlanner):
-    """Planner that stores a block as each plan, in the background, where it can be preempted."""
+    """Planner that stores a block with each plan, in the background, where it can be preempted."""
 
     storage = Storage()
 

@@ -55,6 +55,7 @@ class SwitchRun:
 
 
 def _measure_and_compare(workshop: Workshop) -> SwitchRun:
+    """Measure the context switch, and return it with the time that the config assumes."""
     return SwitchRun(measure_switch(), 1e3 * workshop.load_config(NAME).timing.context_switch_ms)
 
 
@@ -138,7 +139,7 @@ def _run_executor(semaphore: Semaphore, shared: _Shared) -> None:
 
 
 def _run_planner(semaphore: Semaphore, shared: _Shared) -> None:
-    """Run the planner, which computes until it is interrupted, and keep the longest gap."""
+    """Run the planner, which computes until it is interrupted, and record its longest gap."""
     gaps = shared.gaps
     awake = shared.awake
     for number in range(shared.wakes):
@@ -161,11 +162,11 @@ def _run_planner(semaphore: Semaphore, shared: _Shared) -> None:
 
 
 def compute_switch_times_us(gaps: np.ndarray, awake: np.ndarray) -> Distribution:
-    """Return the time of a switch for the wake-ups that interrupted the planner, us.
+    """Return the switch times, in us, of the wake-ups that interrupted the planner.
 
     Args:
-        gaps: Begin and end of the planner's longest gap at each wake-up, ns, shape (n, 2).
-        awake: Begin and end of the executor's time awake, ns, shape (n, 2).
+        gaps: Start and end of the planner's longest gap at each wake-up, ns, shape (n, 2).
+        awake: Start and end of the executor's time awake, ns, shape (n, 2).
 
     Raises:
         Failure: If no wake-up interrupted the planner.

@@ -49,7 +49,7 @@ BROWN = "brown"
 SERVO = "brown/servo"
 BROWN_S = 8.3
 TIMEOUT_FACTOR = 2.0
-"""Multiple of its time after which a task is ended.
+"""Multiple of its expected time after which a task is ended.
 
 A machine that is too slow may never finish it.
 """
@@ -97,6 +97,7 @@ def parse_response(report: Mapping[str, Any] | None) -> SystemResponse | None:
 
 
 def _parse_way_response(direction: Mapping[str, Any]) -> WayResponse:
+    """Return the response in one direction, from its part of a report."""
     delays = [beyond["delayed_by"] for beyond in direction["beyond"]]
     times = direction["measured_ms"]
     return WayResponse(
@@ -140,6 +141,7 @@ class NetworkRun(TaskRun):
 
 
 def _measure_task(name: str, workshop: Workshop) -> TaskRun:
+    """Run the whole task of a system in real time."""
     label = f"task-{name.replace('/', '-')}"
     return summarize_task(
         *workshop.run(label, workshop.load_config(name), TIMEOUT_FACTOR * TASKS_S[name])
@@ -185,6 +187,7 @@ class TableRuns:
 
 
 def _measure_tables(workshop: Workshop) -> TableRuns:
+    """Run the task of the state tables with and without a disturbance."""
     calm = f"{STATE_TABLES}-undisturbed"
     return TableRuns(
         _run_tables(workshop, STATE_TABLES), _run_tables(workshop, calm, UNDISTURBED_SETTINGS)
@@ -192,6 +195,7 @@ def _measure_tables(workshop: Workshop) -> TableRuns:
 
 
 def _run_tables(workshop: Workshop, label: str, settings: Sequence[str] = ()) -> TableRun:
+    """Run the task of the state tables, and list the rows that fired."""
     result, recording = workshop.run(label, workshop.load_config(STATE_TABLES, settings))
     fired = list_fired_rows(recording).items()
     rows = (f"{level}: {row['name']}" for level, rows in fired for row in rows)
@@ -208,6 +212,7 @@ TABLES = Experiment(
 
 
 def _compute_missed_share(*recordings: Recording) -> float:
+    """Return the fraction of all cycles of some runs that were missed or skipped."""
     return count_cycles(
         task for each in recordings for task in each.end_counts["tasks"].values()
     ).share
@@ -274,11 +279,12 @@ def _build_servo_config(workshop: Workshop, later_ms: int) -> RackConfig:
 
 
 def _format_socket(workshop: Workshop) -> str:
+    """Return the address at which the servo rack listens."""
     return f"unix/{workshop.rack}-servo"
 
 
 def _load_renamed(workshop: Workshop, name: str, added: Sequence[str]) -> RackConfig:
-    """Load one of both racks with added settings, under a unique name.
+    """Load one of the two racks with added settings, under a unique name.
 
     The other rack uses this name in its imports.
     """
@@ -296,7 +302,7 @@ def _load_renamed(workshop: Workshop, name: str, added: Sequence[str]) -> RackCo
 
 
 def _compute_response_ms(general: Recording, servo: Recording) -> float | None:
-    """Return the time from the first request for a modification until a status reports it.
+    """Return the time, in ms, from the first request for a modification to its report.
 
     None if either message is missing.
     """
@@ -306,7 +312,7 @@ def _compute_response_ms(general: Recording, servo: Recording) -> float | None:
 
 
 def _find_first_ns(recording: Recording, box: str, field: str) -> int | None:
-    """Return the time at which the first message that names the modification is visible, ns.
+    """Return when the first message that names the modification became visible, in ns.
 
     It is CLOCK_MONOTONIC time, or simulated time in lockstep.
     """
@@ -321,6 +327,7 @@ def _find_first_ns(recording: Recording, box: str, field: str) -> int | None:
 
 
 def _build_network_experiment(later_ms: int, about: str) -> Experiment[NetworkRun]:
+    """Build the experiment with Brown's racks on a network that is slower by `later_ms`."""
     name = f"task-{BROWN}-later" if later_ms else f"task-{BROWN}"
     measure = partial(_measure_two_racks, later_ms)
     return Experiment(name, about, BROWN_S + 2 * LAUNCH_S, NetworkRun, measure)
