@@ -46,7 +46,7 @@ def transposed_mat_vec(matrix: Array, vector: Array) -> Array:
 
 
 def gram(matrix: Array) -> Array:
-    """Return `matrix` (m, n) transposed times itself, (n, n)."""
+    """Return the (n, n) product of the transpose of `matrix` (m, n) and `matrix`."""
     columns = matrix.shape[1]
     product = np.empty((columns, columns))
     mujoco.mju_mulMatTMat(product, matrix, matrix)

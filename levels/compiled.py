@@ -1,15 +1,15 @@
-"""Small fixed-size algebra as machine code: a Python function that numba compiles at its first use.
+"""Compilation of small fixed-size algebra: numba compiles a marked function at its first use.
 
 A few hundred numpy calls on six numbers took most of a servo cycle: each costs a microsecond,
 whatever it computes. A function marked `@compiled` is ordinary numpy code. Called directly, it runs
-as such, and tests compare the machine code with it. A function marked `@compiled_for` states its
+uncompiled, and tests compare the machine code with it. A function marked `@compiled_for` states its
 argument types, so that its machine code can be loaded before a run: see `Executor.preload`.
 Alternatives considered: a C extension (users would need a compiler), `jit` at import (numba takes
 0.4 s to import, and most commands compute nothing).
 
 Without `fastmath` the order of operations is the order in the source, so the bits do not depend on
-the processor. Compiled code is kept from run to run. numba's own cache was rejected: it fails on a
-damaged file, runs code with flipped bits, and notices a change of the function itself, but not of
+the processor. Compiled code is cached from run to run. numba's own cache was rejected: it fails on
+a damaged file, runs code with flipped bits, and notices a change of the function itself, but not of
 the functions that it calls.
 """
 
@@ -31,7 +31,7 @@ from typing import Any, Generic, ParamSpec, TypeVar
 import numpy as np
 
 DIGEST_BYTES = 16
-"""Length of a digest, bytes."""
+"""Length of a digest, in bytes."""
 CACHE_HINT = "set XDG_CACHE_HOME to a folder that can be written"
 _P = ParamSpec("_P")
 _R = TypeVar("_R", covariant=True)
@@ -46,8 +46,8 @@ on_compile: Callable[[str], object] | None = None
 class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     """Decorator that marks a function for compilation.
 
-    Arguments are numbers, arrays and records. The function may call other functions marked
-    likewise.
+    The arguments of the function must be numbers, arrays or records. It may call other marked
+    functions.
     """
 
     def __init__(
@@ -59,22 +59,23 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
         self._machine: Callable[_P, _R] | None = None
 
     def __call__(self, *args: _P.args, **kwargs: _P.kwargs) -> _R:
-        """Call the Python function, uncompiled, which calls other marked functions uncompiled.
+        """Call the function, and all marked functions that it calls, as uncompiled Python.
 
         Tests compare the machine code with this.
         """
         return self._function(*args, **kwargs)
 
     def load_machine_code(self) -> Callable[_P, _R]:
-        """Return the compiled function.
+        """Return the function in its compiled form.
 
-        It is compiled, or read from the cache, at its first call with given argument types.
+        numba compiles it, or reads it from the cache, at the first call with new argument types.
         """
         if self._machine is None:
             self._machine = self._build()
         return self._machine
 
     def _build(self) -> Any:
+        """Return what other compiled functions call: numba's version of this function."""
         return _compile_function(self)
 
     def preload(self) -> None:
@@ -92,8 +93,8 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     def iterate_source(self) -> Iterator[bytes]:
         """Yield everything that determines the machine code.
 
-        This includes instructions, constants, and the values of names, also in functions that are
-        called. It excludes comments, docstrings and line numbers.
+        This includes the instructions, the constants and the values of global names, also those of
+        the functions that it calls. It excludes comments, docstrings and line numbers.
         """
         function: Any = self._function
         code = function.__code__
@@ -110,8 +111,8 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
 class c_function(compiled[..., Any]):  # noqa: N801  # stands for a function
     """A function of a C library whose arguments are integers: addresses, sizes and flags.
 
-    Compiled code finds it by its name, Python through ctypes. The result is a signed word, without
-    meaning if the function returns nothing.
+    Compiled code links to it by name, and Python calls it through ctypes. The result is a signed
+    word, which is meaningless if the C function returns nothing.
     """
 
     def __init__(self, library: str, name: str, arguments: int) -> None:
@@ -123,10 +124,11 @@ class c_function(compiled[..., Any]):  # noqa: N801  # stands for a function
         self._library = library
 
     def iterate_source(self) -> Iterator[bytes]:
-        """Yield what a caller's code depends on: it finds the function by name."""
+        """Yield the name and the number of arguments, on which a caller's machine code depends."""
         yield repr(self._key).encode()
 
     def _build(self) -> Any:
+        """Load the library and return numba's declaration of the function."""
         from llvmlite import binding
         from numba import types
 
@@ -138,13 +140,13 @@ class c_function(compiled[..., Any]):  # noqa: N801  # stands for a function
 def compiled_for(
     types: str, records: np.dtype[Any] | None = None
 ) -> Callable[[Callable[_A, _T]], compiled[_A, _T]]:
-    """Mark a function for compilation, before a run, for arguments of these types.
+    """Mark a function that is to be compiled before a run, for arguments of given types.
 
     Args:
         types: Types as numba writes them: "f8, i8, f8[:, ::1]" are a float, an integer and an array
             in C order.
-        records: Type of the one-dimensional structured array that is the first argument; `types`
-            are then the types of the other arguments. None if all arguments are in `types`.
+        records: Type of the records if the first argument is a one-dimensional structured array;
+            `types` then lists the other arguments. None if `types` lists all arguments.
     """
     return lambda function: compiled(function, types, records)
 
@@ -158,7 +160,7 @@ def preload(*modules: ModuleType) -> None:
 
 
 def _compile_function(marked: compiled[..., Any]) -> Any:
-    """Compile a function. Marked functions that it calls are replaced by their compiled form."""
+    """Compile a marked function. It calls other marked functions in their compiled form."""
     from numba import config, njit
 
     # NUMBA_DISABLE_JIT is meant for a user's own functions. Ours call C functions by address.
@@ -195,7 +197,10 @@ class _CodeCache:
         self._source = source.hex()
 
     def load_overload(self, types: Any, target: Any) -> Any:
-        """Return the code for these types. None if it is missing or damaged."""
+        """Return the cached code for these types. None if it is missing or damaged.
+
+        After None, numba compiles the function.
+        """
         from numba.core.compiler import CompileResult
 
         target.refresh()
@@ -278,7 +283,7 @@ def _iterate_value(value: object) -> Iterator[bytes]:
 
 @cache
 def _find_cache_folder() -> Path:
-    """Return the folder of the code that is compiled from this checkout.
+    """Return the cache folder for code that is compiled from this checkout.
 
     Raises:
         OSError: The user has no home folder.
@@ -291,11 +296,12 @@ def _find_cache_folder() -> Path:
 
 
 def _compute_digest(content: bytes) -> bytes:
+    """Return the BLAKE2 digest of `content`, with `DIGEST_BYTES` bytes."""
     return blake2b(content, digest_size=DIGEST_BYTES).digest()
 
 
 @cache
 def _print_once(text: str) -> None:
-    """Print a line to stderr, once per process."""
+    """Print a line to stderr, unless this process has printed it before."""
     sys.stderr.write(f"{text}\n")
     sys.stderr.flush()

@@ -18,19 +18,19 @@ class LevelError(Exception):
 
 
 class CannotGoOn(LevelError):
-    """A level that cannot continue, and that a restart would not help."""
+    """A level cannot continue, and a restart would not help."""
 
 
 class RobotError(LevelError):
-    """A robot or a cell that cannot be built from its description."""
+    """A robot or a cell cannot be built from its description."""
 
 
 class ProgramError(LevelError):
-    """A task program that is invalid."""
+    """A task program is invalid."""
 
 
 class Refused(LevelError):
-    """A command that cannot be carried out.
+    """A command cannot be carried out.
 
     Attributes:
         code: One of `rack.levels.messages.Error`.

@@ -1,4 +1,4 @@
-"""Faults of what a level drives: steps that corrupt its samples, its motors and its commands.
+"""Fault steps: how injected faults corrupt the samples, motors and commands of a driven device.
 
 A level lists in `Executor.faults` the classes of steps that it implements. Every fault kind with a
 step of such a class can then affect the level, so a new kind requires no change in the level. The
@@ -21,9 +21,9 @@ Sample = Any
 """A `rack.levels.arm.Sensed`. It is not imported because that would import MuJoCo."""
 
 STUCK_SENSOR_ERROR = np.array([[1e-2], [1e-2]])
-"""Error of a stuck sensor, rad and rad/s, from which it counts as wrong.
+"""Error above which a stuck sensor must be detected, in rad and rad/s.
 
-While a joint creeps, a stuck sensor need not be detected earlier.
+While a joint creeps, the error of its stuck sensor grows slowly and need not be detected earlier.
 """
 
 
@@ -44,20 +44,13 @@ class Fault(NamedTuple):
 
 @dataclass(frozen=True)
 class ActiveFault:
-    """An injected fault that is active.
+    """An injected fault that is active."""
 
-    Attributes:
-        place: Index among the injected faults.
-        fault: The fault.
-        joints: (joints,), True for joints that the fault affects.
-        every: Cycle of the level, ticks.
-        kept: First sample of each fault, by `key`.
-    """
-
-    place: int
+    place: int  # index among the injected faults
     fault: Fault
-    joints: NDArray[np.bool_]
-    every: int
+    joints: NDArray[np.bool_]  # (joints,), True for joints that the fault affects
+    every: int  # length of the level's cycle in ticks
+    # The sample with which each active fault began, by `key`. All active faults share this dict.
     kept: dict[Key, Sample]
 
     @cached_property
@@ -66,15 +59,18 @@ class ActiveFault:
         return (self.fault.kind, self.fault.seed, self.fault.since, int(self.joints.argmax()))
 
     def __getitem__(self, parameter: str) -> float:
-        """Return a parameter of the fault."""
+        """Return the value of the fault's parameter of this name."""
         return self.fault.parameters[parameter]
 
     def build_generator(self, tick: int) -> np.random.Generator:
-        """Return the random generator of a tick; a restarted board draws the same numbers."""
+        """Return the random generator for a tick. A restarted board draws the same numbers."""
         return np.random.default_rng((self.fault.seed, tick))
 
     def recall_first_sample(self, sample: Sample) -> Sample:
-        """Return the sample with which the fault began."""
+        """Return the sample with which the fault began.
+
+        This is a copy of the sample that was given in the first call.
+        """
         if self.key not in self.kept:
             copy = sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
             self.kept[self.key] = copy
@@ -85,9 +81,9 @@ class ActiveFault:
 class SensorStep:
     """Fault step that corrupts a sample.
 
-    `act` returns the corrupted sample and whether the corruption is large enough to be detected, or
-    None if the sample still equals the truth. The detection bound counts from the first detectable
-    sample.
+    `act` returns the corrupted sample and a verdict on it: True if its error is large enough that
+    it must be detected, False if it is smaller, None if there is no error. The detection bound
+    counts from the first sample with True.
     """
 
     act: Callable[[Sample, ActiveFault], tuple[Sample, bool | None]]
@@ -115,7 +111,7 @@ class CommandStep:
 
 @dataclass(frozen=True)
 class TendonStep:
-    """Fault step that tears a tendon of a hand, so that it has no tension.
+    """Fault step that tears a tendon of a hand, which then has no tension.
 
     Its parameters are `joint` and `side` (0 for the flexor, 1 for the extensor).
     """
@@ -126,42 +122,42 @@ ARM_STEPS = (SensorStep, MotorStep, CommandStep)
 
 
 def set_position_nan(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
-    """Make positions NaN."""
+    """Replace the positions of the affected joints by NaN."""
     return sample._replace(position=np.where(fault.joints, np.nan, sample.position)), True
 
 
 def bias_position(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
-    """Add `size`, rad, to positions."""
+    """Add the fault's `size`, in rad, to the positions of the affected joints."""
     return sample._replace(position=sample.position + fault["size"] * fault.joints), True
 
 
 def add_position_noise(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
-    """Add noise of standard deviation `size`, rad, to positions."""
+    """Add noise to the affected positions. Its standard deviation is the fault's `size`, in rad."""
     noise = fault["size"] * fault.build_generator(sample.tick).standard_normal(len(fault.joints))
     return sample._replace(position=sample.position + noise * fault.joints), True
 
 
 def repeat_last_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
-    """Repeat the sample of the cycle before the fault."""
+    """Repeat the fault's first sample, with the tick of the cycle before it, as if none arrived."""
     first = fault.recall_first_sample(sample)
     return first._replace(tick=first.tick - fault.every), True
 
 
 def freeze_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool | None]:
-    """Keep positions and velocities as they were when the fault began."""
+    """Freeze the affected positions and velocities at their values when the fault began."""
     first = fault.recall_first_sample(sample)
     truth = (sample.position, sample.velocity)
     stuck = np.where(fault.joints, (first.position, first.velocity), truth)
     off = np.abs(stuck - truth)
-    is_apart = bool((off > STUCK_SENSOR_ERROR).any()) if off.any() else None
-    return sample._replace(position=stuck[0], velocity=stuck[1]), is_apart
+    must_be_found = bool((off > STUCK_SENSOR_ERROR).any()) if off.any() else None
+    return sample._replace(position=stuck[0], velocity=stuck[1]), must_be_found
 
 
 def set_torque_nan(torque: Array, limits: Array, fault: ActiveFault) -> Array:
-    """Make torques NaN."""
+    """Command NaN instead of every torque."""
     return np.full_like(torque, np.nan)
 
 
 def exceed_torque(torque: Array, limits: Array, fault: ActiveFault) -> Array:
-    """Command `factor` times the limit, in the direction of the torque."""
+    """Command the fault's `factor` times the torque limit, in the direction of the torque."""
     return fault["factor"] * np.copysign(limits, torque)

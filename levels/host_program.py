@@ -1,6 +1,7 @@
-"""A program on the host side.
+"""A program of a host board.
 
-It has no rate, no deadline and no real-time priority. It may block, import anything, and raise.
+It has no rate, no deadline and no real-time priority. It may block, import any module, and raise
+exceptions.
 
 A host board is a separate process under ordinary scheduling. The clock does not release it, and
 real time never waits for it. It reaches the levels only through a bus adapter
@@ -44,15 +45,15 @@ M_co = TypeVar("M_co", bound=Message, covariant=True)
 
 
 class Bus(Protocol):
-    """The bus as a host program sees it."""
+    """What a host program may do on the bus besides using its ports."""
 
     @property
     def tick(self) -> int:
-        """Tick of the clock; in lockstep, tick of the adapter cycle in which the program runs."""
+        """Present tick. In lockstep, the tick of the adapter's cycle in which the program runs."""
 
     @property
     def time_s(self) -> float:
-        """Time, s: simulated time in lockstep, CLOCK_MONOTONIC in real time."""
+        """Time in s: simulated time in lockstep, CLOCK_MONOTONIC in real time."""
 
     @property
     def is_over(self) -> bool:
@@ -62,7 +63,8 @@ class Bus(Protocol):
         """Wait until a message arrives.
 
         Returns:
-            False if none arrived within `timeout_s`, measured by `time_s`, or if the run ended.
+            True if a message arrived. False if none arrived within `timeout_s`, measured by
+            `time_s`, or if the run ended.
         """
 
     @property
@@ -87,7 +89,7 @@ class Bus(Protocol):
         """
 
     def finish(self) -> None:
-        """Declare that the program has done its work, like returning from `run`."""
+        """Declare that the program's work is done, as a return from `run` does."""
 
 
 class HostReceiver(Protocol[M_co]):
@@ -96,7 +98,7 @@ class HostReceiver(Protocol[M_co]):
     def read(self) -> Reading[M_co]:
         """Return the newest message.
 
-        The reading's `earlier` holds the unread messages before it that the mailbox still has.
+        `Reading.earlier` contains the older unread messages that are still in the mailbox.
         """
 
 
@@ -114,13 +116,13 @@ class HostSender(Protocol[M_co]):
         """Send a copy of the message and clear it for the next one.
 
         Returns:
-            False if too many messages wait at the adapter. The message is then unchanged and not
-            sent.
+            True if the message was sent. False if too many messages wait at the adapter; the
+            message is then unchanged.
         """
 
     @property
     def sent(self) -> int:
-        """Number of messages sent so far, also by earlier processes of this board."""
+        """Number of messages sent so far, including those of earlier processes of this board."""
 
 
 class ProgramInput(InputPort[M]):
@@ -169,7 +171,7 @@ class HostProgram:
     inputs: ClassVar[Mapping[str, ProgramInput[Any]]] = {}
     """The ports that it reads, by name, collected from the class and its bases."""
     outputs: ClassVar[Mapping[str, ProgramOutput[Any]]] = {}
-    """The ports that it writes, by name, collected likewise."""
+    """The ports that it writes, by name, collected in the same way."""
     params: ClassVar[type[Table] | None] = None
     """Keys of `[host.<name>.params]`, checked before the launch.
 
@@ -198,5 +200,5 @@ class HostProgram:
             bus.wait(1.0)
 
     def list_prompt_names(self, bus: Bus) -> Mapping[str, Any]:
-        """Return objects that an interactive prompt offers by name, besides `bus` and `program`."""
+        """Return further objects, by name, for an interactive prompt with `bus` and `program`."""
         return {}

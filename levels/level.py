@@ -166,11 +166,11 @@ class Program(Table):
     @model_validator(mode="before")
     @classmethod
     def _with_frozen_tables(cls, table: Any) -> Any:
-        """Freeze the lists in tables with user-defined names, too."""
+        """Convert all lists to tuples, including those in tables whose keys the user chooses."""
         return freeze_lists(table)
 
     def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
-        """Yield each entry that does not suit arm or scene, as key, value and reason.
+        """Yield each entry that disagrees with the arm or the scene, as key, value and reason.
 
         A key is the path of the entry, such as "action[0].object". `robot` is None for a rack
         without an arm.
@@ -251,12 +251,12 @@ class LevelContext:
 
     @property
     def period_s(self) -> float:
-        """Period of the level's cycle, s."""
+        """Period of the level's cycle in s."""
         return self.every * self.clock_ns * 1e-9
 
     @property
     def tick_s(self) -> float:
-        """Duration of one tick of the system clock, s."""
+        """Duration of one tick of the system clock in s."""
         return self.clock_ns * 1e-9
 
 
@@ -266,7 +266,7 @@ class LevelSection:
     inputs: ClassVar[Mapping[str, InputPort[Any]]] = {}
     """The ports that it reads, by name, collected from the class and its bases."""
     outputs: ClassVar[Mapping[str, Output[Any]]] = {}
-    """The ports that it writes, by name, collected likewise.
+    """The ports that it writes, by name, collected in the same way.
 
     A planner has the single port "plan".
     """
@@ -306,7 +306,7 @@ class LevelSection:
             self.settings = read_params(self.params, context.params)
 
     def find_input_table(self, port: str) -> dict[str, Any]:
-        """Return the dict into which the board stores the readings of a port, by name.
+        """Return the dict in which the board stores the readings of `port` under its name.
 
         Raises:
             LevelError: The constructor uses the name of the port for something else.
@@ -346,7 +346,7 @@ class LevelSection:
         preload(*cls.preloads)
 
     def self_test(self) -> None:
-        """Raise `LevelError` when the level must not start.
+        """Raise `LevelError` if the level must not start.
 
         The board then holds SYSFAIL, and the launch fails.
         """
@@ -397,14 +397,14 @@ class Executor(LevelSection, ABC):
         # Board and level exchange these in addition to the ports. The board sets `demand` before
         # each `process`, and reports and clears `findings` and `acted` after it. It calls `inject`
         # when the active faults change.
-        # Stop that the rack's safety demands of the arm in this cycle.
+        # Kind of stop that the rack demands of the arm in this cycle, for safety.
         self.demand = Demand.NONE
         # Faults detected in this cycle, once per episode. The board raises alarms for them.
         self.findings: list[Finding] = []
-        # The injected faults that changed anything in this cycle, by index. The value is True if
-        # the effect was large enough to require detection.
+        # The injected faults that had an effect in this cycle, by index. The value is True if the
+        # effect was large enough that it must be detected.
         self.acted: dict[int, bool] = {}
-        # Callbacks of the driven mechanism, which complete each cycle, given the `ArmState`.
+        # Callbacks of the driven arm or hand, called at the end of each cycle with its `ArmState`.
         self.complete_cycle: list[Callable[[ArmState | None], None]] = []
         self._live_orders = Orders(self.commands)
         Executor.last_constructed = self
@@ -460,9 +460,10 @@ class Executor(LevelSection, ABC):
         return self.inputs.get(OPERATOR_PORT.name) is OPERATOR_PORT
 
     def take_settings(self, tick: int) -> None:
-        """Set live parameters as the operator commands, and answer in the status.
+        """Set the live parameters that the operator commands, and answer in the status.
 
-        Called by the board before `process`. Only an `AnsweringStatus` can answer.
+        Called by the board before `process`. There is no answer if the status does not derive from
+        `AnsweringStatus`.
         """
         self._live_orders.take_commands(
             OPERATOR_PORT.__get__(self, type(self)), self._set_parameter
@@ -472,16 +473,16 @@ class Executor(LevelSection, ABC):
             self._live_orders.fill_status(status)
 
     def _set_parameter(self, command: OperatorCommand) -> None:
-        """Set a live parameter, or refuse the command."""
+        """Set the live parameter that a command names, or refuse the command."""
         self.settings, why = set_live(self.settings, command.name)
         if why:
             self._live_orders.refuse_newest(why)
 
     @classmethod
     def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
-        """Return the names of an operator's settings, and of the level's alarms by number.
+        """Return names, such as those of control modifications, which alarms give by their index.
 
-        `params` may be invalid.
+        By default these are also the names that an operator may give. `params` may be invalid.
         """
         return ()
 
@@ -489,7 +490,7 @@ class Executor(LevelSection, ABC):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield each disagreement with the neighbours, before the launch.
+        """Yield each parameter that disagrees with the neighbours. Called before the launch.
 
         Args:
             context: The level.
@@ -521,7 +522,7 @@ class Executor(LevelSection, ABC):
     def build_ports(
         cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
     ) -> ConfiguredPorts:
-        """Return the ports that a config creates by `params`.
+        """Return the ports that the parameters of a board add to those of the class.
 
         Args:
             params: Parameters of the level, which may be invalid.
@@ -530,7 +531,7 @@ class Executor(LevelSection, ABC):
         return ConfiguredPorts()
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the injected faults by `faults`, which are all faults active from now on."""
+        """Replace the injected faults. `faults` are all faults that are active from now on."""
 
     @abstractmethod
     def process(self, tick: int) -> None:
@@ -551,13 +552,13 @@ class Planner(LevelSection, ABC):
         cls.outputs = {"plan": plan} if (plan := cls.outputs.get("output")) is not None else {}
 
     def wanted(self, tick: int) -> bool:
-        """Return True if a plan is wanted now. Must take much less than a cycle.
+        """Return True if a plan has to be computed now. Must take much less than a cycle.
 
-        The default wants a plan for each new command.
+        By default a plan is computed for each new command.
         """
         command: Reading[Message] = getattr(self, "above")  # noqa: B009
         return command.is_new
 
     @abstractmethod
     def plan(self, tick: int) -> None:
-        """Compute a plan into the output. It takes effect `within_cycles` cycles after `tick`."""
+        """Compute a plan and write it to `output`. It takes effect `within_cycles` cycles later."""

@@ -27,7 +27,7 @@ MAX_JOINTS = 16
 It is fixed, because an operator's mailbox has the same layout in every rack.
 """
 MAX_NAME_BYTES = 64
-"""Maximum length of a name in a command, bytes."""
+"""Maximum length of a name in a command, in bytes."""
 
 
 class Operation(IntEnum):
@@ -61,7 +61,7 @@ class Goal(IntEnum):
 
 
 SETTINGS = (Operation.MODIFY, Operation.TABLE, Operation.SET)
-"""Operations that are done at once and do not replace the command in force.
+"""Operations that are done at once and do not replace the command in force (see `Orders`).
 
 Each gives the name of what it sets.
 """
@@ -134,11 +134,11 @@ EFFECTS = {
     Operation.GOTO: "diverted",
     Operation.DO: "commanded",
 }
-"""Effect of a standing command on a level, as text."""
+"""Effect on a level of an operation in force, as text."""
 HELD_FROM_ABOVE = "held by the level above"
-"""Reason of a level that is held by the level above.
+"""Reason that a level reports while the level above holds it.
 
-The level above does not pass this reason on.
+The level above does not repeat this reason in its own status.
 """
 ABOVE_LOST = "no command from the level above: held until its board is back"
 BELOW_LOST = "no status from the level below: waiting for its board"
@@ -153,12 +153,12 @@ def format_commands(commands: Commands) -> str:
 
 
 def format_goals(goals: Sequence[Goal]) -> str:
-    """Return goals as one word, such as "joints|pose"."""
+    """Return forms of goals as one word, such as "joints|pose"."""
     return "|".join(goal.name.lower() for goal in goals)
 
 
 def describe_command(what: int, goal: int) -> str:
-    """Return a command, valid or not, as text, such as "goto pose"."""
+    """Return a command, which may be invalid, as text, such as "goto pose"."""
     names = [
         kind(number).name.lower() if number in set(kind) else str(number)
         for kind, number in ((Operation, what), (Goal, goal))
@@ -167,36 +167,39 @@ def describe_command(what: int, goal: int) -> str:
 
 
 class _CommandAnswer(NamedTuple):
-    """A command and the answer to it."""
+    """The answer to one command."""
 
-    serial: int
+    serial: int  # of the command
     answer: Answer
-    objection: str = ""
+    objection: str = ""  # why the command was refused. Empty if it was not
 
 
 class Orders:
-    """Operator's commands to one level.
+    """Operator's commands to one level, and the answers to them.
 
-    A refused command leaves the command before it in force, even on a restarted board, which
-    processes all commands again in order. Operators may overlap: the command in force is still
-    answered later if a setting or a refused command arrives before it is done. A status shows one
-    answer at a time. Several answers of one cycle are shown in the following cycles, oldest first.
+    The command in force is the newest one that was not refused and is neither one of `SETTINGS` nor
+    one of `DRIVE_OPERATIONS`. It keeps the level from its normal work, unless it is RESUME. After a
+    restart the board processes all commands again in order, so the same command is in force. If a
+    setting or a refused command arrives before the command in force is done, both are answered. A
+    status shows one answer at a time. Several answers of one cycle are shown in the following
+    cycles, oldest first.
     """
 
     def __init__(self, commands: Commands) -> None:
         self._commands = commands
         # Operation in force, one of `EFFECTS`. NONE while the level does its normal work.
         self.standing = Operation.NONE
-        self.serial = 0  # newest command. 0 if none yet
-        self.basis = 0  # newest command that was not refused. 0 if none yet
-        self._in_force = _CommandAnswer(0, Answer.NONE)  # newest one neither refused nor a setting
+        self.serial = 0  # serial of the newest command. 0 if none yet
+        self.basis = 0  # serial of the newest command that was not refused. 0 if none yet
+        self._in_force = _CommandAnswer(0, Answer.NONE)
+        # State before the newest command, which is restored if that command is refused.
         self._before = self.basis, self.standing, self._in_force
         self._news: list[_CommandAnswer] = []  # answers that no status has shown
         self._shown = self._in_force
 
     @property
     def in_force(self) -> int:
-        """Serial of the newest command that was neither refused nor a setting. 0 if none yet."""
+        """Serial of the command in force. 0 if there is none yet."""
         return self._in_force.serial
 
     @property
@@ -206,7 +209,7 @@ class Orders:
 
     @property
     def is_in_force(self) -> bool:
-        """True if a command keeps the level from its normal work."""
+        """True if the command in force keeps the level from its normal work."""
         return self.standing is not Operation.NONE
 
     @property
@@ -223,9 +226,8 @@ class Orders:
 
         Args:
             operator: Reading of the mailbox.
-            judge: Called with each accepted command. The level may refuse it there for reasons of
-                the level, and applies a setting there. None if the level has nothing to check or
-                set.
+            judge: Called with each accepted command, to apply a setting. It may still refuse the
+                command by `refuse_newest`. None if the level has nothing to check or set.
 
         Returns:
             True in the cycle that accepts a command other than a setting.
@@ -244,8 +246,8 @@ class Orders:
         return taken
 
     def _accept_command(self, message: OperatorCommand) -> bool:
-        """Accept or refuse a new command; return True if it is accepted."""
-        # A clock board that is restarted while it gives a command gives it again.
+        """Accept or refuse a command, unless it has been processed. Return True if accepted."""
+        # A clock board that is restarted while it sends a command sends it again.
         if message.id <= self.serial:
             return False
         self._before = self.basis, self.standing, self._in_force
@@ -272,7 +274,7 @@ class Orders:
         return True
 
     def refuse_newest(self, why: str) -> None:
-        """Refuse the command just accepted. The command before it is in force again."""
+        """Refuse the command just accepted. The previous command in force is restored."""
         self.basis, self.standing, self._in_force = self._before
         self._queue_answer(_CommandAnswer(self.serial, Answer.REFUSED, why))
 
@@ -282,7 +284,7 @@ class Orders:
         self._answer_command_in_force(Answer.REFUSED, why)
 
     def report_under_way(self) -> None:
-        """Report that a RESUME is not completed yet."""
+        """Report that the command in force, a RESUME, is not completed yet."""
         self._answer_command_in_force(Answer.TAKEN)
 
     def report_done(self) -> None:
@@ -291,15 +293,18 @@ class Orders:
             self._answer_command_in_force(Answer.DONE)
 
     def report_setting_started(self) -> None:
-        """Report that the setting just accepted is not done yet; `report_drives_done` follows."""
+        """Report that the setting just accepted takes time. Call `report_drives_done` when done."""
         self._queue_answer(_CommandAnswer(self.serial, Answer.TAKEN))
 
     def report_drives_done(self, serial: int) -> None:
-        """Report that a command to the arm's drives, or a setting that took time, is done."""
+        """Report that command `serial`, to the drives or a setting that took time, is done."""
         self._queue_answer(_CommandAnswer(serial, Answer.DONE))
 
     def format_reason(self, board: str) -> str:
-        """Return why an operator keeps level `board` from its normal work. Empty if none does."""
+        """Return text that says why an operator keeps level `board` from its normal work.
+
+        Empty if no operator does.
+        """
         if self.answer is Answer.REFUSED:
             return f"{board} held, `resume` releases it: {self._in_force.objection}"
         effect = EFFECTS.get(self.standing)
@@ -319,14 +324,14 @@ class Orders:
         self._news.append(answer)
 
     def find_basis(self, above: int) -> int:
-        """Return the newest operator's command on which this cycle is based.
+        """Return the serial of the newest operator's command on which this cycle is based.
 
-        `above` is the command on which the command from the level above is based.
+        `above` is the serial of the one on which the command from the level above is based.
         """
         return max(self.basis, above)
 
     def fill_status(self, status: AnsweringStatus, above: int = 0) -> None:
-        """Fill the fields of `AnsweringStatus`. For `above` see `find_basis`."""
+        """Write the next answer to a status. For `above` see `find_basis`."""
         if self._news:
             self._shown = self._news.pop(0)
         status.operator = self.find_basis(above)
@@ -337,7 +342,7 @@ class Orders:
 
 
 def find_answered_serial(status: AnsweringStatus | AnyMessage) -> int:
-    """Return the newest command that a level had accepted when it wrote this status.
+    """Return the serial of the newest command that a level had processed when it wrote a status.
 
     A restarted board uses it so that it does not execute a command twice.
     """
@@ -348,7 +353,7 @@ def find_answered_serial(status: AnsweringStatus | AnyMessage) -> int:
 def read_joint_goal(
     message: OperatorCommand, names: Sequence[str], ranges: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the joint positions of an `OperatorCommand`, (joints,), rad.
+    """Return the joint positions of an `OperatorCommand`, (joints,), in rad.
 
     Args:
         message: The command.

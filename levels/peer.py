@@ -16,7 +16,7 @@ DRIFT_PPM = 100
 
 
 class Presence(IntEnum):
-    """Whether another rack is present."""
+    """Presence of another rack."""
 
     AWAITED = 0  # not seen yet
     THERE = 1

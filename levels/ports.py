@@ -47,8 +47,8 @@ class InputPort(Port[M]):
 
     Attributes:
         source: The mailbox or mailboxes, see `Input`.
-        many: True if it reads the mailbox of every neighbour.
-        optional: True if the level also works without any.
+        many: True if the port reads the mailbox of every neighbour.
+        optional: True if the level also works without any such neighbour.
     """
 
     many = False
@@ -114,9 +114,9 @@ class Output(Port[M]):
 
     Args:
         message: The class of its messages.
-        cycles: The message is written in every n-th cycle: the last one before a multiple of n
-            cycles' ticks, counted from the board's phase, so that readers released then find it
-            fresh. If that cycle is missed, the message is missing too.
+        cycles: Write the message in every n-th cycle. Counted from the board's phase, this is the
+            last cycle of each group of n, so that readers released at the start of the next group
+            find it fresh. If that cycle is missed, the message is missing too.
         rests_on: The input whose information the port passes on. Its messages carry the tick of
             that information, or of the oldest information of an `Inputs`. By default they carry the
             tick of the cycle's release. The response of the whole hierarchy is measured by these
@@ -149,7 +149,7 @@ class Output(Port[M]):
         return vars(level).setdefault(self.name, message)  # type: ignore[no-any-return]
 
     def is_due(self, tick: int, every: int, phase: int) -> bool:
-        """Return True if a cycle writes the port.
+        """Return True if the cycle released at `tick` is one of those that write the port.
 
         Args:
             tick: Release of the cycle.
@@ -164,9 +164,9 @@ class Sender(Generic[M]):
 
     Attributes:
         message: The message to fill.
-        send: Sends a copy of the message. Returns False if the queue is full, and the message was
-            not sent. Takes as optional argument the tick of the information on which the message is
-            based.
+        send: Sends a copy of the message. Returns False if the message was not sent because the
+            queue is full. Its optional argument is the tick of the information on which the message
+            is based.
         room: Returns how many more messages can be sent in this cycle.
     """
 
@@ -194,7 +194,7 @@ class SentOutput(Output[M]):
 
 
 class QueuedOutput(SentOutput[M]):
-    """A port whose messages go through a queue, any number in a cycle, so that none is missed."""
+    """A port that sends any number of messages in a cycle through a queue, so none is missed."""
 
     queued = True
 
@@ -204,8 +204,8 @@ class TimedOutput(SentOutput[M]):
 
     Args:
         message: The class of its messages.
-        max_age_s: Age of the information from which readers consider the writer lost, s of
-            simulated time. Until then they read the message as old.
+        max_age_s: Age of the information, in s of simulated time, from which readers consider the
+            writer lost. Until then they read the message as old.
     """
 
     def __init__(self, message: type[M], max_age_s: float) -> None:
@@ -216,7 +216,7 @@ class TimedOutput(SentOutput[M]):
 class ConfiguredPorts(NamedTuple):
     """Ports that a config creates, in addition to the ports that a class declares.
 
-    `is_whole` is False if some are unknown.
+    `is_whole` is False if the parameters are invalid, so that some ports are unknown.
     """
 
     inputs: Mapping[str, InputPort[Any]] = MappingProxyType({})
@@ -268,8 +268,8 @@ def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[
 
     Args:
         level: The class.
-        attribute: Name of the attribute in which the base classes keep theirs.
-        kinds: Classes to collect.
+        attribute: Name of the class attribute that lists the ports of each base class.
+        kinds: Classes of the ports to collect.
 
     Raises:
         LevelError: The class has a port and another attribute of the same name, or lists its ports

@@ -1,4 +1,4 @@
-"""Import of what a config names as "package.module:Name", including names of earlier versions."""
+"""Import of classes that a config names as "package.module:Name", including their former names."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from rack.backplane.process import describe_end, die_with_parent, wait_readable
 
 T = TypeVar("T")
 SLOW_S = 2.0
-"""Duration of an import after which the user is told that it continues, s."""
+"""Duration of an import after which the user is told that it continues, in s."""
 MAX_IMPORT_S = 60.0
-"""Duration of an import after which the module is refused, s."""
+"""Duration of an import after which the module is refused, in s."""
 IMPORTED_STATUS = 117
 """Exit status of a child that has completed an import. Few modules exit with it themselves."""
 
@@ -60,8 +60,8 @@ def import_reference(reference: str, is_tried: bool = True) -> tuple[ModuleType,
 
     Args:
         reference: The reference.
-        is_tried: Whether to import the module in a child process first, so that a user's module
-            cannot end or block this process.
+        is_tried: True to try the import in a child process first, so that a user's module cannot
+            end or block this process.
 
     Returns:
         The module, and the name in it.
@@ -112,9 +112,11 @@ def find_class(reference: str, base: type[T], is_tried: bool = True) -> type[T]:
 # A config is checked for many mistakes, and each may need the module.
 @cache
 def _try_import(module: str) -> str:
-    """Import a module in a child process; return why it must not be imported in this process.
+    """Import a module in a child process, to find out whether this process may import it.
 
-    Empty if it may be imported. An exception that the module raises is no reason against it.
+    Returns:
+        Why this process must not import it: the import ends the process or takes too long. Empty if
+        it may, even if the module raises an exception.
     """
     parent = os.getpid()
     try:

@@ -51,7 +51,7 @@ Interface = Literal["torque", "position", "velocity"]
 Drives that accept positions or velocities close their control loops themselves.
 """
 Moment = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
-"""Simulated time, s."""
+"""Simulated time, in s."""
 LAST_TICK = 10**15
 """Maximum tick. Ticks are 64-bit words; this many of the shortest ones last 300 years."""
 Tick = Annotated[int, Field(ge=0, le=LAST_TICK)]
@@ -84,9 +84,9 @@ class Table(BaseModel):
 def describe_keys(kind: type[BaseModel]) -> dict[str, FieldInfo]:
     """Return the fields of a table by their keys, each with its description.
 
-    A field without a description takes the text below it. pydantic can look for such texts itself
-    (`use_attribute_docstrings`), but does so for every class when it is defined, so that each start
-    of a rack would take 0.2 s longer.
+    The description of a field is the text below it, unless the field states another. pydantic can
+    find such texts itself (`use_attribute_docstrings`), but does so for every class when it is
+    defined, so that each start of a rack would take 0.2 s longer.
     """
     below = ChainMap(*(_find_field_texts(base) for base in kind.__mro__ if issubclass(base, Table)))
     for name, field in kind.model_fields.items():
@@ -96,7 +96,7 @@ def describe_keys(kind: type[BaseModel]) -> dict[str, FieldInfo]:
 
 @cache
 def _find_field_texts(table: type[Table]) -> dict[str, str]:
-    """Return the texts below the fields of a class in its source, by field."""
+    """Return the text below each field in the source of a table, by field name."""
     texts = {}
     # A class typed at a prompt has no source.
     with suppress(OSError, TypeError):
@@ -110,7 +110,7 @@ def _find_field_texts(table: type[Table]) -> dict[str, str]:
 
 
 def freeze_lists(value: Any) -> Any:
-    """Return a TOML value with tuples instead of lists, also inside tables."""
+    """Return a TOML value with all lists converted to tuples, including lists inside tables."""
     if isinstance(value, dict):
         return {key: freeze_lists(item) for key, item in value.items()}
     return tuple(map(freeze_lists, value)) if isinstance(value, list) else value
@@ -143,7 +143,7 @@ def list_live_keys(kind: type[Table] | None) -> tuple[str, ...]:
 
 
 def read_setting(setting: str) -> tuple[str, Any]:
-    """Return key and value of "key=value", with the value in TOML.
+    """Return the key and the value of a text "key=value", whose value is in TOML.
 
     Raises:
         LevelError: The text has another form.
@@ -160,8 +160,8 @@ def set_live(params: Params, setting: str) -> tuple[Params, str]:
     """Set a live parameter by "key=value".
 
     Returns:
-        The new params, and why the parameter was not set, empty if it was. A refused setting leaves
-        the params unchanged.
+        The new params, and an empty text. If the parameter cannot be set, the unchanged params, and
+        why.
     """
     kind = type(params)
     try:
@@ -177,7 +177,7 @@ def validate_class(reference: str, base: type[T]) -> type[T]:
     """Return the subclass of `base` that "package.module:Class" names.
 
     Raises:
-        ValueError: It is missing or no such subclass.
+        ValueError: The class is missing, abstract, or no subclass of `base`.
     """
     try:
         return find_class(reference, base)
@@ -209,9 +209,9 @@ class CalibrationConfig(Table):
 
 
 GRIPPER_DAMPING_S = 0.03
-"""Default damping of a gripper's loop, divided by its stiffness, s."""
+"""Ratio of the default damping of a gripper's position loop to its stiffness, in s."""
 STILL_DIVISOR = 20
-"""Divisor of the gripper's travel that yields its threshold of motion.
+"""Ratio of a gripper's travel to the largest motion that counts as rest.
 
 The opening may be a length or an angle, so the threshold is relative.
 """
@@ -255,26 +255,27 @@ class GripperConfig(Table):
 
     @model_validator(mode="after")
     def _check_travel(self) -> GripperConfig:
+        """Check that `open` and `closed` differ."""
         if self.open == self.closed:
             raise ValueError(f"open and closed are both {self.open:g}: the gripper does not move")
         return self
 
     @property
     def travel(self) -> float:
-        """Distance of the driven joint from open to closed, m or rad."""
+        """Distance of the driven joint from open to closed, in m or rad."""
         return abs(self.open - self.closed)
 
     @property
     def gains(self) -> tuple[float, float]:
-        """Stiffness and damping of the position loop, N/m and N s/m, or N m/rad and N m s/rad."""
+        """Stiffness and damping of the position loop in N/m and N s/m, or N m/rad and N m s/rad."""
         stiffness = self.stiffness or 2.0 * self.force / self.travel
         return stiffness, self.damping or GRIPPER_DAMPING_S * stiffness
 
     @property
     def rest_threshold(self) -> float:
-        """Motion of the driven joint that counts as none, m or rad.
+        """Largest motion of the driven joint that counts as rest, in m or rad.
 
-        The same in one second is the speed that counts as rest.
+        The largest speed that counts as rest is this distance per second.
         """
         return self.travel / STILL_DIVISOR
 
@@ -420,6 +421,7 @@ class RobotConfig(Table):
     @field_validator("guessed")
     @classmethod
     def _check_guessed(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Check that every name begins with a key of this table."""
         for name in names:
             if name.partition(".")[0] not in cls.model_fields:
                 raise ValueError(
@@ -429,7 +431,7 @@ class RobotConfig(Table):
 
     @property
     def tool_name(self) -> str:
-        """Name of the site whose pose is the pose of the tool. With `tool_offset`, a new name."""
+        """Name of the site at the tool. With `tool_offset`, a site of this name is added."""
         return self.tool if self.tool_offset is None else f"tool of {self.tool}"
 
 

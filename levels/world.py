@@ -42,7 +42,7 @@ class WorldModel(Executor):
         super().__init__(context)
         self._params = read_params(WorldParams, context.params)
         bodies = context.sizes["bodies"]
-        # Poses in the last scene, and poses in which bodies last rested: m, and quaternions.
+        # Poses in the last scene, and poses in which bodies last rested: position in m, quaternion.
         self._last, self._rest = np.zeros((2, bodies, 7))
         self._moving = np.zeros(bodies, dtype=bool)
         self._slow_s = np.zeros(bodies)
@@ -51,7 +51,7 @@ class WorldModel(Executor):
         self._started = False
 
     def process(self, tick: int) -> None:
-        """Update from a new scene. When one is missing, keep poses and set velocities to 0."""
+        """Update the model from a new scene. Set all velocities to 0 if scenes are overdue."""
         model = self.model
         if not self._started:
             self._started = True
@@ -83,7 +83,7 @@ class WorldModel(Executor):
             elapsed_s: Time since the last scene, s.
 
         Returns:
-            True if a body starts or stops moving.
+            True if a body has started or stopped moving.
         """
         p = self._params
         slow_turn = p.turned / p.resting * elapsed_s
@@ -105,15 +105,15 @@ class WorldModel(Executor):
 
 
 def compute_distances(poses: Array, others: Array) -> Array:
-    """Return the distances between corresponding poses, m; both are (bodies, 7)."""
+    """Return the distance in m between each pair of corresponding poses; both are (bodies, 7)."""
     x, y, z = (poses - others)[:, :3].T
     return np.asarray(np.sqrt(x * x + y * y + z * z))
 
 
 def compute_angles(poses: Array, others: Array) -> Array:
-    """Return the angles between the orientations of corresponding poses, rad.
+    """Return the angle in rad between the orientations of each pair of corresponding poses.
 
-    Both are (bodies, 7). The quaternions q and -q are the same orientation.
+    Both arrays are (bodies, 7). The quaternions q and -q are the same orientation.
     """
     w, x, y, z = (poses * others)[:, 3:].T
     return 2.0 * apply_elementwise(math.acos, np.minimum(np.abs(w + x + y + z), 1.0))

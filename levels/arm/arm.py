@@ -3,7 +3,7 @@
 The servo level drives the class that `[board.servo.params] arm = "package.module:Class"` names. The
 default is the simulated arm; it may be your own hardware or simulation. In every cycle the servo
 level calls, in this order: `step` (with the ticks since the last cycle), `sense`, one of `drive`
-(`follow` for drives that take set points), `brake` or neither (the last command stays in force),
+(`follow` for drives that take set points), `brake` or neither (the last command stays active),
 `save` and `look`. All calls come from the executor's process, within its cycle, so none may block.
 An exception ends the board, which is restarted as after any crash. Report a broken arm in `fault`
 instead.
@@ -25,7 +25,7 @@ from rack.levels.tables import SensorConfig
 
 
 class Arm(BrakedArm):
-    """Base class of every arm. It is driven through a guard, unless its drives keep its limits.
+    """Base class of every arm. A guard protects the arm, unless its drives keep the limits.
 
     Subclasses write `sense`, `brake`, `step`, and `drive` or `follow`, depending on whether the
     drives take torques or set points. They keep the attributes of `DrivableArm` up to date.
@@ -60,7 +60,7 @@ class Arm(BrakedArm):
         return ArmLinks(link, FaultyLink(self, acted, link, holds))
 
     def permit_speed(self, speed_fraction: float) -> None:
-        """Change the fraction of their limits below which the link keeps velocities."""
+        """Set the fraction of the velocity limits that the link permits."""
         if self._guard is not None:
             self._guard.permit_speed(speed_fraction)
 
@@ -78,9 +78,10 @@ class Arm(BrakedArm):
         return ""
 
     def look(self, scene: Scene) -> None:
-        """Fill a `Scene` with the poses of bodies and tool.
+        """Fill a `Scene` with the sensed poses of bodies and tool.
 
-        By default bodies are at their start and the tool is where the joint sensors place it.
+        By default, bodies have their initial poses, and the pose of the tool follows from the joint
+        sensors.
         """
         offset = self.cell.encoders.offset
         position = self.sense().position

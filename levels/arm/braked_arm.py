@@ -1,4 +1,4 @@
-"""Behaviour common to all arms: they refuse invalid torques, and count and report braking."""
+"""Behaviour common to all arms: they refuse invalid torques and report braking."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ class BrakedArm(Plant, DrivableArm):
         # Ticks without a command after which the brakes must engage.
         self.patience = cell.patience.ticks(every, clock_ns * 1e-9)
         self.waited = self.patience
-        self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: given to the motors last
-        self.grip_force = 0.0  # N: given to the gripper last
-        self.state = DriveState.DISABLED  # of the drives, as of the last `step`
+        self.torque: Array = np.zeros(len(cell.qpos))  # (joints,), N m: last torque of the motors
+        self.grip_force = 0.0  # N: last force of the gripper
+        self.state = DriveState.DISABLED  # of the drives, after the last `step`
         # Reason (see `Alarm.BRAKES_CLOSED`) and first tick of braking. None while released.
         self._brakes: tuple[int, int] | None = (BRAKED_AT_START, self.tick)
         # For the level that drives the arm, and for an arm that senses exactly.
@@ -57,26 +57,26 @@ class BrakedArm(Plant, DrivableArm):
         """Return the newest sample; see `Link.sense`."""
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Release the brakes and apply torques, N m, and grip force, N; see `Link.drive`.
+        """Release the brakes and apply torques in N m and a grip force in N; see `Link.drive`.
 
-        Sets `waited` to 0. By default it is not implemented; see `has_interface`.
+        Implementations set `waited` to 0. The base class has none; see `has_interface`.
         """
         raise NotImplementedError
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Release the brakes and follow a set point; see `Link.follow`.
 
-        Sets `waited` to 0, and `torque` to the predicted or reported torque. By default it is not
-        implemented; see `has_interface`.
+        Implementations set `waited` to 0, and `torque` to the predicted or reported torque. The
+        base class has none; see `has_interface`.
         """
         raise NotImplementedError
 
     @classmethod
     def has_interface(cls, interface: Interface) -> bool:
-        """Return True if the drives have an interface.
+        """Return True if the drives accept commands of the kind `interface`.
 
-        `rack check` refuses a config that names another one. By default the methods that the class
-        implements decide.
+        `rack check` refuses a config that names another kind. By default, drives accept torques if
+        the class implements `drive`, and set points if it implements `follow`.
         """
         if interface == "torque":
             return cls.drive is not BrakedArm.drive
@@ -126,7 +126,7 @@ class BrakedArm(Plant, DrivableArm):
                 self._report_brakes(BRAKED_WITHOUT_TORQUE, since, self.waited - self.every)
 
     def report_cycle(self) -> None:
-        """Report, with the reason, every change of the brakes in a cycle, however short."""
+        """Report every change of the brakes in this cycle and its reason, however short it was."""
         super().report_cycle()
         why = self.brake_cause
         self.brake_cause = Error.NONE
@@ -147,7 +147,8 @@ class BrakedArm(Plant, DrivableArm):
     def restore(self, state: ArmState) -> None:
         """Continue from an `ArmState`.
 
-        By default drives have no states, so they are enabled unless they had been disabled.
+        By default drives have no states of their own: they are enabled, unless the state says that
+        they had been disabled.
         """
         super().restore(state)
         was_disabled = state.error == Error.DISABLED
@@ -165,7 +166,7 @@ class BrakedArm(Plant, DrivableArm):
         return False
 
     def describe_contact(self, contact: tuple[int, int]) -> str:
-        """Describe a `contact` as text. By default it has the numbers of the geoms."""
+        """Describe a `contact` as text. By default the text gives the numbers of the geoms."""
         return f"geom {contact[0]} touches geom {contact[1]}"
 
     def weaken(self, most: Array | None) -> None:
@@ -176,8 +177,8 @@ class BrakedArm(Plant, DrivableArm):
         """
 
     def sense_wrist(self) -> Array | None:
-        """Return the newest sample of the wrist sensor, (6,), N and N m, in its frame.
+        """Return the newest force in N and torque in N m at the wrist, (6,), in the sensor's frame.
 
-        None, the default, if the arm has none.
+        None, the default, if the arm has no wrist sensor.
         """
         return None

@@ -10,13 +10,13 @@ from rack.levels.robot.limits import MotorPatience
 
 
 class CommandsAbove:
-    """Check that the commands of all boards above are present and fresh.
+    """Checks that the commands of all boards above are present and fresh.
 
-    A command is based on a status of the previous cycle and takes `cycles` cycles of its board;
-    then the motors, or valves, keep it for their patience.
+    A command is based on a status of the previous cycle, and its board needs `cycles` cycles for
+    it. After that, the motors or valves keep it for their patience.
 
     Attributes:
-        oldest: Maximum age of a command, ticks, by board.
+        oldest: Maximum age of a command in ticks, by board.
     """
 
     def __init__(
@@ -27,9 +27,9 @@ class CommandsAbove:
         Args:
             context: The level that reads the commands.
             patience: Time for which motors, or valves, keep a command.
-            cycles: Cycles of its board that a command takes.
-            what: Name of the commands in messages.
-            halted: State of the arm, or hand, while a command is missing, in messages.
+            cycles: Cycles that a board needs for a command.
+            what: Name of the commands, for the reasons of `find_missing`.
+            halted: State of the arm or hand while a command is missing, for the same reasons.
         """
         self._what = what
         self._halted = halted
@@ -41,14 +41,14 @@ class CommandsAbove:
     def find_missing(
         self, commands: Mapping[str, Reading[SampledCommand]], tick: int, since: int
     ) -> str:
-        """Return why commands are missing. Empty if all are fresh.
+        """Return the reason why a command is missing or stale. Empty if all are fresh.
 
         Args:
             commands: Readings of the commands, by board.
             tick: Present tick.
-            since: Tick of the oldest status on which all commands must be based.
+            since: Tick of the oldest status on which a command may be based.
         """
-        all_know = True
+        all_recent = True
         for board, oldest in self.oldest.items():
             value, verdict, is_lost, _ = commands[board]
             if is_lost:
@@ -61,5 +61,5 @@ class CommandsAbove:
                     f"stale {self._what} from board '{board}': based on a status more than {oldest}"
                     " ticks old"
                 )
-            all_know = all_know and sampled >= since
-        return "" if all_know else f"{self._halted} until the boards above have seen it"
+            all_recent = all_recent and sampled >= since
+        return "" if all_recent else f"{self._halted} until the boards above have seen it"

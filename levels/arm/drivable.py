@@ -53,7 +53,7 @@ class LimitViolation(NamedTuple):
 
 
 def copy_sample(sample: Sensed) -> Sensed:
-    """Return a copy of a sample, with arrays that stay valid."""
+    """Return a copy of a sample, whose arrays stay valid when the next sample is taken."""
     return sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
 
 
@@ -82,7 +82,7 @@ class Link(Protocol):
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Release the brakes and let the drives reach `target` at the end of the cycle.
 
-        Afterwards they continue at its velocity. Otherwise as `drive`.
+        After that they continue at its velocity. `grip_force` and the result are as for `drive`.
         """
 
 
@@ -118,7 +118,7 @@ class DrivableArm(ABC):
     failed.
     """
     exceeded: LimitViolation | None = None
-    """Limit that the newest sample exceeds, if the link judges samples."""
+    """Limit that the newest sample exceeds. None if it exceeds none or the link checks none."""
 
     dynamics: Dynamics  # for the level that drives the arm
     tick: int  # present tick
@@ -162,7 +162,7 @@ class DrivableArm(ABC):
 
         Args:
             tick_s: Duration of a tick, s.
-            speed_fraction: Fraction of their limits below which velocities are kept.
+            speed_fraction: Fraction of the velocity limits that is permitted.
             acted: Collects the faults that have an effect, for `Executor.acted`.
             holds: Returns True if the gripper may hold an object, as far as the level knows.
 
@@ -172,7 +172,7 @@ class DrivableArm(ABC):
 
     @abstractmethod
     def permit_speed(self, speed_fraction: float) -> None:
-        """Change the fraction of their limits below which the link keeps velocities."""
+        """Set the fraction of the velocity limits that the link permits."""
 
     @classmethod
     @abstractmethod
@@ -185,9 +185,9 @@ class DrivableArm(ABC):
     @classmethod
     @abstractmethod
     def has_interface(cls, interface: Interface) -> bool:
-        """Return True if the drives have an interface.
+        """Return True if the drives accept commands of the kind `interface`.
 
-        `rack check` refuses a config that names another one.
+        `rack check` refuses a config that names another kind.
         """
 
     @abstractmethod
@@ -201,8 +201,8 @@ class DrivableArm(ABC):
     def step(self, ticks: int) -> None:
         """Let time pass: advance `tick` and `waited`, and engage the brakes after `patience`.
 
-        For hardware this is all. `ticks` exceeds the level's cycle after missed cycles, and may be
-        0.
+        Hardware needs no more; a simulation also simulates the ticks. `ticks` exceeds the level's
+        cycle after missed cycles, and may be 0.
         """
 
     @abstractmethod
@@ -231,14 +231,14 @@ class DrivableArm(ABC):
 
     @abstractmethod
     def sense_wrist(self) -> Array | None:
-        """Return the newest sample of the wrist sensor, (6,), N and N m, in its frame.
+        """Return the newest force in N and torque in N m at the wrist, (6,), in the sensor's frame.
 
-        None if the arm has none.
+        None if the arm has no wrist sensor.
         """
 
     @abstractmethod
     def look(self, scene: Scene) -> None:
-        """Fill a `Scene` with the poses of bodies and tool."""
+        """Fill a `Scene` with the sensed poses of bodies and tool."""
 
     @abstractmethod
     def save(self, state: ArmState) -> None:
@@ -253,7 +253,7 @@ class DrivableArm(ABC):
 
 
 def find_arm(reference: str) -> type[DrivableArm]:
-    """Return the class that "package.module:Class" names.
+    """Return the class of an arm that "package.module:Class" names.
 
     Raises:
         ValueError: The class is missing, abstract, or no arm.

@@ -22,12 +22,12 @@ SPEED_FRACTION = 0.99
 The rest covers model errors within a cycle.
 """
 RANGE_MARGIN_RAD = 0.002
-"""Distance that the gate keeps from the ends of a joint's range, rad.
+"""Distance that the gate keeps from the ends of a joint's range, in rad.
 
 It covers model errors within a cycle.
 """
 CLEAR_SPEED_FRACTION = 0.01
-"""Fraction of a velocity limit that must remain for one rough prediction to suffice."""
+"""Margin to a velocity limit with which one rough prediction suffices, as a fraction of it."""
 HARD = 0
 SOFT = 8
 """Values of the solver's constraint types."""
@@ -68,7 +68,7 @@ class LimitGate:
         self._kinds = np.repeat(np.array([SOFT, HARD], dtype=np.int32), joints)
 
     def limit_torque(self, torque: Array, q: Array, qd: Array) -> tuple[Array, bool]:
-        """Return the torques that may pass.
+        """Return the commanded torques, cut where necessary.
 
         Args:
             torque: Commanded torques, (joints,), N m. They must be finite.
@@ -76,7 +76,7 @@ class LimitGate:
             qd: Velocities, (joints,), rad/s.
 
         Returns:
-            The torques, and whether anything was cut.
+            The permitted torques, and True if anything was cut.
         """
         self._dynamics.terms(q, qd)
         if self._is_clear(torque, self._dynamics.newest, self._limits, self._period_s):
@@ -93,7 +93,7 @@ class LimitGate:
         return passed, not np.array_equal(passed, torque)
 
     def _predict_gain(self, torque: Array, q: Array, qd: Array) -> Array:
-        """Predict the change in velocity that torques cause in one cycle, (joints,), rad/s."""
+        """Predict the change in velocity that torques cause in one cycle, (joints,), in rad/s."""
         self._inertia, bias = self._dynamics.terms(q, qd)
         self._resisting = bias + self._dynamics.friction(qd)
         return np.asarray(solve(self._inertia, torque - self._resisting) * self._period_s)
@@ -123,7 +123,7 @@ class LimitGate:
         )
 
     def _limit_speed(self, distance: Array, speed: Array) -> Array:
-        """Return the highest permitted speed towards an end of the range, (joints,), rad/s."""
+        """Return the highest permitted speed towards an end of the range, (joints,), in rad/s."""
         return compute_stoppable_speed(
             distance, speed, self._fastest, self._braking, self._period_s
         )
@@ -182,7 +182,7 @@ def is_clear(
 
 @compiled
 def cholesky_solve(matrix: Array, vector: Array) -> Array:
-    """Solve like `rack.levels.algebra.solve`, for compiled callers."""
+    """Solve `matrix` x = `vector` like `rack.levels.algebra.solve`, for compiled callers."""
     size = len(vector)
     factor = np.zeros((size, size))
     solution = vector.copy()
@@ -210,15 +210,15 @@ def compute_stoppable_speed(
 ) -> Array:
     """Return the highest permitted speed, at the end of the cycle, towards an end of the range.
 
-    With v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and must stop within
-    the rest: v'^2 / 2 a <= distance - (v + v') T / 2.
+    With speed v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and must stop
+    within the remaining distance: v'^2 / 2 a <= distance - (v + v') T / 2.
 
     Args:
         distance: Distance from the end of the range, rad.
         speed: Present speed towards it, rad/s.
         fastest: Maximum speed, rad/s.
         braking: Deceleration of the joint, rad/s2.
-        period_s: Cycle, s.
+        period_s: Length of the cycle, s.
     """
     half = 0.5 * braking * period_s
     remaining = np.maximum(distance - 0.5 * speed * period_s, 0.0)
@@ -253,7 +253,7 @@ class SetPointGate:
             arm: The arm.
             bounds: Limits to keep.
             tick_s: Duration of a tick, s.
-            span_s: Time for which a set point must be safe, as later cycles may be missed, s.
+            span_s: Time for which a set point must be safe, because later cycles may be missed, s.
             last: Receives the last set point, (2, joints), rad and rad/s.
         """
         cell = arm.cell
@@ -272,10 +272,10 @@ class SetPointGate:
         self._last = last
 
     def limit_set_point(self, target: JointTarget, q: Array, qd: Array) -> JointTarget | Finding:
-        """Return the set point that may pass to the arm.
+        """Return the set point, cut to what may be given to the arm.
 
-        Refused are numbers that are not finite, a predicted torque beyond its limit, and a first
-        set point away from the arm. After a refusal the brakes are engaged.
+        A set point is refused if a number is not finite, a predicted torque is beyond its limit, or
+        it is the first set point and too far from the arm. A refusal engages the brakes.
 
         Args:
             target: Commanded set point.
@@ -283,7 +283,7 @@ class SetPointGate:
             qd: Sensed velocities, (joints,), rad/s.
 
         Returns:
-            The set point, or why it was refused.
+            The permitted set point, or the finding with which it was refused.
         """
         arm = self._arm
         position, velocity = self._last
@@ -310,9 +310,10 @@ class SetPointGate:
         return JointTarget(position.copy(), velocity.copy(), target.torque)
 
     def _check_set_point(self, target: JointTarget, q: Array, qd: Array) -> Finding | None:
-        """Return why a set point is invalid; None if it is valid.
+        """Check a set point. While the arm is braked, motion starts at the sensed state.
 
-        While the arm is braked, or at the first set point, motion starts at the sensed state.
+        Returns:
+            Why the set point is invalid. None if it is valid.
         """
         error = target.position - q
         is_invalid = ~np.isfinite(error + target.velocity)
@@ -325,9 +326,11 @@ class SetPointGate:
         return self._arm.refuse_command(Finding(Alarm.SET_POINT, joint, float(error[joint])))
 
     def _compute_approach(self, target: JointTarget) -> tuple[Array, bool]:
-        """Return the velocity to command for the end of the cycle, rad/s.
+        """Compute the velocity with which to approach a set point.
 
-        Also return True if the set point is too far away to reach it in a cycle.
+        Returns:
+            The velocity for the end of the cycle, (joints,), rad/s, and True if the set point is
+            too far away to be reached in one cycle.
         """
         if not self._by_position:
             return target.velocity, False
@@ -345,7 +348,7 @@ class SetPointGate:
         return target.velocity + closing, bool(cut)
 
     def _compute_resistance(self) -> tuple[Array, Array]:
-        """Return the inertia and the resisting torques at the last set point."""
+        """Return the inertia, and the torques of bias and dry friction, at the last set point."""
         inertia, bias = self._dynamics.terms(*self._last)
         return inertia, bias + self._dynamics.friction(self._last[1])
 
@@ -353,7 +356,8 @@ class SetPointGate:
 def narrow_bounds(bounds: Bounds, limits: Limits) -> Bounds:
     """Return bounds halfway between `bounds` and the limits of planned motion.
 
-    They apply where they are tighter than `bounds`, because drives overshoot a little.
+    Where `limits` are wider than `bounds`, `bounds` apply. The margin is for drives, which
+    overshoot a little.
     """
     low, high = bounds.position.T
     planned_low, planned_high = 0.5 * (bounds.position + limits.position).T

@@ -27,11 +27,11 @@ DETECTABLE_TORQUE_FRACTION = 0.02
 This is in addition to the torque that friction and a contact may hide.
 """
 MIN_TURNING_SPEED = 5.0 * FRICTION_SPEED
-"""Velocity above which the direction of dry friction in a joint is known, rad/s."""
+"""Velocity above which the direction of dry friction in a joint is known, in rad/s."""
 
 
 class FaultyLink:
-    """Implements `Link` with injected faults."""
+    """Implements `Link`, and applies the injected faults on the way to and from the arm."""
 
     def __init__(
         self,
@@ -61,14 +61,14 @@ class FaultyLink:
         # A contact may change from pushing along to pushing back.
         self._pressed = 2.0 * MAX_CONTACT_FRACTION * limits
         self._sensors: list[tuple[SensorStep, ActiveFault]] = []
-        # With the fraction of its torque limit that a motor still provides.
+        # Each with the fraction of its torque limit that the motor still provides.
         self._motors: list[tuple[float, ActiveFault]] = []
         self._commands: list[tuple[CommandStep, ActiveFault]] = []
         self._kept: dict[Key, Sensed] = {}
         self._torque = np.zeros(len(limits))
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the active faults. Faults of joints that the arm lacks have no effect."""
+        """Replace the active faults. A fault of a joint that the arm lacks has no effect."""
         active = [
             ActiveFault(place, fault, joints, self._arm.every, self._kept)
             for place, fault in enumerate(faults)
@@ -94,9 +94,9 @@ class FaultyLink:
         """Return the newest sample with the faults applied."""
         sample = self._next.sense()
         for step, active in self._sensors:
-            sample, shows = step.act(sample, active)
-            if shows is not None:
-                self._effects[active.place] = shows
+            sample, must_be_found = step.act(sample, active)
+            if must_be_found is not None:
+                self._effects[active.place] = must_be_found
         return sample
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
@@ -126,7 +126,7 @@ class FaultyLink:
                     self._effects[active.place] = bool((missing > hidden[active.joints]).any())
 
     def _compute_hidden_torque(self) -> Array | float:
-        """Return how much of a motor's missing torque a contact may hide, N m."""
+        """Return how much of a motor's missing torque a contact may hide, in N m."""
         if self._arm.is_touching_surroundings:
             return self._pressed
         turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > MIN_TURNING_SPEED)
@@ -137,7 +137,7 @@ class FaultyLink:
         )
 
     def _corrupt_torque(self, torque: Array) -> Array:
-        """Return the torques as the active command faults corrupt them, (joints,), N m."""
+        """Return the torques as the active command faults corrupt them, (joints,), in N m."""
         corrupt = self._torque
         np.copyto(corrupt, torque)
         for step, active in self._commands:

@@ -1,4 +1,4 @@
-"""Guard of an arm that does not keep its limits itself: judges samples and limits commands."""
+"""Guard of an arm that does not keep its limits itself: checks samples and limits commands."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rack.levels.robot.limits import Bounds
 def narrow_bounds_by_errors(cell: Cell, speed_fraction: float) -> Bounds:
     """Return the bounds of a cell, narrowed by the error of the encoders.
 
-    `speed_fraction` is the fraction of their limits below which velocities are kept.
+    `speed_fraction` is the fraction of the velocity limits that is permitted.
 
     Raises:
         RobotError: The encoders are too coarse to detect a violated limit.
@@ -47,7 +47,7 @@ def narrow_bounds_by_errors(cell: Cell, speed_fraction: float) -> Bounds:
 
 
 class GuardedArm:
-    """Implements `Link` around an arm, and protects it by its samples alone.
+    """Implements `Link` around an arm, and protects it, using nothing but its samples.
 
     A torque that is not finite, or beyond its limit, is refused and engages the brakes. Other
     torques are cut so that the arm stays within the limits, and can still be stopped (`LimitGate`).
@@ -55,7 +55,7 @@ class GuardedArm:
     may be missed. The largest possible error of the encoders is kept as a margin on each limit. A
     sample that exceeds a limit by more than that error, or is not finite, is a violation. It is
     counted, stored in the arm's `exceeded`, and stops the arm. Contacts and true positions, which
-    only a simulation knows, are not judged.
+    only a simulation knows, are not checked.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class GuardedArm:
             arm: The arm.
             tick_s: Duration of a tick, s.
             below: Link that senses the arm. None if the arm is sensed directly.
-            speed_fraction: Fraction of their limits below which velocities are kept.
+            speed_fraction: Fraction of the velocity limits that is permitted.
 
         Raises:
             RobotError: The encoders are too coarse to detect a violated limit.
@@ -83,7 +83,7 @@ class GuardedArm:
         self.permit_speed(speed_fraction)
 
     def permit_speed(self, speed_fraction: float) -> None:
-        """Keep velocities within `speed_fraction` of their limits.
+        """Set the fraction of the velocity limits that the guard permits.
 
         Raises:
             RobotError: The encoders are too coarse to detect a violated limit.
@@ -100,7 +100,7 @@ class GuardedArm:
             self._set_points = SetPointGate(self._arm, bounds, self._tick_s, self._span_s, last)
 
     def sense(self) -> Sensed:
-        """Return the newest sample, after judging it."""
+        """Return the newest sample, after checking it against the limits."""
         if isinstance(self._below, PresentLink):
             _, state, sample = self._below.estimate_present()
         else:

@@ -21,7 +21,7 @@ from rack.levels.robot.dynamics import Dynamics
 class AppliedTorque(NamedTuple):
     """Torque that has driven an arm until a tick."""
 
-    until: int
+    until: int  # tick
     torque: Array | None  # (joints,), N m. None if its brakes were engaged
 
 
@@ -30,12 +30,13 @@ class PresentState(NamedTuple):
 
     sample: Sensed  # as sensed
     state: Sensed  # extrapolated to the present
-    # Like `state`, but a joint whose sample has not changed stays, because its sensor may be stuck.
+    # Like `state`, but a joint whose sample has not changed keeps its last value, because its
+    # sensor may be stuck.
     reported: Sensed
 
 
 def build_present_link(arm: BrakedArm, tick_s: float) -> Link:
-    """Return a link whose samples are of the present. This is the arm if its samples are."""
+    """Return a link with samples of the present: the arm itself if its samples need no change."""
     encoders = arm.cell.encoders
     is_present = encoders.offset is None and not encoders.latency_ticks
     return arm if is_present else PresentLink(arm, tick_s)
@@ -46,8 +47,8 @@ class PresentLink:
 
     Samples are up to `robot.latency_ticks` old, and `robot.calibration.offset` is added to them. A
     sample is extrapolated to the tick at which it is read, by the torques given since, or by the
-    deceleration of the brakes. The possible error of this is in the cell's `encoders`. A sample
-    that is older than the latency is passed on unchanged.
+    deceleration of the brakes. The cell's `encoders` include the largest error of the
+    extrapolation. A sample that is older than the latency is passed on without extrapolation.
     """
 
     def __init__(self, arm: BrakedArm, tick_s: float) -> None:
@@ -66,7 +67,7 @@ class PresentLink:
         return self.estimate_present().reported
 
     def estimate_present(self) -> PresentState:
-        """Return the newest sample, and the present state."""
+        """Return the newest sample, and the present state estimated from it."""
         arm = self._arm
         last = self._last
         sample = copy_sample(arm.sense())
@@ -119,7 +120,7 @@ class PresentLink:
             position: (joints,), rad.
             velocity: (joints,), rad/s.
             torque: (joints,), N m. None while the brakes were engaged.
-            time_s: Time, s.
+            time_s: Duration for which to advance, s.
         """
         if torque is None:
             change = -np.copysign(np.minimum(np.abs(velocity), time_s * self._braking), velocity)

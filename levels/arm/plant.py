@@ -12,7 +12,7 @@ from rack.levels.messages import ArmState, Error, Scene
 from rack.levels.robot.cell import Cell
 
 EPISODE_TICKS = 20
-"""Ticks without a finding of a kind after which the next one is reported as new."""
+"""Ticks without a finding of one kind after which the next finding begins a new episode."""
 SAVED_ATTRIBUTES = ("waited", "braked", "clipped", "touches", "violations", "pushed", "struck")
 """Attributes of a plant that its `ArmState` contains, and that seldom change."""
 read_saved = attrgetter(*SAVED_ATTRIBUTES)
@@ -32,8 +32,8 @@ class Plant:
         if Executor.last_constructed is not None:
             self.findings = Executor.last_constructed.findings
             Executor.last_constructed.complete_cycle.append(self.complete_cycle)
-        self._found_ticks: dict[Alarm, int] = {}  # last finding of each kind
-        self._reported_tick = -1  # last cycle that was reported
+        self._found_ticks: dict[Alarm, int] = {}  # tick of the last finding of each kind
+        self._reported_tick = -1  # tick of the last cycle that was reported
         self.tick = 0  # present tick
         self.waited = 0  # ticks since the last command
         # True while it is held without commands: by the brakes of an arm, or the valves of a hand.
@@ -47,8 +47,8 @@ class Plant:
         self.first_touch = ""  # description of the first unintended contact
         # Steps in which the drives broke a limit of position, velocity or torque.
         self.violations = 0
-        self.struck = 0  # ticks for which the motion is still attributed to a blow
-        # Steps in which a blow pushed a joint beyond a limit of position or velocity.
+        self.struck = 0  # ticks for which motion is still attributed to a contact
+        # Steps in which an unintended contact pushed a joint beyond a position or velocity limit.
         self.pushed = 0
         self.first_violation = ""  # description of the first violation
         self._saved: tuple[ArmState, object] | None = None  # last state filled, and its values
@@ -82,7 +82,7 @@ class Plant:
                 setattr(state, name, getattr(self, name))
 
     def report_finding(self, finding: Finding) -> None:
-        """Report a finding, unless it continues an episode."""
+        """Report a finding, unless it continues an episode of the same alarm."""
         last = self._found_ticks.get(finding.alarm)
         if last is None or self.tick - last > EPISODE_TICKS:
             self.findings.append(finding)
@@ -96,7 +96,7 @@ class Plant:
         return finding
 
     def report_cycle(self) -> None:
-        """Report the events of a cycle, at its end."""
+        """Report the events of the cycle. Called at its end."""
         self._reported_tick = self.tick
 
     def complete_cycle(self, state: ArmState | None) -> None:

@@ -32,7 +32,7 @@ class CoarseSensors:
         self._sense = sense_coarsely.load_machine_code()
 
     def sample(self, position: Array, velocity: Array, tick: int) -> Array:
-        """Return the sensed positions, rad, and velocities, rad/s, (2, joints).
+        """Return the sensed positions in rad and velocities in rad/s, (2, joints).
 
         Args:
             position: True positions, (joints,), rad.
@@ -63,9 +63,9 @@ class WristSensor:
         self._sense = sense_coarsely.load_machine_code()
 
     def sample(self, tick: int) -> Array:
-        """Return force, N, and torque, N m, in the sensor's frame, (6,).
+        """Return force in N and torque in N m, in the sensor's frame, (6,).
 
-        They are the values of the last step before `tick`.
+        They are the values of the last simulation step before `tick`.
         """
         # The second row is not used.
         sample = np.zeros((2, AXES))
@@ -104,7 +104,7 @@ def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Arra
 def draw_uniform(seed: int, tick: int, count: int) -> Array:
     """Return random numbers between 0 and 1, both excluded.
 
-    They are a function of the arguments alone.
+    They depend on nothing but the arguments.
 
     Args:
         seed: Seed.
@@ -118,7 +118,7 @@ def draw_uniform(seed: int, tick: int, count: int) -> Array:
 
 @compiled
 def mix_bits(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Mix bits by SplitMix64 (Steele, Lea and Flood, OOPSLA 2014)."""
+    """Mix the bits of each number by SplitMix64 (Steele, Lea and Flood, OOPSLA 2014)."""
     bits = bits + np.uint64(0x9E3779B97F4A7C15)
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -22,9 +22,9 @@ from rack.levels.robot.model import SET_POINT_ROWS
 from rack.levels.tables import SceneConfig, SensorConfig
 
 STANDSTILL = 0.01
-"""Joint speed, rad/s, below which a joint holds its position."""
+"""Joint speed in rad/s below which the brakes hold a joint at its position."""
 BRAKE_BANDWIDTH = 20.0
-"""Bandwidth of the position hold by the brakes, rad/s."""
+"""Bandwidth of the position hold by the brakes, in rad/s."""
 POSITION_GAIN = 25.0
 VELOCITY_GAIN = 100.0
 INTEGRAL_GAIN = 10.0
@@ -40,8 +40,8 @@ class SimulatedArm(Simulation, Arm):
 
     Simulated time is always tick times period. Samples have the resolution and noise of the cell's
     encoders. Brakes and limit gate belong to the drives and use the true state. A command is for
-    one torque cycle. It passes the limit gate in every tick, even if the servo level missed
-    it. Drives that follow set points (`[robot] interface`) compute a new torque in every tick.
+    one torque cycle. It passes the limit gate in every tick, even while the servo level misses
+    cycles. Drives that follow set points (`[robot] interface`) compute a new torque in every tick.
     Their state is in MuJoCo's user data.
     """
 
@@ -66,7 +66,7 @@ class SimulatedArm(Simulation, Arm):
         # Samples that are delayed by the latency, oldest first.
         self._samples: deque[Sensed] = deque(maxlen=self._latency + 1)
         self._wrist = None if cell.wrist is None else WristSensor(cell.wrist, d, seed)
-        # (joints,), N m: the command in force, and the torque applied for it.
+        # (joints,), N m: the last command, and the torque applied for it.
         self._command, self.torque = np.zeros((2, joints))
         self._given = False  # True if the command for the coming tick has passed the gate
         self._drives: CascadedDrives | None = None  # None if drives take torques
@@ -129,7 +129,7 @@ class SimulatedArm(Simulation, Arm):
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Release the brakes and follow a set point for the coming cycle; see `Link.follow`."""
         self._apply_grip_force(grip_force)
-        # The encoders measure from another origin.
+        # The origin of the encoders differs from that of the model.
         if (offset := self.cell.encoders.offset) is not None:
             target = target._replace(position=target.position + offset)
         passed = self._set_points.limit_set_point(target, *self._state)
@@ -147,7 +147,7 @@ class SimulatedArm(Simulation, Arm):
         self._apply_command()
 
     def _apply_grip_force(self, force: float) -> None:
-        """Set the force of the gripper, N, unless it is not finite."""
+        """Set the force of the gripper in N. Ignore a force that is not finite."""
         if self._gripper is not None and math.isfinite(force):
             self._data.ctrl[self._gripper.actuator] = self.grip_force = force
 
@@ -192,9 +192,9 @@ class SimulatedArm(Simulation, Arm):
             self._data.time = self._now_s
 
     def sense_wrist(self) -> Array | None:
-        """Return the sample of the wrist sensor, (6,), N and N m.
+        """Return the force in N and the torque in N m that the wrist sensor measures, (6,).
 
-        It is one substep old, like all of MuJoCo's sensors.
+        The sample is one substep old, like all of MuJoCo's sensors.
         """
         return None if self._wrist is None else self._wrist.sample(self.tick)
 
@@ -216,13 +216,14 @@ class SimulatedArm(Simulation, Arm):
         np.copyto(self.torque, self._command)
         if self._gripper is not None:
             self.grip_force = float(d.ctrl[self._gripper.actuator])
-        # Torques stay in force. Drives compute a new torque for a set point before the last tick.
+        # Restored torques have passed the gate. Drives that follow a set point must compute a new
+        # torque, unless the set point arrived in this tick.
         self._given = self._drives is None or self.braked or self.waited == 0
 
     def _apply_command(self) -> None:
-        """Apply torques through the limit gate.
+        """Apply torques to the joints through the limit gate.
 
-        They are the command for the motors, or the torque of the brakes on the joints.
+        These are the command for the motors or, while the arm is braked, the torques of the brakes.
         """
         cell = self.cell
         braked = self.braked
@@ -244,9 +245,9 @@ class SimulatedArm(Simulation, Arm):
         self._given = True
 
     def _compute_braking_torque(self, q: Array, qd: Array) -> Array:
-        """Return the torques that stop the joints or hold them at rest, (joints,), N m.
+        """Return the torques with which the brakes stop or hold the joints, (joints,), in N m.
 
-        The brakes apply them even with the motors off.
+        They act even with the motors off.
         """
         max_acceleration = self.cell.limits.acceleration
         np.copyto(self._rest, q, where=np.abs(qd) > STANDSTILL)
@@ -261,10 +262,10 @@ class SimulatedArm(Simulation, Arm):
 class CascadedDrives:
     """Position servos with cascaded loops: P on position around PI on velocity, limited in torque.
 
-    They know the arm's inertia, like controllers of such arms, or like arms whose gears make it
-    nearly constant. With the inertia of each joint at home instead, the K-1607, which has no gears,
-    swings. Gravity, friction and load are compensated by the integral, which starts from the
-    predicted torque when the brakes are released.
+    Like the controllers of such arms, they use the arm's present inertia. The inertia of each joint
+    at home would suit arms with gears, whose inertia is nearly constant, but makes the K-1607,
+    which has none, swing. Gravity, friction and load are compensated by the integral, which starts
+    from the predicted torque when the brakes are released.
     """
 
     def __init__(
@@ -300,7 +301,7 @@ class CascadedDrives:
         self._rows[2] = torque - mat_vec(self._dynamics.terms(q, qd).inertia, change)
 
     def compute_torque(self, q: Array, qd: Array, waited: int) -> Array:
-        """Return the torques of the coming tick, (joints,), N m.
+        """Return the torques of the coming tick, (joints,), in N m.
 
         Args:
             q: Positions at its start, (joints,), rad.

@@ -1,4 +1,4 @@
-"""Simulation of a cell: the ticks of a plant in MuJoCo, checks of every step, moving obstacles."""
+"""Simulation of a cell in MuJoCo: the steps of a tick, their checks, and moving obstacles."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from rack.levels.robot.lookup import find_geom_name
 from rack.levels.tables import MotionConfig, PushConfig, SceneConfig
 
 STRUCK_TICKS = 40
-"""Ticks for which the motion is attributed to a blow.
+"""Ticks for which motion is attributed to a blow, that is, an unintended contact.
 
-They count from the contact, or from the last limit that was broken since.
+They count from the contact, or from the last limit that was broken after it.
 """
 STEPS_AT_REST = 10
 """Steps for which a body must be slower than `sleep_tolerance` before it sleeps.
@@ -45,7 +45,7 @@ class Simulation(Plant):
     """True if bodies may sleep, because nothing except MuJoCo moves them."""
 
     def prepare_simulation(self, scene: SceneConfig, clock_ns: int) -> None:
-        """Prepare the steps of a tick and their checks. One tick is `clock_ns`."""
+        """Prepare the steps of a tick, which lasts `clock_ns`, and their checks."""
         cell = self.cell
         if self.sleeps:
             self._model = enable_sleep(cell.model, scene)
@@ -76,7 +76,7 @@ class Simulation(Plant):
     def _read_joint_state(self) -> None:
         """Read positions and velocities of the joints from MuJoCo's data.
 
-        Necessary after the data was changed other than by a step.
+        Call this after every change of the data that is not made by a step.
         """
         position, velocity = self._state
         position[:] = self._data.qpos[self.cell.qpos]
@@ -105,14 +105,16 @@ class Simulation(Plant):
 
     @property
     def _now_s(self) -> float:
+        """Simulated time at the beginning of the tick, in s."""
         return self.tick * self._clock_ns * 1e-9
 
     @property
     def _after_s(self) -> float:
+        """Simulated time at the end of the tick, in s."""
         return (self.tick + 1) * self._clock_ns * 1e-9
 
     def _simulate_tick(self) -> None:
-        """Simulate one tick."""
+        """Simulate one tick: move obstacles, apply pushes, and make the steps."""
         for mocap, start, moves in self._motions:
             self._data.mocap_pos[mocap] = compute_obstacle_position(start, moves, self._now_s)
         for body, pushes in self._pushes:
@@ -124,7 +126,7 @@ class Simulation(Plant):
             self.struck -= 1
 
     def _finish_failed_tick(self, steps_made: int) -> None:
-        """Finish a tick in which step `made` failed a check.
+        """Finish a tick whose step number `steps_made` failed a check.
 
         If the cause is a fault of the simulation, the state before the tick is restored.
         """
@@ -148,7 +150,7 @@ class Simulation(Plant):
         self._data.time = self._after_s
 
     def _count_contacts(self) -> None:
-        """Count the unintended contacts of the last step, and store one of the arm or its load."""
+        """Count the unintended contacts of the last step. Store one that involves arm or load."""
         pairs = find_unintended_contacts(self._data, self.cell.geoms.touch)
         if not len(pairs):
             return
@@ -172,11 +174,11 @@ class Simulation(Plant):
         return np.asarray(self._is_arm | self._mark_held_geoms())
 
     def _check_limits(self) -> bool:
-        """Check the joint limits in all steps of a tick; return True if one is broken.
+        """Check the joint limits in all steps of a tick. Return True if any is broken.
 
         Positions, velocities and torques (of motor and brake together) are checked. The check
-        shares no code with the limit gate, which enforces the limits. While a blow still moves the
-        arm, it may break limits of position and velocity, because no drive can prevent that.
+        shares no code with the limit gate, which enforces the limits. For some time after a blow
+        the arm may break limits of position and velocity, because no drive can prevent that.
         """
         seen = self._steps.seen
         low, high = self._steps.judged[:2]
@@ -193,7 +195,7 @@ class Simulation(Plant):
         return bool(is_wrong.any())
 
     def _report_violation(self, violated: Mask, step: int) -> None:
-        """Report the first limit that `step` broke."""
+        """Report the first limit that step `step` broke. `violated` is (steps, 3, joints)."""
         row, joint = (int(at[0]) for at in np.nonzero(violated[step]))
         value = float(self._steps.seen[step, row, joint])
         if not self.first_violation:
@@ -218,9 +220,9 @@ class Simulation(Plant):
 def compute_obstacle_position(
     start: Array, moves: tuple[MotionConfig, ...], time_s: float
 ) -> Array:
-    """Return the origin of a moving obstacle, (3,), m.
+    """Return the origin of a moving obstacle, (3,), in m.
 
-    A move that starts before the previous one has ended cuts that one short.
+    A move that starts before the previous one has ended replaces it.
 
     Args:
         start: Origin before the first move, (3,), m.
@@ -241,7 +243,7 @@ def compute_obstacle_position(
 
 
 def compute_push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
-    """Return the sum of the pushes on an object at simulated `time_s`, (3,), N."""
+    """Return the total force of the pushes on an object at simulated time `time_s`, (3,), in N."""
     total = np.zeros(3)
     for push in pushes:
         elapsed_s = time_s - push.at

@@ -36,11 +36,11 @@ class Substeps(NamedTuple):
     data: int  # address
     places: NDArray[np.int64]  # (4, joints), index in `memory`: position, velocity, motor, brake
     memory: Array  # memory of MuJoCo's data
-    # (2 + substeps, 3, joints): rows of position, velocity and torque. The first is the lowest
-    # permitted, the second the highest permitted; then one follows for each step.
+    # (2 + substeps, 3, joints): position, velocity and torque of each joint. First the lowest and
+    # the highest permitted values, then the values after each step.
     judged: Array
     asleep: NDArray[np.int32]  # (trees,), see `copy_state`
-    states: Array  # (2, state): before the tick, and the part that steps change after it
+    states: Array  # (2, state): state before the tick; the part that steps change, after it
     warnings: NDArray[np.int32]  # (kinds,), count of MuJoCo's warnings
     contacts: NDArray[np.int32]  # (1,), number of contacts
     geoms: NDArray[np.int32]  # (capacity, 2), pairs of geoms in contact
@@ -86,7 +86,7 @@ def prepare_substeps(
 
 @compiled_for("i8, i8, i4[::1], f8[::1]")
 def copy_state(model: int, data: int, asleep: NDArray[np.int32], state: Array) -> None:
-    """Fill a state of the simulation.
+    """Copy the state of the simulation to `state`.
 
     Args:
         model: Address of the model.

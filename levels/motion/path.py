@@ -23,14 +23,14 @@ OVERLAP_ROUNDING = 1e-9
 
 
 class Path(NamedTuple):
-    """A path as messages carry it: waypoints and blends."""
+    """A path in the form that messages contain: waypoints and blends."""
 
     waypoints: Array  # (k, joints), rad
     blend: Array  # (k,), rad: length over which a corner is rounded, on each side
 
     @property
     def end(self) -> Array:
-        """Last waypoint, (joints,), rad."""
+        """Last waypoint, (joints,), in rad."""
         return np.asarray(self.waypoints[-1])
 
 
@@ -96,7 +96,7 @@ class BlendedPath:
         before = at - (radius > 0.0)
         blends = radius[:, None]
         changes = np.where(blends > 0.0, self._changes[at], 0.0)
-        # In the layout of `compute_point`.
+        # For the layout of the two tables see `compute_point`.
         self._marks = np.hstack((self.breaks[:-1, None], self._corners[at, None], blends))
         self._table = np.stack((points[at], directions[before], changes), axis=1)
         self._point = np.zeros((3, self.joints))
@@ -116,17 +116,17 @@ class BlendedPath:
         return PathPoint(*self._point)
 
     def find_pieces(self, s: ArrayLike) -> Ints:
-        """Return the indices of the pieces that contain `s`, rad.
+        """Return the index of the piece that contains each of `s`, in rad.
 
-        At a break this is the following piece.
+        A break belongs to the piece that follows it.
         """
         pieces = np.searchsorted(self.breaks, s, side="right") - 1
         return np.clip(pieces, 0, len(self.breaks) - 2)
 
     def sample_points(self, step_rad: float) -> Array:
-        """Return points along the path, including both ends, (n, joints), rad.
+        """Return points along the path, including both ends, (n, joints), in rad.
 
-        Consecutive points are at most `step_rad` of s apart.
+        Consecutive points differ by at most `step_rad` in s.
         """
         count = max(int(np.ceil(self.length / step_rad)), 1) + 1 if self.length > 0.0 else 1
         return compute_points.load_machine_code()(
@@ -137,8 +137,8 @@ class BlendedPath:
         """Divide the path into lines and corners.
 
         Returns:
-            The pieces and their breaks, rad. A piece is the index of its waypoint with the blend of
-            a corner, or with 0 for the line that starts at the waypoint.
+            The pieces, and the values of s at their ends, in rad. A corner is given as the index of
+            its waypoint and its blend, a line as the index of its first waypoint and 0.
         """
         last = len(self.waypoints) - 1
         starts: list[float] = self._corners.tolist()
@@ -196,7 +196,7 @@ def compute_point(
 
 @compiled_for("f8[:,::1], f8[:,:,::1], f8[::1]")
 def compute_points(marks: Array, table: Array, places: Array) -> Array:
-    """Return points of a path, (n, joints), rad.
+    """Return points of a path, (n, joints), in rad.
 
     Args:
         marks: See `compute_point`.
@@ -212,7 +212,7 @@ def compute_points(marks: Array, table: Array, places: Array) -> Array:
 
 
 def _check_arrays(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]:
-    """Return waypoints and blends as arrays, after checking shapes and values."""
+    """Return waypoints and blends as arrays. Raises `ValueError` for invalid shapes or values."""
     points = np.array(waypoints, dtype=float)
     radii = np.array(blend, dtype=float)
     if points.ndim != 2 or len(points) == 0:
@@ -231,7 +231,7 @@ def _check_arrays(waypoints: ArrayLike, blend: ArrayLike) -> tuple[Array, Array]
 
 
 def _merge_coincident(points: Array, radii: Array) -> tuple[Array, Array]:
-    """Merge coincident waypoints, and set the blends of both ends to 0."""
+    """Return waypoints and blends without coincident waypoints. The blends of both ends are 0."""
     distinct = [0]
     merged = radii.copy()
     for k in range(1, len(points)):
@@ -245,7 +245,7 @@ def _merge_coincident(points: Array, radii: Array) -> tuple[Array, Array]:
 
 
 def _check_overlap(radii: Array, lengths: Array) -> None:
-    """Check that neighbouring blends fit on the line between them."""
+    """Check that the blends at both ends of each line fit on it. Raises `ValueError`."""
     for k, length in enumerate(lengths):
         if radii[k] + radii[k + 1] > length * (1.0 + OVERLAP_ROUNDING) + COINCIDENT_RAD:
             raise ValueError(

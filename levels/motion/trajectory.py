@@ -42,14 +42,14 @@ STOP_INTERVALS = 24
 LIMIT_ROUNDING = 1e-6
 """Fraction by which a stop may exceed a limit, to allow for rounding."""
 MAX_REST_RAD_S = 1e-7
-"""Speed below which motion counts as rest."""
+"""Speed below which motion counts as rest, in rad/s."""
 
 Section = tuple[float, float, float, float, float]
 """Duration, s, then s, ds and dds at the start, and the constant jerk."""
 
 
 class PathState(NamedTuple):
-    """State of the path parameter: rad, rad/s, rad/s2."""
+    """Path parameter s and its derivatives by time, in rad, rad/s and rad/s2."""
 
     s: float
     ds: float
@@ -68,7 +68,7 @@ SMALLEST_LINEAR_TERM = 1e-12
 
 
 class SpeedLimits(NamedTuple):
-    """Limits of ds/dt and its derivatives: rad/s, rad/s2, rad/s3.
+    """Limits of ds/dt and its derivatives, in rad/s, rad/s2 and rad/s3.
 
     If the acceleration is 0, the speed is constant.
     """
@@ -79,7 +79,7 @@ class SpeedLimits(NamedTuple):
 
 
 def compute_speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits:
-    """Return limits of s that keep every joint within its limits on a piece of a path.
+    """Return limits of the motion of s that keep all joints within theirs on a piece of a path.
 
     The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds.
 
@@ -117,7 +117,7 @@ def compute_speed_limits(piece: PathBounds, limits: Limits, share: float) -> Spe
 
 
 def compute_reachable_speed(start: float, length: float, limits: SpeedLimits) -> float:
-    """Return the highest speed reachable from a given speed over a length, rad/s.
+    """Return the highest speed, in rad/s, that is reachable from a given speed over a length.
 
     The acceleration is 0 at both ends. By symmetry this is also the highest speed from which
     `start` can be reached.
@@ -141,9 +141,9 @@ def compute_reachable_speed(start: float, length: float, limits: SpeedLimits) ->
 
 
 def compute_boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> list[float]:
-    """Return the highest speeds at the ends of consecutive stretches, from rest to rest, rad/s.
+    """Return the highest speeds in rad/s at the ends of consecutive stretches of a path.
 
-    `lengths` are in rad, one for each stretch.
+    The motion starts and ends at rest. Each stretch has a length in rad and an entry in `limits`.
     """
     speeds = [0.0]
     for k, (length, limit) in enumerate(zip(lengths, limits, strict=True)):
@@ -155,7 +155,7 @@ def compute_boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimi
 
 
 def compute_least_ratio(room: Array, rate: Array) -> float:
-    """Return the least room / rate over the joints that move. Infinite if none does."""
+    """Return the smallest room / rate of all joints with a rate above 0. Infinite without any."""
     return float(np.divide(room, rate, out=np.full(len(rate), np.inf), where=rate > 0.0).min())
 
 
@@ -181,21 +181,21 @@ class Trajectory:
         self.end = self.evaluate_at(duration).s  # path parameter at the end, rad
 
     def evaluate_at(self, time_s: float) -> PathState:
-        """Return the state at `time_s` after the start, clamped to the duration."""
+        """Return the state `time_s` after the start. The time is clamped to the duration."""
         time_s = min(max(time_s, 0.0), self.duration)
         k = int(np.searchsorted(self.sections[:, 0], time_s, side="right")) - 1
         start, *state = self.sections[max(k, 0)].tolist()
         return PathState(*_integrate_jerk(time_s - start, *state))
 
     def evaluate_states(self, times_s: Array) -> tuple[Array, Array, Array]:
-        """Return s, ds and dds at `times_s` (n,), which must be within the duration; (n,) each."""
+        """Return s, ds and dds, (n,) each, at `times_s`, (n,). All must be within the duration."""
         row = self.sections[np.searchsorted(self.sections[:, 0], times_s, side="right") - 1]
         return _integrate_jerk(times_s - row[:, 0], *row[:, 1:].T)
 
     def stretch_by(self, factor: float) -> Trajectory:
-        """Return the same motion slowed by `factor`, which must be at least 1.
+        """Return the same motion slowed down by `factor`, which must be at least 1.
 
-        It keeps all limits that this motion keeps.
+        It stays within all limits within which this motion stays.
         """
         powers = np.array([factor, 1.0, 1.0 / factor, 1.0 / factor**2, 1.0 / factor**3])
         return Trajectory(self.sections * powers, self.duration * factor)
@@ -264,9 +264,10 @@ def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory
 
 
 def _find_fastest(path: BlendedPath, start: float, end: float, limits: Limits) -> list[Section]:
-    """Return the fastest of a few motions between two points of rest of a path.
+    """Return the sections of the fastest of several motions along a path, from rest to rest.
 
-    Only motions with few enough sections for a message are considered.
+    `start` and `end` are path parameters in rad. Motions with too many sections for a message are
+    not considered.
     """
     first, last = path.find_pieces((start, end - COINCIDENT_RAD))
     bounds = PathBounds(*(bound[first : last + 1] for bound in path.bounds))
@@ -295,9 +296,9 @@ def _find_fastest(path: BlendedPath, start: float, end: float, limits: Limits) -
 
 
 def _build_sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> Iterator[Section]:
-    """Yield the sections from rest at the first mark to rest at the last.
+    """Yield the sections of a motion from rest at the first mark to rest at the last.
 
-    `marks` are path parameters, rad. Each stretch between two marks has an entry in `limits`.
+    `marks` are path parameters in rad. Each stretch between two marks has an entry in `limits`.
     """
     lengths = [end - start for start, end in pairwise(marks)]
     speeds = compute_boundary_speeds(lengths, limits)
@@ -318,7 +319,7 @@ def _build_sections(marks: Sequence[float], limits: Sequence[SpeedLimits]) -> It
 
 
 def _build_ramp(state: PathState, acceleration: float, jerk: float) -> Trajectory:
-    """Return the fastest ramp from `state` to rest within `acceleration` and `jerk`."""
+    """Return the fastest ramp from `state` to rest with the given limits, in rad/s2 and rad/s3."""
     request = _build_ruckig_input(state, acceleration, jerk)
     request.control_interface = ruckig.ControlInterface.Velocity
     return _join_sections(_run_ruckig(request), state.s)
@@ -327,7 +328,7 @@ def _build_ramp(state: PathState, acceleration: float, jerk: float) -> Trajector
 def _build_ruckig_input(
     state: PathState, acceleration: float, jerk: float
 ) -> ruckig.InputParameter:
-    """Return the input of ruckig for motion from `state`, in one dimension."""
+    """Return ruckig's input for a motion of s that begins at `state`."""
     request = ruckig.InputParameter(1)
     request.current_position = [state.s]
     request.current_velocity = [state.ds]
@@ -338,7 +339,7 @@ def _build_ruckig_input(
 
 
 def _run_ruckig(request: ruckig.InputParameter) -> list[Section]:
-    """Return the sections of ruckig's result in one dimension.
+    """Run ruckig for a motion of s, and return the sections of the result.
 
     Raises:
         ArithmeticError: ruckig finds no solution.
@@ -353,7 +354,7 @@ def _run_ruckig(request: ruckig.InputParameter) -> list[Section]:
 
 
 def _join_sections(rows: Sequence[Section], begin: float) -> Trajectory:
-    """Return the trajectory of consecutive sections, or rest at `begin` without sections."""
+    """Join consecutive sections to a trajectory. Without sections it rests at `begin`."""
     if not rows:
         return Trajectory(np.array([[0.0, begin, 0.0, 0.0, 0.0]]), 0.0)
     sections = np.array(rows)
@@ -363,7 +364,7 @@ def _join_sections(rows: Sequence[Section], begin: float) -> Trajectory:
 
 
 def _is_within_limits(stop: Trajectory, path: BlendedPath, limits: Limits) -> bool:
-    """Return True if every joint keeps its limits during a stop.
+    """Return True if every joint stays within its limits during a stop.
 
     The check uses bounds of motion and path over each interval of time.
     """
@@ -391,9 +392,9 @@ def _is_within_limits(stop: Trajectory, path: BlendedPath, limits: Limits) -> bo
 
 
 def _find_check_times(stop: Trajectory) -> Array:
-    """Return the ends of the checked intervals, s.
+    """Return the ends of the intervals in which a stop is checked, in s from its start.
 
-    They are evenly spaced, with further ends where jerk or the sign of dds changes.
+    They are evenly spaced, with further ends where the jerk or the sign of dds changes.
     """
     start = stop.sections[:, 0]
     dds = stop.sections[:, 3]
@@ -406,7 +407,7 @@ def _find_check_times(stop: Trajectory) -> Array:
 
 
 def _find_bounds_over(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
-    """Return bounds of the path derivatives between consecutive `s`, (n - 1, joints) each."""
+    """Return bounds of the derivatives by s between consecutive `s`, (n - 1, joints) each."""
     piece = path.find_pieces(s)
     low = piece[:-1]
     high = piece[1:]

@@ -27,9 +27,9 @@ class Abilities:
 
     Attributes:
         reach: Largest distance of the tool from the axis of the first joint, m.
-        payload: Mass at the tool that the arm can hold in every pose tried, kg.
-        left: Least fraction of a joint's torque that gravity leaves in any pose tried.
-        joint: Index of the joint with this least fraction.
+        payload: Largest mass at the tool that the arm can hold in every pose tried, kg.
+        torque_left: Smallest fraction of a joint's torque that gravity leaves in any pose tried.
+        joint: Index of the joint with this smallest fraction.
     """
 
     reach: float
@@ -39,7 +39,7 @@ class Abilities:
 
 
 def compute_abilities(cell: Cell) -> Abilities:
-    """Compute the abilities of the arm of a cell, from many random poses and stretched out."""
+    """Compute the abilities of a cell's arm, in many random poses and stretched out."""
     statics = Statics(cell)
     poses = statics.draw_poses()
     stretched = statics.stretch_out(max(poses, key=statics.compute_reach))
@@ -51,7 +51,7 @@ def compute_abilities(cell: Cell) -> Abilities:
 
 
 class Statics:
-    """An arm at rest, without contacts."""
+    """Reach and loads of an arm at rest, without contacts."""
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
@@ -65,7 +65,7 @@ class Statics:
         self._low, self._high = np.clip(cell.limits.position, -math.pi, math.pi).T
 
     def draw_poses(self) -> list[Array]:
-        """Return poses over the joints' whole ranges, rad, beginning with home."""
+        """Return home and random poses over the joints' whole ranges, (joints,) each, in rad."""
         drawn = np.random.default_rng(0).uniform(
             self._low, self._high, (POSE_COUNT - 1, len(self._low))
         )
@@ -85,7 +85,7 @@ class Statics:
         return best
 
     def compute_reach(self, position: Array) -> float:
-        """Return the distance of the tool from the axis of the first joint, m."""
+        """Return the distance of the tool from the axis of the first joint, in m."""
         data = self._data
         data.qpos[self._cell.qpos] = position
         mujoco.mj_kinematics(self._model, data)
@@ -96,8 +96,8 @@ class Statics:
         """Return the torque that gravity leaves, and the payload, in a pose.
 
         Returns:
-            Fraction of each joint's torque that gravity leaves, (joints,), and the mass at the tool
-            that uses up the torque of one joint, kg.
+            Fraction of each joint's torque that gravity leaves, (joints,), and the smallest mass at
+            the tool with which a joint reaches its torque limit, kg.
         """
         cell = self._cell
         data = self._data

@@ -34,7 +34,7 @@ from rack.levels.tables import GripperConfig, Interface, RobotConfig, SceneConfi
 TOUCHING_M = 5e-5
 """Distance below which geoms at home count as touching, because rounding decides."""
 SETTLING_S = 1.0
-"""Time in which the fingers of a gripper come to rest, s."""
+"""Time in which the fingers of a gripper come to rest, in s."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Gripper:
 
 
 class CellGeoms(NamedTuple):
-    """Ids of the geoms between which contacts are judged."""
+    """Ids of the geoms whose contacts are checked."""
 
     arm: Ints  # all that the arm moves, including the gripper's
     gripper: Ints  # of the body that carries the gripper, and of the fingers
@@ -95,7 +95,7 @@ class Cell:
     geoms: CellGeoms
 
     def build_start_data(self) -> mujoco.MjData:
-        """Return MuJoCo data of the start.
+        """Return new MuJoCo data, with the arm at its start position.
 
         The gripper is open, and objects are where the model places them.
         """
@@ -105,7 +105,7 @@ class Cell:
         return data
 
     def list_geoms(self, row: int) -> Ints:
-        """Return the geoms of an object or obstacle, given its row in `bodies`."""
+        """Return the ids of the geoms of an object or obstacle, given its index in `bodies`."""
         model = self.model
         return np.flatnonzero(model.body_rootid[model.geom_bodyid] == self.bodies[row])
 
@@ -131,7 +131,7 @@ def build_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> Cell:
 
 
 def build_level_cell(context: LevelContext) -> Cell:
-    """Build the cell of a level's rack; see `build_cell`."""
+    """Build the cell of the rack to which a level belongs; see `build_cell`."""
     return build_cell(context.robot, context.scene, context.clock_ns)
 
 
@@ -175,7 +175,7 @@ def build_unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) 
 
 
 def replace_encoders(cell: Cell, robot: RobotConfig, sensors: SensorConfig) -> Cell:
-    """Return the cell with the encoders `sensors`, unless `[robot.sensors]` states others."""
+    """Return the cell with `sensors` as its encoders, unless `[robot.sensors]` states others."""
     tick_s = robot.substeps * cell.model.opt.timestep
     return replace(cell, encoders=Encoders.from_config(robot, tick_s, sensors))
 
@@ -200,7 +200,7 @@ def assemble_cell(
     motors: list[str],
     torque: Array,
 ) -> Cell:
-    """Find everything that the config names in the compiled model.
+    """Find all elements that the config names in the compiled model, and return the cell.
 
     Args:
         model: The compiled model.
@@ -261,13 +261,13 @@ def find_geoms(
     """Return the geoms of a cell, and which of their contacts are unintended.
 
     Contacts of an object with a support or the gripper, between parts of one object, and between
-    fingers are intended. Contacts of what hangs on a wrist sensor with a support are, too, because
-    the sensor measures them. Every other contact of arm or object is unintended. Contacts between
-    other geoms are ignored.
+    fingers are intended. So are contacts between a support and the bodies that a wrist sensor
+    carries, because the sensor measures them. Every other contact of arm or object is unintended.
+    Contacts between other geoms are ignored.
 
     Args:
         model: The compiled model.
-        scene: Names the supports.
+        scene: The `[scene]` table, which names the supports.
         moved: (nbody,), the bodies that the arm moves.
         linked: (nbody,), the bodies of the gripper.
         objects: Ids of the bodies of the objects.
@@ -295,7 +295,7 @@ def find_geoms(
 
 
 def compute_full_speed_energy(model: mujoco.MjModel, joints: Ints, robot: RobotConfig) -> float:
-    """Return the kinetic energy of the arm at home with all joints at full speed, J."""
+    """Return the kinetic energy of the arm at home with all joints at full speed, in J."""
     data = mujoco.MjData(model)
     data.qpos[model.jnt_qposadr[joints]] = robot.home
     data.qvel[model.jnt_dofadr[joints]] = robot.velocity
@@ -319,7 +319,8 @@ def find_gripper(
         arm: Joints of the arm, none of which is part of the linkage.
 
     Returns:
-        The gripper, and a mask of its bodies, (nbody,). None and no body if the arm has no gripper.
+        The gripper, and a mask of its bodies, (nbody,). None and an empty mask if the arm has no
+        gripper.
 
     Raises:
         RobotError: The arm does not carry the gripper's joint, or the linkage cannot be solved.
@@ -371,7 +372,7 @@ def find_unintended_contacts(
 def fix_gripper_model(
     cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s: float
 ) -> bool:
-    """Change the model where it would keep the gripper from moving.
+    """Change the model where it would prevent the gripper from moving.
 
     Links that overlap when the gripper is open or half open, before its fingers meet, are excluded
     from contact. They overlap because links meet at their pins, and because meshes are simulated by
@@ -410,9 +411,9 @@ def fix_gripper_model(
 
 
 def build_start_qpos(cell: Cell, position: Array) -> Array:
-    """Return qpos of a start, with the arm at `position`.
+    """Return qpos with the arm at `position`, (joints,), rad, for the start.
 
-    The gripper and its linkage are open, and all else is as in the model.
+    The gripper and its linkage are open. Everything else is as in the model.
     """
     qpos = np.array(cell.model.qpos0)
     qpos[cell.qpos] = position
@@ -465,9 +466,9 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> No
 
 
 def check_fingers(cell: Cell, config: GripperConfig) -> None:
-    """Check that the gripper opens and closes, with fingers near where planning expects them.
+    """Check by simulation that the gripper moves and its fingers settle where planning expects.
 
-    Only grippers whose couplings yield are simulated.
+    Only a gripper whose couplings yield needs the check.
 
     Raises:
         RobotError: The gripper does not open or close, or fingers settle farther than
@@ -508,5 +509,5 @@ def check_fingers(cell: Cell, config: GripperConfig) -> None:
 
 
 def compute_half_opening(gripper: GripperConfig | Gripper) -> float:
-    """Return the opening halfway between open and closed, m or rad."""
+    """Return the opening halfway between open and closed, in m or rad."""
     return 0.5 * (gripper.open + gripper.closed)

@@ -32,7 +32,7 @@ from rack.levels.robot.engine import (
 )
 
 FRICTION_SPEED = 0.01
-"""Joint speed at which 3/4 of the dry friction is fed forward, rad/s.
+"""Joint speed, in rad/s, at which 3/4 of the dry friction is fed forward.
 
 A step at zero speed would excite the arm.
 """
@@ -68,7 +68,7 @@ INERTIA_ROW = 3
 class Dynamics:
     """Evaluates the equation of motion of a cell's arm, with open fingers.
 
-    Repeating an evaluation at the same state takes no time.
+    An evaluation at the same state as the previous one returns the same terms without computing.
     """
 
     def __init__(self, cell: Cell) -> None:
@@ -81,7 +81,7 @@ class Dynamics:
         # Compiled functions take one array instead of eight, because passing an array costs more
         # than the arithmetic on it.
         self._evaluations = np.zeros((2, INERTIA_ROW + joints, joints))
-        # The first is read only for users, the second includes the payload.
+        # The first evaluation is without payload, for users to read. The second includes it.
         self.newest, current = self._evaluations
         self.newest[:STATE_ROWS] = np.nan  # not evaluated yet
         self._terms = Terms(current[INERTIA_ROW:], current[BIAS_ROW])
@@ -99,7 +99,7 @@ class Dynamics:
         self.dry = np.array(cell.model.dof_frictionloss[cell.dof])  # (joints,), N m: dry friction
 
     def terms(self, q: Array, qd: Array, payload: Payload | None = None) -> Terms:
-        """Return the terms at a state. The arrays are valid until the next call.
+        """Return the terms of the equation at a state. The arrays are valid until the next call.
 
         Args:
             q: Positions, (joints,), rad.
@@ -116,11 +116,11 @@ class Dynamics:
 
     @property
     def evaluated(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """Model and data of the last evaluation."""
+        """MuJoCo's model and data as the last evaluation left them."""
         return self._model, self._data
 
     def friction(self, velocity: Array) -> Array:
-        """Return the dry friction that opposes motion at `velocity`, rad/s, (joints,), N m."""
+        """Return the torque of dry friction in N m at `velocity` in rad/s, both (joints,)."""
         return np.asarray(self.dry * apply_elementwise(math.tanh, velocity / FRICTION_SPEED))
 
 
@@ -162,8 +162,8 @@ def evaluate_terms(
         data: Address of the data.
         places: Indices in `memory`, see `find_places`.
         memory: Memory of the data.
-        evaluations: (2, 3 + joints, joints). The second holds the state; the first is the last
-            evaluation. Both are equal afterwards.
+        evaluations: (2, 3 + joints, joints). The first is the last evaluation, and the second has
+            the state at which to evaluate. Afterwards both contain the new evaluation.
     """
     newest, current = evaluations
     joints = places.shape[1]

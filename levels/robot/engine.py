@@ -54,23 +54,23 @@ mj_update_sleep = native("mj_updateSleep", 2)
 
 
 def compute_state_size(model: mujoco.MjModel) -> int:
-    """Return the length of the state of a simulation."""
+    """Return the number of values in the state of a simulation."""
     return int(mujoco.mj_stateSize(model, INTEGRATION)) + int(model.ntree)
 
 
 def view_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
-    """Set `data` to a state without its sleep, which is enough to read poses from it.
+    """Set `data` to a saved state, except for which bodies sleep. This suffices to read poses.
 
-    No body of `data` may sleep.
+    Call this only with `data` in which no body sleeps.
     """
     end = mujoco.mj_stateSize(model, INTEGRATION)
     mujoco.mj_setState(model, data, np.ascontiguousarray(state[:end]), INTEGRATION)
 
 
 def build_common_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return one view of memory that contains several arrays of one `MjData`.
+    """Return one view of the memory that contains several arrays of one `MjData`.
 
-    It is valid as long as the data.
+    The view is valid as long as the data exists.
 
     Returns:
         The view, and the index in it at which each array begins.
@@ -88,8 +88,8 @@ def build_common_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:
 def set_margins(model: mujoco.MjModel, margins: ArrayLike) -> None:
     """Set the margins of geoms, so that MuJoCo finds pairs within the sum of their margins.
 
-    MuJoCo first excludes pairs of bodies, by margins of bodies that its compiler sets. Therefore
-    these are set as well. `margins` is (geoms,), or one value for all, m.
+    MuJoCo first excludes pairs of bodies by the margins of the bodies, which its compiler sets.
+    Therefore these are set as well. `margins` is (geoms,), or one value for all geoms, in m.
     """
     model.geom_margin[:] = margins
     model.body_margin[:] = 0.0
@@ -101,15 +101,15 @@ class ContactViews(NamedTuple):
 
     number: NDArray[np.int32]  # (1,)
     geoms: NDArray[np.int32]  # (capacity, 2), of which the first `number` are contacts
-    distance: Array  # (capacity,), m; likewise
+    distance: Array  # (capacity,), m: distances of the contacts, in the same order
 
 
 def build_contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
     """Return views of the contacts.
 
-    The bindings give a copy of their number, and views that are valid only until the contacts
-    change. But contacts are always at the start of the arena, and their number follows warnings and
-    timers (mjdata.h).
+    The bindings only give a copy of the number of contacts, and views that are valid until the
+    contacts change. In memory, however, contacts are always at the start of the arena, and their
+    number follows warnings and timers (mjdata.h).
 
     Raises:
         RuntimeError: This version of MuJoCo stores the number of contacts elsewhere.
@@ -145,6 +145,6 @@ def build_contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactVi
 def _build_view(
     address: int, kind: type, shape: tuple[int, ...], strides: tuple[int, ...]
 ) -> NDArray[Any]:
-    """Return an array of the memory at `address`."""
+    """Return an array of type `kind` that views the memory at `address`."""
     memory = (ctypes.c_char * (shape[0] * strides[0])).from_address(address)
     return np.ndarray(shape, kind, memoryview(memory), 0, strides)

@@ -49,7 +49,7 @@ class Hand:
 
     @property
     def torque(self) -> Array:
-        """Largest torque of a joint in both directions, (joints,), N m.
+        """Largest torque of a joint in both directions, (joints,), in N m.
 
         One tendon then has its largest tension, and the other the least.
         """
@@ -57,10 +57,10 @@ class Hand:
 
 
 def check_hand(robot: RobotConfig, hand: HandConfig) -> None:
-    """Check `[robot.hand]` by itself: lengths of lists, joints of fingers, tensions.
+    """Check `[robot.hand]` without the model: lengths of lists, joints of fingers, tensions.
 
     Raises:
-        RobotError: There is a mistake.
+        RobotError: The table is invalid.
     """
     if robot.gripper is not None:
         raise RobotError(
@@ -121,7 +121,7 @@ def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
 def fit_tendons(
     spec: mujoco.MjSpec, robot: RobotConfig, hand: HandConfig, step_s: float
 ) -> tuple[list[str], Array]:
-    """Remove the drives of the hand's joints, except its tendons.
+    """Prepare a model for a hand: remove all drives of its joints except the tendons.
 
     Each tip gets a force sensor. Actuators that delay their controls get memory for the delay.
 
@@ -167,7 +167,7 @@ def _name_force_sensor(finger: FingerConfig) -> str:
 
 
 def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Hand:
-    """Find everything that `[robot.hand]` names in the compiled model.
+    """Find all elements that `[robot.hand]` names in the compiled model, and return the hand.
 
     Args:
         model: The compiled model.
@@ -228,7 +228,7 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
 
 
 def check_tensions(model: mujoco.MjModel, actuators: Ints, least: float) -> None:
-    """Check that the control of each actuator is the tension of a tendon, N.
+    """Check that the control of each actuator is the tension of a tendon in N.
 
     Args:
         model: The compiled model.
@@ -236,7 +236,7 @@ def check_tensions(model: mujoco.MjModel, actuators: Ints, least: float) -> None
         least: Tension that every actuator must be able to exceed, N.
 
     Raises:
-        RobotError: An actuator does anything else than pull one tendon.
+        RobotError: An actuator does anything but pull one tendon.
     """
     low, high = np.moveaxis(model.actuator_ctrlrange[actuators], -1, 0)
     pulls = (
@@ -258,7 +258,7 @@ def check_tensions(model: mujoco.MjModel, actuators: Ints, least: float) -> None
 
 
 def _find_moment_arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints) -> Array:
-    """Return the moment arms, (joints,), m.
+    """Return the moment arm of the two tendons of each joint, (joints,), in m.
 
     Raises:
         RobotError: Two tendons are not a pair of one joint, or their moment arm varies.
@@ -268,7 +268,7 @@ def _find_moment_arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints
     ranges = np.where(model.jnt_limited[joints, None], model.jnt_range[joints], home[:, None])
     places = (home, *ranges.T)
     moments = np.array([compute_moments(model, joints, place)[actuators] for place in places])
-    # (places, 2, joints), m: arms of flexors and extensors, which turn joints back.
+    # (places, 2, joints), m: moment arms of flexors, and of extensors with the sign reversed.
     arms = np.diagonal(moments, axis1=2, axis2=3) * np.array([[1.0], [-1.0]])
     for number, joint in enumerate(robot.joints):
         least = float(arms[:, :, number].min()) + 0.0  # avoids -0
@@ -290,7 +290,7 @@ def _find_moment_arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints
 
 
 def compute_moments(model: mujoco.MjModel, joints: Ints, position: Array) -> Array:
-    """Return the moment arms of all actuators on joints, (actuators, joints), m.
+    """Return the moment arms of all actuators on joints, (actuators, joints), in m.
 
     Args:
         model: The compiled model.

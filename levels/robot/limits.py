@@ -18,12 +18,12 @@ VELOCITY_MARGIN = 0.05
 It keeps motion with tracking errors clear of the limit gate.
 """
 POSITION_MARGIN_RAD = 0.005
-"""Distance of planned motion from the ends of a joint's range, rad.
+"""Distance of planned motion from the ends of a joint's range, in rad.
 
 It keeps motion with tracking errors clear of the limit gate.
 """
 EDGE_TIMING_S = 0.1
-"""Resolution of position divided by resolution of velocity, s.
+"""Resolution of position divided by resolution of velocity, in s.
 
 A drive times the encoder's edges. That is much finer than the difference of two samples (for 1 mrad
 in 2.5 ms: 0.4 rad/s) and does not lag like a filter.
@@ -34,7 +34,7 @@ MAX_CONTACT_FRACTION = 0.2
 Setting down an object is such a contact. The value is a third more than observed in tasks.
 """
 MAX_RESTING_CONTACT_FRACTION = 0.1
-"""The same for an arm that holds an object and hardly moves.
+"""Largest fraction for an arm that holds an object and hardly moves.
 
 Dry friction may then hide the contact force in all joints except one.
 """
@@ -51,7 +51,7 @@ MIN_PATIENCE_CYCLES = 2
 One late cycle must not engage the brakes.
 """
 MAX_PATIENCE_S = 0.01
-"""Longest default time for which motors keep their last torque, s.
+"""Longest default time, in s, for which motors keep their last torque.
 
 However slow or weak the arm is, a longer absence of torques is more than a late cycle or two.
 """
@@ -78,8 +78,8 @@ class Bounds:
 class Limits:
     """Limits of planned motion.
 
-    They are the bounds with a margin for tracking errors, and the smoothness that the config
-    states.
+    They are the bounds with a margin for tracking errors, and the acceleration and jerk limits that
+    the config states.
     """
 
     position: Array  # (joints, 2), rad: low and high
@@ -99,7 +99,7 @@ class Encoders:
     noise: Array  # (joints,), rad: standard deviation of a position
     latency_ticks: int = 0  # age of a sample when it is read
     late_position_error: Array | float = 0.0  # (joints,), rad: largest error due to the age
-    late_velocity_error: Array | float = 0.0  # (joints,), rad/s: likewise
+    late_velocity_error: Array | float = 0.0  # (joints,), rad/s: largest error due to the age
     offset: Array | None = None  # (joints,), rad: added to the drives' samples. None for 0
 
     @classmethod
@@ -132,21 +132,22 @@ class Encoders:
 
     @property
     def is_exact(self) -> bool:
-        """True if samples have no error."""
+        """True if resolution and noise are zero."""
         return not (self.resolution.any() or self.noise.any())
 
     @property
     def position_error(self) -> Array:
-        """Largest error of the position in a good sample, (joints,), rad."""
+        """Largest error of the position in a good sample, (joints,), in rad."""
         return self._sampling_error + self.late_position_error
 
     @property
     def velocity_error(self) -> Array:
-        """Largest error of the velocity in a good sample, (joints,), rad/s."""
+        """Largest error of the velocity in a good sample, (joints,), in rad/s."""
         return self._sampling_error / EDGE_TIMING_S + self.late_velocity_error
 
     @property
     def _sampling_error(self) -> Array:
+        """Largest position error due to resolution and noise, (joints,), in rad."""
         return np.asarray(0.5 * self.resolution + NOISE_SIGMAS * self.noise)
 
 
@@ -157,7 +158,7 @@ class MotorPatience(NamedTuple):
     """
 
     seconds: float
-    min_cycles: int  # minimum, torque cycles
+    min_cycles: int  # minimum number of torque cycles
 
     def ticks(self, every: int, tick_s: float) -> int:
         """Return the patience in ticks, as a multiple of the torque cycle.
@@ -171,7 +172,7 @@ class MotorPatience(NamedTuple):
 def compute_patience(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPatience:
     """Compute the patience of the motors.
 
-    By default, it is the longest time in which a stop from full speed grows by at most
+    By default, it is the longest time that lengthens a stop from full speed by at most
     `PATIENCE_FRACTION`, by two criteria. The first compares the angle that joints turn at full
     speed in this time with the angle in which the brakes stop them. The second compares the energy
     that all motors add at full torque with the energy that the brakes absorb anyway. (The limits

@@ -38,7 +38,7 @@ STEP_TOLERANCE = 1e-10
 SPRING_WEIGHT = 1e-6
 """Weight of the stiffest spring relative to an equality."""
 DAMPING = 1e-9
-"""Weight of staying in place, for joints that nothing determines."""
+"""Weight with which joints stay in place, for joints that nothing else determines."""
 FREE_RATIO = 0.01
 """Ratio of `DAMPING` to everything that holds a joint, above which the joint counts as free."""
 YIELD_RESIDUAL = 1e-3
@@ -89,8 +89,8 @@ def solve_linkage(
         arm: Joints of the arm.
 
     Raises:
-        RobotError: An equality cannot be kept, nothing determines a joint, or nothing commands a
-            motor.
+        RobotError: An equality cannot be satisfied, a joint is not determined, or a motor is not
+            commanded.
     """
     solver = _Solver(model, config, hand, arm)
     openings = np.linspace(
@@ -164,7 +164,7 @@ class _Solver:
         return np.array(data.qpos)
 
     def _minimize_residual(self, yielding: bool) -> Array:
-        """Minimize the sum of squared residuals; return the factored matrix at the minimum.
+        """Minimize the sum of squared residuals. Return its factored matrix.
 
         With `yielding`, every row is weighted by its stiffness in the simulation.
         """
@@ -198,7 +198,7 @@ class _Solver:
         return matrix
 
     def find_largest_residual(self) -> tuple[float, int]:
-        """Return the largest residual of an equality in the last pose, m or rad, and its id."""
+        """Return the largest residual of the last pose, in m or rad, and the id of its equality."""
         data = self._data
         jacobian = self._compute_jacobian()
         rows = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
@@ -209,10 +209,10 @@ class _Solver:
         return abs(float(data.efc_pos[worst])), int(data.efc_id[worst])
 
     def check_residual(self, opening: float) -> None:
-        """Record whether the last pose leaves an equality open.
+        """Record in `yields` whether an equality yields in the last pose.
 
         Raises:
-            RobotError: A loop stays open.
+            RobotError: A loop stays open by more than the config permits.
         """
         residual, equality = self.find_largest_residual()
         self.yields |= residual > YIELD_RESIDUAL
@@ -260,7 +260,8 @@ class _Solver:
     def _build_tendon_rows(self, most: float) -> tuple[Array, Array]:
         """Return the rows of tendons that are springs.
 
-        Their stiffness is divided by `most`.
+        Args:
+            most: Value by which their stiffness is divided.
 
         Returns:
             Residuals, (tendons,), and their Jacobian, (tendons, joints).
@@ -279,7 +280,7 @@ class _Solver:
 
 
 def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask) -> None:
-    """Check that the gripper has no actuator that nothing commands.
+    """Check that every actuator on the gripper's joints is commanded.
 
     Args:
         model: The compiled model.
@@ -287,7 +288,7 @@ def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask)
         carried: Joints of the gripper that follow, (njnt,).
 
     Raises:
-        RobotError: A joint of the gripper has such an actuator.
+        RobotError: A joint has an actuator that is not the gripper's.
     """
     for k in range(model.nu):
         name = model.actuator(k).name
@@ -301,7 +302,7 @@ def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask)
 
 
 def describe_equality(model: mujoco.MjModel, equality: int) -> str:
-    """Return the name of an equality, or its kind and what it couples if it has no name."""
+    """Return the name of an equality. If it has none, return its kind and what it couples."""
     if name := model.equality(equality).name:
         return f"'{name}'"
     kind = mujoco.mjtEq(int(model.eq_type[equality]))
@@ -323,10 +324,10 @@ def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: boo
     Args:
         model: The compiled model.
         joints: Names of the arm's joints.
-        of_bodies: Whether to check equalities between bodies as well.
+        of_bodies: True to check equalities between bodies as well.
 
     Raises:
-        RobotError: A joint of the arm is tied.
+        RobotError: An equality ties a joint of the arm.
     """
     for equality in range(model.neq):
         tied = [model.joint(joint).name for joint in sorted(find_tied_joints(model, equality))]
@@ -341,9 +342,9 @@ def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: boo
 
 
 def find_tied_joints(model: mujoco.MjModel, equality: int) -> set[int]:
-    """Return the joints that an equality ties.
+    """Return the ids of the joints that an equality ties.
 
-    Two bodies are tied by the joints that move only one of them.
+    An equality between two bodies ties the joints that move only one of them.
     """
     ends = np.array([model.eq_obj1id[equality], model.eq_obj2id[equality]])
     ends = ends[ends >= 0]

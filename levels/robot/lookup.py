@@ -29,7 +29,7 @@ COUNT_ATTRIBUTES = {
     "joint": "njnt",
     "actuator": "nu",
 }
-"""Attributes of a model with the numbers of its elements, by kind of element."""
+"""Attribute of a model that counts its elements, for each kind of element."""
 
 
 def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> int:
@@ -127,7 +127,7 @@ def find_tool_site(model: mujoco.MjModel, name: str, moved: Mask | None) -> int:
 
 
 def find_free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:
-    """Return the ids of the objects' free joints.
+    """Return the ids of the free joints of objects, given the ids of their bodies.
 
     Raises:
         RobotError: A body has no free joint.
@@ -143,7 +143,7 @@ def find_free_joints(model: mujoco.MjModel, bodies: Ints) -> Ints:
 
 
 def find_mocap_ids(model: mujoco.MjModel, bodies: Ints) -> Ints:
-    """Return the mocap ids of the obstacles.
+    """Return the mocap ids of obstacles, given the ids of their bodies.
 
     Raises:
         RobotError: An obstacle is not a mocap body.
@@ -167,7 +167,7 @@ def mark_descendants(model: mujoco.MjModel, roots: Ints) -> Mask:
 
 
 def list_geoms(model: mujoco.MjModel, bodies: Mask) -> Ints:
-    """Return the ids of the geoms on the bodies of a mask, (nbody,)."""
+    """Return the ids of the geoms on the bodies that a mask, (nbody,), selects."""
     return np.flatnonzero(bodies[model.geom_bodyid])
 
 
@@ -177,7 +177,7 @@ def find_geom_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 def derive_robot(robot: RobotConfig) -> RobotConfig:
-    """Return the table with joints, tool and home added from the model.
+    """Return the table, with missing joints, tool and home filled in from the model.
 
     Raises:
         RobotError: The model does not determine them.
@@ -204,7 +204,7 @@ def derive_robot(robot: RobotConfig) -> RobotConfig:
 
 
 def _find_driven_joints(model: mujoco.MjModel, robot: RobotConfig) -> tuple[str, ...]:
-    """Return the names of the joints with an actuator, from base to tool, without the gripper's."""
+    """Return the names of the joints with an actuator, except those of the gripper."""
     of_joint = np.isin(model.actuator_trntype, JOINT_DRIVES)
     driven = np.unique(model.actuator_trnid[of_joint, 0])
     names = [str(model.joint(k).name) for k in driven]

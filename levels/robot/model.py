@@ -25,7 +25,7 @@ MAX_STEP_S = 0.1
 """Maximum time step of an MJCF file. A longer one is a mistake, such as ms for s."""
 JOINT_DRIVES = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 SET_POINT_ROWS = 3
-"""Numbers per joint that MuJoCo's state contains for simulated drives that follow set points.
+"""Number of values per joint in MuJoCo's user data for drives that follow set points.
 
 They are position, velocity, and the torque of the integral.
 """
@@ -78,7 +78,7 @@ def drop_fixed_inertias(body: mujoco.MjsBody) -> bool:
         True if any was removed.
     """
     is_dropped = False
-    # The lists of children of a body raise the error of the failed compilation again.
+    # Iterating over the lists of a body's children would raise the error of the compilation again.
     child = body.first_body()
     while child is not None:
         if child.first_joint() is None:
@@ -126,9 +126,9 @@ def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
 
 
 def prepare_spec(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:
-    """Set everything that the servo level needs in any model.
+    """Prepare a model for the servo level.
 
-    These are integrator, time step, drive inertia, tool, gripper and keyframe.
+    Sets integrator, time step, drive inertia, tool, gripper and keyframe.
 
     Args:
         spec: The model, which is changed.
@@ -257,7 +257,7 @@ def couple_joint(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowCo
     equality.name1 = follower.joint
     equality.name2 = gripper.joint
     equality.data[:2] = [0.0, follower.ratio]
-    # As stiff as a gear. With the default values a finger lags by millimetres.
+    # This is as stiff as a gear. With the default values a finger lags by millimetres.
     equality.solref = [0.002, 1.0]
     equality.solimp[:3] = [0.99, 0.999, 0.001]
 
@@ -283,9 +283,10 @@ def find_driven_joints(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> lis
 def find_torque_limit(
     spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsActuator]
 ) -> float:
-    """Return the tightest torque limit that a model states for a joint, N m.
+    """Return the tightest torque limit, in N m, that a model states for a joint.
 
-    0 if it states none, or only limits that a `[robot]` table must not have, such as infinity.
+    The result is 0 if the model states none, or only limits that a `[robot]` table must not have,
+    such as infinity.
 
     Args:
         spec: The model.
@@ -301,7 +302,7 @@ def find_torque_limit(
 
 
 def compute_drive_limit(actuator: mujoco.MjsActuator) -> float:
-    """Return the torque limit that an actuator on a joint implies, N m. 0 if it has none."""
+    """Return the torque limit in N m that an actuator on a joint implies. 0 if it has none."""
     gear = abs(float(actuator.gear[0]))
     limits = [compute_symmetric_range(actuator.forcelimited, actuator.forcerange) * gear]
     if (
@@ -318,7 +319,7 @@ def compute_drive_limit(actuator: mujoco.MjsActuator) -> float:
 
 
 def compute_symmetric_range(limited: mujoco.mjtLimited, span: Array) -> float:
-    """Return the largest symmetric range within `span`. 0 if there is none."""
+    """Return the largest x for which -x to x is within `span`. 0 without limits or such an x."""
     if limited == mujoco.mjtLimited.mjLIMITED_FALSE or not span[0] < span[1]:
         return 0.0
     return max(0.0, min(-float(span[0]), float(span[1])))
@@ -353,12 +354,12 @@ def remove_actuators(spec: mujoco.MjSpec, actuators: list[mujoco.MjsActuator]) -
 
 
 def format_one_line(problem: Exception) -> str:
-    """Return MuJoCo's message without line breaks."""
+    """Return the message of MuJoCo's error as one line."""
     return " ".join(str(problem).split()).removeprefix("Error: ")
 
 
 def format_names(names: list[str], most: int = 24) -> str:
-    """Format names for an error message, at most `most` of them."""
+    """Return names as a list for an error message, with at most `most` of them."""
     named = [n for n in names if n]
     more = f" and {len(named) - most} more" if len(named) > most else ""
     return (", ".join(named[:most]) or "none") + more

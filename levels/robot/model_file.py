@@ -1,4 +1,4 @@
-"""Reading of a model's XML files before MuJoCo reads them.
+"""Reader that checks the XML files of a model before MuJoCo reads them.
 
 The files are not trusted. Every mistake is one `RobotError`, found in bounded time and memory.
 MuJoCo receives the text that was checked here, and opens no XML file itself.
@@ -58,12 +58,12 @@ MAX_VELOCITY = 1e9
 
 
 class _Place(NamedTuple):
-    """Surroundings of an element."""
+    """Place of an element in the model's files."""
 
     file: Path  # file that contains the element
     owner: str  # kind and name of the nearest named element around it
-    copies: float  # number of its replicas
-    depth: int  # number of elements around it
+    copies: float  # number of copies that replication makes of the element
+    depth: int  # nesting depth of the element
 
 
 class ModelReader:
@@ -151,7 +151,7 @@ class ModelReader:
         element.set("file", str(Path(name).with_name(text_name)))
 
     def _check_element(self, element: ElementTree.Element, place: _Place) -> None:
-        """Check an element and everything in it or to which it refers, and count replicas."""
+        """Check an element, its children and the files that it includes, and count their parts."""
         file, owner, copies, depth = place
         tag = element.tag
         if name := element.get("name"):
@@ -207,6 +207,7 @@ def parse_xml(text: bytes) -> ElementTree.Element:
     line = 1
 
     def start(tag: str, attributes: dict[str, str]) -> None:
+        """Add an element at its start tag, unless it or an element around it has a prefix."""
         nonlocal foreign, line
         prefix, _, name = tag.rpartition(":")
         if prefix == "xacro" and name not in ("property", "arg"):
@@ -219,6 +220,7 @@ def parse_xml(text: bytes) -> ElementTree.Element:
         builder.start(tag, {key: value for key, value in attributes.items() if ":" not in key})
 
     def end(tag: str) -> None:
+        """Complete an element at its end tag."""
         nonlocal foreign
         if foreign:
             foreign -= 1
@@ -226,6 +228,7 @@ def parse_xml(text: bytes) -> ElementTree.Element:
             builder.end(tag)
 
     def refuse(*_: object) -> None:
+        """Refuse the declaration of an entity."""
         raise ValueError(f"line {parser.CurrentLineNumber} declares an entity; write its text out")
 
     parser.StartElementHandler = start
@@ -245,10 +248,10 @@ def find_file(paths: Iterable[Path]) -> Path | None:
 
 
 def check_asset(file: Path, model: Path) -> None:
-    """Check that an asset of a model is a regular file, and not too large, even when decoded.
+    """Check that an asset of a model is a regular file and not too large, also when decoded.
 
     Raises:
-        RobotError: It is not.
+        RobotError: The asset is not a regular file, or it is too large.
     """
     try:
         check_regular_file(file, MAX_ASSET_BYTES)
@@ -296,7 +299,7 @@ def _find_mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> I
 
 
 def parse_numbers(text: str) -> list[float]:
-    """Return the words of an attribute that are numbers. In C syntax, nan(7) is a number."""
+    """Return the numbers among the words of an attribute. As in C, nan(7) is a number."""
     values = []
     for word in text.split():
         with suppress(ValueError):

@@ -25,7 +25,7 @@ class Wrist(NamedTuple):
     Forces are in N, torques in N m. Pairs of values are for force and torque.
     """
 
-    site: int
+    site: int  # id
     addresses: Ints  # (6,), addresses of its values in sensordata
     range: tuple[float, float]  # largest value of a component, in both directions
     contact_limits: tuple[float, float]  # force and torque of a contact at which the arm stops

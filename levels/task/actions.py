@@ -1,4 +1,4 @@
-"""Actions as elemental moves. Of the ways to do an action, the quickest feasible one is used."""
+"""Planning of actions as elemental moves, in the quickest feasible way."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ TURN_COUNT = 8
 MAX_WAYS = 16
 """Maximum number of ways to do an action for which all motions are planned."""
 LEANING_RESTARTS = 20
-"""Random starts of the inverse kinematics for a tool that leans.
+"""Number of random starts of the inverse kinematics for a tool that leans.
 
 Many of its poses are out of reach. Of 7,100 reachable poses in layouts that the PUMA refuses, this
 number missed 80.
 """
 HALVINGS = 7
-"""Bisections in the search for a reachable place on the way to an unreachable one."""
+"""Number of bisections to find a reachable place on the way to an unreachable one."""
 
 
 class Spot(NamedTuple):
     """Pose of the tool at an object."""
 
     tool: Pose
-    above: Array  # a configuration straight above it, (joints,), rad
+    above: Array  # a configuration with the tool straight above that pose, (joints,), rad
 
 
 class Way(NamedTuple):
@@ -57,6 +57,9 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
         program: The program.
         scene: The `[scene]` table.
         start: Rehearsal without moves, at the start of the program.
+
+    Returns:
+        The rehearsal after the last action.
 
     Raises:
         Refused: An action cannot be done. The reason names the place, and a possible alternative.
@@ -78,7 +81,7 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
 
 @contextmanager
 def _refusals_named(k: int, step: str) -> Iterator[None]:
-    """Add the number of the action and the step to a refusal."""
+    """Add the step, and the number `k` of its action, to a refusal that is raised in the block."""
     try:
         yield
     except Refused as refused:
@@ -140,12 +143,12 @@ def rehearse_transfer(
     Raises:
         Refused: The transfer cannot be done. The reason names the step, pick or place.
     """
-    handling = Handling(rehearsal, scene.objects.index(action.object), action.lift)
+    planner = Handling(rehearsal, scene.objects.index(action.object), action.lift)
     pick = f"pick {action.object}"
     place = f"place {action.object} at [{', '.join(f'{value:.4g}' for value in action.to)}]"
     with _refusals_named(k, place):
         situation = rehearsal.situation
-        row = handling.row
+        row = planner.row
         cell = rehearsal.motion.cell
         data = cell.build_start_data()
         standing_goals = [
@@ -156,40 +159,45 @@ def rehearse_transfer(
             for group in find_goals(action, situation.object_pose(row), cell)
         ]
 
-    def choices() -> Iterator[tuple[list[Spot], list[Pose]]]:
+    def pair_takes_with_goals() -> Iterator[tuple[list[Spot], list[Pose]]]:
+        """Yield each group of spots to take the object with each group of goals, in that order."""
         with _refusals_named(k, pick):
-            for takes in handling.find_takes():
+            for takes in planner.find_takes():
                 yield from ((takes, group) for group in standing_goals)
 
-    def chosen(choice: tuple[list[Spot], list[Pose]]) -> Rehearsal:
+    def rehearse_pair(pair: tuple[list[Spot], list[Pose]]) -> Rehearsal:
+        """Rehearse the quickest feasible way from a group of spots to a group of goals."""
         with _refusals_named(k, place):
-            ways = handling.find_ways(*choice)
-        return _rehearse_first(ways[:MAX_WAYS], transferred)
+            ways = planner.find_ways(*pair)
+        return _rehearse_first(ways[:MAX_WAYS], rehearse_way)
 
-    def transferred(way: Way) -> Rehearsal:
+    def rehearse_way(way: Way) -> Rehearsal:
+        """Rehearse the moves that take the object and put it down."""
         with _refusals_named(k, pick):
-            taken = handling.rehearse_moves(rehearsal, k, way.take, Verb.GRASP)
+            taken = planner.rehearse_moves(rehearsal, k, way.take, Verb.GRASP)
         with _refusals_named(k, place):
-            return handling.rehearse_moves(taken, k, way.put, Verb.RELEASE)
+            return planner.rehearse_moves(taken, k, way.put, Verb.RELEASE)
 
-    return _rehearse_first(choices(), chosen)
+    return _rehearse_first(pair_takes_with_goals(), rehearse_pair)
 
 
 class Handling(NamedTuple):
-    """A transfer as planning sees it.
+    """Plans one transfer of an object.
 
     The tool moves straight down to the object and straight up again.
     """
 
-    start: Rehearsal
-    row: int  # row of the object
+    start: Rehearsal  # before the transfer
+    row: int  # row of the object in the world model
     lift: float  # height of the straight motions, m
 
     def find_takes(self) -> Iterator[list[Spot]]:
-        """Yield spots at which the object can be taken and held, lowest height first.
+        """Yield the spots at which the object can be taken and held, one list per group of grasps.
+
+        The groups are in the order of `find_grasps`. Those without a spot are left out.
 
         Raises:
-            Refused: There are no spots. The reason is the first refusal.
+            Refused: No group has a spot. The reason is the first refusal.
         """
         start = self.start
         refusal: Refused | None = None
@@ -217,9 +225,11 @@ class Handling(NamedTuple):
             raise refusal
 
     def find_ways(self, takes: list[Spot], standing_goals: list[Pose]) -> list[Way]:
-        """Return ways to do the transfer, those with the shortest motion first.
+        """Return ways to do the transfer, the quickest first.
 
-        `standing_goals` are poses in which the object may be put down.
+        Args:
+            takes: Spots at which the object can be taken.
+            standing_goals: Poses in which the object may be put down.
 
         Raises:
             Refused: There is no way.
@@ -267,9 +277,9 @@ class Handling(NamedTuple):
         return rehearsal.add_move(k, Verb.DEPART, tool=above, row=row)
 
     def _find_spots(self, tool: Pose, situation: Situation, grasps: bool = False) -> list[Spot]:
-        """Return spots at `tool` from which the arm can come down to it without collision.
+        """Return spots at pose `tool` to which the arm can come down without collision.
 
-        If it `grasps` an object there, the gripper can also close.
+        With `grasps`, the gripper must also be able to close there without collision.
         """
         motion = self.start.motion
         situation.apply_to(motion.checker, None)
@@ -291,7 +301,7 @@ class Handling(NamedTuple):
         """Return the spots at which gripper and motors can hold the object.
 
         Raises:
-            Refused: There are no such spots. The reason is the first refusal.
+            Refused: The object can be held at none of the spots. The reason is the first refusal.
         """
         payloads = self.start.motion.payloads
         seen = self.start.situation.object_pose(self.row)
@@ -316,9 +326,7 @@ class Handling(NamedTuple):
 
 
 def _rehearse_first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehearsal:
-    """Return the first rehearsal that succeeds.
-
-    `do` rehearses an option.
+    """Rehearse options by `do` until one succeeds, and return its rehearsal.
 
     Raises:
         Refused: No option succeeds. The refusal is from the first option.
@@ -333,7 +341,7 @@ def _rehearse_first(options: Iterable[Option], do: Callable[[Option], Rehearsal]
 
 
 def _explain_unreachable(motion: MotionPlanner, tools: list[Pose], here: Array) -> Refused:
-    """Return the refusal for tool poses that cannot be reached without collision."""
+    """Return the refusal for tool poses that cannot be reached from `here` without collision."""
     beyond: Pose | None = None
     for tool in tools:
         reachable = motion.ik.find_solutions(tool, here)

@@ -1,4 +1,4 @@
-"""The executor of the task level: hands down a window of the plan and tracks its execution."""
+"""The executor of the task level, which hands down the moves of the plan and tracks them."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ from rack.levels.task.window import Detour, ShownWindow
 class TaskExecutor(Executor):
     """Hands down the moves of the plan and reports when the program is done.
 
-    It also reports the error that ends the program: refused, failed below, late or stalled. An
-    operator may hold the program, or send the arm elsewhere between two moves.
+    It also reports the error that ends the program: the plan is refused, a move fails in the level
+    below, an action is late, or nothing moves. An operator may hold the program, or send the arm
+    elsewhere between two moves.
     """
 
     below = Input(MoveStatus, "below.status")
@@ -46,7 +47,7 @@ class TaskExecutor(Executor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._actions = self._read_first_actions()
-        self._ahead_s = 0.0  # clock of the program's `by` minus simulated time
+        self._ahead_s = 0.0  # clock to which the actions' `by` refers, minus simulated time
         self._stalled_s = read_params(self.params, context.params).stalled_s
         self._orders = Orders(self.commands)
         self._window = ShownWindow()
@@ -59,7 +60,7 @@ class TaskExecutor(Executor):
         self._moved_at = 0  # tick of their last change
 
     def process(self, tick: int) -> None:
-        """Read progress and operator's commands, and hand down the next moves."""
+        """Track progress, obey the operator, and hand down the next moves of the plan."""
         if not self._started:
             self._restore_state()
         self._orders.take_commands(
@@ -90,7 +91,7 @@ class TaskExecutor(Executor):
         self._answer_operator(below)
 
     def _read_first_actions(self) -> tuple[AnyAction, ...]:
-        """Return the initial actions, which are the whole program."""
+        """Return the actions at the start, which are the whole program."""
         return read_program(self.context.task, self.context.robot, self.context.scene).action
 
     def _find_plan(self, tick: int) -> TaskPlan:
@@ -110,9 +111,9 @@ class TaskExecutor(Executor):
             self._detour = Detour(self.context.robot, self._orders, self._window, last.detour)
 
     def _judge_command(self, command: OperatorCommand, answered: int) -> None:
-        """Accept or refuse a goto.
+        """Accept or refuse a goto. Other commands need no check.
 
-        A goto that was answered before a restart of this board is not new.
+        A goto up to serial `answered` was answered before a restart of this board, and is not new.
         """
         if self._orders.standing is Operation.GOTO:
             self._detour.accept_command(command, command.id > answered)
@@ -135,11 +136,11 @@ class TaskExecutor(Executor):
         return f"action {action}{why}"
 
     def _interrupt_program(self, plan: TaskPlan, below: MoveStatus) -> int:
-        """Interrupt the program for an operator; return how many moves of the plan are done."""
+        """Interrupt the program for an operator. Return how many moves of the plan are done."""
         return self._detour.step(plan, self._done, below)
 
     def _find_reason_to_wait(self, below: Reading[MoveStatus]) -> str:
-        """Return why the level waits, and the condition that ends the wait.
+        """Return text that says why the level waits and what ends the wait.
 
         Empty if it does not wait.
         """
@@ -193,16 +194,16 @@ class TaskExecutor(Executor):
         if detour.move and detour.is_known and not self._error:
             self._window.show_one(detour.to_move(self._count_done_actions(plan)), command)
         else:
-            is_kept = self._error or detour.move
-            until = 0 if is_kept else self._find_last_move(plan)
+            is_stopped = self._error or detour.move
+            until = 0 if is_stopped else self._find_last_move(plan)
             self._window.show_moves(plan, self._done, command, until)
 
     def _find_last_move(self, plan: TaskPlan) -> int:
-        """Return the first move of the plan that must not begin."""
+        """Return the number of the first move of the plan that must not begin yet."""
         return plan.count if self._detour.until is None else self._detour.until
 
     def _write_status(self, plan: TaskPlan, waits: str) -> None:
-        """Fill the status. `waits` is the reason to wait, or empty."""
+        """Write state, error and progress to the status. `waits` is the reason to wait, if any."""
         status = self.status
         status.echo = plan.id
         status.state = self._compute_state(plan)
@@ -219,10 +220,7 @@ class TaskExecutor(Executor):
         status.detour = self._detour.move
 
     def _answer_operator(self, below: MoveStatus) -> None:
-        """Obey and answer the operator.
-
-        The newest operator's command on which this cycle is based is passed down.
-        """
+        """Pass the operator's command down, and write the answer to it to the status."""
         orders = self._orders
         self.command.hold = orders.is_holding or self._detour.holds
         self.command.operator = orders.find_basis(0)
@@ -231,7 +229,7 @@ class TaskExecutor(Executor):
         orders.fill_status(self.status)
 
     def _compute_state(self, plan: TaskPlan) -> State:
-        """Return the state of the level, without holds."""
+        """Return the state of the level, disregarding holds."""
         if self._error:
             return State.ERROR
         if not self._actions:
@@ -240,7 +238,7 @@ class TaskExecutor(Executor):
 
 
 def _format_awaited(plan: TaskPlan, below: MoveStatus) -> str:
-    """Return the event for which a task waits while nothing holds it."""
+    """Return text that names the event for which a task waits that is not held."""
     if not plan.id:
         return "no plan yet: the objects must be at rest and the position of the arm known"
     if below.current:

@@ -53,18 +53,19 @@ pressed onto its support.
 MIN_LEAN = 0.01
 """1 - cosine of the angle from straight down above which a tool counts as leaning."""
 MAX_DISTANCE_M = 10.0
-"""Maximum distance between geoms that is measured."""
+"""Distance up to which distances between geoms are measured."""
 SKIN_M = 1e-6
 """Distance by which a ray that has hit the arm continues inside the surface."""
 MAX_STANDING_GAP_M = 0.02
-"""Distance of a goal from a standing height above which the program is refused."""
+"""Largest distance of a goal from the standing height. Beyond it the program is refused."""
 
 
 def find_grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
-    """Yield groups of tool poses that take object `row`, from the lowest height up.
+    """Yield groups of tool poses that grasp object `row`, in the order of trying.
 
-    The poses straight down come first, then poses that lean over each side of the object. The
-    fingers close along the tool's y axis, across the object's x or y axis.
+    First come the poses straight down, from the lowest height up, then the poses that lean over
+    each side of the object. The fingers close along the tool's y axis, across the object's x or y
+    axis.
     """
     seen = situation.object_pose(row)
     yaws = [compute_yaw(seen.quaternion) + quarter * np.pi / 2.0 for quarter in QUARTER_TURNS]
@@ -90,7 +91,7 @@ def find_grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pos
 def build_leaning_quaternion(yaw: float, tilt: float) -> Array:
     """Return the quaternion of a tool that points down, tilted by `tilt`, rad, towards `yaw`.
 
-    Its y axis is level.
+    The tool's y axis is level.
     """
     across = math.sin(tilt)
     return build_pointing_quaternion(
@@ -106,7 +107,7 @@ def is_leaning(tool: Pose) -> bool:
 
 
 def compute_bearing(cell: Cell, position: Array) -> float:
-    """Return the direction of a position as seen from the arm's first joint, rad."""
+    """Return the horizontal direction from the arm's first joint to a position, in rad."""
     base = cell.build_start_data().xanchor[cell.model.dof_jntid[cell.dof[0]]]
     return math.atan2(position[1] - base[1], position[0] - base[0])
 
@@ -137,7 +138,7 @@ def find_goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[list[Pose]]:
 
 
 def _build_turned_pose(action: Transfer, at: Pose, turn: float) -> Pose:
-    """Return the pose of an object at its goal, turned by `turn`, rad, from its present pose."""
+    """Return the pose of an object at its goal, turned by `turn` rad from its present pose `at`."""
     quaternion = np.zeros(4)
     mujoco.mju_mulQuat(quaternion, build_yaw_quaternion(turn), at.quaternion)
     return make_pose(action.to, quaternion)
@@ -153,7 +154,7 @@ def find_standing_pose(cell: Cell, data: mujoco.MjData, row: int, situation: Sit
         situation: Poses of the objects, with the object at its goal.
 
     Raises:
-        Refused: The goal is not over a support, or far above or below it.
+        Refused: The goal is not over a support, or too far above or below the standing height.
     """
     model = cell.model
     _place_bodies(cell, data, situation)
@@ -182,7 +183,7 @@ def find_standing_pose(cell: Cell, data: mujoco.MjData, row: int, situation: Sit
 
 
 def _find_geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
-    """Return the first geom below a point that is neither object `row` nor part of the arm.
+    """Return the id of the first geom below a point, except those of the arm and object `row`.
 
     -1 if there is none.
     """
@@ -203,7 +204,7 @@ def _place_bodies(cell: Cell, data: mujoco.MjData, situation: Situation) -> None
 
 
 def _find_top(cell: Cell, situation: Situation, row: int) -> float:
-    """Return the height of the highest point of object `row`, from its bounding boxes, m."""
+    """Return the height of the top of object `row` in m, computed from bounding boxes."""
     data = cell.build_start_data()
     _place_bodies(cell, data, situation)
     return compute_extent(cell.model, data, cell.list_geoms(row), UP)

@@ -51,11 +51,11 @@ class TaskPlanner(Planner):
 
         self._program = self._read_first_program()
         self._id = FIRST_PLAN_ID
-        self._ahead_s = 0.0  # clock of the program's `by` minus simulated time
+        self._ahead_s = 0.0  # clock to which the actions' `by` refers, minus simulated time
         self._needs = read_params(self.params, context.params)
         cell = build_level_cell(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
-        self._plan: TaskPlan | None = None  # made by this process
+        self._plan: TaskPlan | None = None  # plan made by this process
         self._visible_at = 0  # tick from which that plan is visible
         self._since: int | None = None  # tick of the first cycle
 
@@ -64,7 +64,10 @@ class TaskPlanner(Planner):
         return read_program(self.context.task, self.context.robot, self.context.scene)
 
     def wanted(self, tick: int) -> bool:
-        """Return True if the program has no plan yet, and the world is known and at rest."""
+        """Return True if the program has no plan yet, and the world is known and at rest.
+
+        Also True if the plan of this process was lost, so that `plan` publishes it again.
+        """
         self._since = tick if self._since is None else self._since
         followed = self.status.message.echo == self._id
         if not self._program.action or followed or self._may_be_reported(tick, self._since):
@@ -102,11 +105,11 @@ class TaskPlanner(Planner):
 
     @property
     def _planning_ticks(self) -> int:
-        """Ticks that the computation of a plan may take."""
+        """Number of ticks that the computation of a plan may take."""
         return self.context.within_cycles * self.context.every
 
     def _may_be_reported(self, tick: int, since: int) -> bool:
-        """Return True if the executor may still report a published plan.
+        """Return True while a published plan may not have reached the executor's status yet.
 
         The plan may be from this process or an earlier one. `since` is the tick of the first cycle.
         """
@@ -135,15 +138,15 @@ class TaskPlanner(Planner):
         self.output.count = len(moves)
 
     def _compute_visible_s(self, tick: int) -> float:
-        """Return when the first moves of a plan begun at `tick` become visible below, s."""
+        """Return when, in s, the level below sees the first moves of a plan begun at `tick`."""
         # The plan is ready within its cycles, is read and handed down at once, and is visible below
         # a cycle later.
         return (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
 
     def _add_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
-        """Set the time by which the last move of each action must be done.
+        """Return the moves, with a deadline for the last move of each action that has one.
 
-        It leaves this level time to report.
+        The move must end one cycle before the action's deadline, so that this level can report it.
         """
         timed = list(moves)
         for k, (move, duration_s) in enumerate(moves):
@@ -160,7 +163,7 @@ class TaskPlanner(Planner):
         """Check that every action can be done by its time.
 
         Raises:
-            Refused: An action cannot. The text has the earliest possible time.
+            Refused: An action cannot be done by its time. The text has the earliest possible time.
         """
         finish_s = compute_finish_times(moves, visible_s, self.context, self._needs)
         for (move, _), finished_s in zip(moves, finish_s, strict=True):

@@ -11,7 +11,7 @@ from rack.levels.level import Mismatches, Program
 from rack.levels.tables import Finite, GoalConfig, Positive, RobotConfig, SceneConfig, Table, Vector
 
 ROUNDING_S = 1e-9
-"""Tolerance of comparisons with deadlines, s, as ticks times the clock's period are rounded."""
+"""Tolerance of comparisons with deadlines in s, as ticks times the clock's period are rounded."""
 DOWN = (0.0, 0.0, -1.0)
 """Default direction of the tool's z axis."""
 
@@ -58,6 +58,7 @@ class Goto(Action):
 
     @model_validator(mode="after")
     def _check_goal(self) -> Goto:
+        """Check that there is one goal, without a zero quaternion or direction."""
         if (self.position is None) == (self.joints is None):
             raise ValueError("a goto has either position or joints")
         if self.quaternion is not None and self.direction is not None:
@@ -101,7 +102,7 @@ class TaskConfig(Program):
                 yield GoalConfig(object=action.object, position=action.to)
 
     def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
-        """Yield key, value and reason of every entry that does not suit arm or scene."""
+        """Yield key, value and reason of every entry that disagrees with the arm or the scene."""
         if robot is None:
             return
         for k, action in enumerate(self.action):
@@ -131,7 +132,7 @@ read_program = TaskConfig.read
 
 
 def find_mismatches(action: Action, robot: RobotConfig, scene: SceneConfig) -> Mismatches:
-    """Yield key, value and reason of every entry of an action that does not suit arm or scene.
+    """Yield key, value and reason of every entry of an action that disagrees with arm or scene.
 
     Args:
         action: The action.

@@ -91,7 +91,7 @@ class Rehearsal:
 def compute_finish_times(
     moves: Sequence[Rehearsed], visible_s: float, context: LevelContext, needs: TaskParams
 ) -> list[float]:
-    """Return the latest times at which the task level reads that a move is done, s.
+    """Return for each move the latest time, in s, at which the task level reads that it is done.
 
     A move begins when the previous move is done, its path is planned, and the window of segments
     has space for it. Each message waits at most one cycle to be read and one to become visible. The
@@ -99,7 +99,7 @@ def compute_finish_times(
 
     Args:
         moves: The moves.
-        visible_s: Simulated time at which the first window of moves becomes visible below, s.
+        visible_s: Simulated time at which the level below sees the first window of moves, s.
         context: The task level.
         needs: Longest times that the levels below need.
     """

@@ -26,7 +26,7 @@ from rack.levels.planning.pose import Pose, build_pointing_quaternion, make_pose
 from rack.levels.tables import RobotConfig
 
 ID_JUMP = 2
-"""Step from the newest id shown to the next; a gap makes the level below start over."""
+"""Step from the newest id to the next one, so that the gap makes the level below start over."""
 FIRST_ID = 1
 """Id of the plan's first move, unless an operator has intervened."""
 FREE_VERBS = (Verb.MOVE, Verb.MOVE_JOINTS)
@@ -36,15 +36,16 @@ MAX_JOINT_RAD = 1e3
 
 
 class ShownWindow:
-    """Ids of the moves on the bus.
+    """The window of moves that the level below sees, and the ids of these moves.
 
-    They always increase, even if an operator inserts moves.
+    The ids always increase, even if an operator inserts moves.
     """
 
     def __init__(self, first: int = FIRST_ID, newest: int = 0, before: int = 0) -> None:
         self.first = first  # id of the plan's first move; its move k has the id `first` + k
         self.newest = newest  # newest id shown
-        self.before = before  # the level below has started over once it has done this id
+        # The level below has started over once it reports this id, or a later one, as done.
+        self.before = before
 
     def reserve_id(self) -> int:
         """Return an id that makes the level below start over."""
@@ -53,7 +54,7 @@ class ShownWindow:
         return self.newest
 
     def renumber_plan(self, done: int) -> None:
-        """Show the plan under new ids, from its move `done` on."""
+        """Give new ids to the moves of the plan, so that it continues with its move `done`."""
         self.first = self.newest + ID_JUMP - done
         self.before = self.first + done - 1
 
@@ -62,7 +63,7 @@ class ShownWindow:
         return below.done - self.first + 1
 
     def find_interruption(self, plan: TaskPlan, done: int, below: MoveStatus) -> tuple[int, bool]:
-        """Return the first move that must not begin so that the program can be interrupted.
+        """Find the move before which the program can be interrupted.
 
         Args:
             plan: The plan.
@@ -70,9 +71,9 @@ class ShownWindow:
             below: Status of the level below.
 
         Returns:
-            The number of the move, and True if the arm may come to rest now. This is permitted
-            during a free motion and right after one. Otherwise work on an object is completed
-            first.
+            The number of the first move that must not begin, and True if the arm may come to rest
+            now. This is permitted during a free motion and right after one. Otherwise work on an
+            object is completed first.
         """
         is_begun = below.current == self.first + done
         if not is_free_motion(plan, done) and (is_begun or not is_free_motion(plan, done - 1)):
@@ -82,8 +83,8 @@ class ShownWindow:
     def show_moves(self, plan: TaskPlan, done: int, command: TaskCommand, until: int) -> None:
         """Show the moves from the first one that is not done up to `until`.
 
-        After the last move the window stays. Moves that were done under other ids are not shown
-        again, because the level below would repeat them.
+        At the end of the plan the window keeps its size, and so shows moves that are done. Moves
+        that were done under other ids are not shown, because the level below would repeat them.
 
         Args:
             plan: The plan.
@@ -103,7 +104,7 @@ class ShownWindow:
         self._finish_window(command, 1)
 
     def _finish_window(self, command: TaskCommand, count: int) -> None:
-        """Set the count and id of a window, and clear its unused moves."""
+        """Set count and id of a command with `count` moves, and clear its unused moves."""
         command.count = count
         # Unused moves are cleared, so that equal windows have equal bytes.
         command.moves[count:] = np.zeros((), command.moves.dtype)
@@ -113,10 +114,7 @@ class ShownWindow:
 
 
 def is_free_motion(plan: TaskPlan, k: int) -> bool:
-    """Return True if move `k` of the plan is a free motion.
-
-    Also True before the first move and after the last.
-    """
+    """Return True if move `k` of the plan is a free motion, or if the plan has no move `k`."""
     return not 0 <= k < plan.count or plan.moves["verb"][k] in FREE_VERBS
 
 
@@ -145,13 +143,13 @@ class Detour:
         return self._target is not None
 
     def format_reason(self) -> str:
-        """Describe the state of the goto, and the command that ends it."""
+        """Return text that describes the state of the goto and the command that ends it."""
         goal = describe_command(Operation.GOTO, self._goal)
         stage = "done" if self._orders.answer is Answer.DONE else "under way"
         return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
 
     def accept_command(self, message: OperatorCommand, is_new: bool) -> None:
-        """Accept or refuse a goto. One that is not new continues under its id."""
+        """Accept or refuse a goto. If it is not new, its move keeps its id."""
         try:
             self._target = self._read_goal(message)
         except ValueError as error:
@@ -161,7 +159,7 @@ class Detour:
         self._is_new = is_new
 
     def step(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
-        """Advance by one cycle.
+        """Begin, track or end the goto, as the operator's command in force requires.
 
         Args:
             plan: The plan.
@@ -187,9 +185,10 @@ class Detour:
         return done
 
     def _interrupt_program(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
-        """Interrupt the program if possible; until then show only moves that must be done first.
+        """Interrupt the program if possible. Until then let the moves end that must be done first.
 
-        Returns how many of the plan's moves are done.
+        Returns:
+            How many of the plan's moves are done: `done`, or one less if a move must be repeated.
         """
         self.until, self.holds = self._window.find_interruption(plan, done, below)
         if not self.holds:
@@ -203,16 +202,17 @@ class Detour:
         return done
 
     def to_move(self, action: int) -> Move:
-        """Return the goto as a move.
+        """Return the goto as an elemental move. Call this only when `is_known`.
 
-        `action` is the program's next action, although the move does not belong to it.
+        `action` is the number of the program's next action, although the move does not belong to
+        it.
         """
         assert self._target is not None, "there is a move only for a goal"
         verb, tool, joints = self._target
         return Move(self.move, action, verb, None, tool, joints, False, 0.0)
 
     def _track_progress(self, below: MoveStatus) -> None:
-        """Report that the goto is done or has failed, when the level below reports it."""
+        """Report the goto to the operator as done or failed, once the level below does so."""
         if below.done >= self.move:
             self._orders.report_done()
         elif below.state == State.ERROR and below.done >= self._window.before:
