@@ -133,7 +133,7 @@ class Recording:
         """Register the fault kinds that the rack's own levels define.
 
         Raises:
-            Failure: The file that describes them is damaged.
+            Failure: published.json, which describes the fault kinds, is damaged.
         """
         path = self.folder / PUBLISHED
         if path.exists():

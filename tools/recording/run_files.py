@@ -196,7 +196,7 @@ class RunFiles(Tally):
         self._signals = create_signal_tables(folder / f"{SIGNALS}{suffix}", layout)
 
     def begin_stretch(self, stretch: StretchHead) -> None:
-        """Begin a stretch. Deleted rows between it and an earlier stretch do not count as lost."""
+        """Begin a stretch. Rows of deleted stretches before it do not count as lost."""
         if stretch.number != self.number + 1:
             self._reached = {name: (stretch.begin - 1, lost) for name, lost in self.lost.items()}
         super().begin_stretch(stretch)

@@ -195,7 +195,7 @@ class Spool:
         return path
 
     def _finish_stretch(self, end: int) -> None:
-        """Close the file of the current stretch, if any. Writes its end unless it is `OPEN_END`."""
+        """Write the end of the current stretch, unless it is `OPEN_END`, and close its file."""
         if self._out is not self._file:
             if end != OPEN_END:
                 _write_part(self._out, StretchEnd(end))

@@ -40,7 +40,7 @@ class RackGrid:
     Attributes:
         recording: The recording.
         rack: Name under which the rack is shown.
-        is_lockstep: True if it ran in lockstep.
+        is_lockstep: True if the rack ran in lockstep.
         clock_ns: Simulated duration of a tick.
         period_ns: Real duration of a tick.
         launch: Time of the launch.

@@ -72,7 +72,8 @@ class Analysis:
     """Comparison of a run with the timing model.
 
     The equations are judged at two percentiles. A level whose times do not fit into its period
-    fails in most of its cycles, while a machine that stalls now and then makes it fail in a few.
+    fails in most of its cycles, while occasional stalls of the machine make a level fail in a
+    few cycles.
 
     Attributes:
         recording: The run.

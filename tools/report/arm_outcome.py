@@ -109,8 +109,8 @@ def summarize_motion(recording: Recording) -> Document | None:
 def _read_counts(recording: Recording, status: Signals | None) -> Document:
     """Return the final counts of touches, exceeded limits and clipped commands.
 
-    The state of the arm and the status of the board that drives it both contain these counts. The
-    board also counts commands that it clipped itself, so the larger number of each is returned.
+    These counts are in the state of the arm, and in the status of the board that drives the arm.
+    The board also counts commands that it clipped itself, so the larger count is returned.
 
     Args:
         recording: The run.

@@ -230,7 +230,7 @@ class RecorderProcess:
         return ": ".join((f"the recorder ended with status {status}", *lines[-1:]))
 
     def _set_follower(self, pid: int) -> None:
-        """Set the process that the clock waits for in lockstep. 0 means that it waits for none."""
+        """Set the process that the clock waits for in lockstep. 0 means no process."""
         if self._words is not None:
             self._words[System.FOLLOWER_PID] = pid
 
