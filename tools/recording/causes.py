@@ -39,7 +39,7 @@ CLUES_BY_EVENT: Mapping[str | None, ClueKind] = {
     "command": "command",
     "demand": "demand",
 }
-"""Clue for each event kind or event code that does not follow from messages."""
+"""Kind of clue for each event kind or event code whose cause lies outside the messages."""
 MISS_TEXTS = {"late": "'{}' missed its deadline", "skipped": "'{}' skipped this cycle"}
 IGNORED_KEYS = ("name", "record.", "clock.mode", "clock.speed", "fault", "command", "python_path")
 """Prefixes of config keys that cannot cause a difference, or whose effects are recorded as events.
@@ -48,10 +48,10 @@ IGNORED_KEYS = ("name", "record.", "clock.mode", "clock.speed", "fault", "comman
 
 @dataclass(frozen=True)
 class ValueDifference:
-    """A value that differs between two runs.
+    """A field, setting or attribute whose value differs between two runs.
 
     Attributes:
-        name: Name of the field, setting or attribute.
+        name: Its name.
         here: Value in the first run, or None if that run has none.
         there: Value in the other run, or None if that run has none.
     """
@@ -81,10 +81,10 @@ class Clue:
 
 
 class EventClue(NamedTuple):
-    """An event as a clue.
+    """A recorded event, as a clue and with the data needed to find the same event in another run.
 
     Attributes:
-        key: Identity of the event; equal for events that happened alike in both runs.
+        key: Identity of the event. Two events with equal keys count as the same event in both runs.
         about: Boards, tasks and mailboxes that the event concerns.
         clue: The clue.
     """
@@ -104,8 +104,8 @@ class DivergentCycle:
         writer: The task that wrote the message.
         fields: Fields of the message that differ.
         read: Mailboxes that the task reads.
-        unequal: The mailbox among these that differed earliest before this cycle, which is the next
-            step back, or "" if all were equal.
+        unequal: The mailbox among `read` whose messages differed earliest before this cycle; the
+            search continues there. "" if all inputs were equal.
         clues: Possible causes in this cycle.
     """
 
@@ -121,7 +121,7 @@ class DivergentCycle:
 class Divergence:
     """Comparison of two runs that finds their first differing messages and the causes.
 
-    Raises `Failure` in the same cases as `list_divergent_messages`.
+    Raises `Failure` if the runs are of different racks, or if one of them lacks rows.
 
     Attributes:
         runs: The two runs.
@@ -136,14 +136,15 @@ class Divergence:
         self._begin, _ = find_common_ticks(first_run, second_run)
 
     def trace_cause(self, mailbox: str = "") -> tuple[DivergentCycle, ...]:
-        """Follow a difference back to its cause.
+        """Trace a difference back to its cause.
 
         Args:
-            mailbox: Mailbox whose first difference is explained. Defaults to the one that differs
-                first.
+            mailbox: Mailbox whose first differing message is explained. Defaults to the mailbox
+                that differs first.
 
         Returns:
-            The cycles from the difference back to its cause. Empty if the mailbox does not differ.
+            The cycles from that message back to the cause, latest first. Empty if the mailbox does
+            not differ.
 
         Raises:
             Failure: The mailbox does not exist.
@@ -152,14 +153,14 @@ class Divergence:
             find_mailbox(mailbox, self.runs[0].layout.timed)
         name = mailbox or next(iter(self.divergent), "")
         cycles: dict[str, DivergentCycle] = {}
-        # Messages that become visible immediately can form a circle within one tick.
+        # Messages that become visible immediately can form a loop within one tick.
         while name in self.divergent and name not in cycles:
             cycles[name] = self._describe_cycle(self.divergent[name])
             name = cycles[name].unequal
         return tuple(cycles.values())
 
     def _describe_cycle(self, message: DivergentMessage) -> DivergentCycle:
-        """Describe the cycle that wrote a differing message: its inputs and possible causes."""
+        """Return the cycle that wrote a differing message, with its inputs and possible causes."""
         layout = self.runs[0].layout
         box = layout.find_mailbox(message.mailbox)
         read = [source for source in layout.timed if box.writer in source.readers]
@@ -188,9 +189,13 @@ class Divergence:
     def _has_read_difference(
         self, source: MailboxSpec, reader: str, message: DivergentMessage
     ) -> bool:
-        """Return True if a task had read a differing message from a mailbox.
+        """Return True if a task read a differing input before it wrote a differing message.
 
-        Only what was visible in the cycle that wrote the task's own differing message counts.
+        Args:
+            source: Mailbox that the task reads.
+            reader: The task.
+            message: The task's own first differing message. The input counts only if it was
+                visible in the cycle that wrote this message.
         """
         earlier = self.divergent.get(source.name)
         grid = self.runs[0].layout.find_read_grid(source, reader)
@@ -209,7 +214,7 @@ class Divergence:
         here, there = (find_row(run, box, serial) for run in self.runs)
         ticks = (None if row is None else int(row["tick"]) for row in (here, there))
         if here is None or there is None or here["tick"] != there["tick"]:
-            # The two messages come from different cycles, so their other fields say nothing.
+            # Messages from different cycles are expected to differ in their other fields.
             yield ValueDifference("tick", *ticks)
             return
         if here["visible_at"] != there["visible_at"]:
@@ -220,7 +225,7 @@ class Divergence:
             yield ValueDifference("basis", int(here["basis"]), int(there["basis"]))
 
     def _find_event_clues(self, box: MailboxSpec, message: DivergentMessage) -> Iterator[Clue]:
-        """Yield events of only one run that concern the writer of a message or the whole rack."""
+        """Yield events of only one run that concern the message's writer or the whole rack."""
         boards = {name.partition(".")[0] for name in (box.writer, box.name)}
         about = {CLOCK, box.writer, box.name, *boards}
         event_clues = [list(self._list_event_clues(run)) for run in self.runs]
@@ -228,11 +233,12 @@ class Divergence:
             event_clues, reversed(event_clues), self.runs, strict=True
         ):
             row = find_row(run, box, message.serial)
-            # A death is reported after the first message is missing, and perhaps none follows it.
+            # A death is reported some time after the first message is missing, and the run may
+            # end without a later message. Accept a death up to the next written message.
             written = NEVER if row is None else int(row["tick"])
             unmatched = Counter(event.key for event in other_run)
             for event in this_run:
-                # A level reads commands as messages, so the comparison of its inputs covers them.
+                # A level reads commands as messages, so they are already compared as its inputs.
                 if event.clue.kind == "command" and box.writer != CLOCK:
                     continue
                 unmatched[event.key] -= 1
@@ -241,7 +247,7 @@ class Divergence:
                     yield event.clue
 
     def _list_event_clues(self, run: Recording) -> Iterator[EventClue]:
-        """Yield the deaths and external interventions among a run's events."""
+        """Yield the deaths, faults, commands and demands among a run's events."""
         for event in run.events:
             kind = CLUES_BY_EVENT.get(event.get("code")) or CLUES_BY_EVENT.get(event["kind"])
             if kind is not None and event["tick"] >= self._begin:
@@ -252,7 +258,7 @@ class Divergence:
                 yield EventClue((kind, *about, text), about, clue)
 
     def _find_miss_clues(self, task: TaskSpec, tick: int) -> Iterator[Clue]:
-        """Yield the miss of a task in the cycle of this tick, if only one of the runs has it."""
+        """Yield the task's deadline miss or skipped cycle at `tick`, if only one run has it."""
         miss_clues = [
             Clue(miss["what"], MISS_TEXTS[miss["what"]].format(task.name), str(run.folder), tick)
             for run in self.runs
@@ -264,7 +270,10 @@ class Divergence:
             yield from miss_clues
 
     def _find_config_clues(self, task: str) -> Iterator[Clue]:
-        """Yield the board's settings that differ, or the rack's if none of the board's do."""
+        """Yield the differing settings of the task's board.
+
+        If no setting of the board differs, yield the differing settings of the rest of the config.
+        """
         tables = (load_toml(run.config) for run in self.runs)
         differences = [
             difference
@@ -291,16 +300,22 @@ class Divergence:
 def _compare_signal(
     signal: Signal, here: np.ndarray, there: np.ndarray
 ) -> Iterator[ValueDifference]:
-    """Yield a field if it differs between two messages, each of shape (1,).
+    """Yield the difference of one field between two messages, or nothing if it is equal.
 
-    Of an array field only the first differing number is yielded.
+    For an array field only the first differing element is yielded.
+
+    Args:
+        signal: The field.
+        here: Message of the first run, shape (1,).
+        there: Message of the other run, shape (1,).
     """
     values = [signal.extract_values(message)[0] for message in (here, there)]
     if values[0].tobytes() == values[1].tobytes():
         return
     plain = [signal.extract_plain(message)[0] for message in (here, there)]
     index = ""
-    # 0.0 and -0.0 compare as equal but have different bytes: show the whole array.
+    # 0.0 and -0.0 compare as equal but have different bytes. In that case no element is found
+    # here, and the whole array is shown.
     for place in np.argwhere(values[0] != values[1])[:1].tolist():
         index = "".join(f"[{number}]" for number in place)
         plain = [np.array(value, "O")[tuple(place)] for value in plain]
@@ -317,7 +332,10 @@ def compare_values(here: Mapping[str, Any], there: Mapping[str, Any]) -> Iterato
 
 
 def _flatten_table(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested tables with dotted names. Lists of tables get an index."""
+    """Yield the values of nested tables, with dotted names.
+
+    Tables in a list get an index, as in `fault[0].kind`.
+    """
     for name, value in table.items():
         is_tables = isinstance(value, list) and value and isinstance(value[0], dict)
         if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Checksums of the files of a run, so that damage is reported and never read as other values.
+"""Checksums of the files of a run, so that damage is reported and never taken for data.
 
 `checksums.xxh128` has the format of `xxh128sum -c`. Because a run may be killed at any time, each
 line of events.jsonl also contains its own checksum.
@@ -28,7 +28,7 @@ _WHOLE = re.compile(_KEY + r'\w*"}')
 
 
 def read_file(path: Path) -> bytes:
-    """Read a file of a run. Raises `Failure` if it is unreadable or no regular file."""
+    """Read a file of a run. Raises `Failure` if it is unreadable or not a regular file."""
     try:
         return read_regular_file(path, MAX_READ_BYTES)
     except OSError as error:
@@ -36,10 +36,10 @@ def read_file(path: Path) -> bytes:
 
 
 class Checksums:
-    """The checksums of a run's files.
+    """The checksums of a run's files, as stored in `checksums.xxh128`.
 
     Attributes:
-        stored: Checksum of each file, by its path relative to the folder.
+        stored: Checksum of each file, by path relative to the folder of the run.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -54,7 +54,11 @@ class Checksums:
             self.stored = {match[2]: match[1] for match in matches if match}
 
     def store(self, *patterns: str) -> None:
-        """Store the checksums of all regular files that match a pattern. Raises `OSError`."""
+        """Compute and store the checksums of all regular files that match one of the patterns.
+
+        Raises:
+            OSError: The checksums cannot be written.
+        """
         for path in (path for pattern in patterns for path in self._folder.glob(pattern)):
             if path.is_file():
                 self.stored[str(path.relative_to(self._folder))] = _compute_digest(path)
@@ -62,7 +66,7 @@ class Checksums:
         write_file(self._folder / CHECKSUMS, text)
 
     def verify(self, *names: str) -> None:
-        """Raise `Failure` for the first of these files that was damaged or changed."""
+        """Raise `Failure` for the first of these files that differs from its stored checksum."""
         for name in names:
             path = self._folder / name
             if _compute_digest(path) != self.stored.get(name):
@@ -71,7 +75,7 @@ class Checksums:
 
 
 def check_file(path: Path) -> None:
-    """Raise `Failure` if a file of a run is missing or no regular file."""
+    """Raise `Failure` if a file of a run is missing or not a regular file."""
     try:
         check_regular_file(path, _MAX_FILE_BYTES)
     except OSError as error:
@@ -103,11 +107,14 @@ def parse_checked_line(line: str) -> Document:
         raise ValueError("its checksum is wrong")
     entry: Document = json.loads(text)
     if "value" in entry and entry["value"] is None:
-        # JSON has no NaN.
+        # JSON cannot represent NaN, so it is stored as null.
         entry["value"] = nan
     return entry
 
 
 def is_cut_off(line: str) -> bool:
-    """Return True if an unterminated last line has no checksum, as when the run was killed."""
+    """Return True if a line lacks its checksum, because the run was killed while writing it.
+
+    Call this only for a last line without a newline.
+    """
     return not _WHOLE.search(line)

@@ -1,4 +1,4 @@
-"""Measures what the machine did to its cores during a run.
+"""Measures stolen time and frequency of the machine's cores during a run.
 
 Steal is time for which the hypervisor withheld a core that this machine needed; /proc/stat counts
 it for each core. A core at a lower frequency computes more slowly; cpufreq shows the frequency, or
@@ -26,7 +26,10 @@ CPUFREQ = Path("/sys/devices/system/cpu")
 STEAL_COLUMN = 8
 """Column of the steal count in a core's line of /proc/stat."""
 FREQUENCY_S = 0.5
-"""Time between two readings of the frequency, because some kernels interrupt every core for it."""
+"""Time between two readings of the frequency.
+
+Some kernels interrupt every core to read it, so it is not read more often.
+"""
 _MS = 1000 // os.sysconf("SC_CLK_TCK")
 
 
@@ -49,7 +52,7 @@ class CoreRecord:
     Attributes:
         lasted_ns: Duration of the measurement.
         stolen: Increases of steal, earliest first, or None if steal was not measured.
-        mhz: Core, lowest and highest MHz, for cores with a known frequency.
+        mhz: (core, lowest MHz, highest MHz) for each core with a known frequency.
     """
 
     lasted_ns: int = 0
@@ -62,11 +65,11 @@ class CoreRecord:
 
     @classmethod
     def from_json(cls, text: str | bytes) -> Self:
-        """Parse the JSON of a record. Raises `ValueError` for any other text."""
+        """Parse a record from JSON. Raises `ValueError` if the text is not a record."""
         return TypeAdapter(cls).validate_json(text)
 
     def sum_stolen_ms(self) -> dict[int, int]:
-        """Return the stolen time by core. Cores without steal are left out."""
+        """Return the stolen time in ms, by core. Cores without steal are left out."""
         spans = self.stolen or ()
         return {
             core: sum(s.ms for s in spans if s.core == core)
@@ -89,7 +92,7 @@ class CoreMeter:
         self._frequency_at = 0.0
 
     def read_counters(self) -> None:
-        """Read the counters and note what changed since the last reading."""
+        """Read the counters, and add the increase of steal since the last reading."""
         counts = _read_steal()
         now = time.monotonic_ns()
         if counts != self._counts:
@@ -108,7 +111,7 @@ class CoreMeter:
                 self._mhz[core] = min(low, mhz), max(high, mhz)
 
     def build_record(self) -> CoreRecord:
-        """Return what was measured up to the last reading."""
+        """Return a record of everything measured up to the last reading."""
         mhz = tuple((core, low, high) for core, (low, high) in sorted(self._mhz.items()))
         return CoreRecord(
             self._looked_ns - self._began_ns, tuple(self._stolen) if self._counts else None, mhz
@@ -116,7 +119,7 @@ class CoreMeter:
 
 
 def _read_steal() -> dict[int, int]:
-    """Return the steal of each core in kernel ticks, or {} where the kernel does not count it."""
+    """Return the steal of each core in kernel ticks, or {} if the kernel does not count it."""
     lines = [line.split() for line in STAT.read_text().splitlines()]
     return {
         int(line[0].removeprefix("cpu")): int(line[STEAL_COLUMN])
@@ -126,7 +129,7 @@ def _read_steal() -> dict[int, int]:
 
 
 def _read_frequencies() -> Iterator[tuple[int, float]]:
-    """Yield cores and their MHz, as far as the machine shows them."""
+    """Yield (core, MHz) for every core whose frequency the kernel reports."""
     frequency_files = sorted(CPUFREQ.glob("cpu[0-9]*/cpufreq/scaling_cur_freq"))
     # An offline core has no readable frequency.
     for path in frequency_files:

@@ -30,9 +30,10 @@ WORST_PERCENTILE = 100.0
 
 @dataclass(frozen=True)
 class Cycles:
-    """The cycles of one task, oldest first. Of a planner only those that produced a plan.
+    """The cycles of one task, oldest first.
 
-    All arrays have shape (n,), and all times are processor times.
+    For a planner, only cycles that produced a plan are included. All arrays have shape (n,), and
+    all times are processor times. The capital letters are the unit functions of the paper.
 
     Attributes:
         task: The task.
@@ -43,10 +44,11 @@ class Cycles:
         read_ns: R, time to read commands and statuses.
         process_ns: X of an executor, P of a planner.
         write_ns: W of an executor, U of a planner.
-        is_judged: False for cycles of a process's start-up and for stalled cycles.
-        stalled: Number of cycles in which the core may have been away, see `analyze_stalls`.
-        overhead_ns: Time per cycle outside these parts, for waking up and closing the cycle.
-        stretches: Stretch of the recording that contains the cycle, see `find_stretches`.
+        is_judged: False for cycles that are left out of all verdicts: those of a process's
+            start-up, and those in which the core may have been taken away.
+        stalled: Number of cycles in which the core may have been taken away, see `analyze_stalls`.
+        overhead_ns: Time per cycle outside these functions, for waking up and closing the cycle.
+        stretches: Number of the recorded stretch that contains each cycle, see `find_stretches`.
     """
 
     task: TaskSpec
@@ -64,12 +66,12 @@ class Cycles:
 
     @property
     def communication_ns(self) -> np.ndarray:
-        """t_comm of an executor: the sum of C, R and W, shape (n,)."""
+        """Communication time t_comm: the sum of C, R and W, shape (n,)."""
         return np.asarray(self.exchange_ns + self.read_ns + self.write_ns)
 
     @property
     def used_ns(self) -> np.ndarray:
-        """Sum of all parts, shape (n,)."""
+        """Processor time of all unit functions together, shape (n,)."""
         return np.asarray(self.communication_ns + self.process_ns)
 
 
@@ -120,7 +122,10 @@ def read_cycles(recording: Recording) -> dict[str, Cycles]:
 
 
 def _find_settled_cycles(recording: Recording, task: str, ticks: np.ndarray) -> np.ndarray:
-    """Return which cycles lie outside the start-up of a process, or all if none do."""
+    """Return a mask of the cycles that lie outside the start-up of a process.
+
+    If every cycle lies within a start-up, the mask is True for all of them.
+    """
     span = round(START_UP_S * 1e9 / recording.layout.clock_ns)
     settled = np.ones(len(ticks), bool)
     for start_tick in (0, *list_restarts(recording).get(task, ())):
@@ -129,7 +134,7 @@ def _find_settled_cycles(recording: Recording, task: str, ticks: np.ndarray) -> 
 
 
 def list_restarts(recording: Recording) -> dict[str, list[int]]:
-    """Return, by task, the ticks at which a restarted process of it rejoined."""
+    """Return the ticks at which restarted processes rejoined the rack, by task."""
     rejoin_ticks: dict[str, list[int]] = {}
     for event in recording.events:
         if event.get("code") == "rejoined":
@@ -142,9 +147,9 @@ def measure_budgets(
 ) -> dict[str, Budget]:
     """Return the processor time that each level of a run needed, by board.
 
-    Each part is the longest of all cycles (eq. 3.6), and the parts may come from different cycles.
-    Cycles of a process's start-up (`START_UP_S`) are excluded. So are stalled cycles, because a
-    virtual machine counts the time of a stall as processor time.
+    Each unit function gets its longest time of all cycles (eq. 3.6), and these may come from
+    different cycles. Cycles of a process's start-up (`START_UP_S`) are excluded. So are stalled
+    cycles, because a virtual machine counts the time of a stall as processor time.
 
     Args:
         recording: The run.
@@ -157,7 +162,7 @@ def measure_budgets(
 
 
 def compute_budgets(cycles_by_task: Mapping[str, Cycles], percentile: float) -> dict[str, Budget]:
-    """Return the budgets, by board, of cycles from `read_cycles`."""
+    """Return the budgets that the cycles from `read_cycles` need, by board."""
     executors = {
         name: cycles for name, cycles in cycles_by_task.items() if cycles.task.role == "executor"
     }
@@ -170,10 +175,10 @@ def compute_budgets(cycles_by_task: Mapping[str, Cycles], percentile: float) -> 
 
 
 def _compute_budget(executor: Cycles, planner: Cycles | None, percentile: float) -> Budget:
-    """Return the budget of one level."""
+    """Return the budget that one level needs."""
 
     def worst_time(cycles: Cycles, times_ns: np.ndarray) -> int:
-        """Return the percentile of the times of all judged cycles."""
+        """Return the percentile of these times, over the judged cycles."""
         return compute_percentile(times_ns[cycles.is_judged], percentile)
 
     planner_parts = {}
@@ -191,8 +196,13 @@ def _compute_budget(executor: Cycles, planner: Cycles | None, percentile: float)
 
 
 def compute_percentile(times_ns: np.ndarray, percentile: float = WORST_PERCENTILE) -> int:
-    """Return the smallest measured time that covers a percentile of the times, shape (n,).
+    """Return the smallest measured time that at least `percentile` percent do not exceed.
 
-    Returns 0 if there are no times.
+    Args:
+        times_ns: The times, shape (n,).
+        percentile: The percentage.
+
+    Returns:
+        The time, or 0 if there are no times.
     """
     return int(np.percentile(times_ns, percentile, method="higher")) if len(times_ns) else 0

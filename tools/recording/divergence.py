@@ -16,7 +16,10 @@ from rack.tools.recording.origin import Origin
 from rack.tools.recording.recording import Recording
 
 COMPARED_COLUMNS = ("serial", "tick", "visible_at", "chain")
-"""Columns that are compared. The chain of a message covers everything written before it."""
+"""Columns that are compared.
+
+The chain of a message is the chained checksum of all messages written before it.
+"""
 Heads = Mapping[str, np.ndarray]
 
 
@@ -57,9 +60,9 @@ def find_other_run(run: Path, named: Path, asked: str = "") -> Path:
 
     Args:
         run: Folder of the run.
-        named: Folder of the other run, or "origin" for the run that `run` continues. That one is
-            looked for at its recorded path, then next to `run`.
-        asked: What the user asked for. Begins the message of a `Failure`.
+        named: Folder of the other run, or "origin" for the run that `run` continues. The origin is
+            searched at its recorded path, then next to `run`.
+        asked: The command line option or request, which begins the message of a `Failure`.
 
     Raises:
         Failure: The run continues no other run, or that run no longer exists.
@@ -78,17 +81,19 @@ def find_other_run(run: Path, named: Path, asked: str = "") -> Path:
 
 
 def find_first_difference(first_run: Recording, second_run: Recording) -> Difference | None:
-    """Return where two runs diverge, or None if everything that both wrote is equal.
+    """Return the first difference between two runs, or None if all compared messages are equal.
 
-    Only ticks up to the end of the shorter run count. Raises `Failure` in the same cases as
-    `list_divergent_messages`.
+    Only ticks that both runs contain are compared.
+
+    Raises:
+        Failure: The runs are of different racks, or one of them lacks rows.
     """
     messages = list_divergent_messages(first_run, second_run)
     return Difference(messages[0].tick, messages[0].mailbox) if messages else None
 
 
 def list_divergent_messages(first_run: Recording, second_run: Recording) -> list[DivergentMessage]:
-    """Return the first differing message of each mailbox, if any, sorted by tick.
+    """Return the first differing message of each mailbox that differs, sorted by tick.
 
     Raises:
         Failure: The runs are of different racks, or one of them lacks rows.
@@ -109,7 +114,7 @@ def list_divergent_messages(first_run: Recording, second_run: Recording) -> list
 
 
 def find_tick_range(recording: Recording) -> tuple[int, int]:
-    """Return the ticks of a recorded run, [first, end)."""
+    """Return the range of ticks of a recorded run: its first tick, and the tick after its last."""
     ticks_by_task = [rows["tick"] for rows in recording.cycles.values()]
     end: int = recording.end_counts.get("outcome", {}).get("ticks", 0)
     end = end or max((int(ticks[-1]) + 1 for ticks in ticks_by_task), default=0)
@@ -117,9 +122,9 @@ def find_tick_range(recording: Recording) -> tuple[int, int]:
 
 
 def find_common_ticks(first_run: Recording, second_run: Recording) -> tuple[int, int]:
-    """Return the ticks that two runs have in common, [first, end).
+    """Return the range of ticks that two runs have in common: the first, and one past the last.
 
-    A run that continues another one begins later.
+    The ranges differ, for example, if one run continues the other from a later tick.
     """
     begins, ends = zip(find_tick_range(first_run), find_tick_range(second_run), strict=True)
     return max(begins), min(ends)
@@ -140,7 +145,7 @@ def _check_comparable(first_run: Recording, second_run: Recording) -> None:
     """Raise `Failure` if two runs are of racks that cannot be compared."""
     both = f"{first_run.folder} and {second_run.folder}"
     boards, others = ([task.board for task in run.layout.tasks] for run in (first_run, second_run))
-    # One rack may have additional boards, for example a watching one.
+    # One rack may have additional boards, for example a board that only monitors.
     if not ({*boards} <= {*others} or {*others} <= {*boards}):
         extra_board = next(board for board in boards if board not in others)
         raise Failure(f"{both} are of different racks: only the first has '{extra_board}'", 2)
@@ -155,10 +160,17 @@ def _check_comparable(first_run: Recording, second_run: Recording) -> None:
 def _find_divergent_message(
     first_run: Recording, second_run: Recording, box: MailboxSpec, begin: int, end: int
 ) -> DivergentMessage | None:
-    """Return the first differing message of a mailbox from tick `begin` on, or None.
+    """Return the first differing message of a mailbox, or None if no message differs.
 
-    The serials show where a message is missing, because a damaged message is in no recording. A
+    A damaged message is not recorded, so a missing message shows as a gap in the serials. A
     difference in the content of a message shows in the chain of the message after it.
+
+    Args:
+        first_run: One run.
+        second_run: The other run.
+        box: The mailbox.
+        begin: First tick that is compared.
+        end: Tick before which the comparison ends.
     """
     heads = [_read_heads(run, box.name, begin) for run in (first_run, second_run)]
     length = min(len(head["serial"]) for head in heads)
@@ -182,7 +194,8 @@ def _find_divergent_message(
     if not positions:
         return None
     serial, tick, visible_at = (min(numbers) for numbers in zip(*positions, strict=True))
-    # The other run may have ended before it could write that message.
+    # A message that only one run has is no difference if the other run ended before it became
+    # visible.
     if len(positions) == 1 and visible_at >= end:
         return None
     return DivergentMessage(box.name, serial, tick, visible_at)
@@ -198,7 +211,10 @@ def _read_heads(run: Recording, mailbox: str, begin: int) -> Heads:
 def _is_last_equal(
     first_run: Recording, second_run: Recording, box: MailboxSpec, heads: list[Heads]
 ) -> bool:
-    """Return True if the last message that both runs have is equal. No chain covers it yet."""
+    """Return True if the last message that both runs have is equal.
+
+    No later message has a chain that covers it, so its content is compared.
+    """
     last = min(len(head["serial"]) for head in heads) - 1
     if any(heads[0][name][last] != heads[1][name][last] for name in COMPARED_COLUMNS):
         return False
@@ -207,7 +223,7 @@ def _is_last_equal(
 
 
 def find_row(run: Recording, box: MailboxSpec, serial: int) -> Any:
-    """Return the row of a message, or None if the recording has no message of that serial."""
+    """Return the recorded row of the message with this serial, or None if it is not recorded."""
     rows = run.read_rows(box.name)
     matches = np.flatnonzero(rows["serial"] == serial)
     return rows[matches[0]] if len(matches) else None

@@ -1,7 +1,7 @@
-"""The external inputs of a recorded run, with which it can be repeated.
+"""Loads the external inputs of a recorded run, so that the run can be repeated with them.
 
-These are the messages that came in through adapters, for a replay without host boards and other
-racks, and the commands of operators.
+External inputs are the messages that entered through adapters, which replace host boards and other
+racks in the repetition, and the commands of operators.
 """
 
 from __future__ import annotations
@@ -27,16 +27,17 @@ def load_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Ex
     """Load the messages that each adapter of a config wrote in a recorded run.
 
     Args:
-        config: The config that is to be run with them.
+        config: Config of the rack that will be run with these messages.
         run: Folder of the recorded run.
-        asked: What the user asked for. Begins the message of a `Failure`.
+        asked: The command line option or request, which begins the message of a `Failure`.
 
     Returns:
         The messages, by adapter and port.
 
     Raises:
         ConfigError: The config has mistakes.
-        Failure: The run has other entries, or its recording lacks some.
+        Failure: The config has no adapter, the run ran in real time on a network, the recorded
+            mailboxes have other types, or messages are missing from the recording.
     """
     asked = asked or f"--entries {run}"
     plan = resolve(config)
@@ -83,7 +84,10 @@ def load_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Ex
 def load_operator_commands(recording: Recording) -> tuple[Request, ...]:
     """Load the commands that operators gave in a recorded run, in order and with their ticks.
 
-    Commands of the run's config are left out. Raises `Failure` if the recording lacks some.
+    Commands from the run's config are left out.
+
+    Raises:
+        Failure: Commands are missing from the recording.
     """
     commanded = _load_issued_commands(recording)
     if commanded and recording.kept:
@@ -105,8 +109,11 @@ def load_operator_commands(recording: Recording) -> tuple[Request, ...]:
 def load_commands_from(recording: Recording, tick: int) -> tuple[Request, ...]:
     """Load all commands issued from `tick` on in a recorded run, including the config's commands.
 
-    For a run with a flight recorder, the commands end with the stretch that contains `tick`. Raises
-    `Failure` if the recording lacks some.
+    For a run with a flight recorder, only commands up to the end of the recorded stretch that
+    contains `tick` are loaded.
+
+    Raises:
+        Failure: Commands are missing from the recording.
     """
     end = next((end for _, end in recording.kept if tick < end), None)
     return tuple(
@@ -117,7 +124,11 @@ def load_commands_from(recording: Recording, tick: int) -> tuple[Request, ...]:
 
 
 def _load_issued_commands(recording: Recording) -> list[Request]:
-    """Load the commands that the clock issued, in order. Raises `Failure` if some are missing."""
+    """Load the commands that the system controller issued, in order.
+
+    Raises:
+        Failure: Commands are missing from the recording.
+    """
     layout = recording.layout
     numbered: list[tuple[int, int, Request]] = []
     for box in layout.mailboxes:
@@ -127,7 +138,7 @@ def _load_issued_commands(recording: Recording) -> list[Request]:
         rows = recording.read_rows(box.name)
         messages = rows["message"]
         ids = messages[COMMAND_ID].tolist()
-        # Clear the id: the clock assigns it when it issues the command again.
+        # Clear the id, because a new one is assigned when the command is issued again.
         messages[COMMAND_ID] = 0
         for tick, number, message in zip(rows["tick"].tolist(), ids, messages, strict=True):
             numbered.append(
@@ -142,7 +153,7 @@ def _load_issued_commands(recording: Recording) -> list[Request]:
 
 
 def _format_type(box: MailboxSpec) -> str:
-    """Describe message type, version and size of a mailbox, to compare and to report it."""
+    """Return message type, version and size of a mailbox as text, to compare and to report."""
     return f"{box.message} {box.version}, {box.size} bytes"
 
 
@@ -155,8 +166,11 @@ def _check_complete(box: MailboxSpec, recording: Recording, asked: str) -> None:
 def _load_rows(recording: Recording, box: MailboxSpec, is_sent: bool) -> EntityRows:
     """Load the messages of a mailbox in the form of `rack.boards.wiring`.
 
-    If `is_sent` is False, the adapter repeats its newest message every cycle, and repeats are left
-    out.
+    Args:
+        recording: The recording.
+        box: The mailbox.
+        is_sent: True if the adapter wrote a message only when one arrived. If it is False, the
+            adapter wrote its newest message again in every cycle, and these repeats are left out.
     """
     if box.name not in recording.mailboxes:
         return []

@@ -30,11 +30,11 @@ EVENT_SCHEMA = {
 }
 SCHEMA_ENCODING = "jsonschema"
 BLOCK_MESSAGES = 1024
-"""Number of messages of a mailbox that are converted to JSON together."""
+"""Number of messages of a mailbox that are converted to JSON in one step."""
 
 
 class ChannelMessage(NamedTuple):
-    """A message of a channel. Messages sort by time."""
+    """A message of a channel. Its log time comes first, so that messages sort by it."""
 
     log_ns: int  # simulated, since the start of the run
     channel: int
@@ -85,7 +85,7 @@ def export_recording(
 
 
 def _register_channel(writer: Writer, topic: str, message: str, schema: Document) -> int:
-    """Register a channel with its schema, and return its number."""
+    """Register a channel and its schema in the file, and return the id of the channel."""
     schema_id = writer.register_schema(message, SCHEMA_ENCODING, encode_json(schema).encode())
     return writer.register_channel(topic, "json", schema_id)
 
@@ -93,7 +93,7 @@ def _register_channel(writer: Writer, topic: str, message: str, schema: Document
 def _build_schema(box: MailboxSpec) -> Document:
     """Return the JSON schema of a mailbox's messages.
 
-    Groups of fields are flattened, as in the parquet files.
+    Nested fields are flattened and get dotted names, as in the parquet files.
     """
     head = {
         "serial": {"type": "integer", "description": "of the message, rising by one"},
@@ -111,7 +111,7 @@ def _build_schema(box: MailboxSpec) -> Document:
 def _encode_messages(
     recording: Recording, box: MailboxSpec, channel: int
 ) -> Iterator[ChannelMessage]:
-    """Yield the messages of a mailbox, oldest first."""
+    """Yield the recorded messages of a mailbox as JSON, oldest first."""
     rows = recording.read_rows(box.name)
     signals = list_signals(box)
     names = ["serial", "tick", *(".".join(signal.path) for signal in signals)]
@@ -131,7 +131,7 @@ def _encode_messages(
 
 
 def _encode_events(recording: Recording, channel: int) -> Iterator[ChannelMessage]:
-    """Yield the events that have a tick, oldest first."""
+    """Yield the events of the run as JSON, oldest first. Events without a tick are left out."""
     ticked = [event for event in recording.events if event.get("tick", -1) >= 0]
     clock_ns = recording.layout.clock_ns
     for number, event in enumerate(ticked):

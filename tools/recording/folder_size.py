@@ -12,10 +12,10 @@ RECORDED_ENDINGS = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", "published.
 
 
 def measure_size(folder: Path) -> int:
-    """Return the size of a run's recorded files, bytes. Reports and pictures do not count."""
+    """Return the size of a run's recorded files in bytes, without reports and pictures."""
     size = 0
     for file in folder.rglob("*"):
-        # A flight recorder may remove files at any time.
+        # A flight recorder may delete files while they are counted.
         with suppress(FileNotFoundError):
             if file.name.endswith(RECORDED_ENDINGS) and file.is_file():
                 size += file.stat().st_size
@@ -23,7 +23,12 @@ def measure_size(folder: Path) -> int:
 
 
 def format_size(size: int, lasted_s: float) -> str:
-    """Format the size of a recording, bytes, and its rate over `lasted_s` of simulated time."""
+    """Format the size of a recording and its data rate.
+
+    Args:
+        size: The size in bytes.
+        lasted_s: Simulated time of the run. The rate is left out if it is 0.
+    """
     rate = f", {size * 1e-6 / lasted_s:.2f} MB/s" if lasted_s else ""
     return f"{size * 1e-6:.1f} MB{rate}"
 
@@ -34,6 +39,6 @@ def format_recorded_line(folder: Path, lasted_s: float) -> str:
 
 
 def measure_sizes(folder: Path, lasted_s: float) -> dict[str, float | None]:
-    """Return the size of a recording and its rate per simulated second, as plain data."""
+    """Return the size of a recording, and its size per simulated second, as plain data."""
     size = measure_size(folder)
     return {"bytes": size, "bytes_per_s": round(size / lasted_s, 1) if lasted_s else None}

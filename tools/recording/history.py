@@ -1,4 +1,4 @@
-"""History of a run: missed cycles, holds, and what the machine did to the cores."""
+"""History of a run: missed cycles, holds, fired rows, and steal and frequency of the cores."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from rack.tools.recording.recording import Recording
 
 BY_LEVEL = "holding"
-"""Value of `by` for a hold that the level itself decided."""
+"""Value of `by` for a hold that the level itself started."""
 
 
 def list_misses(recording: Recording) -> list[Document]:
@@ -35,15 +35,15 @@ def list_misses(recording: Recording) -> list[Document]:
     the run.
 
     Returns:
-        Entries with task, tick, `what` ("late" or "skipped") and count; for late cycles also the
-        times.
+        Entries with task, tick, `what` ("late" or "skipped") and count. Entries of late cycles
+        also have the lateness and the duration in ms.
     """
     entries = []
     for task in recording.layout.tasks:
         entries += _list_task_misses(task, recording.read_trace(task.name))
         done = recording.find_task_counts(task.name).get("done")
         if done is None:
-            # The end of the run was not recorded, or an earlier version recorded it.
+            # The end of the run was not recorded, or the recording is of an earlier version.
             continue
         if count := task.count_unfinished(done, recording.end_counts["outcome"]["ticks"]):
             entries.append(_build_skip_entry(task, task.grid.find_tick(done + 1), count))
@@ -51,7 +51,7 @@ def list_misses(recording: Recording) -> list[Document]:
 
 
 def _list_task_misses(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
-    """Return the missed cycles that the trace of one task shows."""
+    """Return the late cycles and skipped releases in the trace of one task."""
     rows = cycles[find_missed(cycles) | (count_skipped(cycles) > 0)]
     entries = []
     columns = (
@@ -75,12 +75,12 @@ def _list_task_misses(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
 
 
 def _build_skip_entry(task: TaskSpec, tick: int, count: int) -> Document:
-    """Return the entry for skipped releases of a task, of which the first is at `tick`."""
+    """Return the entry for `count` consecutive skipped releases of a task, the first at `tick`."""
     return {"task": task.name, "tick": tick, "what": "skipped", "count": count}
 
 
 def count_misses(entries: Sequence[Document]) -> tuple[int, int]:
-    """Return how many cycles of a list from `list_misses` were late, and how many were skipped."""
+    """Return the numbers of late and of skipped cycles in a list from `list_misses`."""
     late, left_out = (
         sum(miss["count"] for miss in entries if miss["what"] == kind)
         for kind in ("late", "skipped")
@@ -89,9 +89,11 @@ def count_misses(entries: Sequence[Document]) -> tuple[int, int]:
 
 
 def summarize_steal(recording: Recording) -> Document:
-    """Return the time that the hypervisor stole from each core, ms and percent of the run.
+    """Return the time that the hypervisor stole from each core.
 
-    `measured` is False in lockstep, and where the kernel does not count steal.
+    Returns:
+        `ms` and `percent` of the run, by core, and `measured`. The latter is False for a run in
+        lockstep, and if the kernel does not count steal.
     """
     record = recording.cores
     stolen_ms = {str(core): ms for core, ms in record.sum_stolen_ms().items()}
@@ -100,17 +102,17 @@ def summarize_steal(recording: Recording) -> Document:
 
 
 def summarize_frequency(recording: Recording) -> dict[str, dict[str, float]] | None:
-    """Return the lowest and highest frequency of each core, MHz, or None if it was not measured."""
+    """Return the lowest and highest frequency of each core in MHz, or None if not measured."""
     return {str(core): {"min": low, "max": high} for core, low, high in recording.cores.mhz} or None
 
 
 def list_holds(recording: Recording) -> list[Document]:
-    """List every hold, earliest first.
+    """List every hold of every level, earliest first.
 
     Returns:
-        Entries with the level, times in seconds, `by` and `why`. `by` is "operator", with the
-        command as `why`, or "holding", with the last reason that the level gave. `until_s` is None
-        for a hold that lasted to the end of the run.
+        Entries with the level, times in seconds, `by` and `why`. If `by` is "operator", `why` is
+        the command. If `by` is "holding", the level itself held, and `why` is the last reason in
+        its status. `until_s` is None for a hold that lasted to the end of the run.
     """
     levels = [
         mailbox.removesuffix(".status")
@@ -125,8 +127,8 @@ def list_fired_rows(recording: Recording) -> dict[str, list[Document]]:
     """List the rows of state tables that fired, by level.
 
     Returns:
-        For each level its rows in the order in which they first fired: table, row, name, number of
-        cycles, and simulated time of the first firing.
+        The rows of each level, in the order in which they first fired. Each has table, row, name,
+        number of cycles in which it fired, and simulated time of the first firing.
     """
     by_level = {}
     for mailbox in recording.mailboxes:
@@ -154,7 +156,7 @@ def list_fired_rows(recording: Recording) -> dict[str, list[Document]]:
 
 
 def _list_level_holds(recording: Recording, level: str) -> Iterator[Document]:
-    """Yield the holds of one level, from its statuses."""
+    """Yield the holds of one level, found in its recorded statuses."""
     mailbox = f"{level}.status"
     tick_s = recording.layout.clock_ns * 1e-9
     fields = recording.list_fields(mailbox)
@@ -188,10 +190,10 @@ def _list_level_holds(recording: Recording, level: str) -> Iterator[Document]:
 
 
 def _split_equal_runs(numbers: np.ndarray) -> list[tuple[int, int]]:
-    """Split an array into runs of equal numbers, leaving out runs of 0.
+    """Find the runs of equal consecutive numbers in an array. Runs of 0 are left out.
 
     Returns:
-        The first index of each run, and the index after its last.
+        For each run its first index and the index after its last element.
     """
     borders = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
     return [(first, end) for first, end in pairwise(borders) if first < end and numbers[first]]

@@ -1,4 +1,4 @@
-"""Finds the messages that are visible at any tick of a recorded run, and trigger ticks."""
+"""Finds the message visible at any tick of a recorded run, and ticks at which a trigger fires."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from rack.tools.recording.signal import Trigger
 
 
 class VisibleMessages:
-    """The messages of a run by the tick at which readers see them. Mailboxes load on first use."""
+    """Looks up the messages of a run by the tick at which they are visible to readers.
+
+    A mailbox is loaded when it is first used.
+    """
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -22,11 +25,11 @@ class VisibleMessages:
         return rows[visible[-1]] if len(visible) else None
 
     def find_trigger_ticks(self, condition: Trigger) -> np.ndarray:
-        """Find the ticks at which readers see a condition become true.
+        """Find the ticks at which a condition becomes true for the readers of its mailbox.
 
         Returns:
-            Ticks, shape (times,), earliest first. In the message before each of them the condition
-            was false.
+            The ticks at which a message that meets the condition becomes visible while the message
+            before it does not meet the condition. Earliest first, shape (ticks,).
         """
         rows = self._load_rows(condition.signal.mailbox)
         holds = condition.evaluate_messages(rows["message"])
@@ -35,7 +38,7 @@ class VisibleMessages:
         return ticks
 
     def _load_rows(self, mailbox: str) -> np.ndarray:
-        """Return all rows of a mailbox, from memory after the first call."""
+        """Return all rows of a mailbox. They are read from the files once, then kept in memory."""
         if mailbox not in self._rows:
             self._rows[mailbox] = self._recording.read_rows(mailbox)
         return self._rows[mailbox]

@@ -1,4 +1,8 @@
-"""Decides what a flight recorder keeps: which occasions count, and the ticks around each."""
+"""Decides which ticks of a run a flight recorder keeps.
+
+An occasion is anything that is worth keeping the recording around it: an alarm, a missed or skipped
+cycle, and the begin or end of a hold.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from rack.boards.config.record import RecordConfig
 from rack.boards.timing.trace_times import count_skipped, find_missed
 
 ORDINARY_ALARMS = (Alarm.COMMANDED,)
-"""Alarms that are no occasion. All others count: faults, detections, brakes, restarts."""
+"""Alarms that are not occasions. All others are: faults, detections, brakes, restarts."""
 
 
 class TickRange(NamedTuple):
@@ -27,7 +31,14 @@ class TickRange(NamedTuple):
 
 
 class Retention(NamedTuple):
-    """The settings `keep`, `before` and `after` of `[record]`, in ticks."""
+    """The settings of a flight recorder in `[record]`, converted to ticks.
+
+    Attributes:
+        keep: Length of the newest part of the run, which is always kept.
+        before: Number of ticks that are kept before each occasion: an alarm, a missed or skipped
+            cycle, or the begin or end of a hold.
+        after: Number of ticks that are kept after each occasion.
+    """
 
     keep: int
     before: int
@@ -35,7 +46,7 @@ class Retention(NamedTuple):
 
     @classmethod
     def from_config(cls, segment: Segment) -> Self | None:
-        """Read the settings of a rack. Returns None if its recorder keeps everything."""
+        """Read the settings from a rack's config. Returns None if its recorder keeps everything."""
         config = RecordConfig.model_validate(load_toml(segment.config).get("record", {}))
         if config.keep is None:
             return None
@@ -43,18 +54,18 @@ class Retention(NamedTuple):
         return cls(*(round(span_s * 1e9 / segment.layout.clock_ns) for span_s in spans_s))
 
     def find_window(self, tick: int) -> TickRange:
-        """Return the ticks that are kept around an occasion."""
+        """Return the ticks that are kept around an occasion at `tick`."""
         return TickRange(max(0, tick - self.before), tick + self.after)
 
     def find_missing_windows(
         self, segment: Segment, kept: Sequence[tuple[int, int]], ticks: int
     ) -> list[TickRange]:
-        """Find the ticks that should have been kept but were not.
+        """Find the ranges of ticks that should have been kept but were not kept completely.
 
         Args:
-            segment: The rack, whose alarm rings still hold its last alarms.
+            segment: Segment of the rack, whose alarm rings still contain the last alarms.
             kept: Ticks that were kept, as ranges [first, end).
-            ticks: Length of the run.
+            ticks: Length of the run in ticks.
         """
         occasions = Occasions(segment).find_in_alarms()
         windows = [
@@ -70,7 +81,10 @@ class Retention(NamedTuple):
 
 
 class Occasions:
-    """Finds the ticks of occasions: alarms, missed or skipped cycles, and changes of holds."""
+    """Finds the ticks of occasions, around which a flight recorder keeps the recording.
+
+    Occasions are alarms, missed or skipped cycles, and begins and ends of holds.
+    """
 
     def __init__(self, segment: Segment) -> None:
         layout = segment.layout
@@ -84,13 +98,21 @@ class Occasions:
         }
 
     def find_in_alarms(self) -> Iterator[int]:
-        """Yield the ticks of alarms since the last call, or of all remaining alarms at first."""
+        """Yield the ticks of alarms that are occasions and were raised since the last call.
+
+        The first call yields all alarms that the alarm rings still contain.
+        """
         for ring in self._alarms:
             rows = ring.read_new_rows().rows
             yield from rows["tick"][~np.isin(rows["code"], ORDINARY_ALARMS)].tolist()
 
     def find_in_rows(self, ring: str, rows: np.ndarray) -> Iterator[int]:
-        """Yield the ticks of occasions in rows of a ring."""
+        """Yield the ticks of occasions in new rows of a ring.
+
+        Args:
+            ring: Name of the task or mailbox.
+            rows: Its rows since the last call, shape (rows,).
+        """
         ticks = rows["tick"]
         if ring in self._tasks:
             yield from ticks[find_missed(rows) | (count_skipped(rows) > 0)].tolist()

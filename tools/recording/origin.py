@@ -1,8 +1,8 @@
 """The origin of a run: the run that it continues, and the code and files that produced it.
 
 A run can only be repeated with the same code. `code.json` therefore stores versions, and digests of
-the program, of the user's levels and of the model's folder; `origin.json` stores the continued run.
-Launching a run imports this module, so it imports nothing that reads recordings.
+the program, of the user's levels and of the model's folder. `origin.json` identifies the run that
+was continued. Launching a run imports this module, so it imports nothing that reads recordings.
 """
 
 from __future__ import annotations
@@ -33,7 +33,14 @@ PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 
 
 def write_code_state(config: RackConfig, folder: Path) -> None:
-    """Write code.json for a run whose levels have been loaded. Raises `OSError`."""
+    """Write code.json into the folder of a run.
+
+    Call this only when the levels have been loaded, because loaded modules show the code of the
+    user's levels.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
     files = [getattr(module, "__file__", None) for module in [*sys.modules.values()]]
     code_files = [Path(file) for file in files if file]
     paths = {path for path in code_files if any(path.is_relative_to(p) for p in config.python_path)}
@@ -48,11 +55,11 @@ def check_code_state(recording: Recording, asked: str, anyway: bool) -> None:
 
     Args:
         recording: The run.
-        asked: What the user asked for. Begins the message.
-        anyway: Whether to continue despite changes, with a note on stderr.
+        asked: The command line option or request, which begins the message.
+        anyway: Whether to only print a note on stderr if something has changed.
 
     Raises:
-        Failure: Something has changed, or is unknown, and `anyway` is False.
+        Failure: Code or files have changed, or code.json is missing, and `anyway` is False.
     """
     path = recording.folder / CODE
     if not path.exists():
@@ -71,7 +78,14 @@ def check_code_state(recording: Recording, asked: str, anyway: bool) -> None:
 
 
 def _compute_state(name: str) -> str:
-    """Return the version of a component, or the digest of a file or folder."""
+    """Return the current state of an entry of code.json.
+
+    Args:
+        name: "version", "python", `PROGRAM`, or the path of a file or folder.
+
+    Returns:
+        The version for the first two, and a digest of the files for the others.
+    """
     if name == "version":
         return version("nasrem-rack")
     if name == "python":
@@ -84,19 +98,19 @@ def _compute_state(name: str) -> str:
         paths = [*path.rglob("*.xml")]
     digest = xxh3_128()
     for path in sorted(paths):
-        # A missing file changes the digest as well.
+        # The digest includes the name, so it also changes if a file is missing.
         digest.update(path.name.encode() + (path.read_bytes() if path.is_file() else b""))
     return digest.hexdigest()
 
 
 @dataclass(frozen=True)
 class Origin:
-    """The run that another run continues.
+    """The original run that another run, the continuation, continues.
 
     Attributes:
-        folder: Folder of that run, as the user named it.
-        tick: First tick of the later run.
-        launched_ns: Launch time of that run on the wall clock, which identifies it.
+        folder: Folder of the original run, as the user named it.
+        tick: First tick of the continuation.
+        launched_ns: Launch time of the original run on the wall clock, which identifies that run.
     """
 
     folder: str
@@ -105,18 +119,18 @@ class Origin:
 
     @classmethod
     def from_run(cls, run: Recording, tick: int) -> Self:
-        """Return the origin of a run that continues `run` from a tick."""
+        """Return the origin of a run that continues `run` from `tick` on."""
         return cls(str(run.folder), tick, run.launch.created_ns)
 
     @classmethod
     def read_from(cls, recording: Recording) -> Self | None:
-        """Read the origin of a recorded run.
+        """Read the origin of a recorded run from its origin.json.
 
         Returns:
             The origin, or None if the run does not continue another one.
 
         Raises:
-            Failure: The file is damaged.
+            Failure: origin.json is damaged.
         """
         path = recording.folder / ORIGIN
         if not path.exists():
@@ -125,19 +139,19 @@ class Origin:
         return cls(**json.loads(read_file(path)))
 
     def is_same_run(self, run: Recording) -> bool:
-        """Return True if this is the origin's run, not another run with the same folder name."""
+        """Return True if `run` is the original run, not another run with the same folder name."""
         return run.launch.created_ns == self.launched_ns
 
     def write(self, folder: Path) -> None:
-        """Write origin.json into the folder of the later run. Raises `OSError`."""
+        """Write origin.json into the folder of the continuation. Raises `OSError`."""
         (folder / ORIGIN).write_text(encode_json(asdict(self)) + "\n")
 
     def to_document(self, clock_ns: int) -> Document:
-        """Return the origin as plain data, with its tick also as simulated time, s."""
+        """Return the origin as plain data, with the simulated time of its tick in s."""
         return {**asdict(self), "time_s": round(self.tick * clock_ns * 1e-9, 9)}
 
 
 def find_continuation_tick(recording: Recording) -> int | None:
-    """Return the first tick of a run that continues another one, or None for any other run."""
+    """Return the first tick of a run that continues another one, or None if it does not."""
     ticks = (event["tick"] for event in recording.events if event.get("code") == CONTINUATION_CODE)
     return next(ticks, None)

@@ -34,7 +34,7 @@ TIME_COLUMN = "time_s"
 TRACE_ROWS = 1 << 16
 MESSAGE_ROWS = 8192
 MESSAGE_BYTES = 16 << 20
-"""Sizes at which rows are written.
+"""Amounts of waiting rows at which they are written as one block.
 
 Blocks are large because a file's footer has an entry for every column of every block.
 """
@@ -42,11 +42,17 @@ SIGNALS = "signals"
 TABLE_NAME = "{}.parquet"
 PART_NAME = "{:04}.parquet"
 PART_ENTRIES = 1 << 12
-"""Number of footer entries after which a part is finished. An open part keeps 0.7 kB for each."""
+"""Number of footer entries after which a part is finished.
+
+An open part holds 0.7 kB of memory for each entry.
+"""
 
 
 class CyclesFile:
-    """Writer of cycles.parquet."""
+    """Writer of cycles.parquet, the trace of all tasks.
+
+    Trace records wait in memory until there are enough of them for a block.
+    """
 
     def __init__(self, path: Path, layout: Layout, launch: Launch) -> None:
         self._waiting: list[tuple[str, np.ndarray]] = []
@@ -73,7 +79,7 @@ class CyclesFile:
             self._write_block()
 
     def _write_block(self) -> None:
-        """Write the waiting records as one block."""
+        """Write the waiting records to the file as one block."""
         if not self._waiting:
             return
         # Sort by task, so that the rows of each task are contiguous.
@@ -94,12 +100,12 @@ class CyclesFile:
         gaps: Sequence[tuple[str, int, int]],
         kept: Sequence[tuple[int, int]],
     ) -> None:
-        """Finish the file and store these facts as metadata.
+        """Finish the file, with these data of the recording as its metadata.
 
         Args:
             lost: Number of lost rows, by task and by mailbox.
-            cores: What the machine did to its cores.
-            gaps: Ring, first and last tick of each gap.
+            cores: Stolen time and frequency of the cores.
+            gaps: Name of the ring, first and last tick of each gap.
             kept: Ticks that a flight recorder kept, as ranges [first, end).
         """
         self._write_block()
@@ -114,7 +120,10 @@ class CyclesFile:
 
 
 def create_signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]:
-    """Create the tables in signals/, by mailbox, replacing tables of a killed recorder."""
+    """Create the tables in signals/, and return them by mailbox.
+
+    An existing folder, which a killed recorder left, is deleted first.
+    """
     if folder.exists():
         rmtree(folder)
     return {
@@ -124,7 +133,10 @@ def create_signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]
 
 
 class SignalTable:
-    """Writer of the table of a mailbox, which is a folder of parts."""
+    """Writer of the table of a mailbox, which is a folder of parquet files called parts.
+
+    Rows wait in memory until there are enough of them for a block.
+    """
 
     def __init__(self, folder: Path, mailbox: MailboxSpec, layout: Layout) -> None:
         folder.mkdir(parents=True)
@@ -144,7 +156,7 @@ class SignalTable:
         self._begin_part()
 
     def _begin_part(self) -> None:
-        """Open the next part."""
+        """Open the file of the next part."""
         self._parts += 1
         self._entries = 0
         self._writer = pq.ParquetWriter(
@@ -157,7 +169,7 @@ class SignalTable:
         )
 
     def add_rows(self, rows: np.ndarray) -> None:
-        """Add at least one row of the mailbox's ring, shape (rows,)."""
+        """Add rows of the mailbox's ring, at least one, shape (rows,)."""
         self._waiting.append(rows)
         if (
             sum(map(len, self._waiting)) >= MESSAGE_ROWS
@@ -166,7 +178,7 @@ class SignalTable:
             self._write_block()
 
     def _write_block(self) -> None:
-        """Write the waiting rows as one block, and finish the part if its footer is large."""
+        """Write the waiting rows as one block, and begin a new part if the footer is large."""
         if not self._waiting:
             return
         rows = np.concatenate(self._waiting)
@@ -196,9 +208,9 @@ class Column:
     Attributes:
         name: Mailbox, groups and field, as in `servo.status.position`.
         mailbox: Name of the mailbox.
-        path: Names of the groups that contain the field, and of the field.
+        path: Names of the groups of nested fields that contain the field, and of the field itself.
         shape: Shape of the field in a message, () for a single value.
-        spec: The field.
+        spec: Declaration of the field.
     """
 
     name: str
@@ -209,7 +221,7 @@ class Column:
 
     @property
     def label(self) -> str:
-        """Name of the column in the table. Prefixed if a head column has the same name."""
+        """Name of the column in the table, with a prefix if a head column has the same name."""
         name = ".".join(self.path)
         return f"message.{name}" if name in (TIME_COLUMN, *HEAD_COLUMNS) else name
 
@@ -227,13 +239,13 @@ class Column:
         return pa.field(self.label, arrow, metadata=metadata)
 
     def extract_values(self, messages: np.ndarray) -> np.ndarray:
-        """Return the field in a block of messages, as a view of shape (rows, *shape)."""
+        """Return the field's values in an array of messages, as a view of shape (rows, *shape)."""
         for key in self.path:
             messages = messages[key]
         return messages
 
     def to_arrow(self, messages: np.ndarray) -> pa.Array:
-        """Convert the field in a block of messages to an Arrow array, shape (rows,)."""
+        """Return the field's values in an array of messages as an Arrow array, shape (rows,)."""
         flat = np.ascontiguousarray(self.extract_values(messages)).reshape(-1)
         values = pa.array(np.strings.decode(flat, "ascii", "replace") if self.is_text else flat)
         if not self.shape:
@@ -249,12 +261,12 @@ def list_columns(mailbox: MailboxSpec) -> list[Column]:
 def _flatten_columns(
     mailbox: str, path: tuple[str, ...], outer: tuple[int, ...], fields: Sequence[FieldSpec]
 ) -> Iterator[Column]:
-    """Yield the columns of fields, and of groups within them.
+    """Yield the columns of fields, including fields of nested groups.
 
     Args:
         mailbox: Name of the mailbox.
         path: Names of the groups that contain the fields.
-        outer: Shape of these groups.
+        outer: Shape of these groups, which precedes the shape of the fields.
         fields: The fields.
     """
     for field in fields:

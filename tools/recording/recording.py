@@ -53,7 +53,7 @@ class Gap(NamedTuple):
     rings: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the gap as a clause for the user."""
+        """Return the gap as a clause for messages to the user."""
         more = f" and {len(self.rings) - 3} more" if len(self.rings) > 3 else ""
         return (
             f"ticks {self.first:,} to {self.last:,} of {', '.join(self.rings[:3])}{more} are not"
@@ -62,28 +62,30 @@ class Gap(NamedTuple):
 
 
 MAX_SHOWN_STRETCHES = 20
-"""Number of kept stretches that a text lists."""
+"""Largest number of kept stretches that a text lists."""
 READ_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
-"""Errors raised by reading a damaged file or a file of another kind."""
+"""Errors that are raised while a damaged file, or a file of another kind, is read."""
 
 
 class Recording:
-    """The folder of a run. Reading any part of it raises `Failure` if the part is unreadable.
+    """A recorded run, read from its folder.
 
-    Opening it first builds the readable files from the spool of a killed recorder, with a note on
-    stderr, or from the stretches of a flight recorder.
+    If the recorder was killed, or was a flight recorder, the parquet files are first built from its
+    spool. Any method raises `Failure` if a file that it reads is missing or damaged.
+
+    A flight recorder keeps only some ranges of ticks, called stretches.
 
     Attributes:
-        folder: The folder.
-        checksums: Checksums of its files.
+        folder: Folder of the run.
+        checksums: Checksums of the files in the folder.
         config: The resolved config, as TOML text.
         layout: Layout of the rack.
         launch: Time of the rack's launch.
-        cores: What the machine did to the cores. Empty if the recorder did not measure it or was
-            killed.
+        cores: Stolen time and frequency of the cores. Empty if the recorder did not measure them or
+            was killed.
         kept: Ticks that a flight recorder kept, as ranges [first, end). Empty if it removed
             nothing.
-        events: The events of the run by tick, then its outcome.
+        events: The events of the run sorted by tick, then its outcome.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -120,7 +122,7 @@ class Recording:
 
     @cached_property
     def rack_config(self) -> RackConfig:
-        """The resolved config. Raises `Failure` with all of its mistakes."""
+        """The resolved config. Raises `Failure` that lists all of its mistakes."""
         try:
             return read_stored(self.config)
         except ConfigError as error:
@@ -128,7 +130,11 @@ class Recording:
             raise Failure(f"{self.folder / 'config.toml'}: {mistakes}", 2) from None
 
     def register_fault_kinds(self) -> None:
-        """Register the fault kinds that the rack's own levels define. Raises `Failure`."""
+        """Register the fault kinds that the rack's own levels define.
+
+        Raises:
+            Failure: published.json, which describes the fault kinds, is damaged.
+        """
         path = self.folder / PUBLISHED
         if path.exists():
             self.checksums.verify(PUBLISHED)
@@ -146,7 +152,11 @@ class Recording:
         return [self._open_parquet(part, (*HEAD_COLUMNS, *self._shapes[mailbox])) for part in parts]
 
     def _open_parquet(self, path: Path, columns: Iterable[str]) -> pq.ParquetFile:
-        """Open an undamaged parquet file that has these columns. Raises `Failure`."""
+        """Open a parquet file.
+
+        Raises:
+            Failure: The file is damaged, or lacks one of these columns.
+        """
         self.checksums.verify(str(path.relative_to(self.folder)))
         with _name_file_in_errors(path):
             file = pq.ParquetFile(path, page_checksum_verification=True)
@@ -156,7 +166,7 @@ class Recording:
         return file
 
     def _read_text(self, name: str) -> str:
-        """Read a text file of the run. Raises `Failure`."""
+        """Read a text file of the run. Raises `Failure` if it is missing or not text."""
         path = self._require_file(name)
         try:
             return read_file(path).decode()
@@ -172,7 +182,7 @@ class Recording:
         return self.folder / name
 
     def _read_events(self) -> list[Document]:
-        """Read the events of the run, if any were recorded, sorted by tick."""
+        """Read the events of the run, sorted by tick. Returns [] if no events were recorded."""
         path = self.folder / EVENTS
         if not path.exists():
             return []
@@ -201,12 +211,13 @@ class Recording:
         return dict(self.end_counts.get("rows_lost", self._lost_before_end))
 
     def find_stretches(self, ticks: np.ndarray) -> np.ndarray:
-        """Return the number of the kept stretch in which each tick lies, shape (n,).
+        """Return the number of the kept stretch that contains each tick, shape (n,).
 
-        Nothing is known between two stretches. If everything was kept, all ticks are in stretch 0.
+        Use the numbers to leave out differences between rows of different stretches, because
+        nothing is recorded between them. If everything was kept, all numbers are 0.
         """
-        # Rows may lie slightly outside their stretch, so the borders are in the gaps: halfway, but
-        # at most one second after the earlier stretch.
+        # Rows may lie slightly outside their stretch. Each border between two stretches is
+        # therefore halfway between them, but at most one second after the earlier one.
         second = round(1e9 / self.layout.clock_ns)
         borders = [
             end + min((first - end) // 2, second) for (_, end), (first, _) in pairwise(self.kept)
@@ -229,12 +240,14 @@ class Recording:
     def find_gaps(
         self, lost: Mapping[str, int] | None = None, ticks: int | None = None
     ) -> list[Gap]:
-        """Find the places where rows are missing, in order. Overlapping gaps are merged.
+        """Find the ranges of ticks in which rows are missing, in order. Merges overlapping ranges.
 
         Args:
-            lost: Number of lost rows, by ring. Defaults to the counts at the end of the run.
-            ticks: Length of the run. Defaults to its recorded length. Rows that the files do not
-                report as lost were lost between their last row and this tick.
+            lost: Number of lost rows, by task and by mailbox. Defaults to the counts at the end of
+                the run.
+            ticks: Length of the run in ticks. Defaults to its recorded length. If `lost` counts
+                more rows of a ring than the files report, these are missing between the last
+                recorded row of the ring and this tick.
         """
         lost = self.lost_rows if lost is None else lost
         ticks = self.end_counts.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
@@ -262,7 +275,7 @@ class Recording:
         return int(self.read_signal(name, "tick")[-1]) if name in self.mailboxes else -1
 
     def count_untraced(self) -> dict[str, tuple[int, int]]:
-        """Return recorded and total number of cycles, for tasks with missing trace records."""
+        """Return recorded and total number of cycles, for each task with missing trace records."""
         traced = {task.name: len(self.read_trace(task.name)) for task in self.layout.tasks}
         return {
             name: (rows, rows + self.lost_rows[name])
@@ -271,7 +284,9 @@ class Recording:
         }
 
     def count_missing_rows(self, segment: Segment) -> dict[str, MissingRows]:
-        """Count the rows that the files lack of the rings of a rack that has ended.
+        """Count the rows of the rack's rings that are missing from the files.
+
+        Call this only when the rack has ended.
 
         Args:
             segment: Segment of the rack.
@@ -287,14 +302,14 @@ class Recording:
             else:
                 serials = self.read_signal(name, "serial")
                 taken[name] = int(serials[-1]) if len(serials) else ring.before
-                # Rows missing before the last serial were lost or skipped as damaged. Count only
-                # lost ones, and not those lost after the last row, which the ring reports itself.
+                # Rows missing before the last serial were lost, or skipped as damaged. Count only
+                # lost rows. Rows lost after the last serial are counted from the ring itself.
                 lost[name] = min(lost[name], taken[name] - ring.before - len(serials))
         return find_missing(segment, taken, lost)
 
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
-        """The trace by task: records of type `rack.backplane.trace.RECORD`, oldest first."""
+        """Trace records of each task, of type `rack.backplane.trace.RECORD`, oldest first."""
         with _name_file_in_errors(self.folder / CYCLES):
             table = self._cycles.read()
             tasks = table["task"].to_numpy()
@@ -308,15 +323,15 @@ class Recording:
         return dict(self.end_counts.get("tasks", {}).get(task, {}))
 
     def find_core_and_priority(self, task: TaskSpec) -> tuple[int, int]:
-        """Return the core and the priority that a task obtained.
+        """Return the core and the priority with which a task ran.
 
-        If the end of the run was not recorded, these are the settings of its config.
+        If the end of the run was not recorded, the settings of the config are returned.
         """
         counted = self.find_task_counts(task.name)
         return counted.get("core", task.core), counted.get("priority", task.priority)
 
     def read_trace(self, task: str) -> np.ndarray:
-        """Return the trace of a task, as in `cycles`. Empty for a task without trace records."""
+        """Return the trace records of a task, as in `cycles`. Empty if it has none."""
         return self.cycles.get(task, np.empty(0, dtype=RECORD))
 
     def read_signal(self, mailbox: str, field: str) -> np.ndarray:
@@ -325,8 +340,8 @@ class Recording:
         Args:
             mailbox: The mailbox.
             field: Name of the field. Every mailbox has the fields "serial", "tick", "visible_at",
-                "basis", "stamp_ns" and "chain"; a message's own field of such a name is
-                "message.<name>".
+                "basis", "stamp_ns" and "chain". If a message declares a field with one of these
+                names, that field is called "message.<name>".
 
         Returns:
             Values, oldest first, shape (messages, *shape of the field).
@@ -344,12 +359,12 @@ class Recording:
         return np.asarray(values.to_numpy(zero_copy_only=False).reshape(-1, *shape))
 
     def read_reason(self, mailbox: str, row: int) -> str:
-        """Return the reason in a status as printable text, or "" if the status has none."""
+        """Return the reason in one row of a mailbox as printable text, or "" if there is none."""
         has_reason = "reason" in self.list_fields(mailbox)
         return escape_text(str(self.read_signal(mailbox, "reason")[row])) if has_reason else ""
 
     def read_rows(self, name: str) -> np.ndarray:
-        """Return the recorded rows of a ring, oldest first: trace records or rows of a mailbox."""
+        """Return the recorded rows of a task (trace records) or of a mailbox, oldest first."""
         if name in self.cycles:
             return self.cycles[name]
         box = self.layout.find_mailbox(name)
@@ -366,14 +381,14 @@ class Recording:
 
     @property
     def mailboxes(self) -> list[str]:
-        """Mailboxes from which at least one message was recorded."""
+        """Names of the mailboxes with at least one recorded message."""
         tables = self._tables.items()
         return [name for name, parts in tables if any(part.metadata.num_rows for part in parts)]
 
 
 @contextmanager
 def _name_file_in_errors(path: Path) -> Iterator[None]:
-    """Turn an error of reading into a `Failure` that names the file."""
+    """Convert an error while reading a file to a `Failure` that names the file."""
     try:
         yield
     except READ_ERRORS as error:
@@ -386,7 +401,8 @@ def _parse_event(line: str, place: str) -> Document:
     """Parse a line of events.jsonl.
 
     Raises:
-        Failure: The line is damaged or no event. The message begins with `place`.
+        Failure: The line is damaged or not an event. The message begins with `place`, which says
+            where the line was read.
     """
     try:
         event = parse_checked_line(line)

@@ -1,4 +1,4 @@
-"""The files with the rows of a run, cycles.parquet and signals/, written live or from a spool."""
+"""Writes the rows of a run, live or from a spool, to cycles.parquet and signals/."""
 
 from __future__ import annotations
 
@@ -35,17 +35,22 @@ from rack.tools.recording.spool import (
 
 CYCLES = "cycles.parquet"
 TABLE_PATTERNS = (CYCLES, f"{SIGNALS}/*/*")
-"""Patterns of the files that hold rows."""
+"""Patterns of the files that contain rows."""
 EVENTS = "events.jsonl"
 REBUILT_SUFFIX = "-mended"
 POLL_S = 0.2
 """Time between two attempts to lock the spool of a recorder that is finishing."""
 FINISH_S = 20.0
-"""Longest time to wait for a recorder that finishes after its launcher has gone."""
+"""Longest time to wait for a recorder that finishes after its launcher has ended."""
 
 
 class MissingRows(NamedTuple):
-    """Number of rows of a ring that a recording lacks, and number of rows written to that ring."""
+    """Number of rows of a ring that are missing from a recording.
+
+    Attributes:
+        rows: The number of missing rows.
+        written: Number of rows that were written to the ring.
+    """
 
     rows: int
     written: int
@@ -54,12 +59,14 @@ class MissingRows(NamedTuple):
 def find_missing(
     segment: Segment, taken: Mapping[str, int], lost: Mapping[str, int]
 ) -> dict[str, MissingRows]:
-    """Count the rows that a recording lacks of the rings of a rack that has ended.
+    """Count the rows of a rack's rings that are missing from its recording.
+
+    Call this only when the rack has ended.
 
     Args:
         segment: Segment of the rack.
-        taken: Number of the last record taken from each ring.
-        lost: Number of earlier rows that are not in the recording, by ring.
+        taken: Number of the last record that the recorder read from each ring.
+        lost: Number of earlier records that are not in the recording, by ring.
 
     Returns:
         The missing rows by task and by mailbox. Complete rings are left out.
@@ -75,14 +82,18 @@ def find_missing(
 
 
 class Tally:
-    """Counts of the rows that a recorder has taken from a rack's rings.
+    """Counts of the rows that a recorder has read from a rack's rings.
+
+    A ring is named by its task or mailbox. A spool, in which a recorder stores the rows, consists
+    of parts. A flight recorder divides the spool into stretches and deletes some of them.
 
     Attributes:
         tasks: Names of the tasks, whose rings are traces.
-        lost: Number of lost rows, by ring.
-        taken: Number of the last record taken, by ring. Starts at `before`.
-        rows: Number of rows taken, by ring.
-        kept: Ticks of the stretches that a flight recorder kept, [first, end).
+        lost: Number of rows that were overwritten before they were read, by ring.
+        taken: Number of the last record read, by ring. Starts at `before`.
+        rows: Number of rows read, by ring.
+        kept: Ranges of ticks [first, end) that were not deleted. Consecutive stretches are one
+            range.
         number: Number of the newest stretch.
     """
 
@@ -97,7 +108,7 @@ class Tally:
         self._newest = -1
 
     def count_part(self, part: Part) -> None:
-        """Count the content of one part of a spool."""
+        """Add the rows or the stretch border in one part of a spool to the counts."""
         match part:
             case StretchHead():
                 self.begin_stretch(part)
@@ -108,10 +119,10 @@ class Tally:
                     self.add_rows(*block)
 
     def begin_stretch(self, stretch: StretchHead) -> None:
-        """Begin a stretch. Stretches before it may have been removed."""
+        """Continue with the counts at the head of a stretch. Earlier stretches may be deleted."""
         follows = stretch.number == self.number + 1
         if follows:
-            # The counts disagree only if the file of the previous stretch is damaged.
+            # Rows are missing here only if the file of the previous stretch is damaged.
             for name, rows in stretch.rows.items():
                 self.lost[name] += rows - self.rows[name]
         self.taken.update(stretch.taken)
@@ -124,34 +135,39 @@ class Tally:
         self.number = stretch.number
 
     def add_rows(self, name: str, rows: np.ndarray, lost: int) -> None:
-        """Count rows of a ring.
+        """Add rows of a ring to the counts.
 
         Args:
-            name: The ring.
+            name: Name of the ring.
             rows: The rows, shape (rows,).
-            lost: Number of rows lost before them.
+            lost: Number of rows lost before these rows.
         """
         self.count_rows(name, len(rows), lost)
         if len(rows):
             self._newest = int(rows["tick"][-1])
             if name not in self.tasks:
-                # The recorder skips damaged messages, so counting rows would fall behind.
+                # The recorder skips damaged messages, so the serial may exceed the count of rows.
                 self.taken[name] = int(rows["serial"][-1])
 
     def count_rows(self, name: str, rows: int, lost: int) -> None:
-        """Add to the counts of a ring.
+        """Increase the counts of a ring.
 
         Args:
-            name: The ring.
-            rows: Number of rows taken.
-            lost: Number of rows lost before them.
+            name: Name of the ring.
+            rows: Number of rows read.
+            lost: Number of rows lost before these rows.
         """
         self.lost[name] += lost
         self.rows[name] += rows
         self.taken[name] += lost + rows
 
     def end_stretch(self, tick: int = OPEN_END) -> None:
-        """End the last stretch at a tick, or after its newest row if its recorder was killed."""
+        """End the last stretch.
+
+        Args:
+            tick: Tick at which it ends. Defaults to the tick after its newest row, as for the
+                stretch of a killed recorder.
+        """
         if self.kept and self.kept[-1][1] == OPEN_END:
             first = self.kept[-1][0]
             self.kept[-1] = first, max(first, self._newest + 1) if tick == OPEN_END else tick
@@ -161,7 +177,7 @@ class RunFiles(Tally):
     """Writer of cycles.parquet and signals/ in the folder of a run.
 
     Attributes:
-        gaps: Places where rows were lost: ring, first and last tick without rows.
+        gaps: Ring, first and last tick of each range of ticks in which rows were lost.
     """
 
     def __init__(
@@ -180,18 +196,18 @@ class RunFiles(Tally):
         self._signals = create_signal_tables(folder / f"{SIGNALS}{suffix}", layout)
 
     def begin_stretch(self, stretch: StretchHead) -> None:
-        """Begin a stretch. Rows between it and an earlier one were removed, not lost."""
+        """Begin a stretch. Rows of deleted stretches before it do not count as lost."""
         if stretch.number != self.number + 1:
             self._reached = {name: (stretch.begin - 1, lost) for name, lost in self.lost.items()}
         super().begin_stretch(stretch)
 
     def add_rows(self, name: str, rows: np.ndarray, lost: int) -> None:
-        """Write rows of a ring, and note the gap if rows were lost before them.
+        """Write rows of a ring. Adds a gap if rows were lost before these rows.
 
         Args:
-            name: The ring.
+            name: Name of the ring.
             rows: The rows, shape (rows,).
-            lost: Number of rows lost before them.
+            lost: Number of rows lost before these rows.
         """
         super().add_rows(name, rows, lost)
         if len(rows):
@@ -205,7 +221,7 @@ class RunFiles(Tally):
             self._signals[name].add_rows(rows)
 
     def close(self, cores: CoreRecord = UNMEASURED) -> None:
-        """Finish all files, and store the steal and frequencies of the cores with the trace."""
+        """Finish all files. Stolen time and frequency of the cores are stored with the trace."""
         self.end_stretch()
         for table in self._signals.values():
             table.close()
@@ -216,7 +232,8 @@ def rebuild_files(folder: Path) -> bool:
     """Build the files of a run from the spool of a killed recorder or of a flight recorder.
 
     Returns:
-        False if the folder holds no spool.
+        True if the files were built. False if the folder contains no spool, so that nothing has to
+        be built.
 
     Raises:
         Failure: The recorder is still running, or its spool cannot be read.
@@ -233,23 +250,24 @@ def rebuild_files(folder: Path) -> bool:
         files = RunFiles(folder, layout, launch, REBUILT_SUFFIX)
         for part in read_spool(file, folder):
             files.count_part(part)
-        # Keep the lock, so that another process that opens this run waits for the files.
+        # Keep the spool locked, so that another process that opens this run waits for the files.
         files.close()
         rmtree(folder / SIGNALS, ignore_errors=True)
         for name in (CYCLES, SIGNALS):
             (folder / f"{name}{REBUILT_SUFFIX}").replace(folder / name)
         Checksums(folder).store(*TABLE_PATTERNS)
-        # Remove the spool first: without it, leftover stretches are not mistaken for a run.
+        # Remove the spool before the stretches. If this process is killed in between, the leftover
+        # stretches are ignored.
         path.unlink()
         rmtree(folder / STRETCHES, ignore_errors=True)
     return True
 
 
 def count_spool(folder: Path) -> Tally | None:
-    """Count what a flight recorder has left in a folder, without unpacking its rows.
+    """Count the rows in a flight recorder's spool, without decompressing them.
 
     Returns:
-        The counts, or None if the folder holds no flight recorder's spool.
+        The counts, or None if the folder contains no spool of a flight recorder.
 
     Raises:
         Failure: The spool cannot be read.
@@ -271,7 +289,13 @@ def count_spool(folder: Path) -> Tally | None:
 
 
 def _lock_spool(file: IO[bytes], path: Path) -> None:
-    """Lock a spool, waiting for a recorder that is finishing without its launcher."""
+    """Lock a spool, so that no recorder and no other reader uses it.
+
+    Waits up to `FINISH_S` for a recorder that is finishing after its launcher has ended.
+
+    Raises:
+        Failure: A recorder still records the run, or does not finish in time.
+    """
     deadline = time.monotonic() + FINISH_S
     while not try_lock(file):
         if _is_running(*read_head(file, path)):
@@ -282,7 +306,7 @@ def _lock_spool(file: IO[bytes], path: Path) -> None:
 
 
 def _is_running(layout: Layout, launch: Launch) -> bool:
-    """Return True if the rack of this launch has a segment and its run is not over."""
+    """Return True if the rack of this launch is still running."""
     with suppress(SegmentError), closing(Segment.attach(layout.rack)) as segment:
         return segment.launch == launch and not segment.run_is_over
     return False

@@ -1,4 +1,4 @@
-"""Signals and conditions in the form in which users write them.
+"""Parses signals and conditions as users write them.
 
 A signal is a field of a mailbox's messages, or one number of it, as in `servo.status.position[2]`.
 A condition compares a signal with a number, as in `servo.status.position[2] > 1.2`.
@@ -37,10 +37,13 @@ MAX_SUGGESTIONS = 3
 
 @dataclass(frozen=True)
 class Signal(Column):
-    """A field of a mailbox's messages, or a part of an array field: numbers or text.
+    """A field of a mailbox's messages, or an indexed part of an array field.
+
+    Values are numbers, text, or numbers that stand for names, such as the state of a level.
 
     Attributes:
-        index: Indices into an array field. May select one number or a row.
+        index: Indices into an array field. They may select one number or a row. Empty for the
+            whole field.
     """
 
     index: tuple[int, ...] = ()
@@ -55,8 +58,8 @@ class Signal(Column):
         """Parse the name of a signal.
 
         Raises:
-            Failure: The name is unknown, or the index is out of range. The message contains the
-                nearest names or the valid indices.
+            Failure: The name is unknown, or the index is out of range. The message lists similar
+                names or the valid indices.
         """
         known = cls.build_by_name(boxes)
         match = NAME_PATTERN.fullmatch(text)
@@ -78,7 +81,7 @@ class Signal(Column):
 
     @property
     def json_type(self) -> str:
-        """JSON type of a single value."""
+        """JSON type of a single value of the signal."""
         if self.is_text or self.spec.values:
             return "string"
         return "number" if np.dtype(self.spec.kind).kind == "f" else "integer"
@@ -94,34 +97,39 @@ class Signal(Column):
         return len(self.index) == len(self.shape) and not self.is_text
 
     def extract_values(self, messages: np.ndarray) -> np.ndarray:
-        """Return the signal in each of these messages, as a view.
+        """Return the signal's value in each message.
 
-        Its shape is (messages, *shape of what the index selects).
+        Returns:
+            A view of shape (messages, *shape of one value).
         """
         return self.select_part(super().extract_values(messages))
 
     def select_part(self, values: np.ndarray) -> np.ndarray:
-        """Select the signal from values of its whole field, shape (messages, *field shape)."""
+        """Apply the index to values of the whole field, of shape (messages, *field shape)."""
         place: Any = (slice(None), *self.index)
         selected: np.ndarray = values[place]
         return selected
 
     def read_message(self, message: np.ndarray) -> Any:
-        """Return the signal in one message: a number, an array, text, or the name of a state."""
+        """Return the signal's value in one message: a number, an array, text or a name."""
         value = self.replace_numbers(self.extract_values(message[None]))[0]
         return decode_text(value) if isinstance(value, bytes) else value
 
     def replace_numbers(self, values: np.ndarray) -> np.ndarray:
-        """Replace numbers that stand for names, such as states, by these names."""
+        """Replace numbers that stand for names, such as states, by the names.
+
+        Values of other signals are returned unchanged.
+        """
         if not self.spec.values:
             return values
         names = {number: name for name, number in self.spec.values}
         return np.asarray(np.vectorize(lambda number: names.get(number, number), "O")(values))
 
     def extract_plain(self, messages: np.ndarray) -> list[Any]:
-        """Return the signal in each of these messages as users read it.
+        """Return the signal's value in each message as plain Python data.
 
-        Values are numbers, names of states, text, or nested lists of these; None if not finite.
+        Returns:
+            Numbers, names, text, or nested lists of these. Numbers that are not finite become None.
         """
         values = self.extract_values(messages)
         if values.dtype.kind == "S":
@@ -140,7 +148,7 @@ def list_signals(box: MailboxSpec) -> list[Signal]:
 
 
 def find_mailbox(name: str, boxes: Sequence[MailboxSpec]) -> MailboxSpec:
-    """Find a mailbox by its name. Raises `Failure` with the nearest names."""
+    """Return the mailbox with this name. Raises `Failure` with similar names if there is none."""
     known = {box.name: box for box in boxes}
     if name not in known:
         raise _build_failure("mailbox", name, known, boxes)
@@ -150,7 +158,14 @@ def find_mailbox(name: str, boxes: Sequence[MailboxSpec]) -> MailboxSpec:
 def _build_failure(
     what: str, name: str, known: Collection[str], boxes: Sequence[MailboxSpec]
 ) -> Failure:
-    """Return a `Failure` for an unknown name, with the nearest names or else all mailboxes."""
+    """Return the `Failure` for an unknown name.
+
+    Args:
+        what: Kind of the name, "signal" or "mailbox".
+        name: The unknown name.
+        known: The known names, of which the message lists similar ones.
+        boxes: Mailboxes, which the message lists if no known name is similar.
+    """
     near = get_close_matches(name.partition("[")[0], known, MAX_SUGGESTIONS)
     offered = "nearest" if near else "mailboxes"
     names = near or [box.name for box in boxes]
@@ -159,10 +174,10 @@ def _build_failure(
 
 @dataclass(frozen=True)
 class Trigger:
-    """A comparison of a single-number signal with a constant.
+    """A condition that compares a signal with a constant.
 
     Attributes:
-        signal: The signal.
+        signal: The signal, which is a single number.
         sign: The comparison operator.
         number: The constant.
     """
@@ -173,7 +188,11 @@ class Trigger:
 
     @classmethod
     def parse(cls, text: str, boxes: Sequence[MailboxSpec]) -> Trigger:
-        """Parse a condition. Raises `Failure`."""
+        """Parse a condition such as "servo.status.position[2] > 1.2".
+
+        Raises:
+            Failure: The text is not a condition, or its signal is unknown or not a single number.
+        """
         match = CONDITION_PATTERN.fullmatch(text)
         if match is None:
             example = "servo.status.position[2] > 1.2"
@@ -194,5 +213,5 @@ class Trigger:
         return cls(signal, match[2], number)
 
     def evaluate_messages(self, messages: np.ndarray) -> np.ndarray:
-        """Return, for each of these messages, whether the condition is true, shape (messages,)."""
+        """Return True for each message that meets the condition, shape (messages,)."""
         return np.asarray(COMPARISONS[self.sign](self.signal.extract_values(messages), self.number))

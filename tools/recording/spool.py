@@ -3,17 +3,18 @@
 About ten times a second the recorder appends the rows of all rings, compressed, to
 `recorder.spool`. Each append is a line of JSON with its own checksum, as in events.jsonl. A
 restarted recorder continues from the spool, and `rebuild_files` makes the parquet files from the
-spool of a recorder that is gone. The spool is removed when the files are complete. A truncated last
-line is dropped; any other damage is an error. The rings hold two seconds, so a recorder that is
-back within that time loses nothing.
+spool of a recorder that was killed. The spool is removed when the files are complete. A truncated
+last line is dropped; any other damage is an error. The rings hold two seconds, so nothing is lost
+if a recorder is restarted within that time.
 
 Arrow's IPC streams were rejected: a stream of columns for each ring takes six times the processor
 time, and streams have no checksums, so damaged data could be read as other values.
 
-A flight recorder (`[record] keep`) writes no parquet files. Its frames go to files called
-stretches, which are removed again unless something happened near them. The head of each stretch
-contains the counts of everything before it, so the tables can be made from any of them. That
-happens when the run is opened; ten minutes of the NASREM rack take 20 s.
+A flight recorder (`[record] keep`) writes no parquet files. It writes the rows to files called
+stretches, each for a range of ticks, and deletes stretches that are not near an occasion. The head
+of each stretch contains the counts of everything before it, so the parquet files can be built even
+though stretches are missing. They are built when the run is opened; ten minutes of the NASREM rack
+take 20 s.
 """
 
 from __future__ import annotations
@@ -47,8 +48,9 @@ from rack.tools.recording.file_names import CODE, CONFIG, ORIGIN, SPOOL
 FLUSH_S = 0.1
 """Time between two writes of the spool.
 
-SIGKILL of all processes loses what boards wrote during this time, between two drains, and during
-one or two passes of the recorder, which last longer on a busy machine.
+If all processes are killed, the rows that boards wrote in this time are lost, together with those
+written between two drains and during one or two passes of the recorder. A pass lasts longer on a
+busy machine.
 """
 STRETCHES = "stretches"
 OPEN_END = -1
@@ -56,17 +58,17 @@ OPEN_END = -1
 
 
 class SpoolHead(NamedTuple):
-    """First line of a spool: the rack's layout as plain data, and its launch."""
+    """First line of a spool: the rack's layout as plain data, and the time of its launch."""
 
     layout: Any
     launch: Launch
 
 
 class Frame(NamedTuple):
-    """Rows taken from the rings.
+    """A line of a spool with rows that were read from the rings in one or more passes.
 
     Attributes:
-        counts: Blocks of rows: ring, number of rows, and number of rows lost before them.
+        counts: Ring, number of rows, and number of rows lost before them, for each block of rows.
         data: Rows of all blocks in order, compressed, as base64.
     """
 
@@ -80,7 +82,7 @@ class Frame(NamedTuple):
             dtypes: Row type of every ring, from `list_ring_dtypes`.
 
         Yields:
-            Ring, rows, shape (rows,), and number of rows lost before them.
+            Name of the ring, its rows of shape (rows,), and number of rows lost before them.
         """
         sizes = [length * dtypes[ring].itemsize for ring, length, _ in self.counts]
         data = pa.decompress(b64decode(self.data), sum(sizes), "zstd", asbytes=True)
@@ -91,13 +93,14 @@ class Frame(NamedTuple):
 
 
 class StretchHead(NamedTuple):
-    """First line of a stretch.
+    """First line of a stretch, a file for a range of ticks.
 
     Attributes:
-        number: Number of the stretch, from 1.
-        begin: The stretch holds rows of cycles that ended from this tick on.
-        taken: Number of the last record taken before it, by ring.
-        rows: Number of rows taken before it, by ring.
+        number: Number of the stretch, counted from 1.
+        begin: First tick of the range. The stretch contains rows of cycles that ended at or after
+            this tick.
+        taken: Number of the last record read before the stretch, by ring.
+        rows: Number of rows read before the stretch, by ring.
     """
 
     number: int
@@ -110,7 +113,7 @@ class StretchEnd(NamedTuple):
     """Last line of a stretch, which a killed recorder does not write.
 
     Attributes:
-        tick: The stretch holds rows of cycles that ended before this tick.
+        tick: Tick after the range. The stretch contains rows of cycles that ended before this tick.
     """
 
     tick: int
@@ -121,10 +124,14 @@ PART_TYPES = {kind.__name__: kind for kind in (SpoolHead, StretchHead, Frame, St
 
 
 class Spool:
-    """The spool of a folder, open for writing.
+    """The spool in the folder of a run, open for writing.
 
-    To continue the spool of another recorder, call `read_rest` first. Raises `Failure` if another
-    recorder has it open, or if it belongs to another launch or rack.
+    The spool protects rows until the parquet files are complete. It consists of lines called parts:
+    frames with rows and, for a flight recorder, heads and ends of stretches, which are separate
+    files. Before adding rows, call `read_rest` to continue the spool of an earlier recorder.
+
+    Raises `Failure` if another recorder has the spool open, or if it belongs to another launch or
+    rack.
     """
 
     def __init__(self, folder: Path, layout: Layout, launch: Launch) -> None:
@@ -142,8 +149,8 @@ class Spool:
                 # The launcher has written these files before it starts the recorder.
                 Checksums(folder).store(CONFIG, ORIGIN, CODE)
                 _write_part(self._file, SpoolHead(asdict(layout), launch))
-            with self.path.open("rb") as left:
-                recorded_head = read_head(left, self.path)
+            with self.path.open("rb") as file:
+                recorded_head = read_head(file, self.path)
             if recorded_head != (layout, launch):
                 raise Failure(
                     f"{self.path}: holds a recording of another launch or rack,"
@@ -154,27 +161,30 @@ class Spool:
             raise
 
     def read_rest(self) -> Iterator[Part]:
-        """Yield the parts that another recorder left, then cut off a damaged last line."""
-        with self.path.open("rb") as left:
-            read_head(left, self.path)
-            whole = left.tell()
-            for part in _read_parts(left, self.path):
+        """Yield the parts that an earlier recorder wrote, and cut off an incomplete last line.
+
+        Of a flight recorder's stretches, only the last two are read.
+        """
+        with self.path.open("rb") as file:
+            read_head(file, self.path)
+            complete_bytes = file.tell()
+            for part in _read_parts(file, self.path):
                 yield part
-                whole = left.tell()
-        self._file.truncate(whole)
-        # The head of a stretch contains all counts before it. The newest head may be cut off, so
-        # read the last two stretches.
+                complete_bytes = file.tell()
+        self._file.truncate(complete_bytes)
+        # The head of a stretch contains all counts before it, so the last stretch would suffice.
+        # Its head may be incomplete, so read the last two.
         yield from _read_stretches(list_stretch_files(self._folder)[-2:])
 
     def begin_stretch(self, stretch: StretchHead, end: int) -> Path:
-        """Finish the current stretch at a tick, and write into a new stretch from now on.
+        """Finish the current stretch, and write all further rows to a new stretch.
 
         Args:
             stretch: Head of the new stretch.
-            end: Tick at which the current stretch ends.
+            end: Tick after the last tick of the current stretch.
 
         Returns:
-            File of the new stretch.
+            Path of the new stretch.
         """
         self.flush(now=True)
         self._finish_stretch(end)
@@ -185,7 +195,7 @@ class Spool:
         return path
 
     def _finish_stretch(self, end: int) -> None:
-        """Close the file of the current stretch, if any, and mark its end if the end is known."""
+        """Write the end of the current stretch, unless it is `OPEN_END`, and close its file."""
         if self._out is not self._file:
             if end != OPEN_END:
                 _write_part(self._out, StretchEnd(end))
@@ -195,21 +205,21 @@ class Spool:
         """Queue rows of a ring for the next flush.
 
         Args:
-            ring: The ring.
+            ring: Name of the ring.
             rows: The rows, shape (rows,).
-            lost: Number of rows lost before them.
+            lost: Number of rows lost before these rows.
         """
         if len(rows) or lost:
             self._waiting.append((ring, rows, lost))
 
     def flush(self, now: bool = False) -> bool:
-        """Write the queued rows if a write is due.
+        """Write the queued rows if `FLUSH_S` has passed since the last write.
 
         Args:
-            now: Whether to write in any case.
+            now: Whether to write even if that time has not passed.
 
         Returns:
-            True if the queue was written.
+            True if the queue was written, so that it is empty now.
 
         Raises:
             OSError: The disk is full.
@@ -226,12 +236,16 @@ class Spool:
         return True
 
     def remove(self) -> None:
-        """Delete the spool, once the parquet files are complete."""
+        """Delete the spool. Call this only when the parquet files are complete."""
         self.path.unlink()
         self.close()
 
     def close(self, end: int = OPEN_END) -> None:
-        """Close the spool so that another recorder can continue it. Its stretch ends at `end`."""
+        """Close the spool, so that another recorder can continue it.
+
+        Args:
+            end: Tick at which the current stretch of a flight recorder ends. Unknown by default.
+        """
         self._finish_stretch(end)
         self._file.close()
 
@@ -240,7 +254,7 @@ def _write_part(file: IO[bytes], part: SpoolHead | Part) -> None:
     """Write a part as a line to an unbuffered file. Raises `OSError` if the disk is full."""
     line = format_checked_line({type(part).__name__: part}).encode()
     while line:
-        # An unbuffered write may accept only part of the data.
+        # An unbuffered file may write only part of the data at once.
         line = line[file.write(line) :]
 
 
@@ -264,7 +278,14 @@ def _read_parts(file: IO[bytes], path: Path) -> Iterator[Any]:
 
 
 def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
-    """Read layout and launch at the start of a spool. Its frames follow. Raises `Failure`."""
+    """Read the head of a spool, and leave the file position after it.
+
+    Returns:
+        Layout and launch of the rack.
+
+    Raises:
+        Failure: The head is incomplete or damaged.
+    """
     file.seek(0)
     head = next(_read_parts(file, path), None)
     if head is None:
@@ -273,13 +294,13 @@ def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
 
 
 def read_spool(file: IO[bytes], folder: Path) -> Iterator[Part]:
-    """Yield the parts of a spool that is open after its head, then the parts of its stretches."""
+    """Yield the parts of a spool whose head was read, then the parts of all its stretches."""
     yield from _read_parts(file, folder / SPOOL)
     yield from _read_stretches(list_stretch_files(folder))
 
 
 def _read_stretches(paths: Iterable[Path]) -> Iterator[Part]:
-    """Yield the parts of these stretches."""
+    """Yield the parts in these files of stretches, file by file."""
     for path in paths:
         check_file(path)
         with path.open("rb") as file:
@@ -292,7 +313,7 @@ def list_stretch_files(folder: Path) -> list[Path]:
 
 
 def open_rings(segment: Segment) -> dict[str, Ring]:
-    """Return every ring of a rack: traces by task, then messages by mailbox."""
+    """Open every ring of a rack: first the traces by task, then the messages by mailbox."""
     traces = {task.name: open_trace_ring(segment, task.name) for task in segment.layout.tasks}
     return traces | {
         mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in segment.layout.timed
@@ -300,7 +321,7 @@ def open_rings(segment: Segment) -> dict[str, Ring]:
 
 
 def list_ring_dtypes(layout: Layout) -> dict[str, np.dtype]:
-    """Return the row type of every ring of a rack: traces by task, then messages by mailbox."""
+    """Return the row type of every ring of a rack, by task and by mailbox, as `open_rings`."""
     traces = {task.name: RECORD for task in layout.tasks}
     return traces | {mailbox.name: build_row_dtype(mailbox) for mailbox in layout.timed}
 

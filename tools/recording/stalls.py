@@ -1,12 +1,12 @@
-"""Detect what took the cores away from a rack that ran in real time.
+"""Finds out when cores were taken away from a rack that ran in real time, and by what.
 
-The causes are the hypervisor, with or without steal in the kernel's counts, and a quota of the
-host. A host that takes a core away need not count that as steal. The absence then shows as a time
-at which the rack was due but recorded no time stamp. On the clock's core the clock, which preempts
-everything else, woke late (event `CLOCK_LATE`). On any other core a task was due and no task
-recorded a stamp. Both count only with a real-time priority, because without it a task waits for any
-program. Alternative considered: a trace of the clock board, which would show no more but need a
-ring.
+Cores are taken away by the hypervisor, or by a CPU quota of the host. In either case the kernel may
+count the time as steal, but need not. Without steal, an absence shows as a time at which the rack
+was due but recorded no time stamp. On the clock's core, the clock, which preempts everything else,
+woke late (event `CLOCK_LATE`). On any other core, a task was due and no task recorded a stamp. Both
+are considered only for real-time priorities, because without one a task waits for any other
+program. Alternative considered: a trace of the clock board, which would show nothing more but need
+another ring.
 """
 
 from __future__ import annotations
@@ -30,22 +30,22 @@ CLUSTERED_PART = 0.75
 WINDOW_PART = 0.02
 """Thresholds of the quota test: number of stalls, their share in one window, and its width.
 
-The width is a fraction of the quota period. If phases have nothing to do with the period, four of
-five end within 2 % of it once in 6,300 runs; more stalls make that rarer still. Three quarters
-suffice, because a level that is late for its own reasons ends at few phases: at two, if its cycle
-is half the period.
+The width is a fraction of the quota period. If the phases are independent of the period, four of
+five stalls end within 2 % of it in one of 6,300 runs, and more rarely with more stalls. A share of
+three quarters is enough to exclude most levels that are late for their own reasons: a level whose
+cycle is half the period ends its stalls at two phases.
 """
 
 
 @dataclass(frozen=True)
 class Absence:
-    """Times at which a core was away without steal.
+    """Summary of the times at which a core was away, although no steal was counted.
 
     Attributes:
-        core: The core.
+        core: Number of the core.
         times: Number of absences.
-        longest_ms: Longest absence.
-        lost: Number of cycles lost during them.
+        longest_ms: Duration of the longest absence.
+        lost: Number of cycles that were late or skipped because of the absences.
     """
 
     core: int
@@ -61,7 +61,8 @@ class Quota:
     Attributes:
         together: Number of stalls that end at that phase.
         stalls: Number of all stalls.
-        levels: Levels whose period is a multiple of `QUOTA_NS` and which may be the cause instead.
+        levels: Levels that may be the cause instead, because their period is a multiple of
+            `QUOTA_NS`.
     """
 
     together: int
@@ -71,11 +72,11 @@ class Quota:
 
 @dataclass(frozen=True)
 class Stalls:
-    """Lost cycles of a run, and how many of them were due while a core was away.
+    """Lost cycles of a run, which were late or skipped, and the absences of cores.
 
     Attributes:
-        lost: Number of all late or skipped cycles.
-        during_steal: Number of lost cycles that were due while the steal of their core rose.
+        lost: Number of all lost cycles.
+        during_steal: Number of lost cycles that were due while the steal of their core increased.
         absences: Absences without steal, by core.
         quota: The suspected quota, or None.
     """
@@ -87,10 +88,10 @@ class Stalls:
 
 
 def analyze_stalls(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
-    """Find the absences of cores in a run, and the cycles lost to them.
+    """Find the absences of cores in a run, and the late or skipped cycles that they caused.
 
-    While the clock's core is away without steal, the whole machine may be, so that time counts as
-    an absence of every core.
+    While the clock's core is away without steal, the whole machine may be away, so that time counts
+    as an absence of every core.
 
     Returns:
         The summary, and the times at which each core was away.
@@ -111,7 +112,7 @@ def analyze_stalls(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]
         is_home = core == clock_core
         stolen = Occupation(*spans[spans[:, 2] == core, :2].T)
         since, until = late_clock if is_home else cycles.find_idle_spans(on_core, is_shown)
-        # Without the clock no task is released, which explains idle time on the other cores.
+        # While the clock is away no task is released, which explains idle time on other cores.
         explained = stolen if is_home else Occupation.merge([stolen, without_clock])
         is_away = until - since > cycles.grid_ns // LATE_DIVISOR
         is_away &= explained.compute_overlap(since, until) == 0
@@ -131,15 +132,18 @@ def analyze_stalls(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]
 
 
 class _CycleTable:
-    """All cycles of a run, task by task. All arrays have shape (n,).
+    """All cycles of a run, task by task, with the data to find the cause of lost cycles.
+
+    A cycle is lost if it was late or skipped. All arrays have shape (n,).
 
     Attributes:
         rows: Trace records.
         core: Core of the task.
         is_urgent: True if the task has a real-time priority.
         due_ns: Release of this cycle, or of the first cycle skipped before it.
-        resumed_ns: Time at which the cause of the lost cycles was over.
-        lost: Number of cycles lost: this one if late, and those skipped before it.
+        resumed_ns: Time at which the cause of the lost cycles had ended: the end of a late cycle,
+            or the start of a cycle after skipped ones.
+        lost: Number of lost cycles: this one if late, and those skipped before it.
         grid_ns: Length of a tick in real time.
     """
 
@@ -152,62 +156,76 @@ class _CycleTable:
         self.is_urgent = priority > 0
         self.grid_ns = recording.rack_config.tick_ns
         self.due_ns = rows["release_ns"] - count_skipped(rows) * every * self.grid_ns
-        # The cause of skipped releases was over when the next cycle began. The cause of a late
+        # The cause of skipped releases had ended when the next cycle began. The cause of a late
         # cycle may have occurred during that cycle.
         self.resumed_ns = np.where(find_missed(rows), rows["end_ns"], rows["start_ns"])
         self.lost = count_skipped(rows) + find_missed(rows)
 
     def count_lost_during(self, occupied: Occupation, among: np.ndarray) -> int:
-        """Count the cycles among `among` that were lost while a core was occupied."""
+        """Count the cycles that were lost while their core was occupied.
+
+        Args:
+            occupied: Times at which the core was occupied.
+            among: Mask of the cycles that are counted.
+        """
         is_hit = occupied.compute_overlap(self.due_ns, self.resumed_ns) > 0
         return int(self.lost[among & is_hit].sum())
 
     def find_stall_ends(self) -> np.ndarray:
-        """Return the end times of the spans in which executors lost cycles."""
-        # Plans are left out: their time slice may be longer than a stall.
+        """Return the end times of the stalls, in which executors lost cycles.
+
+        Overlapping spans of lost cycles are one stall.
+        """
+        # Planners are left out, because their time slice may be longer than a stall.
         counted = (self.lost > 0) & (self.rows["flags"] & Flag.PLANNED == 0)
         return Occupation(self.due_ns[counted], self.resumed_ns[counted]).ends
 
     def find_clock_absences(self, events: list[Document]) -> tuple[np.ndarray, np.ndarray]:
-        """Return from when to when the clock board was away, for each late wake-up."""
+        """Return the begin and end of each time at which the clock board woke late.
+
+        Args:
+            events: Events of the run, of which those with code "clock_late" count.
+
+        Returns:
+            Begin and end times, in ns of CLOCK_MONOTONIC.
+        """
         late = [
             (e["since"], e["value"])
             for e in events
             if e.get("code") == "clock_late" and e["board"] == CLOCK
         ]
         since, late_ns = np.array(late, np.int64).reshape(-1, 2).T
-        # All releases lie on the clock's grid, so any row yields the time of tick 0.
+        # All releases lie on the clock's grid, so the time of tick 0 follows from any row.
         start_ns = (self.rows["release_ns"] - self.rows["tick"] * self.grid_ns).max(initial=0)
         due_ns = start_ns + since * self.grid_ns
         return due_ns, due_ns + late_ns
 
     def find_idle_spans(self, on_core: np.ndarray, is_shown: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return the span before each cycle of a core in which no task ran although one was due.
+        """Return, for each cycle on a core, the span before it in which the core ran no due task.
 
         Args:
             on_core: Mask of the cycles on that core.
-            is_shown: False if no cycle has a known due time, as in lockstep. All spans are then
-                empty.
+            is_shown: False if due times are unknown, as in lockstep. All spans are then empty.
 
         Returns:
-            Begin and end of each span, ns of CLOCK_MONOTONIC.
+            Begin and end of each span, in ns of CLOCK_MONOTONIC.
         """
         rows = self.rows[on_core]
         starts = rows["start_ns"]
         due_ns = np.where(is_shown & self.is_urgent, self.due_ns, self.rows["start_ns"])[on_core]
         stamps = np.sort(np.concatenate([rows[name] for name in STAMPS]))
-        # Before its first stamp a core is not judged: index -1 is the last stamp of the run, so
-        # that the span is empty.
+        # A span begins no earlier than the last stamp on the core before the cycle. The first
+        # cycle has none; its index -1 selects the last stamp of the run, so its span is empty.
         return np.maximum(due_ns, stamps[np.searchsorted(stamps, starts) - 1]), starts
 
 
 def _detect_quota(ends: np.ndarray, periods_ns: dict[str, int]) -> Quota | None:
-    """Return the quota that stalls point to, or None if their phases look random.
+    """Return the CPU quota that stalls suggest, or None if they do not end at the same phase.
 
     Args:
         ends: Times at which stalls ended. Lost cycles that overlap, on any core, are one stall,
-            which ends when the last of them runs again.
-        periods_ns: Period of each level.
+            which ends when the last of the tasks runs again.
+        periods_ns: Period of each level, by name.
     """
     if len(ends) < MIN_STALLS or (
         at_one_phase := _count_at_one_phase(ends, QUOTA_NS)
@@ -222,7 +240,10 @@ def _detect_quota(ends: np.ndarray, periods_ns: dict[str, int]) -> Quota | None:
 
 
 def _count_at_one_phase(ends: np.ndarray, period_ns: int) -> int:
-    """Return the largest number of times that fall within one window of a period."""
+    """Return the largest number of end times whose phases lie in one window of the period.
+
+    The width of the window is `WINDOW_PART` of the quota period.
+    """
     phases = np.sort(ends % period_ns)
     around = np.append(phases, phases + period_ns)
     following = np.searchsorted(around, phases + WINDOW_PART * QUOTA_NS, side="right")

@@ -2,13 +2,13 @@
 
 In real time each machine has its own CLOCK_MONOTONIC, and each rack its own grid on it. Racks that
 work together over a network record the offset of the other rack's clock (`rack.levels.peer`). These
-offsets lead from rack to rack to the first one. In lockstep all racks share one simulated time, and
-nothing has to be converted.
+offsets convert times from rack to rack until they are times of the first one. In lockstep all racks
+share one simulated time, and nothing has to be converted.
 
-Recordings of different launches share no time line, and are rejected. In real time, the mailbox of
-a peer and the peer's own recording must agree on the peer's simulated time, because tick 0 differs
-between launches. In lockstep, where every launch begins at 0, the messages that a rack imported
-must equal the messages of the sender.
+Recordings of different launches have no common time line, and are rejected. In real time, tick 0
+differs between launches, so the offset that a rack recorded and the peer's own recording must agree
+on the peer's simulated time. In lockstep, where every launch begins at 0, the messages that a rack
+imported must equal the messages of the sender.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ Rounding causes smaller differences; different launches differ by seconds.
 
 
 class RackGrid:
-    """The clock grid of a recorded rack: its simulated time on its machine's CLOCK_MONOTONIC.
+    """The clock grid of a recorded rack, which maps ticks to its machine's CLOCK_MONOTONIC.
 
     Attributes:
         recording: The recording.
-        rack: Name of the rack.
-        is_lockstep: True if it ran in lockstep.
-        clock_ns: Simulated time of a tick.
-        period_ns: Real time of a tick.
+        rack: Name under which the rack is shown.
+        is_lockstep: True if the rack ran in lockstep.
+        clock_ns: Simulated duration of a tick.
+        period_ns: Real duration of a tick.
         launch: Time of the launch.
-        epoch_ns: CLOCK_MONOTONIC of tick 0.
+        epoch_ns: Time of tick 0 on CLOCK_MONOTONIC.
         ticks: First and last recorded tick.
     """
 
@@ -63,19 +63,17 @@ class RackGrid:
             [rows["release_ns"] - rows["tick"] * self.period_ns for rows in cycles]
         )
         self.epoch_ns = int(np.median(releases))
-        """CLOCK_MONOTONIC of tick 0."""
         self.ticks = (
             min(int(rows["tick"].min()) for rows in cycles),
             max(int(rows["tick"].max()) for rows in cycles),
         )
-        """The first and the last one recorded."""
 
     def convert_ticks(self, ticks: Ints, within_ns: Ints | int = 0) -> Ints:
         """Convert ticks to CLOCK_MONOTONIC time stamps.
 
         Args:
             ticks: The ticks, shape (n,).
-            within_ns: Simulated time after each tick.
+            within_ns: Simulated time since each tick, which is added.
         """
         within: Ints = np.asarray(within_ns) * self.period_ns // self.clock_ns
         return self.epoch_ns + ticks * self.period_ns + within
@@ -92,7 +90,8 @@ class TimeShift:
 
     Attributes:
         at_ns: Time stamps of the first machine at which the offset was measured, shape (n,).
-        by_ns: Time by which the first machine is ahead of the second, shape (n,).
+        by_ns: Measured offset: time stamp of the first machine minus time stamp of the second,
+            shape (n,).
         uncertainty_ns: Largest error of the offset.
     """
 
@@ -102,18 +101,19 @@ class TimeShift:
 
     def convert_stamps(self, stamps_ns: Ints) -> Ints:
         """Convert time stamps of the first machine to the clock of the second machine."""
-        # Interpolate relative to the first value, because floats have only 53 bits.
+        # Interpolate differences from the first value. A float cannot represent a whole time stamp
+        # in ns exactly.
         first = self.by_ns[0]
         by_ns = np.interp(stamps_ns - self.at_ns[0], self.at_ns - self.at_ns[0], self.by_ns - first)
         return np.asarray(stamps_ns - first - np.rint(by_ns).astype(np.int64))
 
     def swap_machines(self) -> TimeShift:
-        """Return the offset with the two machines exchanged."""
+        """Return the offset for conversions in the other direction, with the machines exchanged."""
         return TimeShift(self.at_ns - self.by_ns, -self.by_ns, self.uncertainty_ns)
 
 
 class TimeLineNote(NamedTuple):
-    """A note for the user at a tick of the time line."""
+    """A note to the user, which is shown at a tick of the time line."""
 
     tick: int
     text: str
@@ -121,15 +121,16 @@ class TimeLineNote(NamedTuple):
 
 @dataclass(frozen=True)
 class RackPlace:
-    """The place of a recorded rack on the time line of another one.
+    """Conversion of a recorded rack's times to the time line, which is the first rack's time.
 
     Attributes:
         own: Grid of the rack.
-        line: Grid of the rack that gives the time line.
-        offsets: Clock offsets that lead from the rack to the line's. Empty if both share their
-            ticks, as in lockstep, or for the first rack itself.
+        line: Grid of the first rack.
+        offsets: Clock offsets that convert, one after the other, from the rack's machine to the
+            first rack's machine. Empty if both racks have the same ticks, as in lockstep, and for
+            the first rack itself.
         by_ticks: True if two runs of the same rack are aligned tick by tick.
-        marks: Notes for the user. Empty for the first rack.
+        marks: Notes to the user. Empty for the first rack.
     """
 
     own: RackGrid
@@ -140,12 +141,12 @@ class RackPlace:
 
     @property
     def uncertainty_ns(self) -> int:
-        """Largest error of its time stamps after conversion to the line's machine."""
+        """Largest error of the rack's time stamps after conversion to the first rack's machine."""
         return sum(shift.uncertainty_ns for shift in self.offsets)
 
     @property
     def note(self) -> str:
-        """Sentence that says where the rack begins on the time line."""
+        """Sentence that says at which time of the time line the rack begins, and how exactly."""
         text = f"rack '{self.own.rack}' is on the time line of '{self.line.rack}'"
         if self.own.is_lockstep:
             return f"{text}: both ran in lockstep, tick by tick"
@@ -158,17 +159,17 @@ class RackPlace:
         )
 
     def convert_stamps(self, stamps_ns: Ints) -> Ints:
-        """Convert time stamps of the rack's machine to the clock of the line's machine."""
+        """Convert time stamps of the rack's machine to the clock of the first rack's machine."""
         for shift in self.offsets:
             stamps_ns = shift.convert_stamps(stamps_ns)
         return stamps_ns
 
     def convert_ticks(self, ticks: Ints, within_ns: Ints | int) -> Ints:
-        """Convert ticks of the rack to simulated time of the line.
+        """Convert ticks of the rack to simulated time of the first rack.
 
         Args:
             ticks: The ticks, shape (n,).
-            within_ns: Simulated time of the rack after each tick.
+            within_ns: Simulated time of the rack since each tick, which is added.
         """
         if not self.offsets:
             return ticks * self.own.clock_ns + within_ns
@@ -177,7 +178,10 @@ class RackPlace:
         )
 
     def convert_to_wall_clock(self, stamps_ns: Ints) -> Ints:
-        """Convert time stamps to the line's wall clock, or to its own if it has no offsets."""
+        """Convert time stamps of the rack's machine to the wall clock of the first rack's machine.
+
+        Without offsets they are converted to the wall clock of the rack's own machine.
+        """
         launch = self.line.launch if self.offsets else self.own.launch
         return self.convert_stamps(stamps_ns) + launch.wall_offset_ns
 
@@ -186,7 +190,7 @@ def place_on_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
     """Place the racks of these recordings on the time line of the first one.
 
     Raises:
-        Failure: They did not run together, or no clock comparison connects them.
+        Failure: The racks did not run together, or no recorded comparison of clocks connects them.
     """
     grids = [RackGrid(recording) for recording in recordings]
     for index, grid in enumerate(grids):
@@ -217,10 +221,10 @@ def place_on_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
 def place_side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
     """Align two runs of the same rack tick by tick, for example a branch and its origin.
 
-    Each run gets the name of its folder.
+    Both runs are of a rack with the same name, so each is shown under the name of its folder.
 
     Raises:
-        Failure: They are not two runs of the same rack, or one lacks rows.
+        Failure: The recordings are not two runs of the same rack, or one of them lacks rows.
     """
     folders = [recording.folder.resolve() for recording in recordings]
     if len(recordings) != 2 or folders[0] == folders[1]:
@@ -268,9 +272,11 @@ def _check_compatible(grid: RackGrid, others: Sequence[RackGrid]) -> None:
 
 
 def _find_offsets(grid: RackGrid, other: RackGrid) -> tuple[TimeShift, ...] | None:
-    """Return the clock offset between two racks, or None if neither has met the other.
+    """Return the clock offsets that convert times of `grid` to times of `other`.
 
-    In lockstep no offset is needed, so the result is empty.
+    Returns:
+        One offset, or none for racks in lockstep, which share their ticks. None if neither rack
+        communicated with the other.
     """
     if grid.is_lockstep:
         have_met = [
@@ -287,7 +293,7 @@ def _find_offsets(grid: RackGrid, other: RackGrid) -> tuple[TimeShift, ...] | No
 
 
 def _find_peer_mailbox(observer: RackGrid, peer: RackGrid) -> str | None:
-    """Return the mailbox in which a rack recorded the presence of a peer, or None."""
+    """Return the mailbox in which `observer` recorded the presence of `peer`, or None."""
     boxes = observer.recording.layout.mailboxes
     names = (
         box.name
@@ -299,10 +305,13 @@ def _find_peer_mailbox(observer: RackGrid, peer: RackGrid) -> str | None:
 
 
 def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
-    """Return the offset of a peer's clock as recorded by a rack, or None if it never measured it.
+    """Return the offset of the peer's clock that `observer` measured and recorded.
+
+    Returns:
+        The offset, with the peer's machine as the first. None if `observer` never measured it.
 
     Raises:
-        Failure: The rack has met only other launches of the peer.
+        Failure: `observer` measured the clocks of other launches of the peer only.
     """
     if (mailbox := _find_peer_mailbox(observer, peer)) is None:
         return None
@@ -316,7 +325,7 @@ def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
     at_ns = observer.convert_ticks(ticks) + by_ns
     seen_ns = np.rint(ticks * observer.clock_ns + read(mailbox, "ahead")[is_measured] * 1e9)
     disagreement_ns = peer.convert_stamps(at_ns) - seen_ns
-    # A peer that had not started yet cannot be matched to a launch.
+    # A measurement before the peer's tick 0 cannot be assigned to a launch.
     is_this = (np.abs(disagreement_ns) <= TOLERANCE_NS) & (seen_ns > 0)
     if not is_this.any():
         began_s = float(disagreement_ns[-1]) * 1e-9 * peer.period_ns / peer.clock_ns
@@ -331,7 +340,7 @@ def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
     order = np.argsort(at_ns, kind="stable")
     at_ns = at_ns[order]
     by_ns = by_ns[order]
-    # The clocks may drift between two comparisons, before the first and after the last.
+    # The clocks may drift between two measurements, before the first and after the last.
     ends = peer.convert_ticks(np.array(peer.ticks))
     longest_gap_ns = int(np.diff(np.sort(np.concatenate((at_ns, ends)))).max())
     worst_ns = round(float(uncertainty[is_measured][is_this].max()) * 1e9)
@@ -339,10 +348,10 @@ def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
 
 
 def _has_met(observer: RackGrid, peer: RackGrid) -> bool:
-    """Return True if a rack in lockstep worked with another one.
+    """Return True if `observer`, in lockstep, communicated with `peer`.
 
     Raises:
-        Failure: It worked with a different launch of that rack.
+        Failure: It communicated with a different launch of the peer.
     """
     mailbox = _find_peer_mailbox(observer, peer)
     if (
@@ -360,7 +369,14 @@ def _has_met(observer: RackGrid, peer: RackGrid) -> bool:
 def _check_import(
     importer: RackGrid, import_mailbox: str, peer: RackGrid, source_mailbox: str
 ) -> None:
-    """Raise `Failure` if messages that a rack imported are not the messages that the peer wrote."""
+    """Raise `Failure` if imported messages differ from the messages that the peer wrote.
+
+    Args:
+        importer: The rack that imported them.
+        import_mailbox: Mailbox with the imported messages.
+        peer: The rack that wrote them.
+        source_mailbox: Mailbox of the peer from which they were exported.
+    """
     if (
         import_mailbox not in importer.recording.mailboxes
         or source_mailbox not in peer.recording.mailboxes
@@ -371,7 +387,8 @@ def _check_import(
     at_ns = sent["tick"] * peer.clock_ns
     content = [row.tobytes() for row in sent["message"]]
     for row in imported:
-        # The sender's tick is only known in ticks of the importer, which may be longer.
+        # The sender's tick is recorded only in ticks of the importer, which may be longer, so
+        # several messages of the sender are candidates.
         since_ns = int(row["basis"]) * importer.clock_ns
         first, end = np.searchsorted(at_ns, (since_ns, since_ns + importer.clock_ns))
         if first < end and row["message"].tobytes() not in content[first:end]:

@@ -1,1 +1,1 @@
-"""Report on a run, and its comparison with the timing model."""
+"""The report on a run, and the comparison of a run with the timing model."""

@@ -17,13 +17,20 @@ from rack.tools.report.cycle_again import Repetition, repeat_cycle
 from rack.tools.report.report import OtherRun
 
 MAX_SHOWN = 4
-"""Number of fields, attributes and so on that the text lists. The data contain all."""
+"""Largest number of fields or attributes that the text lists. report.json contains all."""
 INCONCLUSIVE_CLUES = ("config", "outside")
-"""Kinds of clues that do not rule out a difference in the level's state."""
+"""Kinds of clues after which a difference in the level's state or code is still possible."""
 
 
 def compare_runs(recording: Recording, other_run: OtherRun) -> Document:
-    """Compare a run with another one, and explain the difference.
+    """Compare a run with another one, and explain their first difference.
+
+    Args:
+        recording: The run.
+        other_run: The other run, and what is to be explained.
+
+    Returns:
+        The entry "against" of report.json.
 
     Raises:
         Failure: The runs cannot be compared.
@@ -59,15 +66,16 @@ def compare_runs(recording: Recording, other_run: OtherRun) -> Document:
 def _try_repetition(
     divergence: Divergence, last: DivergentCycle, is_wanted: bool
 ) -> Repetition | str:
-    """Repeat the cycle that diverged, if that can add anything to the clues.
+    """Repeat the cycle that diverged, if its cause is still unknown.
 
     Args:
-        divergence: The comparison.
+        divergence: The comparison of the two runs.
         last: The cycle at the end of the causal chain.
         is_wanted: Whether the user allows a repetition.
 
     Returns:
-        The result, or the reason why there is none. "" if the clues already exclude state and code.
+        The result of the repetition, or the reason why the cycle was not repeated. "" if the clues
+        already explain the difference, so that no repetition is needed.
     """
     if last.unequal or any(clue.kind not in INCONCLUSIVE_CLUES for clue in last.clues):
         return ""
@@ -81,7 +89,7 @@ def _try_repetition(
 
 
 def _format_cycle(cycle: DivergentCycle, other: str) -> Iterator[str]:
-    """Yield sentences about a cycle: the difference, its inputs, and possible causes."""
+    """Yield sentences about a cycle: what differs in its message, its inputs, possible causes."""
     yield (
         f"at tick {cycle.tick}: "
         f"{_join_clauses(_format_field(cycle, field, other) for field in cycle.fields)}"
@@ -104,7 +112,7 @@ def _format_cycle(cycle: DivergentCycle, other: str) -> Iterator[str]:
 
 
 def _format_field(cycle: DivergentCycle, field: ValueDifference, other_folder: str) -> str:
-    """Return a clause about a field that differs."""
+    """Return a clause that describes a differing field, or a message that one run lacks."""
     box = cycle.mailbox
     values = field.here, field.there
     match field.name, *values:
@@ -122,33 +130,39 @@ def _format_field(cycle: DivergentCycle, field: ValueDifference, other_folder: s
 
 
 def _format_difference(difference: ValueDifference, other_folder: str, absent: str = "-") -> str:
-    """Return a clause with both values of a field or setting."""
+    """Return a clause with both values of a field, setting or attribute.
+
+    Args:
+        difference: The two values.
+        other_folder: Folder of the other run.
+        absent: Text for a value that a run does not have.
+    """
     texts = [_format_value(value, absent) for value in (difference.here, difference.there)]
     if texts[0] == texts[1]:
-        # The numbers differ only in a digit that is not shown.
+        # The numbers differ only in digits that the short format does not show.
         texts = [repr(difference.here), repr(difference.there)]
     return f"{difference.name} is {texts[0]}, in {other_folder} {texts[1]}"
 
 
 def _format_value(value: object, absent: str) -> str:
-    """Format a value. None becomes the text `absent`."""
+    """Format a value for the text. None is shown as `absent`."""
     return absent if value is None else format_value(value) or '""'
 
 
 def _join_clauses(texts: Iterator[str]) -> str:
-    """Join clauses. Beyond `MAX_SHOWN` clauses, only the number of the others is given."""
+    """Join the first `MAX_SHOWN` clauses, and append the number of any further ones."""
     clauses = [*texts]
     more = [f"{len(clauses) - MAX_SHOWN} more"] if len(clauses) > MAX_SHOWN else []
     return "; ".join([*clauses[:MAX_SHOWN], *more])
 
 
 def _format_clue(clue: Clue) -> str:
-    """Return a sentence for a clue."""
+    """Return a sentence about a clue, with the run and tick in which it occurred, if any."""
     return f"in {clue.run} only, at tick {clue.tick}: {clue.text}" if clue.run else clue.text
 
 
 def _format_repetition(repetition: Repetition, cycle: DivergentCycle, other: str) -> Iterator[str]:
-    """Yield sentences about the result of a repetition."""
+    """Yield sentences about the result of repeating a cycle: attributes that differed, and why."""
     task = cycle.writer
     runs = " and ".join(repetition.runs)
     if repetition.attributes:

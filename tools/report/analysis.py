@@ -28,9 +28,12 @@ from rack.tools.recording.recording import Recording
 from rack.tools.timing.measured_response import measure_system_response
 
 MOST_CYCLES_PERCENTILE = 99.0
-"""Percentile for the question whether a level fails in most of its cycles."""
+"""Percentile of the second verdicts, which show what fails in more than 1 % of the cycles."""
 OBSERVED_EQUATIONS = ("3.2", "3.3", "3.7", RESPONSE_TIME, LOAD)
-"""Equations that a run shows directly. The others follow from the times of its levels."""
+"""Equations that are judged by times observed in the run.
+
+The other equations are computed from the measured processor times of the levels.
+"""
 
 
 @dataclass(frozen=True)
@@ -39,9 +42,9 @@ class EquationPair:
 
     Attributes:
         equation: Number or name of the equation.
-        subject: Level, task, core or chain of levels.
-        predicted: Verdict on the budgets, or None without a budget.
-        measured: Verdict on the run, or None if a run cannot show it.
+        subject: Level, task, core or chain of levels that the equation is about.
+        predicted: Verdict based on the budgets of the config, or None without a budget.
+        measured: Verdict based on the run, or None if it cannot be measured.
     """
 
     equation: str
@@ -51,10 +54,10 @@ class EquationPair:
 
     @property
     def is_contradicted(self) -> bool:
-        """True if the run contradicts the prediction."""
+        """True if the equation held in the run against the prediction, or failed against it."""
         if self.predicted is None or self.measured is None:
             return False
-        # The measured load of an overloaded core stays below 1.
+        # The measured load of an overloaded core stays below 1, so it contradicts nothing.
         is_full = self.equation == LOAD and not self.predicted.holds
         return self.predicted.holds != self.measured.holds and not is_full
 
@@ -68,18 +71,20 @@ class EquationPair:
 class Analysis:
     """Comparison of a run with the timing model.
 
-    The equations are judged at two percentiles, because a level that does not fit fails in most of
-    its cycles, while a machine that stalls now and then makes it fail in a few.
+    The equations are judged at two percentiles. A level whose times do not fit into its period
+    fails in most of its cycles, while occasional stalls of the machine make a level fail in a
+    few cycles.
 
     Attributes:
         recording: The run.
-        percentile: Percentage of the cycles that must fit.
+        percentile: Percentage of a level's cycles that must fulfil an equation.
         cycles: Measured cycles, by task.
-        loads: Used part of each core's time.
+        loads: Used fraction of each core's time, by core.
         predicted: Timing of the rack with the budgets of its config.
         measured: Timing of the rack with the measured budgets.
-        pairs: Verdicts at `percentile`.
-        mostly: Verdicts at `MOST_CYCLES_PERCENTILE`, or at `percentile` if that is lower.
+        pairs: Verdicts on all equations at `percentile`.
+        mostly: Verdicts on all equations at `MOST_CYCLES_PERCENTILE`, or at `percentile` if that is
+            lower.
     """
 
     recording: Recording
@@ -102,11 +107,11 @@ class Analysis:
 
         Args:
             recording: The run.
-            percentile: Percentage of the cycles that must fit.
-            progress: Called with the completed fraction.
+            percentile: Percentage of a level's cycles that must fulfil an equation.
+            progress: Called with the completed fraction, 0 to 1.
 
         Raises:
-            Failure: The recording has no cycles.
+            Failure: The recording contains no cycles.
         """
         config = recording.rack_config
         layout = recording.layout
@@ -155,7 +160,7 @@ class Analysis:
 def _pair_verdicts(
     predicted: Sequence[EquationVerdict], measured: Sequence[EquationVerdict]
 ) -> list[EquationPair]:
-    """Pair the verdicts on each equation and subject, in the order of the equations."""
+    """Pair predicted and measured verdicts on the same equation and subject, sorted by equation."""
     sides = [
         {_build_pair_key(verdict): verdict for verdict in side} for side in (predicted, measured)
     ]
@@ -167,9 +172,9 @@ def _pair_verdicts(
 
 
 def _build_pair_key(verdict: EquationVerdict) -> tuple[str, str, str]:
-    """Return the key by which predicted and measured verdicts are paired."""
-    # The response is judged in two directions, and eq. 3.7 differs between a config and a run, so
-    # the meaning must match as well.
+    """Return a key that is equal for predicted and measured verdicts that belong together."""
+    # Equations 3.2 and 3.3 are judged in two directions, and eq. 3.7 means something else for a
+    # config than for a run. For these, the meanings must be equal as well.
     meaning = verdict.meaning if verdict.equation in ("3.2", "3.3", "3.7") else ""
     return verdict.equation, verdict.subject, meaning
 
@@ -177,13 +182,18 @@ def _build_pair_key(verdict: EquationVerdict) -> tuple[str, str, str]:
 def _judge_response(
     response: Mapping[str, Any] | None, rack: RackTiming
 ) -> Iterator[EquationVerdict]:
-    """Yield eqs. 3.2 and 3.3 for the longest response of the run, in both directions.
+    """Yield verdicts on eqs. 3.2 and 3.3 for the longest measured response in each direction.
 
-    The bound of eq. 3.3 is the sum of the cycles and of the waits for the grid.
+    Each chain of levels is judged downward (command) and upward (status). The bound of eq. 3.3 is
+    the sum of the levels' cycles and of the waits for the next cycle of each level.
+
+    Args:
+        response: Result of `measure_system_response`. None yields nothing.
+        rack: Timing of the rack.
     """
     if response is None:
         return
-    # The response is in simulated time.
+    # The response is measured in simulated time, but verdicts are in wall-clock time.
     wall_ns = 1e6 * rack.tick_ns / rack.clock_ns
     for chain, direction in product((response, *response["others"]), ("command", "status")):
         if (times := chain[direction]["measured_ms"]) is None:
@@ -204,19 +214,23 @@ def _judge_response(
 def _judge_tasks(
     cycles_by_task: Mapping[str, Cycles], rack: RackTiming, percentile: float
 ) -> Iterator[EquationVerdict]:
-    """Yield eq. 3.7 for executors, and in real time the response time of every task."""
+    """Yield verdicts on eq. 3.7 for executors, and on the response times of all tasks.
+
+    Response times are judged for runs in real time only.
+    """
     for name, cycles in cycles_by_task.items():
         rows = cycles.rows
         if cycles.task.role == "executor":
             every_ns = compute_cycle_ns(rack, cycles.task)
-            # Use the traced number of skipped releases, because a restart or a row lost by the
-            # recorder is not a skipped release.
+            # Use the number of skipped releases in the trace, not gaps between rows: a restart or a
+            # row lost by the recorder also causes a gap, but is not a skipped release.
             steps_ns = (1 + trace_times.count_skipped(rows)) * every_ns
             step_ns = compute_percentile(steps_ns[cycles.is_judged], percentile)
             yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
             deadline_ns = compute_slice_ns(rack, cycles.task)
-            # A cycle that the trace marks as missed has missed its deadline, whenever it ended.
+            # A cycle marked as missed in the trace counts as beyond its deadline, even if its
+            # measured response is shorter.
             least_ns = np.where(trace_times.find_missed(rows), deadline_ns + 1, 0)
             response_ns = np.maximum(trace_times.compute_response_ns(rows), least_ns)
             worst_ns = compute_percentile(response_ns[cycles.is_judged], percentile)
@@ -227,18 +241,18 @@ def _judge_tasks(
 def compute_core_loads(
     recording: Recording, cycles_by_task: Mapping[str, Cycles], rack: RackTiming
 ) -> dict[int, float]:
-    """Return the part of each core's time that its tasks used, without the clock board.
+    """Return the fraction of each core's time that its tasks used, without the clock board.
 
-    An executor counts at all of its releases, including skipped ones, so the load of an overloaded
-    core exceeds 1.
+    An executor is counted as if it ran at every release, including skipped ones, so the load of an
+    overloaded core exceeds 1.
 
     Args:
         recording: The run.
-        cycles_by_task: Its measured cycles.
+        cycles_by_task: Measured cycles of the run.
         rack: Timing of the rack.
 
     Returns:
-        Loads by core. 1 is a fully used core.
+        Loads by core. 1 means that the core was always busy.
     """
     first = min(int(rows["tick"][0]) for rows in recording.cycles.values())
     last = max(int(rows["tick"][-1]) for rows in recording.cycles.values())
@@ -254,10 +268,10 @@ def compute_core_loads(
 
 
 def compute_cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
-    """Return R_i of a task's level, the time between two of its cycles."""
+    """Return R_i, the time between two cycles of a task's level, in wall-clock ns."""
     return rack.boards[task.board].every * rack.tick_ns
 
 
 def compute_slice_ns(rack: RackTiming, task: TaskSpec) -> int:
-    """Return the time available to a cycle of a task. For a planner it is the time slice, d R_i."""
+    """Return the time slice of a task in wall-clock ns: R_i of an executor, d R_i of a planner."""
     return task.slice * rack.tick_ns

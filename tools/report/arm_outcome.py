@@ -1,4 +1,4 @@
-"""Outcome of the task, its objects, and the arm or hand, as data of a report and as its text."""
+"""Outcome of the task, its objects, and the arm or hand, as data and as text of a report."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ FORCE_STATUS = "force_status"
 A report must not import levels that only other racks have.
 """
 FALLING_M_S = 0.05
-"""Speed above which an object is falling. Slipping grips and lowering fingers are slower."""
+"""Speed above which an object counts as falling. It slips or is lowered more slowly."""
 BOUNCE_SAMPLES = 2
-"""Number of samples that may separate two parts of the same fall."""
+"""Largest number of samples between two parts of the same fall."""
 SETTLE_SAMPLES = 20
-"""Number of samples after a fall until the object rests.
+"""Number of samples after a fall until the object has come to rest.
 
-At first it sinks into the surface on which it landed, or bounces.
+Before that it may bounce, or sink into the surface on which it landed.
 """
 MIN_FALL_M = 0.005
 """Smallest fall that is reported.
 
-Tasks let go up to 2 mm above the support, and opening pads can take an object along.
+Tasks release objects up to 2 mm above the support, and opening pads can drag an object along.
 """
 
 
@@ -43,7 +43,7 @@ Signals = Callable[[str], np.ndarray]
 
 
 def summarize_task(recording: Recording) -> Document | None:
-    """Return the last status of the level that reports on the whole task, or None."""
+    """Return the last `TaskStatus` of the run, or None if no level reports on the whole task."""
     status = find_signals(recording, TaskStatus.message_type.name)
     if status is None:
         return None
@@ -56,23 +56,27 @@ def summarize_task(recording: Recording) -> Document | None:
 
 
 def summarize_objects(recording: Recording, config: RackConfig) -> Iterator[Document]:
-    """Yield, for each object with a goal, its final position and its falls."""
+    """Yield the final distance from its goal, and the falls, of each object that has a goal."""
     for end in recording.end_counts.get("outcome", {}).get("objects", ()):
         row = config.scene.objects.index(end["object"])
         yield {**end, "drops": list(_find_drops(recording, row))}
 
 
 def _find_drops(recording: Recording, row: int) -> Iterator[Document]:
-    """Yield the falls of an object: tick and height, mm.
+    """Yield the tick and the height in mm of each fall of an object.
 
     An object falls while it moves down quickly and its distance from the tool changes.
+
+    Args:
+        recording: The run.
+        row: Index of the object in the messages of the scene.
     """
     scene = find_signals(recording, Scene.message_type.name)
     if scene is None:
         return
     ticks = scene("tick")
     position = scene("position")[:, row]
-    # An object that moves and turns with the tool keeps its distance from the tool.
+    # The distance from the tool does not change while the tool carries the object.
     distance = np.linalg.norm(position - scene("tool_position"), axis=1)
     height = position[:, 2]
     threshold_m = FALLING_M_S * recording.layout.clock_ns * 1e-9 * np.diff(ticks)
@@ -85,10 +89,11 @@ def _find_drops(recording: Recording, row: int) -> Iterator[Document]:
 
 
 def summarize_motion(recording: Recording) -> Document | None:
-    """Return the tracking error, mrad, and the counts of an arm, or None without an arm.
+    """Return the tracking error of an arm in mrad, and its counts.
 
-    The error is None if no status contains it. The counts are touches, exceeded limits, and refused
-    or cut commands.
+    Returns:
+        RMS and peak error, which are None if no status contains the error, and the numbers of
+        touches, exceeded limits, and refused or clipped commands. None without an arm.
     """
     status = find_signals(recording, *DRIVING)
     counts = _read_counts(recording, status)
@@ -102,10 +107,17 @@ def summarize_motion(recording: Recording) -> Document | None:
 
 
 def _read_counts(recording: Recording, status: Signals | None) -> Document:
-    """Return the final counts of an arm or hand, or {} without one.
+    """Return the final counts of touches, exceeded limits and clipped commands.
 
-    They come from the arm's state and from the status of the board that drives it, which counts
-    commands that it cut itself. The larger count is returned.
+    These counts are in the state of the arm, and in the status of the board that drives the arm.
+    The board also counts commands that it clipped itself, so the larger count is returned.
+
+    Args:
+        recording: The run.
+        status: Status of the board that drives the arm or hand, or None.
+
+    Returns:
+        The counts, or {} without an arm or hand.
     """
     state = find_signals(recording, ArmState.message_type.name)
     if not (sources := [source for source in (status, state) if source is not None]):
@@ -120,19 +132,20 @@ def _read_counts(recording: Recording, status: Signals | None) -> Document:
 
 
 def _compute_rms_and_peak(error: np.ndarray) -> tuple[float, float]:
-    """Return the root mean square and the largest magnitude of an error."""
+    """Return the root mean square and the peak magnitude of an error."""
     return round_figure(np.sqrt(np.mean(error**2))), round_figure(np.abs(error).max())
 
 
 def round_figure(value: float) -> float:
-    """Round a number to the precision of reports."""
+    """Round a number to the precision of reports, six decimal places."""
     return round(float(value), 6)
 
 
 def summarize_hand(recording: Recording, config: RackConfig) -> Document | None:
-    """Return the results of a hand, or None without one.
+    """Return tensions, tension errors and fingertip forces of a hand, all in N, and its counts.
 
-    They are tensions and their errors, N, the largest force of each finger, N, and counts.
+    Returns:
+        The results, or None without a hand.
     """
     status = find_signals(recording, HAND_STATUS)
     if status is None or config.robot is None or config.robot.hand is None:
@@ -153,9 +166,10 @@ def summarize_hand(recording: Recording, config: RackConfig) -> Document | None:
 
 
 def summarize_force(recording: Recording) -> Document | None:
-    """Return the largest force, N, and torque, N m, at the wrist, and the force error, N.
+    """Return the largest contact force and torque at the wrist, and the force error.
 
-    None without a wrist sensor.
+    Returns:
+        Forces in N and torques in N m. None without a wrist sensor.
     """
     wrench = find_signals(recording, WRENCH)
     status = find_signals(recording, FORCE_STATUS)
@@ -165,7 +179,8 @@ def summarize_force(recording: Recording) -> Document | None:
     most_n, most_nm = np.linalg.norm(force_and_torque, axis=2).max(axis=0)
     error = np.zeros(0)
     if status is not None:
-        # The tool exerts the opposite of the wrench that it feels.
+        # The sensed wrench is opposite to the wrench that the tool exerts, so their sum is the
+        # error.
         surplus = status("wanted") + status("wrench")
         error = surplus[:, :3][status("selected")[:, :3] == 1]
     return {
@@ -177,9 +192,11 @@ def summarize_force(recording: Recording) -> Document | None:
 
 
 def find_signals(recording: Recording, *messages: str) -> Signals | None:
-    """Return the signals of the first mailbox that carries one of these message types.
+    """Return access to the first mailbox that carries one of these message types.
 
-    None if there is no such mailbox, or if it is empty.
+    Returns:
+        A function that returns a field of all messages, by name. None if there is no such mailbox,
+        or if no message was recorded.
     """
     name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
     return partial(recording.read_signal, name) if name in recording.mailboxes else None

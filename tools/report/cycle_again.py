@@ -1,9 +1,10 @@
 """Repeats a cycle of two recorded runs, to find out why its message differed.
 
-The inputs of the cycle were equal in both runs, see `rack.tools.recording.causes`. If a run does
-not repeat its own message, the level's code has changed since. If it does not even repeat itself,
-the level depends on something besides messages, ticks and parameters. If both runs repeat their
-messages, the state or the parameters of the level differed.
+The inputs of the cycle were equal in both runs, see `rack.tools.recording.causes`. The cycle is
+repeated several times in each run, with three possible results. If all repetitions write the
+recorded message, the state or the parameters of the level differed between the runs. If they write
+another message, but always the same, the level's code has changed since the run. If they write
+different messages, the level depends on something besides messages, ticks and parameters.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from rack.tools.recording.causes import Divergence, DivergentCycle, ValueDiffere
 from rack.tools.recording.recording import Recording
 
 REPETITIONS = 2
-"""Number of times that a cycle is repeated."""
+"""Number of times that a cycle is repeated in each run."""
 Because = Literal["state", "code", "chance"]
 
 
@@ -30,12 +31,13 @@ class Repetition:
     """Result of repeating a cycle in two runs.
 
     Attributes:
-        attributes: Attributes of the level that differed before the cycle.
-        because: "state" (or parameters) if each run repeats its own message, "code" if the level's
-            code has changed since one of them, "chance" if the level does not repeat itself.
-        runs: Runs that do not repeat their own message.
-        strays: Mailboxes of other levels that differ from the recording, by run. If there are any,
-            the result is uncertain.
+        attributes: Attributes of the level that differed between the runs before the cycle.
+        because: Cause of the difference: "state" if both runs repeated their recorded messages, so
+            that the state or the parameters differed; "code" if the level's code has changed since
+            one of the runs; "chance" if repetitions of the same run differed.
+        runs: Folders of the runs that did not repeat their recorded message.
+        strays: Mailboxes of other levels that differed from the recording, by run. If there are
+            any, the result is uncertain.
     """
 
     attributes: tuple[ValueDifference, ...]
@@ -49,8 +51,8 @@ class _RepeatedCycle(NamedTuple):
 
     Attributes:
         attributes: Attributes of the level before the cycle.
-        unlike: Mailboxes that differ from the recording.
-        is_equal: True if every repetition wrote the same.
+        unlike: Mailboxes whose messages differ from the recording.
+        is_equal: True if all repetitions wrote the same message.
     """
 
     attributes: Mapping[str, Any]
@@ -95,13 +97,19 @@ def repeat_cycle(divergence: Divergence, cycle: DivergentCycle) -> Repetition:
 
 
 def _repeat_in_run(run: Recording, cycle: DivergentCycle, until: int) -> _RepeatedCycle:
-    """Repeat a cycle of a run up to tick `until`, at which its message is visible."""
+    """Repeat a cycle of one run `REPETITIONS` times.
+
+    Args:
+        run: The run.
+        cycle: The cycle.
+        until: Tick up to which the rack is run, after the message of the cycle has become visible.
+    """
     with RepeatedRun(run, f"{run.folder} at tick {cycle.tick}", anyway=True) as again:
         attributes = again.read_levels(cycle.tick)[cycle.writer]
         repetitions = []
         for _ in range(REPETITIONS):
             with again.run_rack_to(until) as rack:
-                # Serial and chain of the message that it wrote.
+                # Serial and chain identify the message that the cycle wrote.
                 wrote = find_chains(rack.segment, until)[cycle.mailbox]
                 repetitions.append(
                     (wrote, tuple(list_differing_mailboxes(run, rack.segment, until)))

@@ -41,12 +41,15 @@ from rack.tools.report.task_times import compute_task_times
 from rack.tools.timing.measured_response import measure_system_response
 
 COMPARISON = "rack.tools.report.against"
-"""Module that compares two runs, by name, since it needs code that reports on one run do not."""
+"""Module that compares two runs.
+
+It is given by name, because it imports code that a report on one run does not need.
+"""
 
 
 @dataclass(frozen=True)
 class OtherRun:
-    """The run with which a report compares its own.
+    """Another run with which the report on a run compares that run.
 
     Attributes:
         folder: Folder of the other run.
@@ -64,7 +67,7 @@ def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Documen
 
     Args:
         folder: Folder of the run.
-        against: A run to compare with. The report then says where and why the two diverge.
+        against: A run to compare with. The report then says where and why the two runs diverge.
 
     Returns:
         The report as data and as text.
@@ -93,7 +96,7 @@ def build_report(recording: Recording) -> Document:
     response = measure_system_response(recording)
     report = _build_head(config, ended, last_tick + 1, response)
     if not ended:
-        # The end of the run is not recorded, so count the misses in the trace.
+        # Without the counts at the end of the run, count the misses in the trace.
         missed, skipped = count_misses(missed_cycles)
         report = replace(report, missed=missed, skipped=skipped)
     return replace(
@@ -128,9 +131,13 @@ def build_report(recording: Recording) -> Document:
 
 
 def build_unrecorded_report(config: RackConfig, ended: Mapping[str, Any]) -> Document:
-    """Return the report of a run without a recording.
+    """Return the report of a run that was not recorded.
 
-    It has the same keys, but null for everything that needs a recording.
+    It has the same keys as other reports. The values of keys that need a recording are null.
+
+    Args:
+        config: Config of the run.
+        ended: Counts at the end of the run.
     """
     layout = resolve_layout(config)
     head = _build_head(config, ended, 0, None)
@@ -152,8 +159,8 @@ def _build_head(
 
     Args:
         config: Config of the run.
-        ended: Counts at the end of the run. Empty if the end is not known.
-        ticks: Length of a run whose end is not known.
+        ended: Counts at the end of the run. Empty if the end was not recorded.
+        ticks: Length of the run in ticks, which is used if the end was not recorded.
         response: Measured response of the system, or None.
     """
     outcome = ended.get("outcome", {})
@@ -176,7 +183,7 @@ def _build_head(
 
 
 def _build_task_entry(recording: Recording, config: RackConfig, task: TaskSpec) -> Document:
-    """Return the entry of a task: its place in the rack, counts and times."""
+    """Return the entry of a task in the report: role, slot, rate, counts and times."""
     is_lockstep = config.clock.mode == "lockstep"
     layout = recording.layout
     cycles = recording.read_trace(task.name)
@@ -193,9 +200,9 @@ def _build_task_entry(recording: Recording, config: RackConfig, task: TaskSpec) 
 
 
 def compute_plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
-    """Return the age of the plan that each cycle of an executor could read, in simulated time.
+    """Return the ages in ms of simulated time of the plans that an executor could read.
 
-    See `plan_ages`.
+    One age per cycle for which `compute_plan_ages` finds a visible plan, shape (n,).
     """
     plan = f"{board}.plan"
     plan_ticks = recording.read_signal(plan, "tick")
@@ -215,12 +222,12 @@ def compute_plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
 
 
 def _describe_task(task: TaskSpec, layout: Layout) -> Document:
-    """Return role, slot and rate of a task."""
+    """Return role, slot and rate of a task for its entry in the report."""
     return {"role": task.role, "slot": task.slot, "rate_hz": 1e9 / (task.every * layout.clock_ns)}
 
 
 def _summarize_entries(recording: Recording) -> list[Document]:
-    """Return the entries of all bus adapters: their final counts and the ages of messages, ms."""
+    """Return counts and message ages (in ms) of every entry that a bus adapter passes on."""
     entries = []
     tick_ms = recording.layout.clock_ns * 1e-6
     for mailbox, entry, source in list_entries(recording.layout, recording.config):
@@ -237,9 +244,11 @@ def _summarize_entries(recording: Recording) -> list[Document]:
 
 
 def summarize_network(recording: Recording) -> Document | None:
-    """Return the traffic with other racks, with ages in ms, and the losses of these racks.
+    """Return the traffic with other racks, and how often these racks were lost.
 
-    None if the rack has no network adapter, or nothing of it was recorded.
+    Returns:
+        Imports with counts and ages in ms, exports with counts, and the states of the other racks.
+        None if the rack has no network adapter, or if none of its messages were recorded.
     """
     exchange = read_entries(recording.config)
     if exchange is None or STATUS not in recording.mailboxes:
@@ -250,7 +259,8 @@ def summarize_network(recording: Recording) -> Document | None:
         counts = {
             name: _read_last_count(recording, STATUS, f"import_{port}.{name}") for name in COUNTS
         }
-        # The age at every cycle of the adapter. It grows until the next message comes.
+        # The age is recorded in every cycle of the adapter, and grows until the next message
+        # arrives.
         ages = compute_distribution(ages_s[ages_s >= 0.0] * 1e3)
         imports.append({"entry": f"{ADAPTER}.{port}", "source": source, **counts, "age_ms": ages})
     exports = [
@@ -266,7 +276,7 @@ def summarize_network(recording: Recording) -> Document | None:
 
 
 def _summarize_peer(recording: Recording, rack: str) -> Document:
-    """Return the final state of another rack, and how often and how long it was lost."""
+    """Return the final state of another rack, and how often and how long contact to it was lost."""
     mailbox = f"{ADAPTER}.{format_peer_port(rack)}"
     presence = recording.read_signal(mailbox, "presence")
     cycle_s = recording.layout.find_task(ADAPTER).every * recording.layout.clock_ns * 1e-9
@@ -280,5 +290,5 @@ def _summarize_peer(recording: Recording, rack: str) -> Document:
 
 
 def _read_last_count(recording: Recording, mailbox: str, count: str) -> int:
-    """Return a count in the last message of a mailbox."""
+    """Return a count from the last recorded message of a mailbox."""
     return int(recording.read_signal(mailbox, count)[-1])

@@ -1,4 +1,4 @@
-"""A report as text: report.md with all columns, and a terminal with the columns that fit."""
+"""Formats a report as text: report.md with all columns, or for a terminal those that fit."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from rack.tools.report.run_report import RunReport
 from rack.tools.report.task_times import format_times
 
 MAX_SHOWN_ROWS = 10
-"""Number of misses, holds and long responses in the text. report.json contains all."""
+"""Largest number of misses, holds or long responses in the text. report.json contains all."""
 VERDICT_WORDS = {True: "ok", False: "beyond", None: "-"}
 CHANGED_RATIO = 1.05
-"""Ratio of a core's highest to its lowest frequency above which the text mentions it."""
+"""Ratio of a core's highest to its lowest frequency above which the text mentions the core."""
 
 
 def format_markdown(report: Document) -> str:
@@ -36,14 +36,14 @@ def format_markdown(report: Document) -> str:
 
 
 def format_for_terminal(report: Document) -> Blocks:
-    """Yield a report for a terminal, with the names of the files that contain the rest."""
+    """Yield a report for a terminal, and the names of the files that contain all data."""
     yield from format_report(report)
     yield ""
     yield f"all columns: {report['folder']}/report.md; all data: report.json"
 
 
 def format_summary(document: Document) -> Iterator[str]:
-    """Yield the verdict and the figures that are known even without a recording."""
+    """Yield the verdict, and the numbers that are known even for a run without a recording."""
     report = RunReport.from_document(document)
     yield f"# {format_headline(report.rack, report.outcome, report.failures)}"
     yield ""
@@ -58,7 +58,7 @@ def format_summary(document: Document) -> Iterator[str]:
 
 
 def format_report(document: Document) -> Blocks:
-    """Yield a report as text for people."""
+    """Yield a report as human-readable text and tables."""
     report = RunReport.from_document(document)
     yield from format_summary(document)
     yield from _format_notes(report)
@@ -101,12 +101,20 @@ def _format_notes(report: RunReport) -> Iterator[str]:
 
 
 def _format_selection(rows: Sequence[Any], which: str) -> str:
-    """Return the part of a heading that says which rows are shown, or "" if all are."""
+    """Return the end of a heading that says which rows of a long table are shown.
+
+    Args:
+        rows: All rows.
+        which: Adjective for the rows that are shown, for example "longest".
+
+    Returns:
+        The text, or "" if all rows are shown.
+    """
     return f"; the {which} {MAX_SHOWN_ROWS}" if len(rows) > MAX_SHOWN_ROWS else ""
 
 
 def _format_holds(rack: str, holds: Sequence[Document]) -> Blocks:
-    """Yield the section with the longest holds, and commands that release an operator's holds."""
+    """Yield the section with the longest holds, and commands to release holds by an operator."""
     yield from ("", f"## Holds: {len(holds)}{_format_selection(holds, 'longest')}", "")
     rows = [
         {
@@ -132,7 +140,7 @@ def _format_holds(rack: str, holds: Sequence[Document]) -> Blocks:
 
 
 def _build_state_tables(levels: dict[str, list[Document]]) -> TextTable:
-    """Return a table with one line per level: its state table, and which rows fired."""
+    """Return a table with one line per level: its state table, most frequent and newest row."""
     rows = []
     for level, fired in levels.items():
         most_frequent = max(fired, key=lambda row: row["cycles"])
@@ -154,7 +162,7 @@ def _build_state_tables(levels: dict[str, list[Document]]) -> TextTable:
 
 
 def _format_machine(report: RunReport) -> Iterator[str]:
-    """Yield notes on absences of cores, with their causes if known, and on changed frequencies."""
+    """Yield notes on absences of cores, with their causes if known, and on changes of frequency."""
     steal = report.steal
     stalls = report.stalls
     frequency = report.frequency_mhz or {}
@@ -183,7 +191,7 @@ def _format_machine(report: RunReport) -> Iterator[str]:
 
 
 def _format_comparison(against: Document) -> Iterator[str]:
-    """Yield the comparison with another run."""
+    """Yield where and why the run diverges from another run."""
     difference = against["first_difference"]
     if difference is None:
         yield f"- no message differs from {against['folder']}"
@@ -198,7 +206,7 @@ def _format_comparison(against: Document) -> Iterator[str]:
 
 
 def _format_faults(report: RunReport) -> Blocks:
-    """Yield the sections with faults, restarts and unexplained detections."""
+    """Yield the sections on injected faults, restarts, and detections without a fault."""
     if faults := report.faults:
         yield from ("", f"## Faults: {len(faults)}", "")
         yield TextTable([_build_fault_row(fault) for fault in faults])
@@ -234,7 +242,7 @@ def _build_fault_row(fault: Document) -> dict[str, Cell]:
 
 
 def _format_misses(report: RunReport) -> Blocks:
-    """Yield the section with the first missed cycles, and why some may not be listed."""
+    """Yield the section with the first missed cycles, and the reason if some are not recorded."""
     misses = report.misses
     late, skipped = count_misses(misses)
     which = f"{late} and {skipped}{_format_selection(misses, 'first')}"
@@ -259,7 +267,7 @@ def _format_misses(report: RunReport) -> Blocks:
 
 
 def _format_response(response: Document) -> Blocks:
-    """Yield the response along one chain of levels, with the responses that exceeded the bound."""
+    """Yield the system response along a chain of levels, and the responses beyond the bound."""
     yield ""
     bounds = (
         f"eq. 3.2 bound {response['bound_eq_3_2_ms']:g}, eq. 3.3 sum {response['sum_eq_3_3_ms']:g}"
@@ -298,7 +306,7 @@ def _format_response(response: Document) -> Blocks:
 
 
 def _format_queues(queues: Sequence[Document]) -> Iterator[str]:
-    """Yield a sentence about each queue."""
+    """Yield a sentence about the messages of each queue."""
     for queue in queues:
         refused = f", {queue['refused']} refused" if queue["refused"] else ""
         yield (
@@ -308,7 +316,7 @@ def _format_queues(queues: Sequence[Document]) -> Iterator[str]:
 
 
 def _format_interrupts(boards: Sequence[Document]) -> Iterator[str]:
-    """Yield a sentence about the interrupts of each board."""
+    """Yield a sentence about the interrupts of each board: number and latency."""
     for board in boards:
         lost = f", {board['lost']} lost" if board["lost"] else ""
         latency = board["latency_us"]
@@ -325,7 +333,12 @@ def _format_interrupts(boards: Sequence[Document]) -> Iterator[str]:
 
 
 def _build_traffic_table(rows: Sequence[Document], dropped: Sequence[str]) -> TextTable:
-    """Return a table of the messages that passed an adapter, and of their ages."""
+    """Return a table of the messages that passed an adapter, with their ages.
+
+    Args:
+        rows: Counts and age distribution of each mailbox.
+        dropped: Columns that a narrow terminal leaves out, in that order.
+    """
     cells = [
         {
             **{name: count for name, count in row.items() if name != "age_ms"},
@@ -337,7 +350,7 @@ def _build_traffic_table(rows: Sequence[Document], dropped: Sequence[str]) -> Te
 
 
 def _format_network(network: Document | None) -> Blocks:
-    """Yield the section with the traffic to other racks, and the losses of these racks."""
+    """Yield the section on traffic with other racks, and how often these were lost."""
     if network is None:
         return
     yield from ("", "## Network, ages in ms of simulated time", "")

@@ -12,14 +12,15 @@ from rack.tools.console.answer import Document
 class RunReport:
     """The report of a run: how it ended, the times of its tasks, and what happened in it.
 
-    A field is None if only a recording could tell, or if the rack has nothing of the kind.
+    The attributes are the keys of report.json. A value is None if it needs a recording and the run
+    was not recorded, or if it does not apply to the rack.
 
     Attributes:
-        worked: The verdict.
-        failures: Reasons of the verdict.
-        unjudged: Aspects that the verdict leaves out.
+        worked: The verdict: True if the run succeeded.
+        failures: Reasons of a negative verdict.
+        unjudged: Aspects that the verdict does not cover.
         tasks: Times by task, from `compute_task_times`.
-        system_response: Result of `measured_response`.
+        system_response: Result of `measure_system_response`.
         against: Comparison with another run.
     """
 
@@ -71,10 +72,10 @@ class RunReport:
 
     @classmethod
     def from_document(cls, document: Document) -> RunReport:
-        """Return a report from its plain data. Missing keys become None."""
+        """Build a report from the content of report.json. Missing keys become None."""
         values: Document = {field.name: document.get(field.name) for field in fields(cls)}
         return cls(**values)
 
     def to_document(self) -> Document:
-        """Return the report as plain data."""
+        """Return the report as plain data, the content of report.json."""
         return dict(vars(self))

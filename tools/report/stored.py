@@ -1,6 +1,6 @@
-"""The report of `rack report` and `rack run`, which is reused while it is up to date.
+"""Loads the stored report of a run, or builds it again if it is out of date.
 
-A stored report is up to date if it is newer than the recording and this program.
+A stored report is up to date if it is newer than the recording and than this program.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ PROGRAM_PACKAGES = ("backplane", "levels", "boards", "tools")
 def read_stored_report(folder: Path) -> tuple[Document, str] | None:
     """Return the stored report of a run as data and as text.
 
-    None if the report must be made again, for example because the recording was damaged since.
+    Returns:
+        The report, or None if it must be built again: it is missing, out of date or damaged, or it
+        contains a comparison with another run.
     """
     try:
         checksums = Checksums(folder)
@@ -40,16 +42,19 @@ def read_stored_report(folder: Path) -> tuple[Document, str] | None:
     except (OSError, ValueError, Failure):
         return None
     if not isinstance(data, dict) or data.get("against") or data.get("folder") != str(folder):
-        # The report contains a comparison with another run, or the folder has been moved.
+        # The report contains a comparison with another run, or the folder of the run has moved.
         return None
     return data, text
 
 
 def load_report(folder: Path) -> tuple[Document, str]:
-    """Return the stored report of a run, or a new one if that is missing or out of date."""
+    """Return the report of a run as data and as text.
+
+    A stored report that is up to date is reused. Otherwise the report is built and stored.
+    """
     report = read_stored_report(folder)
     if report is None:
-        # This import takes long.
+        # This import is slow, so it is done only if needed.
         from rack.tools.report.report import write_report
 
         report = write_report(folder)
@@ -57,18 +62,20 @@ def load_report(folder: Path) -> tuple[Document, str]:
 
 
 def show_report(run: str | Path, as_json: bool) -> None:
-    """Print the report of a run."""
+    """Print the report of a run, as JSON or as text. Builds it if necessary."""
     print_report(*load_report(Path(run)), as_json)
 
 
 def print_report(data: Document, text: str, as_json: bool) -> None:
-    """Print a report.
+    """Print a report as JSON or as text.
+
+    If the output is a terminal and the run was recorded, tables are limited to the columns that
+    fit. Otherwise `text` is printed.
 
     Args:
         data: The report as data.
         text: The report as text.
-        as_json: Whether to print `data` as one JSON document. Otherwise a terminal gets the columns
-            that fit, and any other output gets `text`, as does a run without a recording.
+        as_json: Whether to print `data` as one JSON document.
     """
     if as_json:
         print_json(data)

@@ -20,9 +20,9 @@ _Side = LevelTiming | EquationVerdict | None
 
 
 def build_document(analysis: Analysis) -> Document:
-    """Return an analysis as plain data. Infinite numbers are null.
+    """Return an analysis as plain data, the content of analysis.json.
 
-    Restarts and the response of the system are in report.json.
+    Infinite numbers become null. Restarts and the system response are in report.json only.
     """
     recording = analysis.recording
     config = recording.rack_config
@@ -72,7 +72,7 @@ def build_document(analysis: Analysis) -> Document:
 
 
 def _build_sides(predicted: _Side, measured: _Side) -> Document:
-    """Return the predicted and the measured side as plain data."""
+    """Return predicted and measured timing or verdict side by side as plain data."""
     sides = {"predicted": predicted, "measured": measured}
     return {
         side: None if side_timing is None else side_timing.to_document()
@@ -81,9 +81,10 @@ def _build_sides(predicted: _Side, measured: _Side) -> Document:
 
 
 def build_task_document(cycles: Cycles, rack: RackTiming) -> Document:
-    """Return times of the judged cycles of a task, ms, with parts in processor time.
+    """Return counts and times in ms of a task's cycles, without start-up and stalled cycles.
 
-    Includes all entries of `compute_task_times`.
+    The entries of `compute_task_times` are included, with execution and communication in processor
+    time.
     """
     judged = cycles.is_judged
     rows = cycles.rows[judged]
@@ -111,9 +112,11 @@ def build_task_document(cycles: Cycles, rack: RackTiming) -> Document:
 
 
 def format_analysis(analysis: Analysis, is_verbose: bool) -> Blocks:
-    """Yield an analysis as text: how the run ended, which equations held, and what to do.
+    """Yield an analysis as text: how the run ended, which equations held, and advice.
 
-    If `is_verbose`, tables of all levels, tasks and equations follow.
+    Args:
+        analysis: The analysis.
+        is_verbose: Whether to append tables of all levels, tasks and equations.
     """
     yield from _format_summary(analysis)
     if not is_verbose:
@@ -147,12 +150,12 @@ def format_analysis(analysis: Analysis, is_verbose: bool) -> Blocks:
 
 
 def _format_percentile(percentile: float) -> str:
-    """Return a clause that names the percentile."""
+    """Return a clause that says which cycles a percentile covers."""
     return "in the worst cycle" if percentile >= 100 else f"in {percentile:g} of 100 cycles"
 
 
 def _format_summary(analysis: Analysis) -> Iterator[str]:
-    """Yield the summary: the end of the run, the equations, advice, and limitations."""
+    """Yield the summary: how the run ended, failed equations, advice, and what was not judged."""
     config = analysis.recording.rack_config
     pairs = [pair for pair in analysis.pairs if pair.measured is not None]
     failing = [pair for pair in pairs if pair.is_failed]
@@ -179,7 +182,7 @@ def _format_summary(analysis: Analysis) -> Iterator[str]:
 
 
 def _list_unjudged(analysis: Analysis) -> Iterator[str]:
-    """Yield sentences about everything that was not judged."""
+    """Yield sentences about levels, cycles and rows that the verdicts do not cover."""
     config = analysis.recording.rack_config
     measured = analysis.measured.levels
     if unused := ", ".join(name for name in config.board if name not in measured):
@@ -223,7 +226,7 @@ def _describe_end(analysis: Analysis) -> str:
 
 
 def _choose_advice(analysis: Analysis, failing: list[EquationPair]) -> str:
-    """Return advice for failed equations, or for a run that failed although all equations held."""
+    """Return a line that says what to do about failed equations, or about a failed run."""
     folder = analysis.recording.folder
     if not failing:
         outcome = analysis.recording.end_counts.get("outcome", {"cause": "time over"})
@@ -244,7 +247,7 @@ def _choose_advice(analysis: Analysis, failing: list[EquationPair]) -> str:
 
 
 def _join_equations(pairs: list[EquationPair]) -> str:
-    """Join equations by subject, as in "servo 3.1, 3.6; core 1 load"."""
+    """Return equations grouped by subject, as in "servo 3.1, 3.6; core 1 load"."""
     subjects = dict.fromkeys(pair.subject for pair in pairs)
     named = {
         name: ", ".join(pair.equation for pair in pairs if pair.subject == name)

@@ -28,9 +28,9 @@ CLOCK_COLUMNS = {
     "deviation": ("deviation_ms", ""),
     "alpha": ("alpha_ms", ""),
 }
-"""Columns of times relative to a release or a time slice, which mean nothing in lockstep.
+"""Columns of times relative to a release or a time slice, which have no meaning in lockstep.
 
-Each gives the key in the entry of a task, and the figure of the distribution.
+The values are the key in the entry of a task, and the statistic of the distribution.
 """
 USED_COLUMNS = {
     "exec p50": ("execution_ms", "p50"),
@@ -53,7 +53,7 @@ DROPPED_COLUMNS = (
     "R",
     "cycles",
 )
-"""Columns that a narrow terminal leaves out, in that order."""
+"""Columns that are left out on a narrow terminal, in the order in which they are dropped."""
 
 
 def compute_task_times(
@@ -65,18 +65,19 @@ def compute_task_times(
     stretches: np.ndarray,
     parts_ns: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Document:
-    """Return the times of a task's traced cycles, ms (eq. 3.5: R = t_exec + t_comm + t_residual).
+    """Return the times in ms of a task's cycles, as in eq. 3.5: R = t_exec + t_comm + t_residual.
 
     `processor_ms` is the processor time of a cycle and of waking up for it, without waiting and
-    preemption. A planner's cycles are its plans, and its R is their time slice. In lockstep a tick
+    preemption. For a planner, each plan is a cycle, and R is the time slice. In lockstep a tick
     lasts as long as its tasks take, so everything relative to a release or a time slice is None.
 
     Args:
         task: The task.
-        cycles: Its trace records, shape (n,).
+        cycles: Trace records of the task, shape (n,).
         period_ns: Length of a tick on the wall clock.
         is_lockstep: Whether the run was in lockstep.
-        stretches: Stretch of each cycle, as in `gaps_ns`, shape (n,).
+        stretches: Number of the recorded stretch of each cycle, shape (n,). Gaps are measured only
+            between cycles of the same stretch.
         parts_ns: t_exec and t_comm of each cycle. Defaults to the traced times on the wall clock.
     """
     slice_ns = task.slice * period_ns
@@ -93,9 +94,9 @@ def compute_task_times(
         "deviation_ms": None,
     }
     if len(cycles):
-        # Eq. 3.6: alpha is the residual guaranteed in the worst case, even though the longest
-        # execution and the longest communication may come from different cycles. Smooth motion
-        # needs a small deviation.
+        # Eq. 3.6: alpha is the residual time that is guaranteed in the worst case. The longest
+        # execution and the longest communication may come from different cycles. The deviation
+        # is reported because smooth motion needs a small one.
         alpha_ns = slice_ns - int(execution.max()) - int(communication.max())
         by_the_clock["alpha_ms"] = round(alpha_ns * MS_PER_NS, 6)
         by_the_clock["deviation_ms"] = round(
@@ -112,7 +113,7 @@ def compute_task_times(
 
 
 def build_times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextTable:
-    """Return a table with one line per task. Leaves out columns that mean nothing in lockstep."""
+    """Return a table with one line per task. In lockstep it has only the columns that apply."""
     columns = USED_COLUMNS if is_lockstep else CLOCK_COLUMNS | USED_COLUMNS
     rows = [
         {
@@ -132,7 +133,7 @@ def build_times_table(tasks: Mapping[str, Document], is_lockstep: bool) -> TextT
 
 
 def format_times(report: RunReport) -> Blocks:
-    """Yield the section of a report with the table of cycles."""
+    """Yield the section of a report with the table of cycle times."""
     is_lockstep = report.mode == "lockstep"
     yield from ("", "## Cycles, ms", "")
     if is_lockstep:

@@ -1,4 +1,4 @@
-"""The initial view of one run or several: all views, their layout, and the position of the eye."""
+"""Blueprints: the views that the viewer shows at first, their layout, and the eye position."""
 
 from __future__ import annotations
 
@@ -40,25 +40,33 @@ from rack.tools.viewer.timing import BOARDS, list_boards
 
 CONFIG = "config"
 DIMMED = rr.SeriesLines(colors=[0x9A9A9AFF])
-"""Style of the curves of a run with which another run is compared."""
+"""Style of the curves of the first run in a comparison of two runs."""
 LOG_COLUMNS = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
 CYCLES = "boards, cycle by cycle: R read, X process, P plan, W write"
 CYCLES_S = 0.022
-"""Time shown before and after the cursor in the Gantt lanes: several cycles of most boards."""
+"""Time shown before and after the cursor in the lanes of cycles: several cycles of most boards."""
 DIRECTION = np.array([0.75, -0.95, 0.55])
 """Direction from the cell to the eye: from the front right, slightly from above."""
 DISTANCE = 2.05
-"""Distance of the eye, in radii of arm and objects, so that a raised arm fits into the view."""
+"""Distance of the eye, relative to the radius of arm and objects.
+
+It is large enough for a raised arm to fit into the view.
+"""
 TITLES = {TENSIONS: "tensions: flexors bright, extensors dim"}
-"""Titles of finger curves that say more than the name of the quantity."""
+"""Titles of finger plots that differ from the name of the quantity."""
 ABOVE_M = 0.01
-"""Height of the grid above the floor, which would hide a grid at the same height."""
+"""Height of the grid above the floor, so that the floor does not hide it."""
 GRID_M = 0.25
 """Distance between lines of the grid."""
 
 
 def build_blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
-    """Return the blueprint of a view. If `live`, it follows the newest data."""
+    """Return the blueprint, the initial state of the viewer.
+
+    Args:
+        root: Container of all views.
+        live: Whether the time cursor follows the newest data.
+    """
     play = PlayState.Following if live else PlayState.Paused
     return rrb.Blueprint(
         root,
@@ -71,18 +79,24 @@ def build_blueprint(root: rrb.Container, live: bool = False) -> rrb.Blueprint:
 
 
 def build_common_view(racks: Mapping[str, RackViews]) -> rrb.Container:
-    """Return the view of several racks, by name.
+    """Return the view of several racks that ran together.
 
-    The first tab shows all racks above a common log; further tabs show one rack each.
+    The first tab shows all racks above a common log. Each further tab shows one rack.
+
+    Args:
+        racks: Views of the racks, by name.
     """
     return _build_tabs(racks, "all racks", _build_common_log(racks, "racks"), [4, 1])
 
 
 def build_comparison_view(runs: Mapping[str, RackViews]) -> rrb.Container:
-    """Return the view of two runs of the same rack, by name.
+    """Return the view that compares two runs of the same rack.
 
-    The first tab shows both runs and plots with the curves of both, the first run's in grey.
-    Further tabs show one run each.
+    The first tab shows both runs, and plots with the curves of both, those of the first run in
+    grey. Each further tab shows one run.
+
+    Args:
+        runs: Views of the two runs, by name.
     """
     first, other = runs.values()
     names = "{} in grey, {} in colour".format(*runs)
@@ -106,7 +120,7 @@ def _build_tabs(
         racks: Views of the racks, by name.
         name: Title of the first tab.
         below: View below the racks in the first tab.
-        shares: Heights of the racks and of that view.
+        shares: Relative heights of the racks and of the view below them.
     """
     columns = rrb.Horizontal(*(views.build_column(rack) for rack, views in racks.items()))
     first_tab = rrb.Vertical(columns, below, row_shares=shares, name=name)
@@ -116,7 +130,12 @@ def _build_tabs(
 
 
 def _build_common_log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
-    """Return a view with the log lines of all racks."""
+    """Return a view with the log lines of all racks.
+
+    Args:
+        racks: Views of the racks, by name.
+        what: What the racks are called in the title, "racks" or "runs".
+    """
     logs = [f"{build_path(LOG)}/**", *(views.build_query(LOG) for views in racks.values())]
     return rrb.TextLogView(
         origin="/", contents=logs, name=f"log of all {what}", columns=LOG_COLUMNS
@@ -126,7 +145,8 @@ def _build_common_log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
 class RackViews:
     """Builds the views of one rack: its cell in 3D, curves, lanes and log.
 
-    The entities of the rack are below `root`.
+    A lane shows the states of a board or level over time as coloured spans. All entities of the
+    rack in the recording are below the path `root`.
     """
 
     def __init__(
@@ -143,15 +163,15 @@ class RackViews:
         self._joints = config.robot.joints if config.robot is not None and has_arm else ()
 
     def build_path(self, *entity: str) -> str:
-        """Return the path of an entity."""
+        """Return the path of an entity of this rack in the recording."""
         return build_path(*self._root, *entity)
 
     def build_query(self, *entity: str) -> str:
-        """Return the query for an entity and everything below it."""
+        """Return a query that selects an entity of this rack and everything below it."""
         return f"{self.build_path(*entity)}/**"
 
     def build_all_views(self, name: str | None = None) -> rrb.Container:
-        """Return all views of the rack. `name` is the title of its tab."""
+        """Return a container with all views of the rack, which has the title `name`."""
         level_lanes = build_lanes_view(
             "levels and events, whole run", [self.build_query(EVENTS), self.build_query(LEVELS)]
         )
@@ -181,9 +201,10 @@ class RackViews:
         return rrb.Horizontal(left, right, column_shares=[2, 3], name=name)
 
     def list_main_curves(self) -> dict[str, list[str]]:
-        """Return the entities of the curves that describe a run, by title of their plot.
+        """Return the entities whose curves are compared between runs, by title of the plot.
 
-        They are the curves of the arm or, without an arm, all signals.
+        These are tracking error, position, velocity and torque of the arm or, without an arm, all
+        fields of all messages.
         """
         if not self._joints:
             boxes = self._layout.mailboxes
@@ -198,14 +219,14 @@ class RackViews:
         return {"tracking error, mrad": [self.build_path(ERROR)], **by_quantity}
 
     def build_column(self, name: str) -> rrb.Container | rrb.View:
-        """Return the cell, if there is one, above the lanes of the levels."""
+        """Return a column for a view of several racks: the cell, if any, above the level lanes."""
         levels = build_lanes_view(f"{name}: levels", [self.build_query(LEVELS)])
         if self._cell is None:
             return levels
         return rrb.Vertical(self._build_scene(self._cell, name), levels, row_shares=[5, 4])
 
     def _build_scene(self, cell: Cell, name: str) -> rrb.View:
-        """Return the view of the cell."""
+        """Return the 3D view of the cell, without collision shapes, with the title `name`."""
         return rrb.Spatial3DView(
             origin=self.build_path(CELL),
             contents=[
@@ -219,10 +240,10 @@ class RackViews:
         )
 
     def _build_arm_plots(self) -> rrb.Container:
-        """Return plots of the arm.
+        """Return the plots of the arm.
 
-        Each quantity has a plot of all joints, and in a second tab a plot of each joint with its
-        limits.
+        Each quantity has one plot with all joints and, in a second tab, one plot per joint with
+        limits. Requests, forces, tracking error and gripper follow in further tabs.
         """
         error, *plots = (_build_plot(*curves) for curves in self.list_main_curves().items())
         views = [
@@ -248,7 +269,10 @@ class RackViews:
         )
 
     def _build_request_plots(self) -> list[rrb.Container]:
-        """Return plots of the queues of levels that follow motion requests, and of moving goals."""
+        """Return plots for levels that execute motion requests.
+
+        They show the requests taken and done, and the distance from a moving goal.
+        """
         return [
             rrb.Horizontal(
                 _build_plot("taken and done", self._list_field_paths(box, "taken", "done")),
@@ -270,15 +294,21 @@ class RackViews:
         ]
 
     def _list_field_paths(self, mailbox: MailboxSpec, *names: str) -> list[str]:
-        """Return the paths of fields of a mailbox."""
+        """Return the paths of the curves of these fields of a mailbox."""
         return [self.build_path(SIGNALS, mailbox.name, name) for name in names]
 
     def _build_legend(self, what: str, name: str, names: Sequence[str]) -> rrb.View:
-        """Return the view of a legend."""
+        """Return the view of a legend that `write_legend` wrote.
+
+        Args:
+            what: Name of the legend.
+            name: Title of the view.
+            names: Entries of the legend.
+        """
         return build_legend_view(self.build_path(LEGEND, what), name, names)
 
     def _build_force_plots(self) -> list[rrb.View]:
-        """Return plots of contact forces. Empty without a wrist sensor."""
+        """Return plots of contact forces with their limits. Empty without a wrist sensor."""
         if self._cell is None or self._cell.wrist is None:
             return []
         views = [
@@ -300,10 +330,10 @@ class RackViews:
         return [along, *views, *contact]
 
     def _build_finger_plots(self, hand: Hand) -> rrb.Container:
-        """Return plots of a hand.
+        """Return the plots of a hand.
 
-        Tabs contain a plot of every finger for tensions, joints and forces; beside them are the
-        forces of all fingertips.
+        Each tab has one plot per finger, of tensions, joints or forces. Beside the tabs are plots
+        of the forces on all fingertips, and of weight and pull of a grasped object.
         """
         tabs = [
             rrb.Grid(
@@ -338,11 +368,11 @@ class RackViews:
         return _build_plot(f"{name}, {QUANTITIES[quantity]}", entities)
 
     def _build_signal_plot(self) -> rrb.View:
-        """Return a plot of all fields. Its legend contains their units."""
+        """Return a plot of the numeric fields of all messages. Its legend contains their units."""
         return _build_plot("signals", [self.build_query(SIGNALS)], True)
 
     def _build_load_plots(self) -> rrb.Container | rrb.View:
-        """Return plots of the use of the time slices and of execution times."""
+        """Return plots of execution times and, in real time, of the use of the time slices."""
         times = self.build_query(timing.TIMES)
         if self._config.clock.mode == "lockstep":
             return _build_plot("execution, ms", [times])
@@ -350,7 +380,10 @@ class RackViews:
         return rrb.Tabs(use, _build_plot("late and execution, ms", [times]))
 
     def _build_age_plots(self) -> rrb.Container:
-        """Return plots of ages. Plans have their own plot, because they may be much older."""
+        """Return tabs with plots of message ages, plan ages and all signals.
+
+        Plans have a separate plot, because they may be much older than other messages.
+        """
         boxes = [mailbox.name for mailbox in self._layout.mailboxes]
         plans = [self.build_path(timing.AGES, name) for name in boxes if name.endswith(".plan")]
         sampled = [self.build_query(timing.AGES), *(f"- {plan}" for plan in plans)]
@@ -369,7 +402,7 @@ class RackViews:
         return rrb.Tabs(log, config, load, lost)
 
     def _build_graph(self) -> rrb.View:
-        """Return the view of the hierarchy."""
+        """Return the view of the hierarchy of levels as a graph."""
         places = compute_positions(
             self._layout, build_rack_timing(self._config, self._layout)
         ).values()
@@ -410,13 +443,13 @@ def _build_plot(
 
 
 def build_grid(cell: Cell) -> rrb.LineGrid3D:
-    """Return a grid on the floor of a cell, or at the height of the origin without a floor."""
+    """Return a grid just above the floor of a cell, or above the origin if it has no floor."""
     plane = rr.components.Plane3D((0.0, 0.0, 1.0), find_floor_height(cell) + ABOVE_M)
     return rrb.LineGrid3D(visible=True, plane=plane, spacing=GRID_M, color=GRID)
 
 
 def build_eye(cell: Cell) -> rrb.EyeControls3D:
-    """Return an eye position from which the arm and its objects fill the view at the start."""
+    """Return an initial eye position from which the arm and the objects fill the view."""
     centre, radius = compute_extent(cell)
     position = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
     return rrb.EyeControls3D(
@@ -428,9 +461,9 @@ def write_document(stream: Stream, text: str, config: RackConfig, layout: Layout
     """Log the resolved config and the properties of the run.
 
     Args:
-        stream: Where they are written.
-        text: The config as text.
-        config: The config.
+        stream: Stream to write to.
+        text: The resolved config as text.
+        config: The same config as a record.
         layout: Layout of the rack.
     """
     stream.log_static((CONFIG,), rr.TextDocument(f"```toml\n{text}```", media_type="text/markdown"))

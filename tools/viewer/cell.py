@@ -1,6 +1,6 @@
-"""The cell in 3D: geoms, poses of moving bodies, pushes, marks, planned path and goals.
+"""Writes the cell in 3D: geoms, poses of moving bodies, pushes, planned path and goals.
 
-Each geom is written once, in the frame of its body.
+Balls mark engaged brakes and faults. Each geom is written only once, in the frame of its body.
 """
 
 from __future__ import annotations
@@ -45,16 +45,20 @@ WAYPOINTS = (CELL, "way_points")
 GOALS = (CELL, "goals")
 CURRENT_GOAL = (CELL, "current_goal")
 STEP_RAD = 0.03
-"""Longest joint motion between two points of a drawn path.
+"""Largest motion of a joint between two points of a drawn path.
 
-A straight line in joint space is a curve of the tool, so it is drawn in short pieces.
+On a straight line in joint space the tool moves along a curve, so the path is drawn in short
+pieces.
 """
 POINT_M = 0.008
 LINE_M = 0.003
 BRAKES = (CELL, "brakes")
 FAULTS = (CELL, "faults")
 MARK_PART = 0.09
-"""Radius of a mark, relative to the radius of arm and objects. Marks are thicker than a link."""
+"""Radius of a mark, relative to the radius of arm and objects.
+
+Marks are thicker than a link, so that they are visible.
+"""
 AXES = (CELL, "axes")
 AXES_PART = 0.25
 AXES_RADIUS_PART = 0.0125
@@ -71,21 +75,24 @@ PUSH_RADIUS_M = 0.0015
 
 
 def name_frame(model: mujoco.MjModel, body: int) -> str:
-    """Return the name of a body's frame."""
+    """Return the name of a body's coordinate frame in the recording."""
     return WORLD if body == 0 else f"body/{model.body(body).name or body}"
 
 
 def find_moving_bodies(model: mujoco.MjModel) -> Ints:
-    """Return the bodies that joints or mocap poses move, including all bodies attached to them."""
+    """Return the indices of all bodies that can move, shape (n,).
+
+    These are bodies with joints or mocap poses, and all bodies attached to them.
+    """
     moves = np.zeros(model.nbody, dtype=bool)
-    for body in range(1, model.nbody):  # parents come first
+    for body in range(1, model.nbody):  # parents precede their children
         has_motion = model.body_jntnum[body] > 0 or model.body_mocapid[body] >= 0
         moves[body] = has_motion or moves[model.body_parentid[body]]
     return np.flatnonzero(moves)
 
 
 def write_geometry(stream: Stream, cell: Cell) -> None:
-    """Log all geoms, the poses of frames that never move, and the directions of the axes."""
+    """Write everything that never changes: geoms, poses of fixed bodies, and the world's axes."""
     model = cell.model
     data = cell.build_start_data()
     stream.log_static((CELL,), stream.build_frame(WORLD))
@@ -123,10 +130,10 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
 
 
 class PoseWriter:
-    """Writes an `ArmState` as poses of all moving bodies, and as the path of the tool.
+    """Writes the mailbox of an `ArmState` as poses of all moving bodies, and as points of the tool.
 
-    The poses come from MuJoCo's kinematics. With `has_pushes` the forces that the scene exerts on
-    its objects are written as well.
+    The poses are computed by MuJoCo's kinematics. With `has_pushes`, the forces with which the
+    scene pushes objects are written as arrows.
     """
 
     def __init__(self, stream: Stream, cell: Cell, has_pushes: bool) -> None:
@@ -152,7 +159,7 @@ class PoseWriter:
             stream.log_static(PUSHES, stream.build_frame(WORLD))
 
     def write(self, block: RowBlock) -> None:
-        """Write the poses, one every 20 ms of simulated time."""
+        """Write the poses in a block of messages, at most one per 20 ms of simulated time."""
         chosen = self._sampled_rows(block.ticks)
         data = self._data
         bodies = self._bodies
@@ -186,7 +193,7 @@ class PoseWriter:
         )
 
     def _write_pushes(self, when: Moment) -> None:
-        """Write the forces that act on objects now, or that they have ended."""
+        """Write the pushes that act on objects at a moment, or clear them when they have ended."""
         objects = self._cell.bodies
         forces = self._data.xfrc_applied[objects, :3]
         pushed = forces.any(axis=1)
@@ -202,12 +209,12 @@ class PoseWriter:
 
 
 class MarkWriter:
-    """Marks in red why the arm does not move: engaged brakes, and faults while they act."""
+    """Marks joints with red balls while the brakes are engaged or a fault is active."""
 
     def __init__(self, stream: Stream, cell: Cell, joints: Sequence[str]) -> None:
         self._stream = stream
         self._braking_rows = build_change_finder()
-        # Joint and text of each acting fault, by entry of the fault table.
+        # Joint and text of each active fault, by its number in the fault table.
         self._faults: dict[int, tuple[str, str]] = {}
         self._joints = {name: cell.model.joint(name).pos for name in joints}
         self._radius = MARK_PART * compute_extent(cell)[1]
@@ -217,7 +224,7 @@ class MarkWriter:
                 stream.log_static((*group, name), stream.build_frame(name_frame(cell.model, body)))
 
     def write(self, block: RowBlock) -> None:
-        """Mark every joint while the brakes are engaged."""
+        """Mark all joints when the brakes engage, and clear the marks when they are released."""
         braked = block.messages["braked"]
         for row in self._braking_rows(braked):
             texts = dict.fromkeys(self._joints, "") if braked[row] else {}
@@ -226,7 +233,12 @@ class MarkWriter:
             self._write_marks(block.find_moment(row), BRAKES, texts)
 
     def mark_fault(self, when: Moment, event: Event) -> None:
-        """Mark the joint of a fault while it acts. A fault of no joint marks the first joint."""
+        """Mark a joint when a fault begins, and clear the mark when it ends.
+
+        Args:
+            when: Time of the event.
+            event: The begin or end of a fault. A fault that concerns no joint marks the first one.
+        """
         joint = event.subject if event.subject in self._joints else next(iter(self._joints))
         if event.code == "begins":
             text = event.text.partition(" begins")[0]
@@ -236,7 +248,13 @@ class MarkWriter:
         self._write_marks(when, FAULTS, dict(self._faults.values()))
 
     def _write_marks(self, when: Moment, group: tuple[str, str], texts: dict[str, str]) -> None:
-        """Write a ball at each joint in `texts`, labelled with the text unless it is empty."""
+        """Write the current marks, and clear those of all other joints.
+
+        Args:
+            when: Time from which they are shown.
+            group: Parent entity of the marks, `BRAKES` or `FAULTS`.
+            texts: Label of each marked joint, by name. "" means a mark without a label.
+        """
         for name, place in self._joints.items():
             text = texts.get(name)
             places = [] if text is None else [place]
@@ -246,7 +264,7 @@ class MarkWriter:
 
 
 def compute_extent(cell: Cell) -> tuple[Array, float]:
-    """Return the centre of arm and objects at the start, (3,), m, and their radius, m."""
+    """Return centre, shape (3,), and radius of a sphere around arm and objects, both in m."""
     data = cell.build_start_data()
     model = cell.model
     geoms = np.union1d(
@@ -261,28 +279,29 @@ def compute_extent(cell: Cell) -> tuple[Array, float]:
 
 
 def find_floor_height(cell: Cell) -> float:
-    """Return the height of the floor, m, or of the world's origin if the cell has no floor."""
+    """Return the height of the floor in m, or 0 if the cell has no floor below the origin."""
     floors = np.flatnonzero(cell.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
     return float(cell.build_start_data().geom_xpos[floors, 2].min(initial=0.0))
 
 
 def build_path_part(stream: Stream, cell: Cell) -> ViewPart:
-    """Return the part that shows a `MovePlan` as the path of the tool and its way points.
+    """Return the view part that shows a `MovePlan` as path of the tool with way points.
 
-    It is drawn from the tick at which the plan is visible. A plan for the gripper clears it.
+    The path is shown from the tick at which the plan becomes visible. A plan without a path, for
+    example for the gripper, clears it.
     """
     data = cell.build_start_data()
     for entity in (PATH, WAYPOINTS):
         stream.log_static(entity, stream.build_frame(WORLD))
 
     def tool_at(joints: Array) -> Array:
-        """Return the position of the tool at joint positions, (3,), m."""
+        """Return the position of the tool in m, shape (3,), at joint positions in rad."""
         data.qpos[cell.qpos] = joints
         mujoco.mj_kinematics(cell.model, data)
         return np.array(data.site_xpos[cell.tool])
 
     def write(block: RowBlock) -> None:
-        """Write the plans in a block of messages."""
+        """Write the path of every plan in a block of messages."""
         for row, plan in enumerate(block.messages):
             way_points = plan["waypoints"][: plan["count"]]
             if plan["kind"] != SegmentKind.PATH or plan["error"]:
@@ -297,16 +316,23 @@ def build_path_part(stream: Stream, cell: Cell) -> ViewPart:
 
 
 def subdivide_path(corners: Array) -> Array:
-    """Subdivide a joint path, (points, joints), so that no piece is longer than `STEP_RAD`."""
+    """Add points to a joint path, so that no joint moves further than `STEP_RAD` between two.
+
+    Args:
+        corners: Joint positions in rad, shape (points, joints).
+
+    Returns:
+        The path with the additional points, in the same form.
+    """
     longest = np.abs(np.diff(corners, axis=0)).max(axis=1)
     counts = np.maximum(np.ceil(longest / STEP_RAD), 1)
-    numbers = np.concatenate(([0], np.cumsum(counts)))  # of the corners, among all points
+    numbers = np.concatenate(([0], np.cumsum(counts)))  # index of each corner among all points
     points = np.arange(numbers[-1] + 1)
     return np.column_stack([np.interp(points, numbers, joint) for joint in corners.T])
 
 
 class GoalWriter:
-    """Writes the places where a `TaskPlan` releases objects, and the goal of the current move."""
+    """Writes the points where a `TaskPlan` releases objects, and the goal of the current move."""
 
     def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
         self._stream = stream
@@ -318,7 +344,7 @@ class GoalWriter:
             stream.log_static(entity, stream.build_frame(WORLD))
 
     def write(self, block: RowBlock) -> None:
-        """Write the goals of every new plan."""
+        """Write the release points of every new `TaskPlan` in a block of messages."""
         for row in self._planned_rows(block.messages["id"]):
             plan = block.messages[row]
             moves = plan["moves"][: plan["count"]]
@@ -337,7 +363,7 @@ class GoalWriter:
             self._stream.log_at(block.find_visible_moment(row), GOALS, points)
 
     def write_status(self, block: RowBlock) -> None:
-        """Write the goal of the move that each `MoveStatus` names."""
+        """Write the goal of the current move whenever it changes in a block of `MoveStatus`."""
         for row in self._current_rows(block.messages["current"]):
             current = int(block.messages["current"][row])
             goals = [self._goals[current]] if current in self._goals else []
@@ -350,7 +376,7 @@ class GoalWriter:
             self._stream.log_at(block.find_moment(row), CURRENT_GOAL, point)
 
     def _format_label(self, move: np.void) -> str:
-        """Return the label of a move: its verb and its object."""
+        """Return the label of a move: its verb, and the name of its object, if any."""
         return f"{format_enum(Verb, int(move['verb']))} {self._find_object_name(move)}".strip()
 
     def _find_object_name(self, move: np.void) -> str:

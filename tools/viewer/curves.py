@@ -25,32 +25,32 @@ from rack.tools.viewer.style import (
 
 SIGNALS = "signals"
 MAX_CURVES = 16
-"""Largest number of curves of a field. Fields with more numbers are only in signals/."""
+"""Largest number of curves of a field. Fields with more numbers have no curves."""
 JOINTS = "joints"
 ERROR = "tracking_error"
 GRIPPER = "gripper"
 OPENING = "opening"
 GRIP = "force"
 QUANTITIES = {"position": "rad", "velocity": "rad/s", "torque": "N m"}
-"""Quantities of a joint, and their units. The torque is the applied one, after the limit gate."""
+"""Quantities of a joint, and their units. The torque is the torque after the limit gate."""
 FIELDS = {
     "position": {"commanded": "target", "measured": "position"},
     "velocity": {"commanded": "target_velocity", "measured": "velocity"},
     "torque": {"applied": "torque"},
 }
-"""Fields for the curves of a joint, by quantity and meaning."""
+"""Fields of the status for the curves of a joint, by quantity and name of the curve."""
 
 
 def build_joint_curves(
     stream: Stream, names: Sequence[str], cell: Cell, has_gripper: bool
 ) -> Iterator[ViewPart]:
-    """Yield the parts that show the status of the board that drives the arm.
+    """Yield the view parts that show the status of the board that drives the arm.
 
-    They are curves of each joint as measured and commanded, with limits, tracking errors and the
-    gripper.
+    These are curves of each joint, measured and commanded, with their limits, of the tracking
+    errors, and of the gripper.
 
     Args:
-        stream: Where they are written.
+        stream: Stream to write to.
         names: Names of the joints.
         cell: Cell of the arm.
         has_gripper: Whether the status contains the gripper.
@@ -99,9 +99,14 @@ def build_joint_curves(
 
 
 def _build_limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewPart:
-    """Return the part that writes two limits, (2,), at the first and last row of each block.
+    """Return the view part that shows two limits as straight lines.
 
-    Straight lines need no other points.
+    The lines need points only at the first and the last row of each block.
+
+    Args:
+        stream: Stream to write to.
+        entity: Entity of the lines.
+        limits: Lower and upper limit, shape (2,).
     """
     style_curves(stream, entity, ["lower limit", "upper limit"], [LIMIT, LIMIT], [1.0, 1.0])
     return lambda block: stream.send_curves(
@@ -110,12 +115,12 @@ def _build_limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewP
 
 
 def _select_joint(joint: int, fields: Sequence[str], block: RowBlock) -> Array:
-    """Return fields of one joint as columns, (rows, fields)."""
+    """Return the values of these fields for one joint as columns, shape (rows, fields)."""
     return np.stack([block.messages[field][:, joint] for field in fields], axis=-1)
 
 
 def find_gripper_units(cell: Cell) -> tuple[str, str]:
-    """Return the units of the gripper's opening and force."""
+    """Return the units of opening and force of a cell's gripper. Call this only if it has one."""
     assert cell.gripper is not None, "there is a gripper"
     joint = cell.model.dof_jntid[cell.gripper.dof]
     is_hinge = cell.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
@@ -123,9 +128,9 @@ def find_gripper_units(cell: Cell) -> tuple[str, str]:
 
 
 def build_field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
-    """Yield the parts that show the numeric fields of a mailbox.
+    """Yield the view parts that show the numeric fields of a mailbox as curves.
 
-    A user's own messages are shown without any configuration.
+    This works for any message, so messages of the user's levels need no configuration.
     """
     for field in mailbox.fields:
         if field.fields or field.kind[1] not in "iufb" or not 0 < prod(field.shape) <= MAX_CURVES:
@@ -138,5 +143,5 @@ def build_field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPar
 
 
 def _flatten_field(field: str, block: RowBlock) -> Array:
-    """Return a field as one column per number, (rows, numbers)."""
+    """Return the values of a field with one column per number, shape (rows, numbers)."""
     return np.asarray(block.messages[field], float).reshape(len(block.rows), -1)

@@ -1,6 +1,6 @@
-"""Log lines and lanes of the rack's events, and the losses and load of the recorder.
+"""Writes a rack's events as log lines and lanes, and the recorder's lost rows and load.
 
-The lane of a board shows the kind of its last event, until the next one.
+The lane of a board shows the kind of the board's last event, until the next event.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from rack.tools.viewer.style import EVENT_COLOURS, LOST, style_curves, style_lan
 EVENTS = "events"
 RECORDER = "recorder"
 KINDS_WITHOUT_LANE = ("printed", "miss")
-"""Events without a lane in this view. Misses have a lane beside their board's level."""
+"""Kinds of events without a lane. Misses have a separate lane next to their board's level."""
 RACK_LANE = "rack"
 """Lane of events that belong to no board."""
 LOG_LEVELS = {
@@ -35,13 +35,14 @@ LOG_LEVELS = {
     "miss": "DEBUG",
     "printed": "DEBUG",
 }
-"""Log level by kind of event. Others are INFO."""
+"""Log level by kind of event. Other kinds have level INFO."""
 
 
 class EventWriter:
-    """Follows events.jsonl, which the launcher writes line by line.
+    """Writes the events in events.jsonl to the view while the launcher adds them.
 
-    It shows faults in the hierarchy too, and with `marks` also in 3D.
+    Lost boards are also shown in the graph of the hierarchy, and with `marks` faults are also shown
+    in 3D.
     """
 
     def __init__(
@@ -52,26 +53,26 @@ class EventWriter:
         self._hierarchy = hierarchy
         self._marks = marks
         self._read = 0
-        self._lanes: dict[str, str] = {}  # what each board's lane shows
+        self._lanes: dict[str, str] = {}  # state that each board's lane shows
 
     def write_new_events(self) -> None:
-        """Write the events that were added since the last call."""
+        """Write the events that were added to the file since the last call."""
         if not self._path.is_file() or self._path.stat().st_size == self._read:
             return
         with self._path.open("rb") as file:
             file.seek(self._read)
-            # A line that is still being written is read the next time.
+            # A line that is still incomplete is read in the next call.
             lines = [line for line in file.read().splitlines(keepends=True) if line.endswith(b"\n")]
         self._read += sum(map(len, lines))
         for line in lines:
             event = parse_checked_line(line.decode())
-            # The last line is the outcome, not an event. Waits during the launch are no news to
-            # somebody who already sees the run.
+            # The last line is the outcome, not an event. Leave out messages about waiting during
+            # the launch, because the launch is over when the view is open.
             if "tick" in event and not (event["kind"] == "waiting" and event["tick"] < 0):
                 self._write(Event(**event))
 
     def _write(self, event: Event) -> None:
-        """Write an event to the log and to its lane. Faults and losses change other views, too."""
+        """Write an event to the log, to its lane and, if it is a fault or loss, to other views."""
         board = event.board or RACK_LANE
         when = Moment(max(0, event.tick), self._stream.times.to_monotonic(event.time_ns))
         text = f"{event.kind}: {board}: {event.text}"
@@ -88,12 +89,12 @@ class EventWriter:
             self._hierarchy.mark_recovered(when, board)
 
     def _write_lane(self, when: Moment, board: str, event: Event) -> None:
-        """Write an event to the lane of its board."""
+        """Write an event as the new state of its board's lane."""
         if board not in self._lanes:
             style_lane(self._stream, (EVENTS, board), EVENT_COLOURS)
         state: str = event.kind
         if event.code == "ends":
-            # The end of a fault ends the span of that fault only, not the span of a later event.
+            # The end of a fault ends the span of that fault, but not the span of a later event.
             if self._lanes.get(board) != state:
                 return
             state = ""
@@ -102,10 +103,10 @@ class EventWriter:
 
 
 def build_loss_writer(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
-    """Return a function that writes the number of lost rows at a tick, and logs every new loss.
+    """Return a function that writes the total number of lost rows, and logs every new loss.
 
-    It takes the tick, and the number of rows that were overwritten before the recorder took them,
-    by ring.
+    Its arguments are the tick, and the number of rows, by ring, that were overwritten before the
+    recorder read them.
     """
     entity = (RECORDER, "rows_lost")
     style_curves(stream, entity, ["rows lost"], [LOST])
@@ -125,9 +126,10 @@ def build_loss_writer(stream: Stream) -> Callable[[int, Mapping[str, int]], None
 
 
 def build_load_writer(stream: Stream) -> Callable[[int], None]:
-    """Return a function that writes the recorder's processor load since its last call, at a tick.
+    """Return a function that writes the recorder's processor load since the function's last call.
 
-    It measures its own process, which must be the recorder.
+    The load is the load of the calling process, so call the function in the recorder. Its argument
+    is the tick for which the load is written.
     """
     entity = (RECORDER, "load")
     style_curves(stream, entity, ["recorder, % of a core"])

@@ -1,4 +1,4 @@
-"""Contact forces: an arrow at each sensed place, and curves of wanted and exerted forces."""
+"""Shows contact forces: an arrow at each sensor, and curves of wanted and exerted forces."""
 
 from __future__ import annotations
 
@@ -20,19 +20,22 @@ ARROWS = ("cell", "forces")
 FORCES = "forces"
 TASK = "task_frame"
 CONTACT = "contact"
-"""Groups of curves: along the axes of a task frame, and of the contact force against its limits."""
+"""Names of two groups of curves.
+
+The first shows forces along the axes of the task frame, the second contact forces with limits.
+"""
 CONTACT_UNITS = {"force": "N", "torque": "N m"}
 """Quantities of a contact, and their units."""
 ARROW_COLOUR = 0x00E6FFFF
 LONGEST_M = 1.0
 TOOL_SHAFT_M = 0.014
-"""Length of an arrow at the arm's limit on contacts, and its radius.
+"""Length of an arrow for a contact force at the arm's limit, and radius of arrows.
 
-The length makes small forces visible beyond the tool.
+The arrow is long, so that arrows of small forces also reach beyond the tool.
 """
 TIP_M = 0.02
 TIP_SHAFT_M = 0.003
-"""Length of an arrow at a fingertip per newton, and its radius."""
+"""Length per newton, and radius, of an arrow at a fingertip."""
 AXES = dict(zip(AXIS_NAMES, UNITS, strict=True))
 """Unit of each axis of a task frame."""
 
@@ -42,9 +45,9 @@ class ContactPlace(NamedTuple):
 
     Attributes:
         name: Name of the place.
-        site: Site at which it is.
-        orientation_site: Site whose orientation the sensed vectors have, or None if they have the
-            world's.
+        site: Index of the MuJoCo site at the place.
+        orientation_site: Index of the site in whose axes the forces are given, or None if they are
+            given in the axes of the world.
     """
 
     name: str
@@ -53,11 +56,11 @@ class ContactPlace(NamedTuple):
 
     @property
     def frame(self) -> str:
-        """Name of the place's frame in the recording."""
+        """Name of the coordinate frame at the place, in which the arrow is drawn."""
         return f"contact/{self.name}"
 
     def compute_pose(self, data: mujoco.MjData) -> tuple[Array, Array]:
-        """Return position, m, and quaternion of the frame in `data`."""
+        """Return position (in m) and quaternion (w first) of the frame for the poses in `data`."""
         quaternion = np.array([1.0, 0.0, 0.0, 0.0])
         if self.orientation_site is not None:
             mujoco.mju_mat2Quat(quaternion, data.site_xmat[self.orientation_site])
@@ -65,9 +68,9 @@ class ContactPlace(NamedTuple):
 
 
 def list_contacts(cell: Cell) -> list[ContactPlace]:
-    """Return the places where a cell's forces are sensed.
+    """Return the places where the forces on a cell's tool or hand are sensed.
 
-    These are the tool on a wrist sensor, or the fingertips of a hand.
+    These are the tool of an arm with a wrist sensor, or the fingertips of a hand.
     """
     if cell.hand is not None:
         tips = zip(cell.hand.names, cell.hand.tips, strict=True)
@@ -76,14 +79,14 @@ def list_contacts(cell: Cell) -> list[ContactPlace]:
 
 
 def build_contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
-    """Return the part that shows the forces on the tool or on the fingertips as arrows.
+    """Return the view part that shows the forces on the tool or on the fingertips as arrows.
 
-    An arrow is drawn every 20 ms of simulated time.
+    The arrows are drawn every 20 ms of simulated time.
 
     Args:
-        stream: Where it is written.
+        stream: Stream to write to.
         cell: The cell.
-        field: Field of the message with three numbers for each place, and perhaps more after them.
+        field: Field of the message that begins with three numbers for each place, its force in N.
     """
     scale, shaft = TIP_M, TIP_SHAFT_M
     if cell.wrist is not None:
@@ -95,7 +98,7 @@ def build_contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
     sampled_rows = build_row_sampler(stream.times.clock_ns)
 
     def write(block: RowBlock) -> None:
-        """Write the arrows of the rows that are drawn."""
+        """Write the arrows for one row of each drawing interval."""
         chosen = sampled_rows(block.ticks)
         if not len(chosen):
             return
@@ -109,9 +112,10 @@ def build_contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
 
 
 def build_task_force_curves(stream: Stream) -> Iterator[ViewPart]:
-    """Yield the parts that show a `ForceStatus` along the axes of the task frame.
+    """Yield the view parts that show the forces and torques in a `ForceStatus`.
 
-    Each axis has a curve of the wanted value and one of the value that the tool exerts.
+    For each axis of the task frame there is a curve of the wanted value, and a curve of the value
+    that the tool exerts.
     """
     for index, (axis, unit) in enumerate(AXES.items()):
         names = [f"{axis} wanted, {unit}", f"{axis} exerted, {unit}"]
@@ -121,7 +125,10 @@ def build_task_force_curves(stream: Stream) -> Iterator[ViewPart]:
 
 
 def _select_wanted_and_exerted(axis: int, block: RowBlock) -> Array:
-    """Return both values along an axis, (rows, 2). Nothing is wanted on an axis of motion."""
+    """Return the wanted and the exerted value along an axis, shape (rows, 2).
+
+    The wanted value is NaN while the axis is controlled by position instead of force.
+    """
     selected, wanted, wrench = (
         block.messages[field][:, axis] for field in ("selected", "wanted", "wrench")
     )
@@ -129,11 +136,11 @@ def _select_wanted_and_exerted(axis: int, block: RowBlock) -> Array:
 
 
 def build_contact_curves(stream: Stream, most: tuple[float, float]) -> Iterator[ViewPart]:
-    """Yield the parts that show force and torque of a `Wrench`.
+    """Yield the view parts that show force and torque in a `Wrench` with the arm's limits.
 
     Args:
-        stream: Where they are written.
-        most: The arm's limits on force, N, and torque, N m.
+        stream: Stream to write to.
+        most: The arm's limits on the contact force in N and the contact torque in N m.
     """
     for index, (quantity, unit) in enumerate(CONTACT_UNITS.items()):
         names = [f"limit, {unit}", f"{quantity} of the contact, {unit}"]
@@ -144,6 +151,12 @@ def build_contact_curves(stream: Stream, most: tuple[float, float]) -> Iterator[
 
 
 def _compute_limit_and_magnitude(limit: float, first: int, block: RowBlock) -> Array:
-    """Return a limit, and the magnitude of three numbers of a wrench from `first` on, (rows, 2)."""
+    """Return a limit, and the magnitude of the force or torque in each row, shape (rows, 2).
+
+    Args:
+        limit: The limit, which is equal in all rows.
+        first: Index of the first of three numbers in the wrench: 0 for force, 3 for torque.
+        block: Messages with wrenches.
+    """
     size = np.linalg.norm(block.messages["wrench"][:, first : first + 3], axis=1)
     return np.column_stack((np.full(len(size), limit), size))

@@ -29,7 +29,13 @@ TIPS = (HAND, "tip_forces")
 
 
 def build_hand_curves(stream: Stream, names: Sequence[str], hand: Hand) -> Iterator[ViewPart]:
-    """Yield the parts that show a `HandStatus` of a hand whose joints have these names."""
+    """Yield the view parts that show a `HandStatus`.
+
+    Args:
+        stream: Stream to write to.
+        names: Names of all joints of the hand.
+        hand: The hand.
+    """
     colours = choose_joint_colours(len(hand.names))
     write_legend(stream, HAND, hand.names, colours)
     for index, finger in enumerate(hand.names):
@@ -45,14 +51,14 @@ def build_hand_curves(stream: Stream, names: Sequence[str], hand: Hand) -> Itera
 def _build_finger_curves(
     stream: Stream, names: Sequence[str], finger: str, finger_index: int, joints: Ints
 ) -> Iterator[ViewPart]:
-    """Yield the parts that show one finger: joints, sensed and commanded tensions, and tip force.
+    """Yield the view parts that show joints, tensions and tip force of one finger.
 
     Args:
-        stream: Where they are written.
+        stream: Stream to write to.
         names: Names of all joints of the hand.
         finger: Name of the finger.
         finger_index: Index of the finger.
-        joints: Indices of its joints.
+        joints: Indices of the finger's joints.
     """
     joint_names = [names[joint] for joint in joints]
     colours = choose_joint_colours(len(joint_names))
@@ -65,7 +71,10 @@ def _build_finger_curves(
     )
 
     def stack_tensions(block: RowBlock) -> np.ndarray:
-        """Return commanded, then sensed tensions of the finger, each flexors first."""
+        """Return the finger's tensions in N, shape (rows, tensions).
+
+        Commanded tensions precede sensed ones. In each group flexors precede extensors.
+        """
         columns = [
             block.messages[field][:, row][:, joints]
             for field in ("wanted", "tension")

@@ -1,4 +1,4 @@
-"""The levels in the view: lanes for states and moves, log lines for errors, and a graph."""
+"""Shows the levels: lanes for states and moves, log lines for errors, and a graph."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ LEVELS = "levels"
 HIERARCHY = "hierarchy"
 ROW = 45.0
 COLUMN = 110.0
-"""Distance between nodes, in the graph's units. A letter is about 7 units wide."""
+"""Vertical and horizontal distance of nodes in the units of the graph. A letter has about 7."""
 MAX_ROW_BOARDS = 3
-"""Number of boards per row of the graph, so that it stays large enough to read."""
+"""Largest number of boards in a row of the graph, so that the text is large enough to read."""
 FIRED = ["table", "row", "fired", "in_state"]
 """Fields of a status that say which row of a state table fires."""
 
@@ -33,18 +33,18 @@ FIRED = ["table", "row", "fired", "in_state"]
 def build_value_lane(
     stream: Stream, lane: tuple[str, str], fields: str | list[str], name: Callable[[Any], str]
 ) -> ViewPart:
-    """Return the part that shows a value of a level's messages as a lane of names.
+    """Return the view part that shows how a value in a level's messages changes, as a lane.
 
     Args:
-        stream: Where it is written.
-        lane: The board, and the name of the lane.
-        fields: The field with the value. Several fields give a tuple.
-        name: Returns the name of a value.
+        stream: Stream to write to.
+        lane: Name of the board, and name of the lane.
+        fields: Field with the value. For several fields, the value is a tuple.
+        name: Function that returns the text for a value.
     """
     changed_rows = build_change_finder()
 
     def write(block: RowBlock) -> None:
-        """Write the name of the value wherever it changes."""
+        """Write the text for the value at every row in which the value changes."""
         values = block.messages[fields]
         rows = changed_rows(values)
         if len(rows):
@@ -55,36 +55,36 @@ def build_value_lane(
 
 
 def format_serial(serial: int) -> str:
-    """Format the number of a command or motion request. Empty for 0, which means none."""
+    """Format the number of a command or motion request. Returns "" for 0, which means none."""
     return str(serial) if serial else ""
 
 
 def format_step(step: tuple[int, int]) -> str:
-    """Format a step of a grasp, given the number of steps before it and its kind."""
+    """Format a step of a grasp, which is given as number of earlier steps and kind."""
     return f"{step[0] + 1} {format_enum(GraspKind, step[1])}"
 
 
 def format_move(move: tuple[int, int]) -> str:
-    """Format the verb of a move, given its serial and verb. Empty without a move, serial 0."""
+    """Format the verb of a move, which is given as serial and verb. "" for serial 0: no move."""
     return format_enum(Verb, move[1]) if move[0] else ""
 
 
 def format_enum(kind: type[IntEnum], number: int) -> str:
-    """Return the name of an enum's number in words."""
+    """Return the name of an enum member with this number, in lower case and with spaces."""
     return kind(number).name.lower().replace("_", " ")
 
 
 def build_state_lane(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
-    """Yield the parts that show a level's state as a lane, and each of its errors as a log line."""
+    """Yield the view parts that show a level's states as a lane and its errors as log lines."""
     board, _, port = mailbox.name.partition(".")
-    # An adapter also writes the statuses of other racks' levels.
+    # An adapter also writes the statuses of other racks' levels, one port for each.
     lane = board, "state" if port == "status" else port
     style_lane(stream, (LEVELS, *lane), STATES)
     yield build_value_lane(stream, lane, "state", partial(format_enum, State))
     changed_rows = build_change_finder()
 
     def write_errors(block: RowBlock) -> None:
-        """Write a log line for each new error."""
+        """Write a log line for each new error in a block of messages."""
         messages = block.messages
         for row in changed_rows(messages["error"]):
             if error := messages["error"][row]:
@@ -96,12 +96,12 @@ def build_state_lane(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]
 
 
 def build_fired_lane(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
-    """Return the part that shows which row of a state table fires, as a lane and as log lines."""
+    """Return the view part that shows the firing rows of a state table, as lane and log lines."""
     board = mailbox.name.partition(".")[0]
     changed_rows = build_change_finder()
 
     def write(block: RowBlock) -> None:
-        """Write every change of the fired row to the lane and to the log."""
+        """Write the fired row to the lane and to the log whenever it changes."""
         changed = changed_rows(block.messages[FIRED])
         names = []
         for row_index in changed:
@@ -121,8 +121,9 @@ def build_fired_lane(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
 class Hierarchy:
     """Writes the tasks as nodes of a graph, coloured by state.
 
-    Levels are above each other, and other boards to their left. Edges lead down the levels, and
-    from planners to their boards.
+    Higher levels are drawn above lower levels, and boards outside the hierarchy to their left.
+    Edges lead from each level to the levels below it, and from each planner to its board. Changes
+    of state are collected until `write_changes` writes them.
     """
 
     def __init__(self, stream: Stream, layout: Layout, rack: RackTiming) -> None:
@@ -138,29 +139,29 @@ class Hierarchy:
         self._write_graph(stream.times.estimate_moment(0))
 
     def write(self, task: str, block: RowBlock) -> None:
-        """Note the changes of a task's state."""
+        """Collect the changes of a task's state from a block of its trace records."""
         names = _name_states(block.rows)
         before = np.concatenate(([self._states[task]], names[:-1]))
         for row in np.flatnonzero(names != before):
             self._add_change(block.find_moment(row), task, str(names[row]))
 
     def mark_lost(self, when: Moment, board: str) -> None:
-        """Note that a board died or stopped responding."""
+        """Set the state of a board that died or stopped responding to "lost"."""
         if board in self._states:
             self._add_change(when, board, "lost")
 
     def mark_recovered(self, when: Moment, board: str) -> None:
-        """Note that a lost board is back. Its state follows from its next cycles."""
+        """Set the state of a restarted board to "idle", until its next cycles show its state."""
         if self._states.get(board) == "lost":
             self._add_change(when, board, "idle")
 
     def _add_change(self, when: Moment, task: str, state: str) -> None:
-        """Add a change of state, to be written by `write_changes`."""
+        """Add a change of state that `write_changes` will write."""
         self._changes.append((when, task, state))
         self._states[task] = state
 
     def write_changes(self) -> None:
-        """Write the noted changes in the order of time."""
+        """Write the collected changes of state, earliest first."""
         for when, task, state in sorted(self._changes):
             self._shown[task] = state
             self._write_graph(when)
@@ -172,24 +173,24 @@ class Hierarchy:
             self._tasks,
             positions=[self._positions[task] for task in self._tasks],
             colors=pack_colours(STATES[self._shown[task]] for task in self._tasks),
-            # A planner's node is next to its board's.
+            # A planner's label omits the board, because its node is next to the board's node.
             labels=[task.partition(".")[2] or task for task in self._tasks],
         )
         self._stream.log_at(when, (HIERARCHY,), nodes)
 
 
 def _name_states(rows: np.ndarray) -> np.ndarray:
-    """Return the state of the level in each trace record, or "missed"."""
+    """Return the state of the level in each trace record, or "missed" for a missed cycle."""
     names = np.array([state.name.lower() for state in State] + ["missed"])
     indices = np.where(find_missed(rows), len(names) - 1, rows["state"])
     return np.asarray(names[indices])
 
 
 def compute_positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:
-    """Return the positions of the tasks in the graph.
+    """Return the positions of the tasks in the graph, by name.
 
-    Each rank of levels is a row, or several if it has many boards. Planners are to the right of
-    their boards, and boards outside the hierarchy to the left.
+    Each rank of the hierarchy is one row, or several rows if it has many boards. Planners are to
+    the right of their boards, and boards outside the hierarchy are in a column on the left.
     """
     placed: dict[str, tuple[int, int]] = {}
     next_row = 0

@@ -22,12 +22,13 @@ from rack.tools.viewer.stream import Moment, Stream, Timelines, open_recording
 def write_merged(
     placed: Sequence[RackPlace], file: Path, show_progress: Callable[[float], None]
 ) -> None:
-    """Write one recording that shows all of these racks, each under its name.
+    """Write one viewer recording that shows all of these racks, each under its name.
 
-    The notes on the times of the racks go to its log. A single rack's recording equals its run.rrd.
+    The log of the recording contains the notes on how the times of the racks were aligned. For a
+    single rack, the recording is equal to the run.rrd of the run.
 
     Args:
-        placed: The racks and their places on the time line.
+        placed: The racks and the conversions of their times to the common time line.
         file: File to write.
         show_progress: Called with the completed fraction, 0 to 1.
 
@@ -80,12 +81,15 @@ def write_merged(
 def _split_blocks(
     recording: Recording, last: int, block: int
 ) -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
-    """Yield the rows of all rings in blocks: the tick at which a block ends, and rows by ring.
+    """Yield the rows of all rings of a recording in blocks.
 
     Args:
         recording: The recording.
-        last: Tick after the last one.
-        block: Ticks in a block.
+        last: Tick after the last recorded tick.
+        block: Number of ticks in a block.
+
+    Yields:
+        The tick at which the block ends, and the rows of the block by task and by mailbox.
     """
     layout = recording.layout
     names = [*(task.name for task in layout.tasks), *(box.name for box in layout.timed)]

@@ -1,4 +1,4 @@
-"""The viewer's files of a run: run.rrd, and the parts that continue it in a long run."""
+"""The viewer's files of a run: run.rrd, and the parts that continue it if the run is long."""
 
 from __future__ import annotations
 
@@ -10,17 +10,20 @@ FILE = "run.rrd"
 
 
 def list_part_names(file: Path) -> Iterator[Path]:
-    """Yield the names of a file and of its parts without end: run.rrd, run-2.rrd and so on."""
+    """Yield the names of a file and of all possible further parts: run.rrd, run-2.rrd and so on."""
     yield file
     for part in count(2):
         yield file.with_stem(f"{file.stem}-{part}")
 
 
 def find_next_file(folder: Path) -> Path:
-    """Return the next unused file name, so that a restarted recorder overwrites nothing."""
+    """Return the next unused name of a part in the folder of a run.
+
+    A restarted recorder thus overwrites nothing.
+    """
     return next(path for path in list_part_names(folder / FILE) if not path.is_file())
 
 
 def list_parts(file: Path) -> list[Path]:
-    """Return the existing parts of a recording, oldest first."""
+    """Return the existing parts of the recording that begins with `file`, oldest first."""
     return [*takewhile(Path.is_file, list_part_names(file))]

@@ -1,4 +1,4 @@
-"""Pictures of a recording, drawn without a screen.
+"""Draws pictures of a recording without a screen.
 
 Usage: `python -m rack.tools.viewer.pictures RUN/run.rrd OUT.png --at 7.5`.
 """
@@ -26,12 +26,15 @@ from rack.tools.viewer.window import HOST, ViewerWindow, find_free_port, format_
 TIMEOUT_S = 30.0
 POLL_S = 0.05
 DYING_S = 2.0
-"""Time to wait for the end of a viewer. Without a graphics driver it listens first, then ends."""
+"""Time to wait for a failing viewer to end.
+
+Without a graphics driver, the viewer first listens on its port and then ends.
+"""
 PAUSE_S = 0.4
-"""Time between two pictures. If they are equal, the viewer has drawn everything."""
+"""Time between two pictures. If both are equal, the viewer has finished drawing."""
 QUIET_LEVELS = ("INFO", "DEBUG", "TRACE")
 SOFTWARE = "Software rasterizer"
-"""Remark of the viewer on a machine without a graphics card, which does not affect drawing."""
+"""Part of a warning on a machine without a graphics card, which does not affect the picture."""
 PACKAGES = (
     "mesa-vulkan-drivers",
     "libvulkan1",
@@ -44,19 +47,19 @@ PACKAGES = (
     "libxi6",
     "libxrandr2",
 )
-"""Debian packages for drawing without a graphics card; .ci/run installs them."""
+"""Debian packages that are needed to draw without a graphics card. .ci/run installs them."""
 
 
 class NoViewerError(Failure):
-    """This machine cannot draw pictures. The message says why, and what to install."""
+    """Raised if this machine cannot draw pictures. The message says why, and what to install."""
 
 
 class Picture(NamedTuple):
-    """A picture as PNG, and the complaints of the viewer.
+    """A picture, and the complaints of the viewer that drew it.
 
     Attributes:
-        picture: The picture.
-        complaints: Reports of its views and warnings in its log.
+        picture: The picture in PNG format.
+        complaints: Reports shown in the views, and warnings and errors in the viewer's log.
     """
 
     picture: bytes
@@ -71,15 +74,15 @@ class Screen:
 
     @property
     def views(self) -> dict[str, str]:
-        """Ids of the open views, by name."""
+        """Ids of the views that the viewer shows, by name."""
         return {view.name: view.view_id for view in self._client.get_state().views}
 
     def take_picture(self, at_s: float, view: str | None = None) -> Picture:
-        """Return the picture at a simulated time, once it no longer changes.
+        """Show a simulated time, wait until the picture no longer changes, and return it.
 
         Args:
-            at_s: Simulated time, s.
-            view: Name of the only view to draw. Defaults to all views.
+            at_s: The simulated time in s.
+            view: Name of the only view to draw. By default all views are drawn.
 
         Raises:
             KeyError: No view has that name.
@@ -99,7 +102,7 @@ class Screen:
         return Picture(drawn, tuple(self._list_complaints()))
 
     def _list_complaints(self) -> Iterator[str]:
-        """Yield the reports of all views, and the viewer's log above the level of information."""
+        """Yield the reports shown in all views, and the warnings and errors in the viewer's log."""
         for view in self._client.get_state().views:
             yield from (f"view '{view.name}': {report}" for report in view.reports)
         for entry in self._client.get_logs():
@@ -109,10 +112,10 @@ class Screen:
 
 @contextmanager
 def open_screen(recording: Path) -> Iterator[Screen]:
-    """Open a recording in a headless viewer.
+    """Open a recording in a headless viewer, which is closed at the end of the context.
 
     Raises:
-        NoViewerError: The machine lacks the graphics libraries.
+        NoViewerError: The viewer does not run, for example because graphics libraries are missing.
     """
     port = find_free_port()
     # `ViewerClient.spawn` would start a viewer that listens on every network.
@@ -129,7 +132,11 @@ def open_screen(recording: Path) -> Iterator[Screen]:
 
 
 def _connect_client(window: ViewerWindow, port: int) -> ViewerClient:
-    """Connect to a viewer as soon as it listens. Raises `NoViewerError` if it never does."""
+    """Connect to a viewer as soon as it listens on the port.
+
+    Raises:
+        NoViewerError: The viewer ended, or does not listen within `TIMEOUT_S`.
+    """
     deadline = time.monotonic() + TIMEOUT_S
     while window.is_open and time.monotonic() < deadline:
         with socket.socket() as probe:
@@ -142,13 +149,18 @@ def _connect_client(window: ViewerWindow, port: int) -> ViewerClient:
 
 
 def _explain_failure(window: ViewerWindow, otherwise: object) -> str:
-    """Return the reason why there is no picture, and what to install."""
+    """Return the reason why no picture can be drawn, and which packages to install.
+
+    Args:
+        window: The viewer. If it has ended with an error, that error is the reason.
+        otherwise: The reason in any other case.
+    """
     reason = window.wait_until_closed() if window.wait_for_end(DYING_S) else otherwise
     return f"{reason}; {describe_missing_packages()}"
 
 
 def describe_missing_packages() -> str:
-    """Return which packages for drawing without a graphics card are missing."""
+    """Return a clause with the missing packages for drawing without a graphics card."""
     if shutil.which("dpkg-query") is None:
         return f"without a graphics card, these Debian packages are needed: {' '.join(PACKAGES)}"
     query = ["dpkg-query", "--show", "--showformat", "${Package} ${Status}\\n", *PACKAGES]
@@ -160,7 +172,11 @@ def describe_missing_packages() -> str:
 
 
 def main() -> int:
-    """Save one picture. Returns 1 if the viewer complained."""
+    """Save one picture, and print the viewer's complaints.
+
+    Returns:
+        The exit status: 0, 1 if the viewer complained, or the status of a failure.
+    """
     parser = argparse.ArgumentParser(
         prog="python -m rack.tools.viewer.pictures", description=__doc__
     )

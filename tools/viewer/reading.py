@@ -13,11 +13,12 @@ from rack.tools.viewer.stream import TICK
 
 
 class EntityRows(NamedTuple):
-    """Rows of one entity in the order of ticks.
+    """Rows of one entity of the recording, sorted by tick.
 
     Attributes:
         ticks: Tick of each row, shape (rows,).
-        values: One list or array per row.
+        values: Values of each row. An array of shape (rows, values) if all rows have equally many
+            values, otherwise an array of lists.
     """
 
     ticks: np.ndarray
@@ -25,12 +26,13 @@ class EntityRows(NamedTuple):
 
 
 def read_component(file: Path, entity: str, component: str = "Scalars:scalars") -> EntityRows:
-    """Read one component of an entity, from a file and the parts that continue it.
+    """Read one component of an entity from run.rrd and the parts that continue it.
 
     Args:
         file: The first file of the recording.
         entity: Path of the entity.
-        component: The component. Defaults to curves, whose values have shape (rows, curves).
+        component: Name of the component. Defaults to the values of curves, which have shape
+            (rows, curves).
 
     Raises:
         KeyError: The files contain no such component.
@@ -51,6 +53,6 @@ def read_component(file: Path, entity: str, component: str = "Scalars:scalars") 
     order = np.argsort(ticks, kind="stable")
     try:
         values = np.array(rows)
-    except ValueError:  # rows of different lengths
+    except ValueError:  # the rows have different lengths
         values = np.array(rows, dtype=object)
     return EntityRows(ticks[order], values[order])

@@ -1,4 +1,4 @@
-"""Shapes of MuJoCo geoms, in the frame of their body."""
+"""Converts MuJoCo geoms to shapes of the viewer, in the frame of their body."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Geom = mujoco.mjtGeom
 
 
 def build_shape(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
-    """Return the shape of a geom, or None if it is invisible."""
+    """Return the shape of a geom. None if the geom is invisible or of an unknown type."""
     rgba = read_colour(model, geom)
     if rgba[3] == 0:
         return None
@@ -37,7 +37,7 @@ def build_shape(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
         case Geom.mjGEOM_CYLINDER:
             return rr.Cylinders3D(lengths=[2 * half], radii=[radius], **centred)
         case Geom.mjGEOM_CAPSULE:
-            # MuJoCo's capsule is centred on its origin; rerun's begins at its origin.
+            # The origin of a capsule is its centre in MuJoCo, but one of its ends in rerun.
             begin = transform_to_body(model, geom, np.array([[0.0, 0.0, -half]]))
             return rr.Capsules3D(lengths=[2 * half], radii=[radius], translations=begin, **solid)
         case Geom.mjGEOM_PLANE:
@@ -50,27 +50,27 @@ def build_shape(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
 
 
 def read_colour(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
-    """Return red, green, blue and alpha of a geom or of its material, 0 to 255."""
+    """Return red, green, blue and alpha (0 to 255) of a geom's material or of the geom itself."""
     material = model.geom_matid[geom]
     rgba = model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]
     return np.asarray(np.round(rgba * 255), dtype=np.uint8)
 
 
 def to_xyzw(quaternions: Array) -> Array:
-    """Convert MuJoCo's quaternions, w first, to rerun's, w last; shape (..., 4)."""
+    """Convert quaternions of shape (..., 4) from MuJoCo's order, w first, to rerun's, w last."""
     return np.roll(quaternions, -1, axis=-1)
 
 
 def _build_plane(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    """Return a plane as two triangles."""
-    # A half size of zero means an infinite plane, which is drawn larger than the model.
+    """Return the shape of a plane, which consists of two triangles."""
+    # A half size of zero means an infinite plane. Draw it larger than the model.
     x, y = (half_size or 2 * model.stat.extent for half_size in model.geom_size[geom][:2])
     corners = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
     return _build_surface(model, geom, corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def _build_mesh(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    """Return a mesh or signed distance field as triangles."""
+    """Return the shape of a mesh or signed distance field, which consists of triangles."""
     mesh = model.geom_dataid[geom]
     vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
     faces = slice(model.mesh_faceadr[mesh], model.mesh_faceadr[mesh] + model.mesh_facenum[mesh])
@@ -80,7 +80,7 @@ def _build_mesh(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
 
 
 def _build_height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
-    """Return a height field as triangles."""
+    """Return the shape of a height field, which consists of triangles."""
     field = model.geom_dataid[geom]
     rows = model.hfield_nrow[field]
     columns = model.hfield_ncol[field]
@@ -102,11 +102,11 @@ def _build_surface(
 
     Args:
         model: The model.
-        geom: The geom, which gives pose and colour.
-        vertices: Vertices in the frame of the geom, shape (n, 3), m.
-        triangles: Indices of the vertices, shape (triangles, 3).
+        geom: The geom that has these triangles, and whose pose and colour they get.
+        vertices: Positions in m in the frame of the geom, shape (n, 3).
+        triangles: Indices of the vertices of each triangle, shape (triangles, 3).
     """
-    # Flat shading: triangles share no corners, so that edges stay sharp.
+    # Flat shading: each triangle has its own corners and normals, so that edges look sharp.
     corners = transform_to_body(model, geom, vertices)[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -120,7 +120,13 @@ def _build_surface(
 
 
 def transform_to_body(model: mujoco.MjModel, geom: int, points: Array) -> Array:
-    """Transform points from the frame of a geom to the frame of its body, shape (points, 3), m."""
+    """Transform points from the frame of a geom to the frame of its body.
+
+    Args:
+        model: The model.
+        geom: The geom.
+        points: Positions in m, shape (points, 3).
+    """
     rotation = np.zeros(9)
     mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
     return np.asarray(model.geom_pos[geom] + points @ rotation.reshape(3, 3).T)

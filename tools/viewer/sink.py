@@ -1,4 +1,7 @@
-"""Writes the recorder's rows as a recording for the viewer, in blocks."""
+"""Writes the rows that the recorder reads as a recording for the viewer, in blocks.
+
+View parts are functions that each show one aspect of a mailbox or task.
+"""
 
 from __future__ import annotations
 
@@ -80,25 +83,25 @@ LANES: tuple[tuple[type[Message], str, str | list[str], Callable[[Any], str]], .
     (GraspStatus, "step", ["step", "kind"], format_step),
     (ServerStatus, "mode", "mode", partial(format_enum, Mode)),
 )
-"""Lanes of messages: message class, name of the lane, its fields, and the names of their values."""
+"""Lanes for messages: message class, name of the lane, fields, and function that names values."""
 BLOCK_S = 1.0
-"""Simulated time in a block. Writing costs the same for 4 rows as for 400."""
+"""Simulated duration of a block. Writing 4 rows takes as long as writing 400."""
 
 
 PART_S = 180.0
-"""Simulated time in a file.
+"""Simulated duration of a part, which is one file.
 
-Until a file is finished, its index is in memory, which takes 0.65 MB per second of the NASREM rack.
+Until a file is finished, its index is kept in memory: 0.65 MB per second of the NASREM rack.
 """
 
 
 class RunContext(NamedTuple):
-    """Everything that the view needs to know of a run before its first row.
+    """Everything that the view needs to know about a run before its first row.
 
     Attributes:
         layout: Layout of the rack.
-        text: The resolved config as text.
-        config: The config.
+        text: The resolved config as TOML text.
+        config: The resolved config as a record.
         cell: Cell of the arm, or None without an arm.
         events: Path of the event log.
     """
@@ -111,7 +114,13 @@ class RunContext(NamedTuple):
 
     @classmethod
     def from_config(cls, layout: Layout, text: str, folder: Path) -> Self:
-        """Build the context of a run in `folder`, whose resolved config is `text`."""
+        """Build the context of a run.
+
+        Args:
+            layout: Layout of the rack.
+            text: The resolved config as TOML text.
+            folder: Folder of the run.
+        """
         config = read_stored(text)
         robot = config.robot
         cell = None if robot is None else build_cell(robot, config.scene, config.clock_ns)
@@ -119,7 +128,10 @@ class RunContext(NamedTuple):
 
 
 class RackWriter:
-    """Writes the rows of a rack's rings to a stream, in blocks."""
+    """Writes the rows of all rings of a rack to a stream, in blocks.
+
+    A ring contains the trace records of a task or the messages of a mailbox.
+    """
 
     def __init__(self, stream: Stream, ran: RunContext) -> None:
         layout = ran.layout
@@ -140,7 +152,7 @@ class RackWriter:
                     parts_by_mailbox[box.name].append(marks.write)
                 parts_by_mailbox[box.name] += _build_arm_parts(stream, box, config, ran.cell, goals)
         lockstep = config.clock.mode == "lockstep"
-        # Traces measure real time, in which a tick of lockstep has no fixed length.
+        # Traces measure real time, in which a tick has no fixed length in lockstep.
         tick_ns = layout.clock_ns if lockstep else config.tick_ns
         colours = choose_task_colours(layout)
         boards = list_boards(layout)
@@ -155,8 +167,8 @@ class RackWriter:
             ]
             for task in layout.tasks
         }
-        # Mailboxes of operators and host boards, and queues, have no age, because they are not
-        # written periodically.
+        # Ages are shown only for messages that are written periodically, not for messages of
+        # operators and host boards and not for queues.
         periodic = [box for box in layout.timed if box.writer != CLOCK and box.protocol != "queue"]
         self._ages = {
             mailbox.name: AgeWriter(stream, mailbox, layout, colours[mailbox.writer])
@@ -172,12 +184,12 @@ class RackWriter:
     def write(
         self, rows_by_ring: Mapping[str, np.ndarray], tick: int, lost: Mapping[str, int]
     ) -> None:
-        """Write a block of rows, which contains everything before `tick`.
+        """Write a block of rows.
 
         Args:
-            rows_by_ring: Rows, each of shape (rows,), by ring.
-            tick: Tick at which the block ends.
-            lost: Number of lost rows, by ring.
+            rows_by_ring: Rows of each ring, shape (rows,), by task or mailbox.
+            tick: Tick at which the block ends. The rows include everything before this tick.
+            lost: Number of lost rows since the start, by ring.
         """
         if (fastest := rows_by_ring.get(self._fastest)) is not None:
             self._times.add_stamps(fastest["tick"], fastest["start_ns"])
@@ -192,16 +204,16 @@ class RackWriter:
         self._write_losses(tick, lost)
 
     def skip_to(self, tick: int) -> None:
-        """Continue at a tick before which nothing is recorded."""
+        """Continue at `tick` after a range of ticks that was not recorded."""
         for age in self._ages.values():
             age.skip_to(tick)
 
 
 class ViewSink:
-    """Writes run.rrd of a rack into `folder`, in parts for a long run.
+    """The recorder's sink that writes run.rrd of a rack into `folder`, in parts if the run is long.
 
-    With a port it also serves a viewer, and then everything is in one part, because the viewer's
-    server cannot change files. A rack with a flight recorder gets no file.
+    With a port, the recording is also served to a viewer. It then has only one part, because a
+    recording that is served cannot change its file. A rack with a flight recorder gets no file.
     """
 
     def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
@@ -225,14 +237,19 @@ class ViewSink:
         self._part_ends = self._written + self._part if port is None else None
 
     def add(self, ring: str, rows: np.ndarray) -> None:
-        """Take rows of a ring, shape (rows,)."""
+        """Queue rows of a ring, shape (rows,), for the next block."""
         if len(rows):
             self._waiting[ring].append(rows)
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write a block if one is full. Everything before `tick` has been added.
+        """Write the queued rows if they cover the duration of a block.
 
-        `lost` counts lost rows by ring. Raises `RuntimeError` if the file cannot be written.
+        Args:
+            tick: Tick before which all rows have been added.
+            lost: Number of lost rows, by ring.
+
+        Raises:
+            RuntimeError: The file cannot be written.
         """
         if tick - self._written >= self._block:
             self._write(tick, lost)
@@ -242,13 +259,21 @@ class ViewSink:
                 self._stream.continue_in(find_next_file(self._folder))
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write the remaining rows and finish the file. Raises `RuntimeError` if that fails."""
+        """Write the remaining rows and finish the file.
+
+        Args:
+            tick: Tick at which the run ended.
+            lost: Number of lost rows, by ring.
+
+        Raises:
+            RuntimeError: The file cannot be written.
+        """
         self._write(tick, lost)
         self._stream.flush()
         self._stream.close()
 
     def _write(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write the waiting rows as a block, and the load of the recorder."""
+        """Write the queued rows as a block that ends at `tick`, and the load of the recorder."""
         self._written = tick
         waiting = self._waiting
         self._waiting = defaultdict(list)
@@ -259,12 +284,12 @@ class ViewSink:
 
 
 def compute_block_ticks(layout: Layout) -> int:
-    """Return the number of ticks in a block."""
+    """Return the duration of a block in ticks."""
     return max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
 
 
 def _build_mailbox_parts(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
-    """Yield the parts that show a mailbox of any rack, chosen by its fields and message type."""
+    """Yield the view parts for a mailbox that do not depend on an arm: lanes and curves."""
     names = {field.name for field in mailbox.fields}
     board, _, port = mailbox.name.partition(".")
     kind = mailbox.message
@@ -284,14 +309,15 @@ def _build_mailbox_parts(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewP
 def _build_arm_parts(
     stream: Stream, mailbox: MailboxSpec, config: RackConfig, cell: Cell, goals: GoalWriter
 ) -> Iterator[ViewPart]:
-    """Yield the parts that show a mailbox in the cell, or as curves of the arm.
+    """Yield the view parts that show a mailbox in the 3D cell, or as curves of the arm or hand.
 
     Args:
-        stream: Where they are written.
+        stream: Stream to write to.
         mailbox: The mailbox.
         config: Config of the rack.
         cell: Cell of the arm.
-        goals: Writer of the goals, shared by the plan and the status of moves.
+        goals: Writer of the goals. It is shared because goals need both `TaskPlan` and
+            `MoveStatus`.
     """
     robot = config.robot
     assert robot is not None, "there is an arm"

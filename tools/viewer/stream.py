@@ -1,7 +1,7 @@
-"""The recording for the viewer as a stream into a file, to a viewer on this machine, or both.
+"""Streams a recording for the viewer into a file, to a viewer on this machine, or both.
 
-Its rows have three timelines: simulated time, tick and wall clock. They are written in blocks, each
-with rows of one mailbox or task.
+The rows of the recording have times on three timelines: simulated time, tick and wall clock. They
+are written in blocks, each with rows of one mailbox or task.
 """
 
 from __future__ import annotations
@@ -25,16 +25,19 @@ SIM_TIME = "sim_time"
 TICK = "tick"
 WALL = "wall"
 REMEMBERED_TICKS = 4096
-"""Number of remembered pairs of tick and time, which place events that have no time stamp."""
+"""Number of remembered pairs of tick and time stamp.
+
+From these the times of ticks without a time stamp are interpolated.
+"""
 APPLICATION = "rack"
 LOG = "log"
 FLUSH_S = 0.5
-"""Longest wait for the disk in one call.
+"""Longest time that a flush waits for the disk.
 
-The rings are not drained in that time, and hold two seconds.
+The recorder does not read the rings in that time, and they hold only two seconds.
 """
 SERVER_MEMORY = "200MB"
-"""Amount of data that the server keeps for a viewer that connects later."""
+"""Amount of recorded data that the server keeps for viewers that connect later."""
 
 
 class Moment(NamedTuple):
@@ -45,7 +48,7 @@ class Moment(NamedTuple):
 
 
 class RowTimes(NamedTuple):
-    """Times of rows, each of shape (rows,): simulated time, ns; tick; wall clock, ns."""
+    """Times of rows on the three timelines of the recording, each of shape (rows,)."""
 
     simulated_ns: Ints
     ticks: Ints
@@ -53,9 +56,10 @@ class RowTimes(NamedTuple):
 
 
 class Timelines:
-    """Converts ticks and CLOCK_MONOTONIC stamps to times in the recording. All are integers, ns.
+    """Converts ticks and CLOCK_MONOTONIC stamps to times on the timelines of the recording.
 
-    If a rack is `placed` on the time line of another one, all three timelines are the other rack's.
+    The timelines are simulated time, tick and wall clock. If `placed` is given, they are the
+    timelines of another rack, to which the times are converted. All times are integers, in ns.
     """
 
     def __init__(self, clock_ns: int, launch: Launch, placed: RackPlace | None = None) -> None:
@@ -66,12 +70,12 @@ class Timelines:
         self._stamps: Ints = np.array([launch.monotonic_ns])
 
     def compute_times(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> RowTimes:
-        """Return the times of rows.
+        """Return the times of rows on the timelines.
 
         Args:
             ticks: Release ticks, shape (rows,).
             stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
-            within_ns: Simulated time after the release.
+            within_ns: Simulated time since the release, which is added.
         """
         if (placed := self._placed) is None:
             return RowTimes(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
@@ -85,12 +89,12 @@ class Timelines:
     def build_columns(
         self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0
     ) -> list[rr.TimeColumn]:
-        """Return the times of rows as columns of the recording.
+        """Return the times of rows as one time column for each timeline.
 
         Args:
             ticks: Release ticks, shape (rows,).
             stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
-            within_ns: Simulated time after the release.
+            within_ns: Simulated time since the release, which is added.
         """
         times = self.compute_times(ticks, stamps_ns, within_ns)
         return [
@@ -100,33 +104,39 @@ class Timelines:
         ]
 
     def add_stamps(self, ticks: Ints, stamps_ns: Ints) -> None:
-        """Remember the time stamps of ticks. Both arrays are sorted."""
+        """Remember the time stamps of ticks, from which other times are estimated.
+
+        Args:
+            ticks: The ticks in ascending order, shape (n,).
+            stamps_ns: Their time stamps of CLOCK_MONOTONIC, shape (n,).
+        """
         new = ticks > self._ticks[-1]
         self._ticks = np.concatenate((self._ticks, ticks[new]))[-REMEMBERED_TICKS:]
         self._stamps = np.concatenate((self._stamps, stamps_ns[new]))[-REMEMBERED_TICKS:]
 
     def estimate_stamps(self, ticks: Ints) -> Ints:
-        """Return the approximate CLOCK_MONOTONIC time of ticks, ns."""
-        # Interpolate relative to the newest stamp, because floats have only 53 bits.
+        """Return the approximate times of ticks on CLOCK_MONOTONIC, in ns."""
+        # Interpolate differences from the newest stamp. A float cannot represent a whole time
+        # stamp in ns exactly.
         last = self._stamps[-1]
         return np.asarray(
             last + np.interp(ticks, self._ticks, self._stamps - last).astype(np.int64)
         )
 
     def estimate_moment(self, tick: int) -> Moment:
-        """Return a tick with its approximate time."""
+        """Return a tick together with its approximate time."""
         return Moment(tick, int(self.estimate_stamps(np.array([tick]))[0]))
 
     def to_monotonic(self, time_ns: int) -> int:
-        """Convert a CLOCK_REALTIME stamp to CLOCK_MONOTONIC."""
+        """Convert a time stamp of CLOCK_REALTIME to CLOCK_MONOTONIC, both in ns."""
         return time_ns - self._offset_ns
 
 
 class RowBlock:
-    """Rows of one ring, oldest first, with their times.
+    """Rows of one task or mailbox, oldest first, with their times.
 
-    The rows of a mailbox have the fields of `rack.backplane.mailbox.history.MailboxRing`, the rows
-    of a trace have the fields of `rack.backplane.trace.RECORD`.
+    The rows of a task are trace records with the fields of `rack.backplane.trace.RECORD`. The rows
+    of a mailbox have the fields of `rack.backplane.mailbox.history.MailboxRing`.
 
     Attributes:
         rows: The rows, shape (rows,).
@@ -143,7 +153,7 @@ class RowBlock:
 
     @cached_property
     def time_columns(self) -> list[rr.TimeColumn]:
-        """Time columns of all rows, built once for all parts that write them."""
+        """Time columns of all rows, which are built once for all view parts."""
         return self._timelines.build_columns(self.ticks, self.stamps_ns)
 
     def build_time_columns(self, rows: Ints | list[int]) -> list[rr.TimeColumn]:
@@ -151,16 +161,16 @@ class RowBlock:
         return self._timelines.build_columns(self.ticks[rows], self.stamps_ns[rows])
 
     def find_moment(self, row: SupportsIndex) -> Moment:
-        """Return the time at which a row was written."""
+        """Return the release tick and the time stamp of a row."""
         return Moment(int(self.ticks[row]), int(self.stamps_ns[row]))
 
     def find_visible_moment(self, row: SupportsIndex) -> Moment:
-        """Return the tick at which a mailbox's row is visible, with the row's time stamp."""
+        """Return the tick at which a message becomes visible, with the time stamp of its row."""
         return Moment(int(self.rows["visible_at"][row]), int(self.stamps_ns[row]))
 
     @property
     def messages(self) -> np.ndarray:
-        """The messages of a mailbox's rows."""
+        """The messages in the rows of a mailbox, shape (rows,)."""
         return np.asarray(self.rows["message"])
 
 
@@ -169,10 +179,11 @@ ViewPart = Callable[[RowBlock], None]
 
 
 def build_change_finder() -> Callable[[np.ndarray], Ints]:
-    """Return a function that finds the rows that differ from the row before.
+    """Return a function that finds the rows in which a value changes.
 
-    It takes the values of consecutive blocks, of shape (rows,) or structured, and returns indices
-    of rows. The very first row counts as a change.
+    Call the function with the values of one block after the other, shape (rows,). It returns the
+    indices of the rows that differ from the previous row, which may be in the previous block. The
+    first row of the first block counts as a change.
     """
     last: np.ndarray | None = None
 
@@ -188,13 +199,14 @@ def build_change_finder() -> Callable[[np.ndarray], Ints]:
 
 
 SHOWN_S = 0.02
-"""Time between two drawn rows: the rate of a screen."""
+"""Simulated time between two drawn rows, about the refresh interval of a screen."""
 
 
 def build_row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
-    """Return a function that chooses the rows to draw, the first of every 20 ms of simulated time.
+    """Return a function that chooses the rows to draw: the first in every 20 ms of simulated time.
 
-    It takes the ticks of consecutive blocks, and returns indices of rows.
+    Call the function with the ticks of one block after the other. It returns the indices of the
+    chosen rows.
     """
     every = max(1, round(SHOWN_S * 1e9 / clock_ns))
     last = -1
@@ -216,13 +228,13 @@ def open_recording(
     """Open a recording that is written into a file, served on a port of this machine, or both.
 
     Args:
-        name: Name that the viewer shows.
+        name: Name of the recording in the viewer.
         run: Id of the run. Files with the same id are shown as one recording.
-        file: The file, or None.
+        file: File to write, or None.
         blueprint: The initial view.
-        port: The port, or None.
+        port: Port on which the recording is served, or None.
     """
-    # Without strict mode a mistake is only a warning on stderr and a gap in the recording.
+    # Without strict mode, rerun only prints a warning about a wrong call and leaves out its data.
     rr.set_strict_mode(True)
     recording = rr.RecordingStream(APPLICATION, recording_id=run)
     recording.set_log_time_enabled(False)
@@ -231,7 +243,8 @@ def open_recording(
     if file is not None:
         sinks.append(rr.FileSink(str(file)))
     if port is not None:
-        # Use a server, not a client: a client without its viewer would also block the file.
+        # Use a server, not a client: a client whose viewer is not running would also block writing
+        # to the file.
         sinks.append(rr.GrpcServerSink("127.0.0.1", port, server_memory_limit=SERVER_MEMORY))
     recording.set_sinks(*sinks, default_blueprint=blueprint)
     recording.send_recording_name(name)
@@ -239,10 +252,10 @@ def open_recording(
 
 
 class Stream:
-    """The part of a recording that one rack writes.
+    """Writes the data of one rack to a recording.
 
-    Entities are named by parts, which may contain any character, and all are below `root`. `flush`
-    raises `RuntimeError` once the file cannot be written.
+    An entity is given as the parts of its path, which may contain any character. All entities of
+    the rack are below the path `root`.
     """
 
     def __init__(
@@ -253,52 +266,55 @@ class Stream:
         self._root = root
 
     def format_frame(self, name: str) -> str:
-        """Return the full name of a coordinate frame, since frames of a recording are global."""
+        """Return the full name of a coordinate frame of the rack.
+
+        Frames are global in a recording, so the name begins with the root.
+        """
         return "/".join((*self._root, name))
 
     def build_frame(self, frame: str) -> rr.CoordinateFrame:
-        """Return the component that puts an entity into a frame."""
+        """Return the component that attaches an entity to a coordinate frame of the rack."""
         return rr.CoordinateFrame(self.format_frame(frame))
 
     def _build_path(self, entity: Sequence[str]) -> str:
-        """Return the path of an entity, below the root."""
+        """Return the full path of an entity, including the root."""
         return build_path(*self._root, *entity)
 
     def log_static(self, entity: Sequence[str], *archetypes: rr.AsComponents) -> None:
-        """Log data that hold at all times."""
+        """Write data of an entity that apply at all times."""
         self._recording.log(self._build_path(entity), *archetypes, static=True)
 
     def send_columns(
         self, entity: Sequence[str], times: list[rr.TimeColumn], columns: rr.ComponentColumnList
     ) -> None:
-        """Send a block of rows.
+        """Write a block of rows of an entity.
 
         Args:
             entity: The entity.
-            times: Times of the rows.
-            columns: Components of the rows.
+            times: Time columns of the rows.
+            columns: Component columns of the rows.
         """
         self._recording.send_columns(self._build_path(entity), times, columns)
 
     def send_curves(
         self, entity: Sequence[str], times: list[rr.TimeColumn], values: np.ndarray
     ) -> None:
-        """Send a block of curves.
+        """Write a block of values of an entity that are shown as curves.
 
         Args:
             entity: The entity.
-            times: Times of the rows.
-            values: Values, shape (rows,) or (rows, curves).
+            times: Time columns of the rows.
+            values: Values of one curve, shape (rows,), or of several, shape (rows, curves).
         """
         self.send_columns(entity, times, rr.Scalars.columns(scalars=values))
 
     def log_at(self, when: Moment, entity: Sequence[str], archetype: rr.AsComponents) -> None:
-        """Log a single item.
+        """Write data of an entity for a single moment.
 
         Args:
-            when: Its time.
+            when: The moment.
             entity: The entity.
-            archetype: The item.
+            archetype: The data.
         """
         times = self.times.compute_times(np.array([when.tick]), np.array([when.stamp_ns]))
         self._recording.set_time(
@@ -309,27 +325,27 @@ class Stream:
         self._recording.log(self._build_path(entity), archetype)
 
     def log_line(self, when: Moment, source: str, text: str, level: str) -> None:
-        """Write a line to the log. Of a rack among several, it begins with the rack's name.
+        """Write a line to the log. If the recording has several racks, the rack's name precedes it.
 
         Args:
             when: Time of the line.
-            source: Entity below the log to which it belongs.
+            source: Name of the entity below the log that gets the line.
             text: The line.
-            level: Log level of rerun.
+            level: Log level of rerun, for example "WARN".
         """
         line = rr.TextLog(": ".join((*self._root, text)), level=level)
         self.log_at(when, (LOG, source), line)
 
     def log_property(self, name: str, values: rr.AsComponents) -> None:
-        """Log a property of the run."""
+        """Write values as a property of the whole recording."""
         self._recording.send_property(" ".join((*self._root, name)), values)
 
     def flush(self) -> None:
-        """Write everything to the file. Raises `RuntimeError` if that fails."""
+        """Write all pending data to the file. Raises `RuntimeError` if that is not possible."""
         self._recording.flush(timeout_sec=FLUSH_S)
 
     def continue_in(self, file: Path) -> None:
-        """Finish the file, and continue in another file of the same run."""
+        """Finish the current file, and write all further data to another file of the same run."""
         self._recording.set_sinks(rr.FileSink(str(file)))
 
     def close(self) -> None:
@@ -338,5 +354,5 @@ class Stream:
 
 
 def build_path(*parts: str) -> str:
-    """Return the path of an entity from its parts."""
+    """Return the path of an entity, given its parts."""
     return rr.new_entity_path(list(parts))

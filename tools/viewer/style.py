@@ -1,6 +1,7 @@
-"""Colours of the view, each with one meaning, and lanes, which are spans of coloured states.
+"""Colours of the view, curves, legends and lanes.
 
-rerun marks the archetype of lanes as unstable, so only this module uses it.
+Each colour has one meaning. A lane shows states over time as coloured spans. rerun marks its
+archetype for lanes as unstable, so only this module uses it.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _JOINTS: tuple[Colour, ...] = (
     0xD55E00FF,
     0x968CFFFF,
 )
-"""Colours that can be told apart without red or green vision (Okabe and Ito)."""
+"""Colours that are distinguishable with red-green colour blindness (Okabe and Ito)."""
 COMMANDED: Colour = 0x828282A0
 LIMIT: Colour = 0xC83C3C6E
 PLANNED: Colour = 0xFFC828FF
@@ -35,11 +36,11 @@ FORCE: Colour = 0xF03C3CFF
 LOST: Colour = 0xE63232FF
 GRID: Colour = 0xFFFFFF78
 OVERLAID = (2.5, 1.0)
-"""Widths of two curves, so that the lower one shows on both sides where they coincide."""
+"""Widths of two curves. Where they coincide, the wider one is visible on both sides."""
 LEGEND = "legend"
 LEGEND_ROW = 30.0
 LEGEND_LETTER = 7.0
-"""Distance between the names of a legend and width of a letter, in the units of a graph."""
+"""Distance between the entries of a legend, and width of a letter, in the units of a graph."""
 
 _GREY: Colour = 0x6E6E78FF
 _BLUE: Colour = 0x468CE6FF
@@ -68,7 +69,7 @@ EVENT_COLOURS: dict[str, Colour] = {
     "reaction": 0xDC5A3CFF,
     "recovery": _GREEN,
 }
-"""Colours by kind of event. The viewer chooses a colour for any other kind."""
+"""Colour of each kind of event. The viewer chooses the colours of other kinds."""
 PHASES: dict[str, Colour] = {
     "wait": 0x3C3E46FF,
     "read": 0x5AAADCFF,
@@ -78,11 +79,11 @@ PHASES: dict[str, Colour] = {
     "missed": 0xE63232FF,
 }
 LETTERS = {"wait": " ", "read": "R", "process": "X", "plan": "P", "write": "W", "missed": "!"}
-"""Labels of phases, as in the paper's figures, because words would not fit into their spans."""
+"""Labels of phases, as in the paper's figures, because words would not fit into the spans."""
 
 
 def choose_joint_colour(index: int) -> Colour:
-    """Return the colour of a joint by its index, from base to tool."""
+    """Return the colour of the joint with this index. Joints are counted from base to tool."""
     return _JOINTS[index % len(_JOINTS)]
 
 
@@ -97,7 +98,10 @@ def dim_colour(colour: Colour) -> Colour:
 
 
 def pack_colours(colours: Iterable[Colour]) -> np.ndarray:
-    """Pack colours into an array, since rerun takes three or four plain numbers as one colour."""
+    """Return colours as an array.
+
+    rerun would take a list of three or four numbers as the components of one colour.
+    """
     return np.array(list(colours), np.uint32)
 
 
@@ -107,13 +111,13 @@ def style_lane(
     colours: Mapping[str, Colour],
     labels: Mapping[str, str] | None = None,
 ) -> None:
-    """Set the colours and labels of a lane's states. The viewer chooses colours for other states.
+    """Set colours and labels for states of a lane. The viewer chooses the colours of other states.
 
     Args:
-        stream: Where they are written.
+        stream: Stream to write to.
         entity: The lane.
-        colours: Colour of each state.
-        labels: Label of each state. Defaults to the names of the states.
+        colours: Colours, by state.
+        labels: Labels, by state. Defaults to the names of the states.
     """
     shades = pack_colours(colours.values())
     shown_labels = list(colours)
@@ -134,11 +138,11 @@ def style_curves(
     """Set names, colours and widths of an entity's curves.
 
     Args:
-        stream: Where they are written.
+        stream: Stream to write to.
         entity: The entity.
         names: Names of the curves.
         colours: Their colours. By default the viewer chooses them.
-        widths: Their widths. By default the viewer's.
+        widths: Their widths. By default the viewer chooses them.
     """
     shades = None if colours is None else pack_colours(colours)
     stream.log_static(entity, rr.SeriesLines(names=names, colors=shades, widths=widths))
@@ -152,28 +156,29 @@ def build_curves(
     colours: Sequence[Colour] | None = None,
     widths: Sequence[float] | None = None,
 ) -> ViewPart:
-    """Style the curves of an entity, and return the part that writes them.
+    """Set the style of an entity's curves, and return the view part that writes their values.
 
     Args:
-        stream: Where they are written.
+        stream: Stream to write to.
         entity: The entity.
-        values: Returns the values of all rows of a block, (rows,) or (rows, curves).
+        values: Function that returns the values of all rows of a block, shape (rows,) or
+            (rows, curves).
         names: Names of the curves, with their units.
         colours: Their colours. By default the viewer chooses them.
-        widths: Their widths. By default the viewer's.
+        widths: Their widths. By default the viewer chooses them.
     """
     style_curves(stream, entity, names, colours, widths)
     return lambda block: stream.send_curves(entity, block.time_columns, values(block))
 
 
 def write_legend(stream: Stream, what: str, names: Sequence[str], colours: list[Colour]) -> None:
-    """Write a legend as a separate graph, because a legend within a plot would cover curves.
+    """Write a legend as a separate entity, because a legend within a plot would cover curves.
 
     Args:
-        stream: Where it is written.
+        stream: Stream to write to.
         what: Name of the legend.
-        names: Its entries, from top to bottom.
-        colours: Their colours.
+        names: Entries of the legend, from top to bottom.
+        colours: Colours of the entries.
     """
     places = [(0.0, LEGEND_ROW * row) for row in range(len(names))]
     nodes = rr.GraphNodes(names, labels=names, positions=places, colors=pack_colours(colours))
@@ -181,7 +186,7 @@ def write_legend(stream: Stream, what: str, names: Sequence[str], colours: list[
 
 
 def build_legend_view(origin: str, name: str, names: Sequence[str]) -> rrb.View:
-    """Return a view of a legend.
+    """Return the view of a legend, large enough for its entries.
 
     Args:
         origin: Path of the legend's entity.
@@ -197,22 +202,22 @@ def build_legend_view(origin: str, name: str, names: Sequence[str]) -> rrb.View:
 def write_spans(
     stream: Stream, entity: Sequence[str], times: list[rr.TimeColumn], states: Sequence[str]
 ) -> None:
-    """Write the states of a lane. Each lasts until the next one, and "" means no state.
+    """Write states of a lane. Each state lasts until the next one.
 
     Args:
-        stream: Where they are written.
+        stream: Stream to write to.
         entity: The lane.
-        times: Times at which the states begin.
-        states: The states.
+        times: Time columns with the begins of the states.
+        states: The states. "" means no state.
     """
     stream.send_columns(entity, times, rr.StateChange.columns(state=states))
 
 
 def write_span(stream: Stream, when: Moment, entity: Sequence[str], state: str) -> None:
-    """Write one state of a lane.
+    """Write one state of a lane, which lasts until the next one.
 
     Args:
-        stream: Where it is written.
+        stream: Stream to write to.
         when: Time at which the state begins.
         entity: The lane.
         state: The state, or "" for none.
@@ -221,12 +226,13 @@ def write_span(stream: Stream, when: Moment, entity: Sequence[str], state: str) 
 
 
 def build_lanes_view(name: str, contents: Sequence[str], around_s: float | None = None) -> rrb.View:
-    """Return a view of lanes.
+    """Return a view that shows lanes below each other.
 
     Args:
         name: Title of the view.
         contents: Queries for the lanes.
-        around_s: Time to show before and after the time cursor. Defaults to the whole run.
+        around_s: Time that is shown before and after the time cursor. By default the whole run is
+            shown.
     """
     axis = rrb.TimeAxis(link="LinkToGlobal")
     if around_s is not None:

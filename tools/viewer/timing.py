@@ -1,4 +1,4 @@
-"""The timing of a rack in the view: lanes and curves of tasks, and ages of messages."""
+"""Shows the timing of a rack: lanes and curves of tasks, and ages of messages."""
 
 from __future__ import annotations
 
@@ -37,23 +37,24 @@ AGES = "ages"
 MOMENTS = ("start_ns", "read_ns", "process_ns", "end_ns")
 MISSED = "missed"
 SPAN_S = 0.25
-"""Time that is marked around a missed cycle, which itself would be too narrow to see."""
+"""Duration of the mark for a missed cycle. The cycle itself would be too narrow to see."""
 
 
 def build_cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> ViewPart:
-    """Return the part that shows each cycle as four spans: read, process or plan, write, wait.
+    """Return the view part that shows each cycle as four spans: read, process or plan, write, wait.
 
-    Missed cycles are red. In real time the spans have their position on the wall clock, scaled to
-    simulated time. In lockstep, where simulated time does not pass during a cycle, they begin at
-    the tick and are cut at the end of the time slice.
+    Missed cycles are red. In real time, the spans are shown at their wall-clock times, scaled to
+    simulated time. In lockstep, simulated time does not pass during a cycle. The spans then begin
+    at the tick, and are cut off at the end of the time slice.
 
     Args:
-        stream: Where it is written.
+        stream: Stream to write to.
         task: The task.
-        speed: Simulated time per wall-clock time.
+        speed: Ratio of simulated time to wall-clock time.
         lockstep: Whether the run is in lockstep.
     """
-    lane = (BOARDS, f"{task.slot}-{task.board}", task.role)  # in the order of slots
+    # The slot precedes the name of the board, so that lanes are in the order of slots.
+    lane = (BOARDS, f"{task.slot}-{task.board}", task.role)
     last_ns = task.slice * stream.times.clock_ns - len(MOMENTS)
     work = "process" if task.role == "executor" else "plan"
     style_lane(stream, lane, PHASES, LETTERS)
@@ -64,7 +65,7 @@ def build_cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: boo
         moments = np.stack([rows[name] for name in MOMENTS], axis=1)
         within = ((moments - rows["release_ns"][:, None]) * speed).astype(np.int64)
         if lockstep:
-            # Cut spans keep distinct begins and their order.
+            # Spans that are cut off still begin at different times and in the right order.
             within = np.minimum(within, last_ns + np.arange(len(MOMENTS)))
         ticks = np.repeat(block.ticks, len(MOMENTS))
         states = np.array([["read", work, "write", "wait"]] * len(rows))
@@ -76,12 +77,12 @@ def build_cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: boo
 
 
 def list_boards(layout: Layout) -> list[str]:
-    """Return the boards in the order of their tasks."""
+    """Return the names of the boards, in the order of their tasks in the layout."""
     return list(dict.fromkeys(task.board for task in layout.tasks))
 
 
 def choose_task_colours(layout: Layout) -> dict[str, Colour]:
-    """Return a colour for each task, by name. A planner has the dimmed colour of its board."""
+    """Return the colour of each task, by name. A planner gets the dimmed colour of its board."""
     boards = list_boards(layout)
     by_task = {task.name: choose_joint_colour(boards.index(task.board)) for task in layout.tasks}
     return {name: dim_colour(colour) if "." in name else colour for name, colour in by_task.items()}
@@ -90,23 +91,23 @@ def choose_task_colours(layout: Layout) -> dict[str, Colour]:
 def build_load_curves(
     stream: Stream, task: TaskSpec, colour: Colour, period_ns: int, is_lockstep: bool
 ) -> Iterator[ViewPart]:
-    """Yield the parts that show the times of a task as curves.
+    """Yield the view parts that show the times of a task as curves.
 
-    These are lateness, execution and deadline in ms, and the used part of the time slice, whose 100
-    % are the deadline. In lockstep a tick lasts as long as its tasks take, so only execution is
-    shown.
+    These are lateness, execution time and deadline in ms, and the used part of the time slice in
+    percent, where 100 % is the deadline. In lockstep a tick lasts as long as its tasks take, so
+    only the execution time is shown.
 
     Args:
-        stream: Where they are written.
+        stream: Stream to write to.
         task: The task.
-        colour: Its colour.
+        colour: Colour of the task.
         period_ns: Length of a tick on the wall clock.
         is_lockstep: Whether the run is in lockstep.
     """
     slice_ns = task.slice * period_ns
 
     def times_ms(block: RowBlock) -> np.ndarray:
-        """Return lateness, execution and deadline of each cycle, (rows, 3), ms."""
+        """Return lateness, execution time and deadline of each cycle in ms, shape (rows, 3)."""
         rows = block.rows
         columns = np.full((len(rows), 3), np.nan)
         columns[:, 1] = compute_execution_ns(rows) * 1e-6
@@ -128,15 +129,16 @@ def build_load_curves(
 
 
 def build_miss_lane(stream: Stream, task: TaskSpec) -> ViewPart:
-    """Return the part that shows missed cycles as a lane, and as one log line per block.
+    """Return the view part that shows missed cycles as a lane, and as one log line per block.
 
-    The lane is visible at any zoom. A task that never misses has no lane.
+    The marks in the lane are wide enough to be visible at any zoom. A task without missed cycles
+    has no such lane.
     """
     lane = (LEVELS, task.board, f"{task.role}_{MISSED}")
     span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
 
     def write(block: RowBlock) -> None:
-        """Mark the missed cycles of a block, and log them."""
+        """Write the missed cycles of a block to the lane and to the log."""
         missed = np.flatnonzero(find_missed(block.rows))
         if not len(missed):
             return
@@ -160,7 +162,7 @@ def build_miss_lane(stream: Stream, task: TaskSpec) -> ViewPart:
 
 
 class AgeWriter:
-    """Writes the age of a mailbox's visible message, ms, at every release of its fastest reader."""
+    """Writes the age in ms of the newest visible message at every release of its fastest reader."""
 
     def __init__(
         self, stream: Stream, mailbox: MailboxSpec, layout: Layout, colour: Colour
@@ -177,20 +179,20 @@ class AgeWriter:
         style_curves(stream, self._lane, [f"{mailbox.name}, ms"], [colour])
 
     def add_messages(self, block: RowBlock) -> None:
-        """Add messages. They count from the tick at which they become visible."""
+        """Add messages, whose ages are written from the tick at which they become visible."""
         self._visible_at = np.concatenate((self._visible_at, block.rows["visible_at"]))
         self._made = np.concatenate((self._made, block.ticks))
 
     def skip_to(self, tick: int) -> None:
-        """Continue at a tick, without any message from before."""
+        """Drop all messages, and continue at `tick` after a range that was not recorded."""
         self._upto = tick - 1
         self._visible_at = self._visible_at[:0]
         self._made = self._made[:0]
 
     def write_ages(self, tick: int) -> None:
-        """Write the ages at all releases before `tick`.
+        """Write the ages at all releases before `tick` that have not been written yet.
 
-        All messages that were visible before that tick must have been added.
+        Call this only when all messages that became visible before that tick have been added.
         """
         releases = np.arange(self._releases.find_tick(self._upto + 1), tick, self._releases.every)
         self._upto = max(self._upto, tick - 1)

@@ -1,6 +1,6 @@
-"""The window of the viewer, a separate process that outlives the command that opened it.
+"""The window of the viewer, a separate process.
 
-The user may close it at any time.
+The user may close the window at any time. It stays open when the command that opened it ends.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ PANIC_TEXT = "panicked at "
 
 
 class ViewerWindow:
-    """A viewer that shows the files of a recording, or the stream of a recorder.
+    """A viewer process that shows files of a recording, or the stream that a recorder serves.
 
-    With a `port` it accepts commands on that port. Raises `Failure` if no viewer is installed, or
-    if there is no screen and `headless` is False.
+    With a `port`, the viewer accepts commands on that port. A `headless` viewer opens no window.
+    Raises `Failure` if the viewer is not installed, or if the machine has no screen and `headless`
+    is False.
     """
 
     def __init__(self, *sources: str, headless: bool = False, port: int | None = None) -> None:
@@ -53,35 +54,43 @@ class ViewerWindow:
         self._is_reported = False
 
     def read_news(self) -> list[str]:
-        """Return once how the window ended, and nothing while it is open."""
+        """Return a message about the end of the viewer.
+
+        Returns:
+            The message, once. [] while the viewer runs, and after the message was returned.
+        """
         if self._is_reported or self.is_open:
             return []
         self._is_reported = True
         return [self.wait_until_closed() or "the viewer was closed"]
 
     def wait_until_closed(self) -> str:
-        """Wait until the window is closed. Returns the error, or "" if there was none."""
+        """Wait until the viewer has ended.
+
+        Returns:
+            The error with which it ended, or "" if there was none.
+        """
         if (status := self._process.wait()) == 0:
             return ""
         self._said.seek(0)
         lines = self._said.read().decode(errors="replace").strip().splitlines()
-        # A panic prints its cause before the trace.
+        # If the viewer panicked, the cause precedes the stack trace in its output.
         panic = [line.partition(PANIC_TEXT)[2] for line in lines if PANIC_TEXT in line]
         return ": ".join([f"the viewer ended with status {status}", *(panic or lines[-1:])[:1]])
 
     def wait_for_end(self, bound_s: float) -> bool:
-        """Wait at most `bound_s` for the window to end. Returns True if it has."""
+        """Wait for the viewer to end, for at most `bound_s`. Returns True if it has ended."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(bound_s)
         return not self.is_open
 
     @property
     def is_open(self) -> bool:
-        """True while the viewer runs."""
+        """True while the viewer process runs."""
         return self._process.poll() is None
 
     def close(self) -> None:
-        """Close the window."""
+        """End the viewer, if it still runs."""
         self._is_reported = True
         if self.is_open:
             # The command is a script that starts the viewer. Both are in its process group.
@@ -91,12 +100,12 @@ class ViewerWindow:
 
 
 def has_screen() -> bool:
-    """Return True if a window can be opened."""
+    """Return True if this session has a screen on which a window can be opened."""
     return any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
 def find_executable() -> str:
-    """Return the path of the installed viewer. Raises `Failure` if there is none."""
+    """Return the path of the viewer's executable. Raises `Failure` if it is not installed."""
     beside_python = Path(sys.executable).with_name("rerun")
     path = str(beside_python) if beside_python.is_file() else shutil.which("rerun")
     if path is None:
@@ -105,12 +114,12 @@ def find_executable() -> str:
 
 
 def find_free_port() -> int:
-    """Return a free port of this machine."""
+    """Return a TCP port of this machine that no program uses."""
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
 
 
 def format_url(port: int) -> str:
-    """Return the address of the stream that a recorder serves on a port."""
+    """Return the URL of a recorder's stream, or of a viewer, on a port of this machine."""
     return f"rerun+http://{HOST}:{port}/proxy"

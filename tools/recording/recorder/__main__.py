@@ -1,8 +1,9 @@
 """The recorder process, `python -m rack.tools.recording.recorder`.
 
-Its argument names the class of the view, "package.module:Class". Its stdin names rack and folder,
-and closes when the run is over. It prints "recording" once it has attached. Every other line that
-it prints is a message for the user.
+Its argument names the class of the view, "package.module:Class". The view is the sink that writes
+the viewer's file. The first line on stdin names the rack and the folder of the run. The launcher
+closes stdin when the run is over. The recorder prints "recording" once it has attached. Every other
+line that it prints is a message to the user.
 """
 
 from __future__ import annotations
@@ -25,16 +26,17 @@ if TYPE_CHECKING:
 NICENESS = 5
 """Niceness of the recorder.
 
-On a shared core boards run first, even those without real-time priority. A higher value would
-starve it: next to three busy programs per core, niceness 10 leaves a thirtieth of the core, but a
-recorder needs a tenth.
+On a shared core, boards run before the recorder, even boards without real-time priority. A higher
+value would starve the recorder: next to three busy programs per core, niceness 10 leaves it a
+thirtieth of the core, but it needs a tenth.
 """
 
 
 def main() -> None:
     """Attach to the rack named by a line of JSON on stdin, and record until stdin closes.
 
-    A second line asks the recorder to hurry.
+    A second line on stdin ends the recording, and asks the recorder not to wait for the viewer's
+    file.
     """
     # Ctrl-C reaches the whole foreground group, but the launcher decides when recording ends.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -61,7 +63,7 @@ def main() -> None:
             _print_message("recording")
             recorder.record_until(until=sys.stdin.fileno())
             if segment.run_is_over:
-                # No boards are left that need the core. Only root may lower the niceness again.
+                # No board needs the core any more. Only root may lower the niceness again.
                 with suppress(PermissionError):
                     os.nice(-NICENESS)
             # If the launcher was killed, nobody waits for the viewer's file, whose libraries alone
@@ -76,22 +78,22 @@ def main() -> None:
 
 
 def _import_view() -> None:
-    """Import the module of the view ahead of time."""
-    # If it is missing, opening the view reports that.
+    """Import the module of the view, so that opening the view takes less time."""
+    # A missing module is reported when the view is opened.
     with suppress(LookupError):
         import_reference(sys.argv[1])
 
 
 def _open_view(segment: Segment, folder: Path, port: int | None) -> Sink:
-    """Open the view of a run in `folder`, served on a port if one is given."""
+    """Open the view that writes into `folder`, and serves a viewer if a port is given."""
     module, name = import_reference(sys.argv[1])
     sink: Sink = getattr(module, name)(segment, folder, port)
     return sink
 
 
 def _print_message(text: str) -> None:
-    """Print a message for the launcher."""
-    # The launcher may be gone, but the files must still be finished.
+    """Print a line for the launcher, if it still runs."""
+    # If the launcher was killed, the files must still be finished.
     with suppress(OSError):
         print(text, flush=True)
 

@@ -1,4 +1,7 @@
-"""The flight recorder, which deletes old stretches of a recording that are not near an occasion."""
+"""The flight recorder, which deletes old parts of a recording that are not near an occasion.
+
+Occasions are alarms, missed or skipped cycles, and begins and ends of holds.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +18,15 @@ from rack.tools.recording.run_files import Tally
 from rack.tools.recording.spool import Spool, StretchHead
 
 STRETCH_S = 1.0
-"""Simulated time in a stretch."""
+"""Simulated duration of a stretch."""
 
 
 class FinishedStretch(NamedTuple):
-    """A finished stretch that is not near any occasion so far.
+    """A finished stretch that is not near any occasion found so far.
 
     Attributes:
-        path: Its file.
-        last: Its last tick.
+        path: File of the stretch.
+        last: Last tick of the stretch.
     """
 
     path: Path
@@ -33,8 +36,10 @@ class FinishedStretch(NamedTuple):
 class FlightRecorder:
     """Divides the spool of a recorder into stretches, and deletes stretches that are not needed.
 
-    Stretches of a killed recorder are all kept, because the occasions that it had seen are unknown.
-    A rack restarts its recorder at most three times.
+    A stretch is a file with the rows of about one second. It is needed if it is near an occasion:
+    an alarm, a missed or skipped cycle, or the begin or end of a hold. Stretches of an earlier,
+    killed recorder are all kept, because its occasions are unknown. A rack restarts its recorder at
+    most three times, so these are few.
     """
 
     def __init__(self, segment: Segment, retention: Retention, spool: Spool, tally: Tally) -> None:
@@ -53,28 +58,28 @@ class FlightRecorder:
         self._path = self._begin_stretch(self._began, self._began)
 
     def find_occasions(self, ring: str, rows: np.ndarray, lost: int) -> None:
-        """Look for occasions in rows of a ring.
+        """Keep the stretches around all occasions in new rows of a ring.
 
         Args:
-            ring: The ring.
+            ring: Name of the ring.
             rows: The rows, shape (rows,).
-            lost: Number of rows lost before them. Lost rows count as an occasion, because their
-                content is unknown.
+            lost: Number of rows lost before these rows. A loss counts as an occasion, because the
+                content of the lost rows is unknown.
         """
         loss_ticks = [self._words[System.TICK]] if lost else []
         for tick in (*loss_ticks, *self._occasions.find_in_rows(ring, rows)):
             self._keep_around(tick)
 
     def advance_to(self, tick: int) -> None:
-        """Continue after everything before `tick` has been added to the spool.
+        """Begin a new stretch if the current one is long enough, and delete old ones.
 
-        Begins a new stretch if the current one is long enough, and deletes old ones.
+        Call this when all rows written before `tick` are in the spool.
         """
         for alarm_tick in self._occasions.find_in_alarms():
             self._keep_around(alarm_tick)
         if tick - self._began < self._length:
             return
-        # Rows of cycles that began in the meantime may be in either stretch.
+        # Rows of cycles that ended since `tick` may be in either stretch.
         next_tick = self._words[System.TICK] + 1
         path = self._begin_stretch(next_tick, tick)
         if self._began > self._kept_until:
@@ -85,20 +90,28 @@ class FlightRecorder:
             self._sealed.popleft().path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Finish the last stretch. An empty one follows, whose head contains the final counts."""
+        """Finish the last stretch, and add an empty one whose head contains the final counts."""
         end = self._words[System.TICK] + 1
         self._begin_stretch(end, end)
         self._spool.close(end)
 
     def _begin_stretch(self, begin: int, end: int) -> Path:
-        """Begin a stretch at tick `begin`, end the previous one at `end`, and return the file."""
+        """Begin a new stretch.
+
+        Args:
+            begin: First tick of the new stretch.
+            end: Tick at which the current stretch ends.
+
+        Returns:
+            File of the new stretch.
+        """
         tally = self._tally
         stretch = StretchHead(tally.number + 1, begin, dict(tally.taken), dict(tally.rows))
         tally.begin_stretch(stretch)
         return self._spool.begin_stretch(stretch, end)
 
     def _keep_around(self, tick: int) -> None:
-        """Keep the stretches around an occasion."""
+        """Exempt the stretches around an occasion at `tick` from deletion."""
         window = self._retention.find_window(tick)
         self._kept_until = max(self._kept_until, window.last)
         while self._sealed and self._sealed[-1].last >= window.first:

@@ -1,6 +1,6 @@
-"""The recorder process as its launcher sees it.
+"""The launcher's side of the recorder process: start, supervision, restart and end.
 
-It is spawned, never forked, so that no board inherits its threads.
+The recorder is spawned, never forked, so that no board inherits its threads.
 """
 
 from __future__ import annotations
@@ -19,7 +19,10 @@ from rack.backplane.words import System
 from rack.tools.console.answer import Failure
 
 VIEW_CLASS = "rack.tools.viewer.sink:ViewSink"
-"""Class that shows a recording, by name, because recording itself needs none of its libraries."""
+"""Class that writes the viewer's file.
+
+It is given by name, because recording itself needs none of its libraries.
+"""
 ATTACHED_LINE = "recording"
 """Line that the recorder prints once it has attached."""
 ATTACH_S = 30.0
@@ -28,13 +31,13 @@ MAX_IDLE_CHECKS = 100
 MAX_STOPPED_CHECKS = 5
 """Number of idle checks in a row after which a recorder is killed.
 
-A check finds the recorder idle if it has used no processor time since the check before, 0.2 s to 1
-s earlier. On a busy machine a recorder is slow but never idle. The smaller number applies to a
-recorder that a signal has stopped. The limits are checks, not seconds, because Ctrl-Z stops both
-processes.
+A check finds the recorder idle if it has used no processor time since the previous check, 0.2 s to
+1 s earlier. On a busy machine a recorder is slow but never idle. The smaller number applies to a
+recorder that a signal has stopped. The limits count checks, not seconds, because Ctrl-Z stops both
+the recorder and the launcher that checks it.
 """
 CHECK_PERIOD_S = 0.2
-"""Shortest time between two of these checks."""
+"""Shortest time between two checks of the recorder."""
 MAX_RESTARTS = 3
 UNWRITABLE = os.EX_IOERR
 """Exit status of a recorder whose files cannot be written, for example because the disk is full.
@@ -43,27 +46,27 @@ It is not restarted, since another recorder would fail as well.
 """
 
 END_CLAUSE = "the recording ends at tick"
-"""Marks the line with the reason among the lines that such a recorder prints.
+"""Text in the line with which a recorder reports that its files cannot be written.
 
-The viewer's library may print more after it.
+The viewer's library may print more lines after that line.
 """
 
 
 def format_write_failure(folder: Path, error: OSError, tick: int) -> str:
-    """Return a sentence that says why a recording ended before its run.
+    """Return a sentence that says why the recording ended before the run did.
 
     Args:
         folder: Folder of the run.
-        error: The error of writing.
+        error: Error that was raised while writing.
         tick: Tick up to which the recording is complete.
     """
-    # Messages of pyarrow are long, so prefer the text of the error number.
+    # Error messages of pyarrow are long, so prefer the standard text of the error number.
     why = os.strerror(error.errno) if error.errno else error
     return f"{folder}: {why}: {END_CLAUSE} {tick}"
 
 
 class IdleCounter:
-    """Counts the checks in a row in which a process has used no processor time."""
+    """Counts consecutive checks that found a process idle, that is, without processor use."""
 
     def __init__(self, pid: int) -> None:
         self._pid = pid
@@ -71,7 +74,11 @@ class IdleCounter:
         self._count = 0
 
     def count_idle_checks(self) -> int:
-        """Check the process, and return the number of idle checks in a row, including this one."""
+        """Check whether the process used processor time since the last call.
+
+        Returns:
+            Number of consecutive idle checks, including this one. 0 if the process was active.
+        """
         used_ns = read_processor_ns(self._pid)
         self._count = self._count + 1 if used_ns == self._used_ns else 0
         self._used_ns = used_ns
@@ -81,9 +88,11 @@ class IdleCounter:
 class RecorderProcess:
     """Starts and supervises the recorder of a rack that is about to run.
 
-    The recorder imports its libraries while the rack is being launched. If it dies, it is restarted
-    up to `MAX_RESTARTS` times in the same folder; if it hangs, it is killed first. In lockstep the
-    clock waits for it. If its files cannot be written, `read_news` and `finish` raise `Failure`.
+    The recorder process starts at once and imports its libraries while the rack is being launched.
+    `attach` makes it record. A recorder that dies is restarted in the same folder, up to
+    `MAX_RESTARTS` times, and a recorder that hangs is killed and restarted. In lockstep the clock
+    waits for the recorder. If its files cannot be written, `read_news` and `finish` raise
+    `Failure`.
 
     Attributes:
         folder: Folder of the run.
@@ -100,7 +109,7 @@ class RecorderProcess:
         self._start()
 
     def _start(self) -> None:
-        """Spawn a recorder process."""
+        """Spawn a recorder process and reset everything known about the previous one."""
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "rack.tools.recording.recorder", VIEW_CLASS],
             stdin=subprocess.PIPE,
@@ -121,15 +130,16 @@ class RecorderProcess:
         return self._process.pid
 
     def attach(self, rack: str, port: int | None, words: memoryview | None = None) -> bool:
-        """Let the recorder record a rack.
+        """Make the recorder attach to a rack and record it.
 
         Args:
             rack: Name of the rack.
-            port: Port on which it serves a viewer, or None.
-            words: Words of a rack in lockstep, whose clock then waits for the recorder.
+            port: Port on which the recorder serves a viewer, or None.
+            words: Words of the rack's segment, through which the clock of a rack in lockstep is
+                told to wait for the recorder. None if the clock need not wait.
 
         Returns:
-            False if it has not attached in time.
+            True if the recorder has attached within `ATTACH_S`.
         """
         self._request = encode_json([rack, str(self.folder), port]).encode() + b"\n"
         self._words = words
@@ -137,10 +147,10 @@ class RecorderProcess:
         return self.wait_until_attached(ATTACH_S)
 
     def wait_until_attached(self, bound_s: float = inf) -> bool:
-        """Wait until the recorder has attached, died or hung, but at most `bound_s`.
+        """Wait until the recorder has attached, has died or hangs, but at most `bound_s`.
 
         Returns:
-            True if it has attached.
+            True if the recorder has attached.
         """
         deadline = time.monotonic() + bound_s
         while not self._has_begun and time.monotonic() < deadline and self._process.poll() is None:
@@ -149,16 +159,21 @@ class RecorderProcess:
         return self._has_begun
 
     def _send_request(self) -> None:
-        """Send the name of the rack and the folder to the recorder."""
+        """Send the name of the rack, the folder and the viewer's port to the recorder."""
         assert self._process.stdin is not None, "it is a pipe"
-        # From now on the clock waits for the recorder. Until it reads, the rings hold the rows.
+        # From now on the clock waits for the recorder. Until the recorder reads the rings, they
+        # hold all rows.
         self._set_follower(self.pid)
         with suppress(BrokenPipeError):
             self._process.stdin.write(self._request)
             self._process.stdin.flush()
 
     def read_news(self) -> list[str]:
-        """Return new messages for the user, and restart the recorder if it has died."""
+        """Return the messages to the user since the last call. Restarts the recorder if it died.
+
+        Raises:
+            Failure: The files of the recording cannot be written.
+        """
         had_begun = self._has_begun
         if not self._is_gone:
             self._kill_hung()
@@ -181,7 +196,14 @@ class RecorderProcess:
             self._process.kill()
 
     def _restart_or_give_up(self) -> str:
-        """Restart a dead recorder unless it has died too often. Returns a message for the user."""
+        """Restart a dead recorder unless it has been restarted `MAX_RESTARTS` times.
+
+        Returns:
+            A message to the user.
+
+        Raises:
+            Failure: The files of the recording cannot be written.
+        """
         ended = self._describe_end()
         if self._restarts == MAX_RESTARTS:
             self._is_gone = True
@@ -194,7 +216,11 @@ class RecorderProcess:
         return f"{ended}; restarted, {self._restarts} of at most {MAX_RESTARTS} times"
 
     def _describe_end(self) -> str:
-        """Describe how the recorder ended, with the last line that it printed on stderr."""
+        """Return the exit status of the recorder, with the last line that it printed on stderr.
+
+        Raises:
+            Failure: The files of the recording could not be written.
+        """
         size = os.fstat(self._complaints).st_size
         status = self._process.returncode
         text = os.pread(self._complaints, 4096, max(0, size - 4096)).decode(errors="replace")
@@ -204,18 +230,24 @@ class RecorderProcess:
         return ": ".join((f"the recorder ended with status {status}", *lines[-1:]))
 
     def _set_follower(self, pid: int) -> None:
-        """Name the process that the clock in lockstep waits for, or 0 for none."""
+        """Set the process that the clock waits for in lockstep. 0 means no process."""
         if self._words is not None:
             self._words[System.FOLLOWER_PID] = pid
 
     def finish(self, in_a_hurry: bool = False) -> str:
-        """Let the recorder take the remaining rows and finish its files. May be called repeatedly.
+        """Let the recorder read the remaining rows and finish its files, and wait for its end.
+
+        Only the first call has an effect. Later calls return the same result.
 
         Args:
-            in_a_hurry: Whether it should skip the viewer's file if that is not open yet.
+            in_a_hurry: Whether the recorder should leave out the viewer's file if that file is not
+                open yet.
 
         Returns:
-            A description of how it ended.
+            A description of how the recorder ended.
+
+        Raises:
+            Failure: The files of the recording cannot be written.
         """
         if self._result is None:
             self._result = ""
@@ -237,7 +269,7 @@ class RecorderProcess:
             finally:
                 os.close(self._complaints)
             if self._process.returncode and not was_reported:
-                # The tables may still be complete.
+                # The parquet files may still be complete.
                 self._lines.append(f"{self._result}; run.rrd may lack its end")
         return self._result
 
@@ -249,10 +281,10 @@ class RecorderProcess:
                     pipe.close()
 
     def _read_output(self, timeout_s: float) -> bool:
-        """Read the recorder's output.
+        """Read what the recorder has printed on stdout, waiting for it up to `timeout_s`.
 
         Returns:
-            False if nothing came in time, or the output has ended.
+            True if something was read. False after the time-out, or if the output has ended.
         """
         stdout = self._process.stdout
         if stdout is None or not wait_readable(stdout.fileno(), timeout_s):

@@ -1,4 +1,7 @@
-"""The recorder, which reads the rings of a rack from the host side and never delays its boards."""
+"""The recorder, which reads the rings of a rack and writes them to the folder of the run.
+
+It reads from the host side and never delays a board.
+"""
 
 from __future__ import annotations
 
@@ -32,13 +35,14 @@ REALTIME_PERIOD_S = 0.05
 LOCKSTEP_PERIOD_S = 0.005
 """Time between two drains of the rings, in real time and in lockstep.
 
-The rings hold two seconds of real time. A rack in lockstep runs faster and waits for its recorder.
+The rings hold two seconds. A rack in lockstep may run faster than real time, and waits for its
+recorder.
 """
 
 HAND_OVER_S = 0.1
-"""Longest time per pass for catching up a late sink.
+"""Longest time per pass for which waiting rows are passed on to a sink that was opened late.
 
-Rows that boards write in that time are not in the spool yet.
+Rows that boards write in that time reach the spool only in the next pass.
 """
 OPENING_TIMEOUT_S = 120.0
 """Longest time that a finishing recorder waits for its sink to open.
@@ -46,7 +50,7 @@ OPENING_TIMEOUT_S = 120.0
 On a busy machine, loading the viewer's library alone may take a minute.
 """
 MAX_OPENING_CHECKS = 25
-"""Number of idle checks in a row, 0.2 s apart, after which opening the sink counts as hung.
+"""Number of consecutive idle checks, 0.2 s apart, after which opening the sink counts as hung.
 
 The viewer's library waits forever for a file that cannot be written.
 """
@@ -58,24 +62,40 @@ An interrupted run must end within 2 s.
 
 
 class Sink(Protocol):
-    """Takes the rows that a recorder drains."""
+    """Receives the rows that a recorder reads from the rings, for example to show them."""
 
     def add(self, ring: str, rows: np.ndarray) -> None:
-        """Take rows of a ring, shape (rows,): trace records of a task or messages of a mailbox."""
+        """Receive rows of a ring.
+
+        Args:
+            ring: Name of the task or mailbox.
+            rows: Its trace records or rows with messages, shape (rows,).
+        """
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Note that everything before `tick` has been added. `lost` counts lost rows by ring."""
+        """Process the rows received so far, which include everything before a tick.
+
+        Args:
+            tick: The tick.
+            lost: Number of lost rows, by ring.
+        """
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Finish the output at `tick`. `lost` counts lost rows by ring."""
+        """Finish the output.
+
+        Args:
+            tick: Tick at which the run ended.
+            lost: Number of lost rows, by ring.
+        """
 
 
 class SafeSink:
-    """Protects the recorder from errors and delays of a sink.
+    """A sink that protects the recorder from errors and delays of another sink, the viewer's file.
 
-    The first error ends the sink and is reported once through `tell`, and the recorder continues.
-    Rows are passed on in `advance`, after the spool has them. With `in_background` a thread opens
-    the sink, because its imports may take as long as a launch; rows wait until it is open.
+    After its first error, which is reported through `tell`, the other sink is dropped and the
+    recorder continues without it. Calls are queued and passed on in `advance`, when the rows are
+    already in the spool. With `in_background` a thread opens the other sink, because its imports
+    may take as long as a launch. Calls then wait until it is open.
     """
 
     def __init__(
@@ -87,7 +107,7 @@ class SafeSink:
         # viewer's library wait forever.
         self._failed: Sink | None = None
         self._waiting: deque[Callable[[Sink], None]] = deque()
-        self._late = 0  # calls that were left waiting
+        self._late = 0  # number of calls still waiting from earlier passes
         # A daemon thread, so that a hurried process can exit without it.
         self._opening = Thread(
             target=self._call_guarded,
@@ -113,12 +133,12 @@ class SafeSink:
         Args:
             segment: Segment of the rack.
             port: Port of the viewer, or None.
-            opened: Opens the sink.
-            tell: Prints a message for the user.
+            opened: Function that opens and returns the sink.
+            tell: Function that prints a message to the user.
 
         Returns:
-            The sink. None for a flight recorder without a port, because `rack replay` makes the
-            file of what it kept.
+            The sink. None for a flight recorder without a port: `rack replay` makes the viewer's
+            file later, from the stretches that were kept.
         """
         if port is None and Retention.from_config(segment) is not None:
             return None
@@ -127,13 +147,13 @@ class SafeSink:
         return cls(opened, tell, port is None)
 
     def add(self, ring: str, rows: np.ndarray) -> None:
-        """Keep rows until they can be passed on."""
+        """Queue rows for the sink."""
         self._waiting.append(lambda sink: sink.add(ring, rows))
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Pass on what is waiting, and the tick.
+        """Pass on the queued calls if the sink is open.
 
-        A sink that was opened late catches up over several passes.
+        A sink that was opened late gets the older calls over several passes.
         """
         counted = dict(lost)
         self._waiting.append(lambda sink: sink.advance(tick, counted))
@@ -142,7 +162,10 @@ class SafeSink:
         self._late = len(self._waiting)
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Finish the sink, waiting for it to open if necessary."""
+        """Wait for the sink to open, pass on all queued calls and finish it.
+
+        If the sink does not open in time, a message says that the viewer's file is missing.
+        """
         self._waiting.append(lambda sink: sink.close(tick, lost))
         until = time.monotonic() + self._patience_s
         idle = IdleCounter(os.getpid())
@@ -157,14 +180,15 @@ class SafeSink:
             self._make_waiting_calls()
 
     def hurry(self) -> None:
-        """Stop waiting for a sink that will not be open soon."""
+        """Make `close` wait for the sink for at most `HURRIED_TIMEOUT_S`."""
         self._patience_s = HURRIED_TIMEOUT_S
         self._why_late = "the run was interrupted before the libraries of the viewer were loaded"
 
     def _make_waiting_calls(self, until: float = 0.0) -> None:
-        """Make the waiting calls: all new ones, and older ones until the time `until`.
+        """Pass queued calls on to the sink, oldest first.
 
-        The calls of a failed sink are dropped.
+        As many calls are passed on as were queued since the last pass, and further ones until the
+        time `until`. Calls to a failed sink are dropped.
         """
         while len(self._waiting) > self._late or (self._waiting and time.monotonic() < until):
             call = self._waiting.popleft()
@@ -172,7 +196,7 @@ class SafeSink:
                 self._call_guarded(partial(call, sink))
 
     def _call_guarded(self, call: Callable[[], None]) -> None:
-        """Make a call. If it fails, drop the sink and report the error."""
+        """Make a call to the sink. If the call fails, drop the sink and report the error."""
         try:
             call()
         except Exception as error:
@@ -181,17 +205,17 @@ class SafeSink:
 
 
 RISKED_DIVISOR = 4
-"""Divisor of the rings' length, in ticks.
+"""Divisor of the rings' length that limits the rows not yet in the spool's file.
 
-Lockstep may run ahead of the spool's file by this part of the rings.
+A rack in lockstep may run ahead of the file by at most this fraction of the rings.
 """
 
 
 class Recorder:
     """Records one rack into `folder`. A context manager that finishes the files on exit.
 
-    `view` takes the same rows. The first recorder of a rack in lockstep is its follower, for which
-    the clock waits.
+    `view` receives the same rows. The first recorder of a rack in lockstep becomes its follower,
+    the process that the clock waits for.
     """
 
     def __init__(self, segment: Segment, folder: Path, view: Sink | None = None) -> None:
@@ -224,13 +248,13 @@ class Recorder:
         # In lockstep the machine cannot cause a deadline miss.
         self._cores = None if self._words[System.LOCKSTEP] else CoreMeter()
         follower = self._words[System.FOLLOWER_PID]
-        # The clock cannot see a process of another PID namespace, and so cannot wait for it.
+        # The clock cannot wait for a process in another PID namespace, which it cannot see.
         is_visible = bool(segment.launcher)
         is_awaited = is_visible and follower == os.getpid()
         self._is_follower = is_awaited or (is_visible and not is_alive(follower))
         # All rows before this tick are in the spool's file. A recorder that the clock waits for
-        # continues where the last one stopped, even if that one died without writing a row. Any
-        # other recorder begins now.
+        # continues where the previous recorder stopped, even if that one died before it wrote a
+        # row. Any other recorder begins at the current tick.
         self._safe_tick = self._words[System.FOLLOWER_TICK if is_awaited else System.TICK]
         self._most_at_risk = round(RETAINED_S * 1e9 / layout.clock_ns) // RISKED_DIVISOR
         self._report_progress()
@@ -242,12 +266,12 @@ class Recorder:
         if kind is None:
             self.close()
         else:
-            # The tables may lack rows now. The next recorder, or `rebuild_files`, makes them from
-            # the spool.
+            # The parquet files may be incomplete. The next recorder, or `rebuild_files`, builds
+            # them from the spool.
             self._spool.close()
 
     def drain_rings(self) -> None:
-        """Record everything written since the last call."""
+        """Record all rows that were written to the rings since the last call."""
         tick = self._words[System.TICK]
         for name, ring in self._rings.items():
             rows, lost = ring.read_new_rows()
@@ -259,8 +283,8 @@ class Recorder:
                 self._view.add(name, rows)
         if self._is_follower:
             self._words[System.FOLLOWER_DRAINED] = tick
-        # A killed recorder loses the rows that are not in its file, so lockstep must not run far
-        # ahead of the file.
+        # If the recorder is killed, rows that are not in the spool's file must still be in the
+        # rings, so a rack in lockstep must not run far ahead of the file.
         is_late = self._is_follower and tick - self._safe_tick >= self._most_at_risk
         if self._spool.flush(now=is_late):
             self._safe_tick = tick
@@ -273,16 +297,16 @@ class Recorder:
         self._report_progress()
 
     def _report_progress(self) -> None:
-        """Tell the clock in lockstep how far the recording is.
+        """Tell the clock of a rack in lockstep up to which tick the recording is safe.
 
-        This also reclaims the role of follower, which a delay may have cost.
+        This also makes the recorder the follower again, if the clock gave up waiting for it.
         """
         if self._is_follower:
             self._words[System.FOLLOWER_TICK] = self._safe_tick
             self._words[System.FOLLOWER_PID] = os.getpid()
 
     def record_until(self, until: int) -> None:
-        """Record until a file descriptor is readable or closed."""
+        """Record until the file descriptor `until` is readable or closed."""
         period_s = LOCKSTEP_PERIOD_S if self._words[System.LOCKSTEP] else REALTIME_PERIOD_S
         watched = select.poll()
         watched.register(until, select.POLLIN)
