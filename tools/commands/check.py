@@ -163,7 +163,7 @@ def _use_measured_budgets(config: RackConfig, run: Path, percentile: float) -> R
 
 
 def _compute_abilities(config: RackConfig) -> Abilities | None:
-    """Compute what the arm of a rack can do at rest. None for a hand, or without an arm."""
+    """Compute reach and payload of a rack's arm at rest. None for a hand, or without an arm."""
     robot = config.robot
     if robot is None or robot.hand is not None:
         return None
@@ -174,7 +174,7 @@ def _compute_abilities(config: RackConfig) -> Abilities | None:
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:
-    """Print the config that fits on stdout, and its changes on stderr."""
+    """Print the repaired config on stdout and its changes on stderr, or both as JSON."""
     config = None if fitting.remaining_failures else fitting.end.config.to_toml_text()
     if as_json:
         print_json(fitting.to_document() | {"config": config})
