@@ -79,7 +79,7 @@ def campaign(
     of its task. There are also runs without faults in real time, alone and under load. The same
     --out continues an interrupted campaign.
 
-    Exit status: 0 the campaign passed; 1 a fault did not strike, or was not detected, handled and
+    Exit status: 0 the campaign passed; 1 a fault had no effect, or was not detected, handled and
     recovered from in time; a limit was violated; a process or segment was left behind; a task was
     neither done nor safely stopped; or a detection had no fault; 2 usage or config error.
 

@@ -54,7 +54,7 @@ def check(
     r"""Validate a config, and predict whether its levels meet their cycles.
 
     The command prints every mistake, one per line. A valid config gets five lines: whether the rack
-    fits, where it is tightest, how soon it responds, what its arm can do at rest, and what to do.
+    fits, where it is tightest, how soon it responds, reach and payload of its arm, and what to do.
     --verbose adds slots, cores, rates, mailboxes with their bus addresses, and every equation. On a
     terminal the tables show as many columns as fit; --json has all.
 

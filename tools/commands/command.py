@@ -52,7 +52,7 @@ def command(
         False,
     ),
     is_list: bool = option(
-        "--list", "list the levels, the commands each takes, and the one in force", False
+        "--list", "list the levels, the commands that each takes, and its command in force", False
     ),
     as_json: Json = False,
 ) -> None:

@@ -53,7 +53,7 @@ def new(
     actuators or a URDF's efforts, and a keyframe. The rest is found (the tool, a home free of
     contact, the drive of the gripper and the joints or jaw that go with it, bodies that always
     overlap) or guessed. Each guess is named here, in the file, and in [robot] guessed. The task
-    moves two blocks on a table, or tours poses if no gripper can take blocks. The planner has
+    moves two blocks on a table, or tours poses if no gripper can grasp blocks. The planner has
     rehearsed it. On a terminal the command asks for values that no option gives.
 
     Exit status: 0 written; 2 the model cannot be used, and nothing is written.

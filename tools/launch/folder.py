@@ -63,7 +63,7 @@ class EventLog:
         self._write_entry(asdict(event))
 
     def open_file(self, path: Path) -> None:
-        """Start writing to a file, beginning with the events so far."""
+        """Start writing to a file, beginning with all earlier events."""
         # Flush after each line, so that the log of a killed run is complete up to its end.
         self._file = path.open("w", buffering=1)
         self._write_text(self._earlier.getvalue())

@@ -195,7 +195,7 @@ def run_rack(
             wall_s = time.monotonic() - started
         log_news()
         if recorder is not None and not INTERRUPT.number:
-            # The recorder could not attach to a closed rack.
+            # Wait for the recorder, because it cannot attach to a closed rack.
             recorder.wait_until_attached()
         rack.close()
         recording, rows_lost = "none", dict[str, int]()

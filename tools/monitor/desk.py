@@ -50,7 +50,7 @@ class LevelCommander:
         self._levels = {name: published for name, published in levels.items() if published.commands}
 
     def list_levels(self) -> list[dict[str, str]]:
-        """Return plain data about each level: the commands it takes, and the one in force."""
+        """Return plain data about each level: the commands it takes, and its command in force."""
         return [
             {
                 "level": name,

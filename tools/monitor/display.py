@@ -241,7 +241,7 @@ def _format_head(snapshot: Snapshot) -> Text:
 
 
 def _list_demands(snapshot: Snapshot) -> list[str]:
-    """Return the safety demand on the arm, stop or brake, as a list of one text, or of none."""
+    """Return the safety demand on the arm as a list of one text. Empty without a stop or brake."""
     return [f"arm: {snapshot.demand}"] if snapshot.demand != NO_DEMAND else []
 
 

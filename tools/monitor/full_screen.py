@@ -155,7 +155,7 @@ class RackScreen(App[None]):
         self.query_one(TabbedContent).active = [*self._panes][number - 1]
 
     def action_level(self) -> None:
-        """Select the next level as the one that keys command."""
+        """Select the next level. Keys then command this one."""
         self._levels.rotate(-1)
 
     def action_worst(self) -> None:

@@ -76,7 +76,7 @@ def find_holds(newest: NewestMessages) -> tuple[Hold, ...]:
 
 
 def _list_holds(newest: NewestMessages) -> Iterator[Hold]:
-    """Yield the holds by the emergency stop, then by lost boards, then those of levels."""
+    """Yield the hold of an emergency stop, then those of lost boards, then those of levels."""
     segment = newest.segment
 
     def hold(level: str, since: int, why: str, release: str = "") -> Hold:
@@ -143,7 +143,7 @@ def _find_command_in_force(
 
 
 class StandstillDetector:
-    """Reports, once each, the holds during which nothing moves and that a user must end."""
+    """Reports, once each, the holds during which nothing moves and that only a user can end."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment

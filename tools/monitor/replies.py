@@ -80,7 +80,7 @@ class Reply:
 
 
 def find_answering_status(segment: Segment, level: str) -> MailboxSpec | None:
-    """Find the status mailbox of a level. None if the status does not answer operators."""
+    """Find the status mailbox of a level. None if it has no fields for replies to operators."""
     boxes = [box for box in segment.layout.mailboxes if box.name == f"{level}.status"]
     return next(
         (box for box in boxes if {"order", "answer", "objection"} <= {f.name for f in box.fields}),

@@ -134,7 +134,7 @@ def fix_joints(path: Path, kept: Iterable[str]) -> list[str]:
 
     Args:
         path: The file, as MuJoCo writes it. It is overwritten.
-        kept: Names of the joints that stay.
+        kept: Names of the joints that remain movable.
 
     Returns:
         Names of the removed bodies.

@@ -492,9 +492,9 @@ def find_home(
     low, high = cell.limits.position.T
 
     def compute_spare_torque(q: Array) -> float:
-        """Return the spare torque fraction above `MIN_SPARE_TORQUE`.
+        """Return the least fraction of torque that gravity leaves to a joint, minus the minimum.
 
-        It is that of the joint with the least. Returns -1 for a pose out of range or in contact.
+        Returns -1 for a pose out of range or in contact.
         """
         is_within = np.all(q >= low) and np.all(q <= high)
         if is_within and checker.is_free(q, 0.0) and (not ends or later.is_free(q)):
