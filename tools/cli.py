@@ -84,14 +84,14 @@ COMMAND_SOURCES = {
     "robot": "rack.tools.commands.robot:app",
     "lan": "rack.tools.network.group:app",
 }
-"""Places of commands as "module:attribute", each a function or a `typer.Typer`.
+"""Where commands are found, as "module:attribute" of a function or a `typer.Typer`.
 
-Any other command is the function of its name in the module of its name.
+A command that is not listed is the function of the same name in the module of that name.
 """
 MAX_ARGUMENT = 4096
-"""Maximum number of characters, as in the longest path. Longer values belong in the config file."""
+"""Maximum length of an argument, the same as of a path. Longer values belong in the config."""
 COMPLETION_VARIABLE = "_RACK_COMPLETE"
-"""Environment variable of a shell that asks for the completion of a command line."""
+"""Environment variable that a shell sets to request the completion of a command line."""
 USAGE_ERRORS = (
     errno.ENAMETOOLONG,
     errno.ENOENT,
@@ -101,11 +101,11 @@ USAGE_ERRORS = (
     errno.ELOOP,
     errno.EACCES,
 )
-"""System errors that mean that the user gave a wrong path."""
+"""System errors that indicate a wrong path given by the user."""
 
 
 def main() -> None:
-    """Run the command line. A mistake of the user is reported in one line."""
+    """Run the command line, and report a user's mistake in one line."""
     if sys.platform != "linux":
         sys.exit(
             f"rack runs only on Linux, not on {sys.platform}: it needs /dev/shm, pidfds and"
@@ -118,7 +118,7 @@ def main() -> None:
         try:
             run_commands()
         except OSError:
-            # If the error was one of stdout, this reports it.
+            # If stdout is broken, this call reports it.
             _flush_stdout("\n")
             raise
         finally:
@@ -146,10 +146,10 @@ class ClosedInput(TextIOBase):
 def _open_closed_streams() -> None:
     """Open closed standard streams on /dev/null.
 
-    Otherwise the next file to be opened would get such a descriptor, and everything that is
-    printed.
+    Otherwise the next file to be opened would get the descriptor of a standard stream, and printed
+    text would end up in that file.
     """
-    # `os.open` returns the lowest free descriptor: the one that the first closed stream had.
+    # `os.open` returns the lowest free descriptor, which is that of the first closed stream.
     if sys.stdin is None:
         os.open(os.devnull, os.O_RDONLY)
         sys.stdin = ClosedInput()
@@ -174,7 +174,7 @@ def run_commands() -> None:
     except OSError as error:
         _fail_on_system_error(error)
     except Exception as error:
-        # Usage errors of the parser have `show`. Their class is not imported just for this.
+        # Recognise the parser's usage errors by their method `show`, without importing their class.
         if not hasattr(error, "show"):
             raise
         error.show(usage := StringIO())
@@ -182,9 +182,9 @@ def run_commands() -> None:
 
 
 def _fail_on_system_error(error: OSError) -> NoReturn:
-    """Exit with the reason of a system error in one line.
+    """Exit with a one-line message about a system error.
 
-    Raises it again if no input explains it.
+    Re-raises an error that neither the user's input nor a resource limit explains.
     """
     from rack.backplane.process import describe_refusal
     from rack.boards.errors import format_value
@@ -201,11 +201,11 @@ def _fail_on_system_error(error: OSError) -> NoReturn:
 
 
 def _flush_stdout(text: str = "") -> None:
-    """Print a text and everything that is still buffered."""
+    """Print a text, and flush stdout."""
     try:
         print(end=text, flush=True)
     except OSError as error:
-        # Otherwise the flush at the end of the interpreter would fail with a traceback.
+        # Otherwise the interpreter's own flush at exit would print a traceback.
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         # A reader that has closed the pipe needs no message.
         if error.errno != errno.EPIPE:
@@ -214,9 +214,9 @@ def _flush_stdout(text: str = "") -> None:
 
 
 def _start_crate_early(arguments: Sequence[str]) -> AbstractContextManager[CrateLine | None]:
-    """Start the crate of `rack run`, whose slow imports then run on another core.
+    """Start the crate of `rack run`, so that its slow imports run on another core.
 
-    Other commands get an empty context.
+    The returned context provides the crate, or None for any other command.
     """
     if (
         arguments[:1] != ["run"]
@@ -234,12 +234,12 @@ def _start_crate_early(arguments: Sequence[str]) -> AbstractContextManager[Crate
 
 
 def build_commands() -> TyperGroup:
-    """Build the command line. Its commands are loaded when they are used."""
+    """Build the command line. Each command is imported only when it is used."""
     import typer
     from typer.core import TyperCommand, TyperGroup
 
     class Grouped(TyperGroup):
-        """The command line, with its commands in groups."""
+        """Command group whose help lists the commands by purpose."""
 
         def format_commands(self, ctx: Any, formatter: Any) -> None:
             """Write a table of the commands for each group."""
@@ -250,13 +250,14 @@ def build_commands() -> TyperGroup:
                     )
 
     class LazyCommand(TyperCommand):
-        """A command that is loaded on use. Until then only its name and line of help are known."""
+        """Command that is imported on use. Until then only its name and help line are known."""
 
         def make_context(self, *given: Any, **named: Any) -> Any:
-            """Load the command, which replaces this object."""
+            """Import the real command, and create its context instead."""
             return _load_command(str(self.name)).make_context(*given, **named)
 
     def show_version(is_asked: bool) -> None:
+        """Print the version and exit, if --version was given."""
         from importlib.metadata import version
 
         if is_asked:
@@ -272,7 +273,7 @@ def build_commands() -> TyperGroup:
             is_eager=True,
         ),
     ) -> None:
-        """Declare the options before a command."""
+        """Declare the options that precede the command."""
 
     app = _create_app(
         cls=Grouped,
@@ -318,7 +319,7 @@ def _load_command(name: str) -> Any:
 
 
 def _check_arguments(arguments: list[str]) -> None:
-    """Reject arguments that no command can use. Raises `Failure`."""
+    """Raise `Failure` for an argument that is too long or not UTF-8."""
     from rack.boards.errors import format_value
     from rack.tools.console.answer import Failure
 

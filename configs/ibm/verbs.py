@@ -12,13 +12,13 @@ from rack.levels.systems.trajectory.commands import Motions
 from rack.levels.systems.trajectory.messages import MotionRequest, MotionStatus, RequestEnd
 
 TOUCH_TORQUE = 6.0
-"""Change of a joint's torque that counts as touch, N m."""
+"""Change of a joint's torque in N m that counts as touch."""
 MIN_OPENING = 0.01
-"""Opening of the gripper below which it holds no block, m."""
+"""Opening of the gripper in m below which it holds no block."""
 GOAL = (0.70, 0.30)
-"""Goal of the blocks, m."""
+"""Goal of the blocks: x and y in m."""
 GUARDED_SPEED = 0.03
-"""Speed of a guarded move, m/s."""
+"""Speed of a guarded move in m/s."""
 
 
 def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> bool:
@@ -26,7 +26,7 @@ def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> boo
 
     Args:
         motions: The verbs.
-        goal: End of the line, (3,), m.
+        goal: End of the line, (3,), in m.
         seconds: Duration of the whole line.
 
     Returns:
@@ -38,14 +38,14 @@ def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> boo
 
 
 class Assembly(HostProgram):
-    """Puts one block on the table and another on top of it. Heights are found by touch."""
+    """Puts one block on the table and another on top of it, finding heights by touch."""
 
     motion = ProgramInput(MotionStatus, "below.motion")
     sensors = ProgramInput(ArmStatus, "below.sensors")
     requests = ProgramOutput(MotionRequest)
 
     def run(self, bus: Bus) -> None:
-        """Carry both blocks."""
+        """Move both blocks."""
         motions = Motions(bus, self.motion, self.requests, self.context)
         for block in ("block1", "block2"):
             self._fetch_block(motions, block)

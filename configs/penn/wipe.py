@@ -36,10 +36,10 @@ def expect(request, end, what):
 
 
 def wipe(y, seconds, end, what):
-    """Press while moving along the surface to y.
+    """Press on the surface while moving along it to y.
 
     Args:
-        y: Goal, m.
+        y: Goal in m.
         seconds: Duration of the motion.
         end: The expected end.
         what: Name of the step, for the error.
@@ -50,6 +50,7 @@ def wipe(y, seconds, end, what):
     pressed = {}
 
     def check_force():
+        """Note whether the force is right at this point of the way. Never ends the motion."""
         position_step = round(where()[1] / STEP)
         pressed[position_step] = abs(wrench()["z"] - PRESS) < 0.3 * PRESS
         return False

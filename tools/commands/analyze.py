@@ -38,7 +38,7 @@ def analyze(
     stall as processor time. Cycles with a detected stall are not judged. Some stalls go undetected:
     --percentile 99 leaves out whatever happens less than once in 100 cycles.
 
-    The answer tells how the run ended, which equations held, which was tightest, and what to do.
+    The output tells how the run ended, which equations held, which was tightest, and what to do.
     --verbose adds every level, task and equation. The command writes analysis.json. `rack gantt
     RUN` shows which tasks had a core.
 

@@ -61,9 +61,9 @@ def machine(
     r"""Is this machine fit for real time, and up to which rate?
 
     The fastest board of a rack runs at each rate in turn. The other levels keep their rates.
-    Between these runs `cyclictest` of rt-tests sleeps to the same grid on the same core: no board
-    can wake earlier. A rate is held if `cyclictest` is late by a cycle in at most 0.1 % of its
-    wakes, and the board misses at most 0.1 % of its cycles in addition. Without SCHED_FIFO (see
+    Between these runs `cyclictest` of rt-tests sleeps to the same grid on the same core; no board
+    can wake earlier than it. A rate is held if `cyclictest` is late by a cycle in at most 0.1 % of
+    its wakes, and the board misses at most 0.1 % of its cycles in addition. Without SCHED_FIFO (see
     `ulimit -r`) no machine is fit.
 
     Lateness is the time from grid point to start. As root the rack also runs with idle cores held

@@ -20,7 +20,7 @@ SIZES = 10
 FAULTLESS_S = 60.0
 NO_TIME = "no time for the report: 'rack campaign' with --out {} continues from here"
 MAX_COUNT = 100_000
-"""Upper bound for injections of a kind, kills and sizes of one campaign."""
+"""Upper bound for the number of injections of a kind, of kills and of sizes in a campaign."""
 
 
 def campaign(
@@ -79,7 +79,7 @@ def campaign(
     of its task. There are also runs without faults in real time, alone and under load. The same
     --out continues an interrupted campaign.
 
-    Exit status: 0 the campaign passed; 1 a fault did not strike, or was not detected, handled and
+    Exit status: 0 the campaign passed; 1 a fault had no effect, or was not detected, handled and
     recovered from in time; a limit was violated; a process or segment was left behind; a task was
     neither done nor safely stopped; or a detection had no fault; 2 usage or config error.
 
@@ -147,9 +147,12 @@ def campaign(
 
 
 def _write_report(work: Campaign, results: Results, wall_s: float) -> tuple[dict[str, object], str]:
-    """Write campaign.json, campaign.md and campaign.png, and return the first two.
+    """Write campaign.json, campaign.md and campaign.png.
 
-    The picture needs matplotlib, and is left out of an interrupted campaign.
+    The picture is omitted without matplotlib, or if the campaign was interrupted.
+
+    Returns:
+        The document of campaign.json, and the text of campaign.md.
     """
     from rack.tools.faults.campaigns.report import CampaignReport
 
@@ -159,7 +162,7 @@ def _write_report(work: Campaign, results: Results, wall_s: float) -> tuple[dict
     text = report.to_markdown()
     write_json(work.folder / "campaign.json", document)
     (work.folder / "campaign.md").write_text(text)
-    # Drawing takes too long for an interrupted campaign.
+    # An interrupted command has too little time left to draw.
     if not results.is_interrupted and can_draw():
         from rack.tools.faults.campaigns.plot import plot_campaign
 

@@ -54,7 +54,7 @@ def check(
     r"""Validate a config, and predict whether its levels meet their cycles.
 
     The command prints every mistake, one per line. A valid config gets five lines: whether the rack
-    fits, where it is tightest, how soon it responds, what its arm can do at rest, and what to do.
+    fits, where it is tightest, how soon it responds, reach and payload of its arm, and what to do.
     --verbose adds slots, cores, rates, mailboxes with their bus addresses, and every equation. On a
     terminal the tables show as many columns as fit; --json has all.
 
@@ -163,7 +163,7 @@ def _use_measured_budgets(config: RackConfig, run: Path, percentile: float) -> R
 
 
 def _compute_abilities(config: RackConfig) -> Abilities | None:
-    """Compute what the arm of a rack can do at rest. None for a hand, or without an arm."""
+    """Compute reach and payload of a rack's arm at rest. None for a hand, or without an arm."""
     robot = config.robot
     if robot is None or robot.hand is not None:
         return None
@@ -174,7 +174,7 @@ def _compute_abilities(config: RackConfig) -> Abilities | None:
 
 
 def _print_fixed(fitting: Repair, as_json: bool) -> None:
-    """Print the config that fits on stdout, and its changes on stderr."""
+    """Print the repaired config on stdout and its changes on stderr, or both as JSON."""
     config = None if fitting.remaining_failures else fitting.end.config.to_toml_text()
     if as_json:
         print_json(fitting.to_document() | {"config": config})

@@ -52,7 +52,7 @@ def command(
         False,
     ),
     is_list: bool = option(
-        "--list", "list the levels, the commands each takes, and the one in force", False
+        "--list", "list the levels, the commands that each takes, and its command in force", False
     ),
     as_json: Json = False,
 ) -> None:
@@ -66,7 +66,7 @@ def command(
     resume    let the level continue its own work
     modify    switch a control modification of the servo level on or off,
               between two samples and without a step in the torque
-    table     decide by another state table from now on
+    table     switch to another state table
     do        give the level one of its own commands, in place of the level above
     set       set a live parameter of the level, as 'rack set' does
     enable    ask the arm's drives for torque; the arm continues from its position

@@ -21,7 +21,7 @@ from rack.tools.console.parameters import (
 )
 
 MAX_RESPONSE_S = 2.0
-"""Longest wait until the clock, which reads the latch every tick, has obeyed."""
+"""Maximum time that the clock, which reads the latch every tick, may take to obey it."""
 
 
 def estop(
@@ -138,7 +138,7 @@ class _ChangePrinter:
 
 
 def _wait_for_enter(wait_s: float) -> bool:
-    """Wait for a line on stdin, up to a time, and return whether one has come.
+    """Wait up to `wait_s` for a line on stdin, and return True if a line was read.
 
     Raises `Failure` at the end of the input.
     """
@@ -153,7 +153,8 @@ def _set_latch(rack: str, reset: bool) -> tuple[int, str]:
     """Set or clear the latch of a rack on this machine, and wait until the clock has obeyed.
 
     Returns:
-        The tick of the clock, and why the arm obeys later, which is empty unless the rack is held.
+        The current tick, and the reason if the arm obeys only later. The reason is empty unless the
+        rack is held.
     """
     segment = Segment.attach(rack)
     words = segment.words
@@ -165,7 +166,7 @@ def _set_latch(rack: str, reset: bool) -> tuple[int, str]:
     else:
         lines.latch_emergency_stop()
     deadline = time.monotonic() + MAX_RESPONSE_S
-    # The demand on the arm follows at the next tick. A lost board may also cause a demand.
+    # The clock updates the demand on the arm at its next tick. A lost board can demand brakes, too.
     wait_reason = ""
     while (words[System.DEMAND] == Demand.BRAKE) == reset and words[System.STATE] == Run.RUNNING:
         if wait_reason := describe_wait(segment):

@@ -72,7 +72,7 @@ def gantt(
 
 
 def _draw_figure_5(subject: Subject, figure: int, as_json: bool) -> None:
-    """Draw the paper's figure 5. Raises `Failure` for another number."""
+    """Draw figure 5 of the paper. Raises `Failure` if another figure is requested."""
     if figure != 5:
         raise Failure(
             f"--figure {figure}: must be 5; figures 2 to 4 are racks, as in: rack gantt fig2", 2

@@ -25,7 +25,7 @@ def inject(
         "RACK", "running rack by name, as 'rack list' shows it", None, callback=check_rack_name
     ),
     board: str | None = argument(
-        "BOARD", "task to strike: servo, servo.planner, ..., or clock", None
+        "BOARD", "task to disturb: servo, servo.planner, ..., or clock", None
     ),
     kind: str | None = argument("KIND", "kind of fault; the kinds are listed below", None),
     parameters: list[str] | None = argument(
@@ -34,14 +34,14 @@ def inject(
     lasts: str | None = option("--for TIME", "duration in simulated time, as in 0.5s or 20ms"),
     cycles: str | None = option("--cycles N", "duration in cycles of the task"),
     mailbox: str | None = option(
-        "--mailbox NAME", "mailbox to strike; default: all that the task writes"
+        "--mailbox NAME", "mailbox to disturb; default: all that the task writes"
     ),
     tick: str | None = option("--tick T", "tick at which the fault begins; default: the next one"),
     when: str | None = option(
         "--when CONDITION", 'begin when this holds, as in "task.status.action == 2"'
     ),
     phase: str | None = option(
-        "--phase X", "fraction of its first tick that passes before it strikes, 0 to below 1"
+        "--phase X", "fraction of its first tick that passes before it begins, 0 to below 1"
     ),
     seed: str | None = option("--seed N", "seed of its random choices"),
     wait: bool = option("--wait", "wait until the fault, or the run, is over", False),
@@ -143,7 +143,7 @@ def format_kinds() -> Iterator[str]:
     ]
     yield from format_fitted_table(["kind", "effect", "found within", ""], rows)
     yield ""
-    yield "A cycle is one of the task that is struck; for a planner it is its time slice."
+    yield "Cycles are those of the disturbed task. A cycle of a planner is its time slice."
     yield "A delivery is the time until a message is visible and its reader has read it."
     yield ""
     numbers = [

@@ -36,9 +36,10 @@ def list_racks(as_json: Json = False) -> None:
 
 
 def describe_rack(name: str) -> Document:
-    """Build the answer for one rack: its name as "rack", its state and details.
+    """Return a document with the name, state and details of one rack.
 
-    The age is in seconds. The launcher is None in another PID namespace.
+    `age_s` is the time since its launch. `launcher` is None in another PID namespace. A foreign
+    rack has neither.
     """
     try:
         segment = Segment.attach(name)

@@ -17,7 +17,7 @@ from rack.tools.recording.signal import find_mailbox
 
 READ_INTERVAL_S = 0.1
 PLAIN_INTERVAL_S = 1.0
-"""Wall-clock time between two readings: on a terminal or as JSON, and as plain text."""
+"""Wall-clock time between two readings: for a terminal or JSON, and for plain text."""
 
 
 def mailbox(
@@ -62,9 +62,10 @@ def mailbox(
 def _watch_mailbox(
     segment: Segment, ring: MailboxRing, formatter: MessageFormatter, as_json: bool
 ) -> None:
-    """Show the newest message, and each new one until the run is over.
+    """Show the newest message of a mailbox, then each new one until the run is over.
 
-    With JSON all messages are printed. For people the newest one of each reading is shown.
+    JSON output contains every message. Text output skips all but the newest message of each
+    reading.
     """
     from rich.live import Live
     from rich.text import Text

@@ -70,7 +70,7 @@ def new(
 
 
 def _find_name_problem(kind: str, name: str) -> str:
-    """Return why a name cannot be used for the module, its rack and its board, or an empty text."""
+    """Return why the module, its rack or its board cannot have this name. Empty if they can."""
     if not re.fullmatch(RACK_NAME, name) or not name.isidentifier() or keyword.iskeyword(name):
         return "must be at most 40 of a-z, 0-9 and '_', begin with a letter, and not be a keyword"
     if name in list_names() or name in load("nasrem").board:
@@ -86,6 +86,7 @@ def _find_name_problem(kind: str, name: str) -> str:
 
 
 def _class_name(name: str) -> str:
+    """Return the class name for a module name, as in `MyLevel` for `my_level`."""
     return "".join(part.capitalize() for part in name.split("_"))
 
 

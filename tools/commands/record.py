@@ -98,7 +98,7 @@ def record(
 
 
 def _save_recording(segment: Segment, folder: Path) -> tuple[Document, str]:
-    """Save the recording of a running rack so far. Returns the answer as data and as a line."""
+    """Save what has been recorded of a running rack. Returns the answer as data and as a line."""
     name = segment.layout.rack
     run = find_run_folder(segment)
     if run is None:
@@ -120,23 +120,23 @@ def _save_recording(segment: Segment, folder: Path) -> tuple[Document, str]:
 
 
 def save_run(folder: Path, into: Path) -> None:
-    """Copy the recording in `folder` so far to the run folder `into`. The recorder continues."""
+    """Copy what `folder` contains of a recording to the run folder `into`, while it continues."""
     stretches = (f"{STRETCHES}/{path.name}" for path in list_stretch_files(folder))
     for name in (CONFIG, PUBLISHED, ORIGIN, CODE, EVENTS, CHECKSUMS, SPOOL, *stretches):
         (into / name).parent.mkdir(parents=True, exist_ok=True)
-        # The flight recorder may have removed a file since, and few runs have an origin.
+        # The flight recorder may have removed a listed file by now, and few runs have an origin.
         with suppress(FileNotFoundError):
             copyfile(folder / name, into / name)
     rebuild_files(into)
 
 
 def _start_recorder(segment: Segment, folder: Path, port: int | None) -> RecorderProcess:
-    """Start to record a rack into a folder.
+    """Start recording a rack into a folder.
 
     Args:
         segment: The rack.
         folder: Run folder, created if missing.
-        port: Port at which the recorder serves the viewer. None for no viewer.
+        port: Port on which the recorder serves the viewer. None for no viewer.
 
     Raises:
         Failure: The folder cannot be written, or the recorder does not start.
@@ -160,7 +160,7 @@ def _record_racks(racks: Sequence[Segment], folder: Path, view: bool) -> list[st
 
     Args:
         racks: One rack, or several, which are then joined on one time line.
-        folder: Run folder of the rack, or folder that gets a run folder for each of several.
+        folder: Run folder of a single rack, or parent of the run folders of several racks.
         view: True to open the viewer. Only for one rack.
 
     Returns:
@@ -199,7 +199,16 @@ def _record_racks(racks: Sequence[Segment], folder: Path, view: bool) -> list[st
 def _await_runs(
     racks: Sequence[Segment], recorders: Sequence[RecorderProcess], unfinished: str
 ) -> list[str]:
-    """Record until all runs are over, or until Ctrl-C. Returns notes of the recorders."""
+    """Record until all runs are over or Ctrl-C is pressed, then finish the recordings.
+
+    Args:
+        racks: The racks that are recorded.
+        recorders: Their recorders.
+        unfinished: Message for the user if finishing takes too long after Ctrl-C.
+
+    Returns:
+        Notes of the recorders for the user.
+    """
     notes: list[str] = []
     ended = Event()
     with INTERRUPT.stop_orderly(ended.set, unfinished):

@@ -20,7 +20,7 @@ from rack.tools.viewer.parts import FILE, list_parts
 from rack.tools.viewer.window import ViewerWindow, has_screen
 
 Places = Callable[[Sequence[Recording]], list[RackPlace]]
-"""Puts recordings on one time line."""
+"""Function that puts recordings on one time line."""
 
 
 def replay(
@@ -91,13 +91,13 @@ def _find_viewer_files(run: Path) -> list[Path]:
     is_file = run.suffix == ".rrd"
     checksums = Checksums(run.parent if is_file else run)
     files = [run] if is_file and run.is_file() else list_parts(run / FILE)
-    # A killed recorder leaves a file without a checksum.
+    # A killed recorder leaves a file without a checksum, which cannot be verified.
     checksums.verify(*{part.name for part in files} & {*checksums.stored})
     return files
 
 
 def _list_runs(run: Path) -> list[Path]:
-    """Return the runs in a folder made by `rack record --with`, or the folder if it is a run."""
+    """List the runs in a folder made by `rack record --with`. A run folder lists only itself."""
     parts = (
         [] if (run / CONFIG).exists() else sorted(path.parent for path in run.glob(f"*/{CONFIG}"))
     )
@@ -113,9 +113,9 @@ def _open_viewer(*recordings: Path) -> None:
 
 
 def _write_file(runs: Sequence[Path], out: Path, place: Places) -> None:
-    """Write the file of `merge_runs`, printing its notes.
+    """Merge runs into the file `out`, and print the notes of `merge_runs` on stderr.
 
-    Raises `Failure` for an unusable `out`.
+    Raises `Failure` if `out` exists or is not an .rrd file.
     """
     if out.suffix != ".rrd":
         raise Failure(f"--out {out}: the name of a file for the viewer must end in .rrd", 2)

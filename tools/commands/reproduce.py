@@ -12,7 +12,7 @@ from rack.tools.console.parameters import Json, option
 from rack.tools.launch.folder import RUNS
 
 DEFAULT_FOLDER = RUNS / "paper"
-"""Default folder of the page. It is always the same, so that the command continues."""
+"""Default folder of the page. It is fixed, so that a repeated command continues in it."""
 MISSING_JINJA2 = "the page needs jinja2: pip install 'nasrem-rack[lab]'"
 CONTINUE_HINT = "{}: finished experiments are kept; the same command continues from there"
 

@@ -85,10 +85,10 @@ class _ArgumentParser(argparse.ArgumentParser):
 
 
 class RewindPrompt(cmd.Cmd):
-    """The prompt and its commands.
+    """The prompt of `rack rewind`, with a method for each of its commands.
 
     Attributes:
-        failed: Number of commands that failed.
+        failed_count: Number of commands that failed.
     """
 
     def __init__(self, run: RewoundRun, as_json: bool) -> None:
@@ -103,10 +103,10 @@ class RewindPrompt(cmd.Cmd):
         return f"{self._run.to_time_s(self._run.tick):g} s> "
 
     def onecmd(self, line: str) -> bool:
-        """Execute one command. Returns True if it was the last."""
+        """Execute one command. Returns True if the prompt should end."""
         try:
             with convert_errors():
-                # A signal that ended a branch also ends the prompt.
+                # A signal that stopped a running branch also ends the prompt.
                 return bool(super().onecmd(line)) or INTERRUPT.number != 0
         except Failure as failure:
             self._report_failure(str(failure))
@@ -140,10 +140,9 @@ class RewindPrompt(cmd.Cmd):
         raise Failure(f"{name}: no such command; nearest: {', '.join(near)}", 2)
 
     def do_goto(self, line: str) -> None:
-        """Go to a simulated time, s, or to the next tick at which a condition begins to hold.
+        """Go to a simulated time in s, or to the next tick at which a condition begins to hold.
 
-        The condition begins to hold at a message for which it holds, after one for which it does
-        not.
+        That is the tick of the first message that meets the condition after one that does not.
         Comparisons: == != <= >= < >; a state may be named, as in "primitive.status.state ==
         holding".
         """
@@ -174,15 +173,13 @@ class RewindPrompt(cmd.Cmd):
         """Show a message, one of its signals, or the object of a level at this tick.
 
         The name can be a mailbox, as in primitive.status, or primitive.plan for the plan; a signal,
-        as in
-        servo.status.position[2]; or a task, as in primitive or primitive.planner, for the
-        attributes of the
-        level's object.
+        as in servo.status.position[2]; or a task, as in primitive or primitive.planner, for the
+        attributes of the level's object.
         """
         self._print_answer(self._run.show_name(_parse_arguments("show", line).name))
 
     def complete_show(self, text: str, line: str, begin: int, end: int) -> Sequence[str]:
-        """List the names that complete a text."""
+        """List the names that begin with `text`, for completion."""
         return [name for name in self._run.names if name.startswith(text)]
 
     def do_events(self, line: str) -> None:
@@ -190,11 +187,10 @@ class RewindPrompt(cmd.Cmd):
         self._print_answer(self._run.list_events(_parse_arguments("events", line).seconds))
 
     def do_branch(self, line: str) -> None:
-        """Run the rack from this tick with other settings or faults, and record that as a new run.
+        """Run the rack from this tick with other settings or faults, and record it as a new run.
 
         The answer states where the branch first differs. --seconds counts from the beginning of the
-        run. By
-        default the branch ends with its task, or after as long a time as the run.
+        run. By default the branch ends with its task, or after as long a time as the run.
         """
         arguments = _parse_arguments("branch", line)
         with open_display(silent=self._as_json) as display:
@@ -223,7 +219,7 @@ class RewindPrompt(cmd.Cmd):
 
 
 def _parse_seconds(text: str) -> float:
-    """Parse a time, s. Raises `ArgumentTypeError`."""
+    """Parse a time in s. Raises `ArgumentTypeError`."""
     with suppress(ValueError):
         if 0.0 <= (seconds := float(text)) <= MAX_SECONDS:
             return seconds

@@ -53,7 +53,7 @@ def new(
     actuators or a URDF's efforts, and a keyframe. The rest is found (the tool, a home free of
     contact, the drive of the gripper and the joints or jaw that go with it, bodies that always
     overlap) or guessed. Each guess is named here, in the file, and in [robot] guessed. The task
-    moves two blocks on a table, or tours poses if no gripper can take blocks. The planner has
+    moves two blocks on a table, or tours poses if no gripper can grasp blocks. The planner has
     rehearsed it. On a terminal the command asks for values that no option gives.
 
     Exit status: 0 written; 2 the model cannot be used, and nothing is written.
@@ -66,10 +66,10 @@ def new(
     """
     from rack.tools.robot.draft import ArmOptions
 
-    asks = sys.stdin.isatty() and sys.stdout.isatty() and not as_json
+    is_interactive = sys.stdin.isatty() and sys.stdout.isatty() and not as_json
     taken = list_names()
     derived = derive_name(model.stem, taken)
-    name = name or (_ask("name", derived) if asks else derived)
+    name = name or (_ask("name", derived) if is_interactive else derived)
     if not is_free_name(name, taken):
         why = "must be at most 40 of a-z, 0-9, '-' and '_', and not the name of a bundled config"
         raise Failure(f"--name = {name}: {why}; for example {derive_name(name, taken)}", 2)
@@ -79,7 +79,7 @@ def new(
     chain = tuple(filter(None, joints.split(",")))
     wanted = ArmOptions(tip, chain, tool, gripper, home, _parse_torques(torque))
     with draft_folder(model) as draft:
-        document = _write_draft(model, wanted, draft / name, name, asks)
+        document = _write_draft(model, wanted, draft / name, name, is_interactive)
         shutil.copytree(draft / name, folder)
     print_answer(
         document | {"folder": str(folder)}, _format_answer(document, folder, name), as_json
@@ -126,7 +126,14 @@ def check(
 
 
 def _examine_robot(model: str, folder: Path) -> tuple[ArmExamination, str]:
-    """Examine the arm of a config or a model. Returns also its name. Raises `RobotError`."""
+    """Examine the arm of a config or a model file.
+
+    Returns:
+        The examination, and the name of the config or model.
+
+    Raises:
+        RobotError: The model cannot be used, or the config has no arm.
+    """
     from rack.tools.robot.draft import CLOCK_NS, EMPTY_SCENE, ArmOptions, draft_arm
     from rack.tools.robot.findings import examine_arm
     from rack.tools.robot.source import read_source
@@ -141,7 +148,7 @@ def _examine_robot(model: str, folder: Path) -> tuple[ArmExamination, str]:
 
 
 def _format_examination(document: Document) -> Iterator[str]:
-    """Yield the lines of the answer for people."""
+    """Yield the lines of the examination as readable text."""
     yield from format_fitted_records(document["joints"])
     yield f"reach {document['reach_m']} m, payload {document['payload_kg']} kg at any pose in reach"
     for finding in document["findings"]:
@@ -151,13 +158,16 @@ def _format_examination(document: Document) -> Iterator[str]:
 
 
 def _ask(text: str, default: str = "") -> str:
-    """Ask the user for a value. An empty answer means the default, or what the draft will find."""
+    """Ask the user for a value, and return the answer or else the default.
+
+    An empty result leaves the choice of the value to the draft.
+    """
     question = text if default else f"{text} [found]"
     return str(typer.prompt(question, default, show_default=bool(default))).strip()
 
 
 def _ask_for_options(source: Source, wanted: ArmOptions) -> ArmOptions:
-    """Ask on the terminal for each value that no option gives. Raises `RobotError`."""
+    """Ask on the terminal for each option that was not given. Raises `RobotError`."""
     from rack.levels.robot.model import format_names
     from rack.tools.robot.arm import find_arm
 
@@ -183,8 +193,8 @@ def draft_folder(model: Path) -> Iterator[Path]:
     """Provide a temporary folder for a draft.
 
     Raises:
-        Failure: A `RobotError` of the body. Its text names the user's model, not files in the
-            folder.
+        Failure: The body of the context raised `RobotError`. The text names the user's model
+            instead of files in the folder.
     """
     with TemporaryDirectory() as folder:
         try:
@@ -206,7 +216,9 @@ def _parse_torques(text: str) -> tuple[float, ...]:
         raise Failure(f"--torque = {text}: must be numbers, as in 80,80,12", 2) from None
 
 
-def _write_draft(model: Path, wanted: ArmOptions, folder: Path, name: str, asks: bool) -> Document:
+def _write_draft(
+    model: Path, wanted: ArmOptions, folder: Path, name: str, is_interactive: bool
+) -> Document:
     """Write the folder of an arm, and return the answer to `--json`. Raises `RobotError`."""
     from rack.tools.robot.assignment import find_assignment
     from rack.tools.robot.draft import draft_arm
@@ -216,7 +228,7 @@ def _write_draft(model: Path, wanted: ArmOptions, folder: Path, name: str, asks:
 
     folder.mkdir()
     source = read_source(model)
-    if asks:
+    if is_interactive:
         wanted = _ask_for_options(source, wanted)
     drafted = draft_arm(source, wanted, folder, name)
     layout = find_assignment(drafted)
@@ -231,12 +243,13 @@ def _write_draft(model: Path, wanted: ArmOptions, folder: Path, name: str, asks:
 
 
 def _format_answer(document: Document, folder: Path, name: str) -> Iterator[str]:
+    """Yield lines that tell what was written, what is guessed, and how to run it."""
     joints = document["joints"]
     yield f"{folder}: {len(joints)} joints, {', '.join(joints)}; {document['task']}"
     yield from document["notes"]
     for key, why in document["guessed"].items():
         yield f"guessed: {key}: {why}"
     config_path = folder / f"{name}.toml"
-    # A file beside the folder would be found first under that name.
+    # A file of that name beside the folder would be found first.
     is_found = folder == Path(name) and not Path(config_path.name).exists()
     yield f"rack run {name if is_found else shlex.quote(str(config_path))}"

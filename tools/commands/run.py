@@ -171,7 +171,7 @@ def run(
 
 
 def _preload_levels(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
-    """Let the crate load the levels of a config while this process imports the config checks."""
+    """Let the crate import a config's levels while this process checks the config."""
     if crate is not None:
         python_path = tables.get("python_path")
         crate.send_request(
@@ -186,7 +186,7 @@ def _preload_levels(crate: CrateLine | None, tables: Tables) -> CrateLine | None
 def _report_run(
     config: RackConfig, folder: Path | None, result: RunResult, as_json: bool
 ) -> Document:
-    """Write the report, print it and return it. A run whose report cannot be written has failed."""
+    """Write, print and return the report. A run whose report cannot be written has failed."""
     from rack.tools.recording.folder_size import format_recorded_line
     from rack.tools.report.report import build_unrecorded_report, write_report
     from rack.tools.report.report_markdown import format_summary

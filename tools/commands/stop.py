@@ -38,7 +38,11 @@ def stop(
 def stop_rack(rack: str, timeout_s: float) -> bool:
     """Request the end of a rack and wait until its launcher has ended.
 
-    In another PID namespace, it waits until the launcher has closed the rack.
+    For a rack in another PID namespace, wait until the launcher has closed it.
+
+    Args:
+        rack: Name of the rack.
+        timeout_s: Maximum time to wait.
 
     Returns:
         False if the launcher still runs after `timeout_s`.

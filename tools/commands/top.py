@@ -11,7 +11,7 @@ from rack.tools.commands.status import OnlyRack, find_only_rack
 from rack.tools.console.interrupt import INTERRUPT
 
 SNAPSHOT_INTERVAL_S = 0.2
-"""Time between two snapshots, s."""
+"""Time between two snapshots."""
 
 
 def top(rack: OnlyRack = None) -> None:

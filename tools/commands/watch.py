@@ -100,7 +100,7 @@ def watch(
 
 
 def _parse_seconds(option: str, text: str) -> float:
-    """Parse the time of an option, s. Raises `Failure`."""
+    """Parse the time of an option in s. Raises `Failure`."""
     seconds = -1.0
     with suppress(ValueError):
         seconds = parse_seconds(text)
@@ -111,7 +111,10 @@ def _parse_seconds(option: str, text: str) -> float:
 
 
 def _check_writable(path: Path) -> None:
-    """Raise `OSError` if a file cannot be written, before the captured messages would be lost."""
+    """Raise `OSError` if a file cannot be written.
+
+    This is checked before the capture, because its messages would otherwise be lost.
+    """
     is_new = not path.exists()
     with path.open("a"):
         pass
@@ -145,16 +148,19 @@ def _show_signals(
 
 
 def _await_trigger(segment: Segment, strip: SignalHistory, trigger: Trigger, after: int) -> int:
-    """Wait for the first tick at which a condition holds, and `after` more ticks.
+    """Wait until a condition holds, and then for `after` more ticks.
 
     Args:
         segment: The rack.
-        strip: Messages of the signals, which this function keeps up to date.
+        strip: History of the signals, which this function updates.
         trigger: The condition.
         after: Number of ticks to wait for afterwards.
 
+    Returns:
+        The first tick at which the condition held.
+
     Raises:
-        Failure: The run ends first.
+        Failure: The run ended, or the user interrupted it, before the condition held.
     """
     tick = -1
     for _ in poll_run(segment, READ_INTERVAL_S):
@@ -171,7 +177,7 @@ def _await_trigger(segment: Segment, strip: SignalHistory, trigger: Trigger, aft
 
 
 def _save_csv(path: Path, strip: SignalHistory, rows: EntityRows) -> None:
-    """Write the CSV file. Raises `Failure` when messages are missing."""
+    """Write the captured values as CSV. Raises `Failure` if messages were lost on the way."""
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)

@@ -1,4 +1,4 @@
-"""Shared by all commands: arguments, answers, tables, progress, signals.
+"""Input and output of all commands: arguments, answers, tables, pictures, progress, signals.
 
 Nothing in this package knows about runs.
 """

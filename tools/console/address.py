@@ -49,9 +49,9 @@ class Operator(NamedTuple):
 
 
 class RackAddress(NamedTuple):
-    """A rack on another machine: host and port at which it listens, and its name.
+    """Address of a rack on another machine: host, port and name.
 
-    An IPv6 address has its brackets.
+    The host keeps the brackets of an IPv6 address.
     """
 
     host: str
@@ -71,7 +71,7 @@ class RackAddress(NamedTuple):
 
     @property
     def endpoint(self) -> str:
-        """Host and port as users write them: the default port is left out."""
+        """Host and port as users type them, without the port if it is the default."""
         return self.host if self.port == PORT else f"{self.host}:{self.port}"
 
     def __str__(self) -> str:

@@ -33,7 +33,7 @@ def convert_errors() -> Iterator[None]:
 
 
 def write_file(path: Path, text: str) -> None:
-    """Write a file of an answer by replacing whatever has its name. That file is never opened."""
+    """Write a file under a temporary name, and rename it over any existing file or link."""
     unfinished = path.with_name(f"{path.name}.unfinished")
     unfinished.unlink(missing_ok=True)
     unfinished.write_text(text, encoding="utf-8")
@@ -41,12 +41,12 @@ def write_file(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write a document as a JSON file, in the way of `write_file`."""
+    """Write a document as JSON with `write_file`."""
     write_file(path, encode_json(document, indent=2) + "\n")
 
 
 def print_json(document: Any) -> None:
-    """Print the answer to `--json`."""
+    """Print a document as the answer to `--json`."""
     print(encode_json(document, indent=2))
 
 
@@ -55,7 +55,7 @@ def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> Non
 
     Args:
         document: The answer as plain data.
-        text: The same for people, whole or as lines.
+        text: The answer as readable text, whole or as lines.
         as_json: True to print the document, and nothing else.
     """
     if as_json:
@@ -67,7 +67,7 @@ def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> Non
 
 
 def exit_with_failure(reason: str, status: int) -> NoReturn:
-    """End the command with a reason on stderr, and with --json as a JSON document on stdout too."""
+    """Print the reason on stderr, with --json also as JSON on stdout, and exit with `status`."""
     lines = [
         line if line.isprintable() and len(line) <= MAX_LINE else to_one_line(line, MAX_LINE)
         for line in reason.splitlines()

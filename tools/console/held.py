@@ -1,4 +1,4 @@
-"""Describes a rack that is held between two ticks, where requests wait."""
+"""Describes why requests to a rack wait while it is held between two ticks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def describe_wait(segment: Segment) -> str:
-    """Describe how long a request to the rack must wait. Empty if the rack is not held."""
+    """Describe until when a request to a held rack waits. Empty if the rack is not held."""
     tick = segment.words[System.HELD] - 1
     if tick < 0:
         return ""

@@ -1,9 +1,9 @@
 """SIGINT, SIGTERM and SIGHUP end a command within 2 s, with exit status 128 + signal.
 
 They leave no process and no segment behind. A command with nothing to finish ends inside the signal
-handler. Python's own way, an exception raised there, was rejected: it may strike after a segment
-has been created and before its owner has been recorded, and libraries that are being imported turn
-it into other errors. A command with something to finish uses `stop_orderly`, and gets `BOUND_S`.
+handler. Python's own way, an exception raised there, was rejected: it may occur after a segment has
+been created and before its owner has been recorded, and libraries that are being imported turn it
+into other errors. A command with something to finish uses `stop_orderly`, and gets `BOUND_S`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class _SignalReaction(NamedTuple):
 
 
 class Interrupt:
-    """The signals of this process.
+    """Handles the signals of this process.
 
     Attributes:
         number: Number of the first signal received. 0 before that.
@@ -58,9 +58,9 @@ class Interrupt:
         return signal.Signals(self.number).name if self.number else ""
 
     def install_handlers(self) -> None:
-        """Install the handlers.
+        """Install the signal handlers.
 
-        Before that a signal kills the process, with the same exit status.
+        Without them a signal kills the process, with the same exit status.
         """
         for number in SIGNALS:
             # Leave SIGHUP ignored under nohup, so that the command outlives its terminal.
@@ -72,13 +72,12 @@ class Interrupt:
     def stop_orderly(
         self, stop: Callable[[], object] = lambda: None, unfinished: str = ""
     ) -> Iterator[None]:
-        """Let the first signal call a function in its handler. The command then ends by itself.
+        """Let the first signal call `stop`, after which the command is expected to end by itself.
 
         Args:
             stop: Called in the signal handler, or at once if a signal has been received already.
             unfinished: Printed if the command has not ended within `BOUND_S`. Tells the user what
-                to
-                do.
+                to do.
         """
         self._reactions.append(_SignalReaction(stop, unfinished))
         try:
@@ -89,17 +88,20 @@ class Interrupt:
             self._reactions.pop()
 
     def end_at_once(self) -> AbstractContextManager[None]:
-        """Let a signal end the process in its handler, even inside `stop_orderly`."""
+        """Let a signal end the process in the signal handler, even inside `stop_orderly`."""
         return self.stop_orderly(self.end_process)
 
     def raise_interrupted(self) -> AbstractContextManager[None]:
-        """Let the first signal raise `Interrupted`, for waits and where contexts clean up files."""
+        """Let the first signal raise `Interrupted`.
+
+        Use it for waits, and where contexts have files to clean up.
+        """
         return self.stop_orderly(_raise_interrupted)
 
     def exit_if_signalled(self) -> None:
-        """End the process with the signal's exit status if one was received.
+        """If a signal was received, end the process with its exit status.
 
-        Call it when the command has finished.
+        Call this when the command has finished.
         """
         if self.number:
             for stream in (sys.stdout, sys.stderr):
@@ -161,11 +163,12 @@ def _is_resource_tracker(pid: int) -> bool:
 
 
 def _raise_interrupted() -> None:
+    """Raise `Interrupted`, as the reaction to a signal."""
     raise Interrupted
 
 
 def _leave_terminal() -> None:
-    """Discard further output, because writing to a closed terminal is an error."""
+    """Redirect terminal output to /dev/null, because writing to a closed terminal fails."""
     for fd in (1, 2):
         with suppress(OSError):
             if stat.S_ISCHR(os.fstat(fd).st_mode):
@@ -186,7 +189,7 @@ def _kill_children(family: list[int]) -> None:
 
 
 def await_ends(pids: Iterable[int], bound_s: float) -> None:
-    """Wait until processes have ended, for at most `bound_s` in all."""
+    """Wait until all processes have ended, for at most `bound_s` in total."""
     deadline = time.monotonic() + bound_s
     for pid in pids:
         with suppress(ProcessLookupError):
@@ -204,7 +207,7 @@ def list_descendants(pid: int, session: int | None = None) -> Iterator[int]:
         pid: The process.
         session: Only processes of this session. None for all.
     """
-    # The files of a process that has ended since cannot be read.
+    # The files of a process that has ended in the meantime cannot be read.
     children: list[int] = []
     with suppress(OSError):
         for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -217,7 +220,7 @@ def list_descendants(pid: int, session: int | None = None) -> Iterator[int]:
 
 
 def _remove_racks(killed: list[int]) -> None:
-    """Remove the racks of this process, whose `killed` children cannot do so."""
+    """Remove the racks of this process, because its `killed` children no longer can."""
     # Look the module up instead of importing it: a signal handler may run in the middle of an
     # import. If it is not loaded, this process has not made any racks.
     remove_own = getattr(sys.modules.get("rack.boards.crate.clean"), "remove_own_racks", None)

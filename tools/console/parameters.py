@@ -56,16 +56,16 @@ def check_timeout(timeout: float | None, wait: bool) -> None:
 
 
 def check_rack_name(rack: str | None) -> str | None:
-    """Check the name of a rack. Raises `Failure` if it is empty."""
+    """Return the name of a rack unchanged. Raises `Failure` if it is empty."""
     if rack == "":
         raise Failure('RACK = "": must be the name of a running rack, as "rack list" shows it', 2)
     return rack
 
 
 def check_local_rack_name(rack: str | None) -> str | None:
-    """Check the name of a rack.
+    """Return the name of a rack unchanged.
 
-    Raises `Failure` for an empty one and for a rack on another machine.
+    Raises `Failure` if it is empty or names a rack on another machine.
     """
     if rack is not None and "/" in rack:
         raise Failure(

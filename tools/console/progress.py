@@ -13,13 +13,13 @@ from rich.progress import Progress as RichProgress
 from rack.tools.console.tables import create_console
 
 LINE_INTERVAL_S = 2.0
-"""Least time between two lines about the progress of reading."""
+"""Minimum time between two lines about the progress of reading."""
 
 
 class Progress:
-    """Progress of a series of runs, measured in the seconds that each is expected to take.
+    """Progress of a series of runs, weighted by their expected durations.
 
-    It shows a `bar`, or prints lines, or neither.
+    Shows a `bar`, or prints lines, or neither.
     """
 
     def __init__(self, bar: RichProgress | None = None, prints_lines: bool = False) -> None:
@@ -28,22 +28,22 @@ class Progress:
         self._task = self._bar.add_task("", total=None)
 
     def set_total(self, seconds: float) -> None:
-        """Set the expected duration of the whole series, s."""
+        """Set the expected duration of the whole series in s."""
         self._bar.update(self._task, total=seconds)
         self._print(f"about {seconds / 60.0:.0f} minutes")
 
     def begin_run(self, text: str) -> None:
-        """Show which run begins."""
+        """Announce the run that begins."""
         self._bar.update(self._task, description=text)
         self._print(text)
 
     def end_run(self, seconds: float, ended: str = "done", shortfalls: Sequence[str] = ()) -> None:
-        """Advance by a run that has ended.
+        """Advance the progress by a run that has ended.
 
         Args:
-            seconds: Time that the run was expected to take.
-            ended: How it ended. Not shown on a terminal.
-            shortfalls: Its failures, one line each.
+            seconds: Expected duration of the run.
+            ended: How the run ended. Printed only in line mode.
+            shortfalls: Failures of the run, one line each.
         """
         self._bar.update(self._task, advance=seconds)
         if not self._bar.disable:
@@ -53,6 +53,7 @@ class Progress:
             self._print(f"  {line}")
 
     def _print(self, line: str) -> None:
+        """Print a line if progress is shown as lines."""
         if self._prints_lines:
             print(line, flush=True)
 
@@ -84,6 +85,7 @@ def create_reading_progress(
     last_shown = time.monotonic()
 
     def show(fraction: float) -> None:
+        """Print the progress if the last line is at least `LINE_INTERVAL_S` old."""
         nonlocal last_shown
         if not silent and time.monotonic() - last_shown > LINE_INTERVAL_S:
             last_shown = time.monotonic()

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 PIPE_WIDTH = 120
-"""Width of views that always have one, such as `rack status`, when stdout is not a terminal."""
+"""Width of fixed-width views, such as `rack status`, when stdout is not a terminal."""
 GAP = 2
 """Number of spaces between columns."""
 UNLIMITED_WIDTH = 1_000_000
@@ -23,7 +23,7 @@ UNLIMITED_WIDTH = 1_000_000
 
 
 def create_console() -> Console:
-    """Return the console on stdout."""
+    """Return a rich console on stdout, with a fixed width if stdout is not a terminal."""
     stdout_console = Console()
     return stdout_console if stdout_console.is_terminal else Console(width=PIPE_WIDTH)
 
@@ -61,7 +61,7 @@ def format_table(
 def format_fitted_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], dropped: Sequence[str] = ()
 ) -> Iterator[str]:
-    """Yield the lines of a table that fits the terminal on stdout. In a pipe it is complete.
+    """Yield the lines of a table, fitted to the terminal if stdout is one.
 
     Args:
         head: Names of the columns.
@@ -74,7 +74,7 @@ def format_fitted_table(
 def format_fitted_records(
     records: Sequence[Mapping[str, object]], dropped: Sequence[str] = ()
 ) -> Iterator[str]:
-    """Yield the lines of a table like `format_fitted_table`, with a row for each record.
+    """Yield the lines of a table with a row for each record, as `format_fitted_table` does.
 
     The keys of the first record are the columns.
     """
@@ -90,7 +90,7 @@ def build_grid(
     dropped: Sequence[str] = (),
     style: Callable[[str, str], str] = lambda column, text: "",
 ) -> Table:
-    """Return a table for rich to draw.
+    """Build a rich table that fits a width.
 
     Args:
         head: Names of the columns.
@@ -162,18 +162,18 @@ class TextTable:
 
 
 def format_cell(cell: Cell) -> str:
-    """Format a cell."""
+    """Format a cell as text. None becomes a dash."""
     if cell is None:
         return "-"
     return f"{cell:g}" if isinstance(cell, float) else str(cell)
 
 
 Blocks = Iterator[str | TextTable]
-"""A text for people, line by line, with tables in it. A line that begins with "#" is a title."""
+"""Lines of text and tables, in reading order. A line that begins with "#" is a title."""
 
 
 def render_markdown(blocks: Iterable[str | TextTable]) -> str:
-    """Format a text as Markdown, with all columns of its tables."""
+    """Format text and tables as Markdown, with all columns of the tables."""
     lines: list[str] = []
     for block in blocks:
         if isinstance(block, TextTable):
@@ -193,7 +193,7 @@ def render_text(blocks: Iterable[str | TextTable], width: int | None = None) -> 
 
 
 def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
-    """Print a text on a terminal. Tables are fitted to its width, and titles are bold."""
+    """Print text and tables on a terminal. Tables fit its width, and titles are bold."""
     for line in render_text(blocks, terminal.width):
         is_title = line.startswith("#")
         text = line.lstrip("# ") if is_title else line
@@ -201,7 +201,7 @@ def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
 
 
 def print_blocks(blocks: Iterable[str | TextTable]) -> None:
-    """Print a text on stdout, fitted to a terminal or complete in a pipe."""
+    """Print text and tables on stdout, fitted to a terminal or complete in a pipe."""
     terminal = create_console()
     if terminal.is_terminal:
         show_blocks(blocks, terminal)

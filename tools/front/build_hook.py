@@ -13,7 +13,7 @@ FILES = {"tools/front/rack": "rack", "tools/front/nasrem_rack.py": "nasrem_rack.
 
 
 class FrontHook(BuildHookInterface[Any]):
-    """Places the files of this folder at the root of a wheel."""
+    """Build hook that places the files of this folder at the root of a wheel."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Add the files, unless the install is editable."""

@@ -16,22 +16,22 @@ def main() -> None:
     """Run the command line of `rack`, or exit with one line that names the wrong package."""
     place = _find_package()
     if "nasrem-rack" not in place.read_text():
-        sys.exit(f"rack: {place} is not nasrem-rack's package `rack`: {_remedy()}")
+        sys.exit(f"rack: {place} is not nasrem-rack's package `rack`: {_describe_remedy()}")
     from rack.tools.cli import main as run
 
     run()
 
 
 def _find_package() -> Path:
-    """Find the file of the package `rack` that would be imported, without running any of it."""
+    """Return the file of the package `rack` that would be imported, without importing it."""
     spec = find_spec("rack")
     assert spec is not None
     assert spec.origin is not None
     return Path(spec.origin)
 
 
-def _remedy() -> str:
-    """Return what removes the other package, which is installed over ours or found before it."""
+def _describe_remedy() -> str:
+    """Tell how to remove the other package, which overwrites ours or precedes it on the path."""
     try:
         version("rack")
     except PackageNotFoundError:

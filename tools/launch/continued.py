@@ -1,6 +1,6 @@
 """Runs a recorded run again in lockstep, up to any tick, with snapshots on the way.
 
-`rack run --from RUN@TIME` and `rack rewind` use it. Lockstep is deterministic, so the rack comes to
+`rack run --from RUN@TIME` and `rack rewind` use it. Lockstep is deterministic, so the rack reaches
 each tick in the same state as in the recorded run. Commands of operators are repeated, and messages
 of host boards and other racks are replayed. Up to the tick nothing is changed: a branch may differ
 only from there.
@@ -56,15 +56,15 @@ DIFFERENCE_CAUSES = (
 
 
 class RepeatedRun:
-    """The rack of a recorded run, which is repeated up to any tick.
+    """The rack of a recorded run, which can be repeated up to any tick.
 
-    Each tick that was reached has a snapshot, from which later ticks are near. A run that continues
-    another run first repeats that one. Use it as a context: its snapshots and its `crate` end with
-    it.
+    Each tick reached leaves a snapshot, from which later ticks take less time. If the run continues
+    another run, that one is repeated first. Use it as a context, at whose end the snapshots and the
+    `crate` end.
 
     Args:
         recording: The run.
-        asked: Beginning of the text of each `Failure`. Empty for the folder of the run.
+        asked: Prefix of the text of each `Failure`. Empty for the folder of the run.
         crate: A crate that was started earlier, to save time.
         anyway: True to repeat the run even if its code or files have changed since.
     """
@@ -118,9 +118,9 @@ class RepeatedRun:
         )
 
     def reach_tick(self, tick: int) -> None:
-        """Make a snapshot before `tick`. Differences from the recording are noted on stderr.
+        """Make a snapshot before `tick`. Differences from the recording are reported on stderr.
 
-        Raises `Failure` if there is none, because a board is lost at that tick.
+        Raises `Failure` if a board is lost at that tick, because no snapshot is possible then.
         """
         if not self._has_begun and self._branched_at not in (None, tick):
             # First reach the branching tick, so that all later snapshots belong to this run.
@@ -145,7 +145,7 @@ class RepeatedRun:
 
     @contextmanager
     def run_rack_to(self, tick: int, snapshots: SnapshotPolicy | None = None) -> Iterator[Rack]:
-        """Yield the rack after it has run, unchanged, up to `tick`.
+        """Provide the rack after an unchanged run up to `tick`.
 
         Args:
             tick: The tick before which the rack stops.
@@ -180,14 +180,14 @@ class RepeatedRun:
         return replace(self._find_beginning(tick), origin=Origin.from_run(self.recording, tick))
 
     def read_levels(self, tick: int) -> dict[str, Document]:
-        """Return the attributes of the levels' objects before `tick`, by task."""
+        """Return the attributes of each level's object before `tick`, by task."""
         self.reach_tick(tick)
         tasks = [task.name for task in self.recording.layout.tasks]
         texts = {task: self.crate.read_attributes(tick, task).attributes for task in tasks}
         return {task: json.loads(text) for task, text in texts.items() if text}
 
     def _find_beginning(self, tick: int) -> Beginning:
-        """Return the state from which this run is repeated towards `tick`."""
+        """Return the nearest state from which the run can be repeated towards `tick`."""
         run = self.recording
         begins = Beginning(crate=self.crate, entries=self.entries)
         if self._has_begun:
@@ -202,13 +202,16 @@ class RepeatedRun:
         return replace(begins, requests=load_operator_commands(run))
 
     def _find_continuation(self, tick: int) -> Continuation:
-        """Return the newest snapshot up to `tick`, with the number of entries in the tables."""
+        """Return how a rack continues from the newest snapshot up to `tick`.
+
+        The result counts the faults and commands of the config that the snapshot already contains.
+        """
         ran = self.recording.rack_config
         return Continuation(tick, len(ran.fault), len(ran.command), self._losses)
 
     @cached_property
     def _losses(self) -> tuple[tuple[str, int], ...]:
-        """Boards that died in this run and those it continues, with the ticks."""
+        """Boards that died in this run or in one that it continues, each with the tick."""
         died = (event for event in self.recording.events if event["kind"] == "died")
         earlier = () if self._parent is None else self._parent._losses
         before = (loss for loss in earlier if loss[1] < (self._branched_at or 0))
@@ -218,9 +221,9 @@ class RepeatedRun:
         """Return the tick of the newest snapshot up to `tick`."""
         return self.crate.read_attributes(tick, "").tick
 
-    def _report_differences(self, unlike: Sequence[str], tick: int) -> None:
-        """Report on stderr which mailboxes differ from the recording, with the first difference."""
-        names = ", ".join(unlike)
+    def _report_differences(self, mailboxes: Sequence[str], tick: int) -> None:
+        """Report on stderr which mailboxes differ from the recording, and the first difference."""
+        names = ", ".join(mailboxes)
         first = ""
         with suppress(Failure), TemporaryDirectory(prefix="rack-") as folder:
             first = f"{self._describe_first_difference(Path(folder) / 'again', tick)}: "
@@ -295,18 +298,18 @@ def open_beginning(
 
 
 def parse_tick(recording: Recording, text: str, asked: str = "") -> int:
-    """Convert a time, s, to a tick of a recorded run.
+    """Convert a time in s to a tick of a recorded run.
 
     Args:
         recording: The run.
         text: The time.
-        asked: Beginning of the text of a `Failure`.
+        asked: Prefix of the text of a `Failure`.
 
     Raises:
-        Failure: The time is outside the run, or between two recorded stretches.
+        Failure: The time is not a number, outside the run, or between two recorded stretches.
     """
     tick = -1
-    # A text that is not a number counts as outside.
+    # Text that is not a number is treated as a time outside the run.
     with suppress(ValueError, OverflowError):
         tick = round(float(text) * 1e9 / recording.layout.clock_ns)
     is_kept = any(first <= tick < end for first, end in recording.kept or [(0, tick + 1)])

@@ -44,8 +44,7 @@ def choose_run_folder(wanted: Path | None, rack: str) -> Path:
 class EventLog:
     """Shows every event and writes it to events.jsonl.
 
-    The file is opened only after the rack has been launched. A write that fails, as on a full disk,
-    is
+    The file is opened only after the rack has been launched. A failed write, as on a full disk, is
     reported once and does not end the run.
 
     Attributes:
@@ -64,15 +63,15 @@ class EventLog:
         self._write_entry(asdict(event))
 
     def open_file(self, path: Path) -> None:
-        """Write to a file from now on, beginning with the events so far."""
-        # Buffer single lines, so that the log of a killed run is complete up to its end.
+        """Start writing to a file, beginning with all earlier events."""
+        # Flush after each line, so that the log of a killed run is complete up to its end.
         self._file = path.open("w", buffering=1)
         self._write_text(self._earlier.getvalue())
 
     def write_outcome(self, outcome: Document) -> None:
         """Write the outcome, close the file, and sort its events.
 
-        Until then they are in the order in which they became known.
+        Before that, events are in the order in which they became known.
         """
         self._write_entry({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
         self.close()
@@ -80,13 +79,13 @@ class EventLog:
             self._sort_lines(Path(self._file.name))
 
     def close(self) -> None:
-        """Close the file, with or without an outcome."""
+        """Close the file, whether or not it has an outcome."""
         # Closing repeats a failed write, which would fail again.
         with suppress(OSError):
             self._file.close()
 
     def _sort_lines(self, path: Path) -> None:
-        """Sort the lines of the file. On a full disk it stays unsorted."""
+        """Sort the events in the file by tick. On a full disk the file stays unsorted."""
         lines = path.read_text().splitlines(keepends=True)
         ordered = sorted(lines, key=lambda line: get_event_order(json.loads(line)))
         if ordered == lines:
@@ -98,6 +97,7 @@ class EventLog:
         sorted_file.unlink(missing_ok=True)
 
     def _write_entry(self, entry: Document) -> None:
+        """Write an entry as one line of JSON with a checksum."""
         self._write_text(format_checked_line(entry))
 
     def _write_text(self, text: str) -> None:

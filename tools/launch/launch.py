@@ -44,14 +44,14 @@ COUNTED_WORDS = (
     "CORRUPT",
     "BUS_ERRORS",
 )
-"""Words of a task's control block that the result of a run keeps."""
+"""Words of a task's control block that are copied to the result of a run."""
 UNFINISHED_HINT = "no time for the report: 'rack report {}' makes it"
 VIEWER = "rack.tools.viewer.window"
 """Module of the viewer, imported by name because running and recording do not need it."""
 NO_RECORDER = "the recorder has not begun yet: real time begins without it, lockstep waits"
 
 News = Callable[[], list[str]]
-"""Returns messages of the recorder or the viewer for the user, since the last call."""
+"""Function that returns new messages of the recorder or the viewer for the user."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Beginning:
         requests: Commands of operators to repeat.
         entries: Recorded messages of host boards and other racks, which are not started in that
             case.
-        origin: The run that is continued, for the record.
+        origin: The run that is continued, to be recorded.
     """
 
     continues: Continuation | None = None
@@ -88,7 +88,7 @@ class RunResult:
         clock_offset_ns: Converts CLOCK_MONOTONIC, the clock of boards, to the time of the events.
         refused: Messages that full queues refused, by queue.
         others: Racks that were launched with this one.
-        failed: Which of them failed, and why. Empty if none did.
+        failed: Which of these other racks failed, and why. Empty if none did.
     """
 
     rack: str
@@ -106,14 +106,14 @@ class RunResult:
 
     @property
     def worked(self) -> bool:
-        """True if the run succeeded as far as its end shows.
+        """True if nothing at the end of the run shows a failure.
 
-        Only a report judges the response of the system.
+        The response of the system is judged separately, in the report.
         """
         return not self.describe_failure()
 
     def describe_failure(self) -> str:
-        """Return in one line why the run failed, or an empty text."""
+        """Return in one line why the run failed. Empty if it did not fail."""
         return "; ".join(list_failures(self.outcome, self.recording, self.failed))
 
 
@@ -130,13 +130,12 @@ def run_rack(
 ) -> RunResult:
     """Run a rack, and record it.
 
-    The racks that the config names are launched as well. If one of them fails, the run ends; if the
-    run
-    does not succeed, they end. A recorder that dies does not end the run.
+    The other racks that the config names are launched as well. If one of them fails, this run ends.
+    If this run fails, they are ended. A recorder that dies does not end the run.
 
     Args:
         config: Config of the rack.
-        seconds: Simulated time of the run, s. None to run until its task ends.
+        seconds: Simulated duration of the run. None to run until its task ends.
         folder: Folder of the run. None to record nothing.
         display: Shows the run.
         view: True to open a viewer on the recorder. The user may close it at any time.
@@ -153,7 +152,7 @@ def run_rack(
         # Until the run has begun there is nothing to save, so a signal may end it at once.
         with INTERRUPT.end_at_once():
             lan = config.adapter.lan
-            # In a repeated run their recorded messages are replayed instead.
+            # A repeated run replays the recorded messages of other racks instead.
             launches = lan.launch if lan is not None and beginning.entries is None else ()
             others = stack.enter_context(OtherRacks(launches, config, seconds, folder is not None))
             recorder = None if folder is None else RecorderProcess(folder)
@@ -183,6 +182,7 @@ def run_rack(
                     news.append(_open_viewer(port))
 
         def log_news() -> None:
+            """Log new messages of the recorder and the viewer."""
             for text in [text for source in news for text in source()]:
                 log.add_event(
                     Event(time.time_ns(), segment.words[System.TICK], "recorder", "", text)
@@ -195,7 +195,7 @@ def run_rack(
             wall_s = time.monotonic() - started
         log_news()
         if recorder is not None and not INTERRUPT.number:
-            # The recorder could not attach to a closed rack.
+            # Wait for the recorder, because it cannot attach to a closed rack.
             recorder.wait_until_attached()
         rack.close()
         recording, rows_lost = "none", dict[str, int]()
@@ -247,13 +247,13 @@ def build_result(
     recording: str,
     rows_lost: dict[str, int],
 ) -> RunResult:
-    """Build the result of a finished run from the words of its segment.
+    """Build the result of a finished run from the counts in its segment.
 
     Args:
         segment: Segment of the rack, still attached.
         config: Config of the rack.
         outcome: Outcome of the run.
-        wall_s: Wall-clock time of the run, s.
+        wall_s: Wall-clock duration of the run.
         recording: As in `RunResult`.
         rows_lost: As in `RunResult`.
     """
@@ -283,7 +283,7 @@ def build_result(
 
 
 def _open_viewer(port: int) -> News:
-    """Open the viewer on the recorder and return its news, which report a missing viewer."""
+    """Open the viewer on the recorder. The returned function also reports a missing viewer."""
     window = import_module(VIEWER)
     try:
         opened: News = window.ViewerWindow(window.url(port)).news
@@ -301,7 +301,7 @@ def _watch_rack(
     log_news: Callable[[], None],
     others: OtherRacks,
 ) -> Outcome:
-    """Run the rack to its end, show it, and log events that only the host side can detect."""
+    """Run the rack to its end, show it, and log events that no board reports."""
     rack.start(seconds)
     monitor = RackMonitor(rack.segment)
     standstill = StandstillDetector(rack.segment)

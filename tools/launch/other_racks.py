@@ -35,7 +35,7 @@ class OtherRackEnd:
 
 
 class LaunchedProcess(NamedTuple):
-    """Another rack. Its report goes to a file in memory, because nobody would empty a pipe."""
+    """Process of another rack. Its report goes to a memory file, as no one would read a pipe."""
 
     config: str
     process: subprocess.Popen[bytes]
@@ -80,7 +80,7 @@ class OtherRacks:
         return len(self._racks)
 
     def describe_failures(self) -> str:
-        """Return which of the racks have failed so far, and how. Empty if none has."""
+        """Describe which of the racks have failed so far, and why. Empty if none has."""
         # Racks stopped by this process end by a signal, which does not count as a failure.
         if not self._is_stopped:
             failed = [rack for rack in self._racks if rack.process.poll()]
@@ -88,13 +88,13 @@ class OtherRacks:
         return self._failed
 
     def stop_racks(self) -> None:
-        """Ask all of the racks to end."""
+        """Ask all of these racks to end."""
         self._is_stopped = True
         for rack in self._racks:
             rack.process.terminate()
 
     def await_end(self) -> str:
-        """Wait for the end of the racks, and return their failures as `describe_failures` does."""
+        """Wait until the racks have ended. Returns failures as `describe_failures` does."""
         deadline = time.monotonic() + (MAX_STOP_S if self._is_stopped else MAX_END_S)
         late = []
         for rack in self._racks:

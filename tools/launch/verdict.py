@@ -16,16 +16,15 @@ ACROSS_RACKS = "the system response: there are no bounds yet for a response acro
 
 
 def judge_run(ended: Mapping[str, Any], response: Document | None) -> Document:
-    """Judge a run.
+    """Judge a run by its end and by the response of the system.
 
     Args:
         ended: End of the run, a `RunResult` as plain data. Empty if it was not recorded.
         response: Response of the system. None if the rack has none, or nothing was recorded.
 
     Returns:
-        `worked`, `failures` with one line for each reason, and `unjudged` with whatever was not
-            judged
-        and why.
+        `worked`, `failures` with one line for each reason, and `unjudged` with each check that was
+        not made and the reason.
     """
     unjudged: list[str] = []
     failures = ["the end of the run is not recorded"]
@@ -41,7 +40,7 @@ def judge_run(ended: Mapping[str, Any], response: Document | None) -> Document:
 
 
 def list_failures(outcome: Outcome, recording: str, others: str) -> list[str]:
-    """List the reasons why a run failed, as far as its end shows them.
+    """List the reasons why a run failed that are known at its end, without the response.
 
     Args:
         outcome: Outcome of the run.

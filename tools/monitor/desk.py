@@ -32,7 +32,7 @@ from rack.tools.monitor.newest_messages import NewestMessages
 from rack.tools.monitor.replies import Reply, ReplyDeadline, ReplyReader, find_answering_status
 
 MAX_SILENCE_S = 5.0
-"""A wait is given up after this time without a tick."""
+"""A wait fails after this time without a tick."""
 EXPLAIN_AFTER_S = 1.5
 """A wait is explained on stderr after this time."""
 CHECK_INTERVAL_S = 0.001
@@ -41,7 +41,7 @@ GOAL_KEYS = ("joints", "position", "quaternion", "direction")
 
 
 class LevelCommander:
-    """Commands the levels of one rack."""
+    """Gives an operator's commands to the levels of one rack."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -50,7 +50,7 @@ class LevelCommander:
         self._levels = {name: published for name, published in levels.items() if published.commands}
 
     def list_levels(self) -> list[dict[str, str]]:
-        """List the commands that each level takes, and the one in force, as plain data."""
+        """Return plain data about each level: the commands it takes, and its command in force."""
         return [
             {
                 "level": name,
@@ -61,18 +61,18 @@ class LevelCommander:
         ]
 
     def format_levels(self) -> Iterator[str]:
-        """Yield the lines of a table of `list_levels`."""
+        """Yield the lines of a table with the data of `list_levels`."""
         return format_fitted_table(
             ["level", "in force", "takes"], [list(row.values()) for row in self.list_levels()]
         )
 
     def list_highest_levels(self, *in_force: str) -> list[str]:
-        """List the highest levels that can hold and have one of some commands in force.
+        """List the highest levels that can hold and whose command in force is one of `in_force`.
 
-        A level below another one of the result is left out.
+        Levels below another level of the result are left out.
 
         Args:
-            in_force: Names of commands. "" stands for no command.
+            in_force: Names of operator's commands. "" stands for no command.
         """
         levels = [
             name
@@ -85,33 +85,33 @@ class LevelCommander:
     def give_command(
         self, given: Mapping[str, Any], wait: bool, timeout_s: float | None = None
     ) -> Reply:
-        """Give a command, and wait until its level has taken it up or, with `wait`, has done it.
+        """Give a command, and wait until its level has accepted it or, with `wait`, completed it.
 
         Args:
             given: Keys of a `[[command]]` table.
             wait: True to wait until the command is done.
-            timeout_s: Wall-clock time for that. None to wait until the end of the run.
+            timeout_s: Maximum wall-clock time to wait. None to wait until the end of the run.
 
         Raises:
-            ConfigError: The command has mistakes: all of them.
+            ConfigError: The command has mistakes, which are all listed.
             Failure: The command was not given, or not answered in time.
         """
         segment = self._segment
         command, clock_request = self._build_request(given)
         if wait_text := describe_wait(segment):
-            # Leave the request in the table for the next step, after this process has ended.
+            # Leave the request in the table for the next step, even after this process has ended.
             entry = OperatorTable(segment).add_request(clock_request)
             text = describe_command(copy_request_message(entry, segment.layout))
             return Reply(0, command.level, text, -1, "waiting", waits=wait_text)
-        # Leaving the claim withdraws a request that has not been given, however the wait ends.
+        # On any exit from the context, a request that has not been given is withdrawn.
         with OperatorTable(segment).claim_request(clock_request) as entry:
             reply = self._await_given(entry, command.level)
         return self._await_reply(reply, wait, timeout_s)
 
     def lease_command(self, given: Mapping[str, Any], tell: Callable[[Reply], None]) -> None:
-        """Give a command under a lease, and stay until a newer one is in force or the run is over.
+        """Give a command, and keep it leased until a newer one is in force or the run is over.
 
-        If this process ends or falls silent before that, the level holds.
+        If this process ends or hangs before that, the level holds.
 
         Args:
             given: As in `give_command`.
@@ -139,10 +139,11 @@ class LevelCommander:
                 time.sleep(CHECK_INTERVAL_S)
 
     def _can_hold(self, level: str) -> bool:
+        """Return whether a level takes the command `hold`."""
         return Operation.HOLD in (self._levels[level].commands)
 
     def _build_request(self, fields: Mapping[str, Any]) -> tuple[CommandConfig, Request]:
-        """Build a command and its request to the clock. Raises like `give_command`."""
+        """Build a command and its request to the clock. Raises the errors of `give_command`."""
         tick = self._segment.words[System.TICK]
         command = parse_command({key: value for key, value in fields.items() if value is not None})
         wanted = build_request(command, self._config, self._levels, self._segment.layout)
@@ -159,7 +160,10 @@ class LevelCommander:
         Args:
             setting: KEY=VALUE, as in `board.servo.params.bandwidth=80`.
             tick: Tick of the command. None for the next one.
-            at: The same in simulated seconds.
+            at: Simulated time of the command in s, in place of `tick`.
+
+        Returns:
+            The reply of the level.
 
         Raises:
             Failure: The parameter is not live, or as in `give_command`.
@@ -195,7 +199,7 @@ class LevelCommander:
         raise Failure(f"{about}: given, but the reply is lost because too many commands followed")
 
     def _await_reply(self, reply: Reply, wait: bool, timeout_s: float | None) -> Reply:
-        """Wait until the level has taken the command up or, with `wait`, has done it."""
+        """Wait until the level has accepted the command or, with `wait`, completed it."""
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
         status = find_answering_status(self._segment, reply.level)
         if status is None:
@@ -219,11 +223,10 @@ class LevelCommander:
         return reply
 
     def _poll_run(self, about: str, awaited: str) -> Iterator[bool]:
-        """Yield at each check of the rack whether the run is over.
+        """Check the rack repeatedly, and yield each time whether the run is over.
 
-        A long wait is explained on stderr, once. Raises `Failure` if the clock stops ticking and
-        the rack
-        is not held.
+        A long wait is explained once on stderr. Raises `Failure` if the clock stops ticking
+        although the rack is not held.
         """
         words = self._segment.words
         tick = words[System.TICK]
@@ -248,14 +251,14 @@ class LevelCommander:
                 )
 
     def _name_command_in_force(self, level: str) -> str:
-        """Return the operator's command in force at a level, or an empty text."""
+        """Return the name of the operator's command in force at a level. Empty for none."""
         status = NewestMessages(self._segment).read_message(f"{level}.status")
         standing = getattr(status, "standing", 0)
         return Operation(standing).name.lower() if standing else ""
 
 
 def parse_goal(what: str, words: Sequence[str]) -> Document:
-    """Parse the words after the verb of a command, as keys of a `[[command]]` table.
+    """Convert the words after the verb of a command to keys of a `[[command]]` table.
 
     Args:
         what: The verb.
@@ -288,7 +291,7 @@ def parse_goal(what: str, words: Sequence[str]) -> Document:
 
 
 def _parse_number(text: str, word: str) -> float:
-    """Parse a number of a goal. Raises `Failure` with the whole word."""
+    """Parse a number of a goal. Raises `Failure`, which quotes the whole word."""
     try:
         return float(text)
     except ValueError:

@@ -70,7 +70,7 @@ COUNT_STYLES = {**dict.fromkeys(LOSSES, "red"), **dict.fromkeys(TROUBLES, "yello
 """Colours of counts above 0."""
 HOLD_STYLE = "bold yellow"
 NO_DEMAND = "none"
-"""Demand on an arm that is free to move."""
+"""Safety demand on an arm that is free to move."""
 EVENT_STYLES = {"fault": "magenta", "detection": "yellow", "reaction": "red", "recovery": "green"}
 DEFAULT_EVENT_STYLE = "yellow"
 HIDDEN_EVENTS = ("launch", "start", "end", "miss")
@@ -89,7 +89,7 @@ class Display:
     period_s = 0.5
 
     def show(self, snapshot: Snapshot) -> None:
-        """Show the rack as in a snapshot."""
+        """Show the state of the rack in a snapshot."""
 
     def show_event(self, event: Event) -> None:
         """Show an event, unless the table shows it already."""
@@ -101,7 +101,7 @@ class Display:
 
 
 class LiveDisplay(Display):
-    """A table that changes in place."""
+    """Shows a run as a table that is redrawn in place."""
 
     period_s = 0.2
 
@@ -119,7 +119,7 @@ class LiveDisplay(Display):
 
 
 class PlainDisplay(Display):
-    """Prints one line a second."""
+    """Shows a run as one line per second."""
 
     period_s = 1.0
 
@@ -127,7 +127,7 @@ class PlainDisplay(Display):
         self._next = 0.0
 
     def show(self, snapshot: Snapshot) -> None:
-        """Print the rack as one line, once a second and at the end."""
+        """Print the state of the rack as one line, once a second and at the end."""
         now = time.monotonic()
         if now >= self._next or snapshot.run == "stopped":
             self._next = now + self.period_s
@@ -199,7 +199,7 @@ class RackView:
 
 
 def _format_cell(column: str, value: Any) -> str:
-    """Format a cell, with decimals by the unit at the end of the column's name."""
+    """Format a cell. The unit in its column's name determines the number of decimals."""
     if not isinstance(value, float | None):
         return str(value)
     digits = {"s": 3, "ticks": 0}
@@ -207,7 +207,7 @@ def _format_cell(column: str, value: Any) -> str:
 
 
 def format_line(snapshot: Snapshot) -> str:
-    """Format a snapshot as one short line that only counts holds and faults."""
+    """Format a snapshot as one short line, which counts holds and faults without details."""
     counts = {
         "missed": sum(row.missed for row in snapshot.tasks),
         "skipped": sum(row.skipped for row in snapshot.tasks),
@@ -220,7 +220,7 @@ def format_line(snapshot: Snapshot) -> str:
     parts += [f"{name} {n}" for name, n in counts.items() if n or name in LOSSES]
     at = snapshot.progress
     parts += [f"task {at.state} {at.moves_done}/{at.moves}"] if at is not None else []
-    # Keep only the text before the colon. The rest is for the table.
+    # Keep only the part of a warning before the colon. The details are for the table.
     return "  ".join(
         [*parts, *(line.partition(":")[0] for line in snapshot.lines), *_list_demands(snapshot)]
     )
@@ -241,12 +241,12 @@ def _format_head(snapshot: Snapshot) -> Text:
 
 
 def _list_demands(snapshot: Snapshot) -> list[str]:
-    """Return the demand on the arm, or an empty list."""
+    """Return the safety demand on the arm as a list of one text. Empty without a stop or brake."""
     return [f"arm: {snapshot.demand}"] if snapshot.demand != NO_DEMAND else []
 
 
 def _list_reasons(snapshot: Snapshot) -> list[str]:
-    """Return the reasons that tasks give, except those that a hold already shows."""
+    """Return the reasons that tasks report, except those already shown by a hold."""
     held_levels = {hold.level for hold in snapshot.holds}
     shown_reasons = [hold.why for hold in snapshot.holds]
     return [
@@ -265,13 +265,14 @@ def _format_exchange(board: str, ports: Mapping[str, PortAge]) -> str:
 
 
 def _choose_style(column: str, text: str) -> str:
+    """Return the colour of a cell, which depends on a state or marks a count above 0."""
     if column == "state":
         return STATE_STYLES.get(text.partition(" (")[0], "")
     return COUNT_STYLES.get(column, "") if text != "0" else ""
 
 
 def is_worth_showing(event: Event) -> bool:
-    """Return whether an event tells more than the table."""
+    """Return whether an event tells the user more than the table does."""
     is_brief = event.subject == NO_TORQUE and event.value < BRIEF_TICKS
     return event.kind not in HIDDEN_EVENTS and not is_brief
 

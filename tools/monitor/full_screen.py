@@ -36,11 +36,11 @@ from rack.tools.monitor.snapshot import RackMonitor, Snapshot
 
 REFRESH_INTERVAL_S = 0.2
 LATENESS_BORDERS_US = (-np.inf, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, np.inf)
-"""Borders of the classes of lateness in which cycles are counted, us."""
+"""Borders in us of the classes of lateness in which cycles are counted."""
 INJECT = "inject"
 """First word of a fault on the command line. Any other word is the level of a command."""
 CORE_FAULTS = [kind.name for kind in KINDS if kind.where == "core"]
-"""Kinds of faults that keep a core busy with this process, which must not be the screen."""
+"""Kinds of faults in which the injecting process occupies a core. The screen must not do that."""
 
 
 class RackScreen(App[None]):
@@ -128,7 +128,7 @@ class RackScreen(App[None]):
         self.query_one(f"#{pane} Static", Static).update(self._panes[pane](snapshot))
 
     def _format_levels(self, snapshot: Snapshot) -> Text:
-        """Format the levels, coloured by state. The level that keys command is reversed."""
+        """Format the levels, coloured by state. The selected level is shown in reverse."""
         states = {row.task: row.state for row in snapshot.tasks}
         chosen = {self._levels[0]: "reverse"}
         levels = [
@@ -151,28 +151,28 @@ class RackScreen(App[None]):
         return build_grid(("late us", level), rows, self.size.width)
 
     def action_pane(self, number: int) -> None:
-        """Show a pane by its number."""
+        """Show the pane with a number."""
         self.query_one(TabbedContent).active = [*self._panes][number - 1]
 
     def action_level(self) -> None:
-        """Let keys command the next level."""
+        """Select the next level. Keys then command this one."""
         self._levels.rotate(-1)
 
     def action_worst(self) -> None:
-        """Forget the longest times and the lateness so far."""
+        """Reset the longest times and the counts of lateness."""
         self._monitor.forget_times()
         self._late.clear()
 
     def action_interrupt(self) -> None:
-        """End the program as Ctrl-C ends every command."""
+        """End the program in the way in which Ctrl-C ends every command."""
         signal.raise_signal(signal.SIGINT)
 
     def action_stop(self) -> None:
-        """Set the emergency stop. The head line shows it."""
+        """Set the emergency stop, which the head line then shows."""
         self._lines.latch_emergency_stop()
 
     def action_give(self, what: str) -> None:
-        """Give a command without a goal to the selected level."""
+        """Give the selected level a command that needs no goal."""
         self.action_carry_out([self._levels[0], what])
 
     def action_kinds(self) -> None:
@@ -209,18 +209,19 @@ class RackScreen(App[None]):
         self.set_focus(None)
 
     def _open(self, widget: Widget) -> None:
+        """Open a menu or the command line, and close any other."""
         self.action_close()
         widget.add_class("open")
         widget.focus()
 
     def action_carry_out(self, words: Sequence[str]) -> None:
-        """Execute a command in a thread, and show its answer when it arrives."""
+        """Execute a command in the background, and show its answer when it arrives."""
         self.run_worker(partial(self._execute_in_thread, words), thread=True)
 
     def _execute_in_thread(self, words: Sequence[str]) -> None:
         """Execute a command and show its answer.
 
-        It runs in a thread, since a level may take seconds.
+        This runs in a thread, because a level may take seconds to answer.
         """
         try:
             with convert_errors():
@@ -231,7 +232,7 @@ class RackScreen(App[None]):
         self.notify(answer, markup=False)
 
     def _execute(self, words: Sequence[str]) -> str:
-        """Execute a command and return its answer. Raises `Failure`."""
+        """Execute a reset, a fault or a command, and return its answer. Raises `Failure`."""
         match words:
             case ["reset"]:
                 self._lines.reset_emergency_stop()

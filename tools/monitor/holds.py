@@ -24,7 +24,7 @@ STANDSTILL_S = 5.0
 RELAYED_PREFIX = re.compile(r"(?:holding|waiting for \w+): ")
 """Words that a level puts before a reason of the level below."""
 COMPARED_CHARACTERS = 60
-"""Number of characters that identify a reason. The end of a long one is cut on its way up."""
+"""Number of characters that identify a reason. Levels that relay a long reason cut off its end."""
 NEEDED_COMMANDS = {Error.DISABLED: "enable", Error.DRIVES: "reset"}
 """Command that an arm needs, by the error in its status."""
 OPERATOR_FIELDS = frozenset({"standing", "order", "answer"})
@@ -33,10 +33,10 @@ OPERATOR_FIELDS = frozenset({"standing", "order", "answer"})
 
 @dataclass(frozen=True)
 class Hold:
-    """A level, or the arm, that is kept from its work.
+    """A level or an arm that is prevented from doing its work.
 
     Attributes:
-        since_s: Simulated time of its beginning.
+        since_s: Simulated time at which the hold began.
         release: Command that ends the hold. Empty if it ends by itself.
     """
 
@@ -48,7 +48,7 @@ class Hold:
 
     @property
     def line(self) -> str:
-        """The hold as one line of text."""
+        """Description of the hold in one line."""
         release_text = f"; to release: {self.release}" if self.release else ""
         return f"{self.level} {self.why}, since {self.since_s:.2f} s{release_text}"
 
@@ -59,9 +59,9 @@ def format_resume_command(rack: str, level: str) -> str:
 
 
 def is_new_reason(reason: str, shown: list[str]) -> bool:
-    """Return whether a reason is new, and add it to those `shown`.
+    """Return whether a reason is not among those shown, and if so add it to `shown`.
 
-    Levels repeat the reasons of the level below, which does not count as new.
+    A reason that a level only repeats from the level below is not new.
     """
     origin = RELAYED_PREFIX.split(reason)[-1][:COMPARED_CHARACTERS]
     if any(origin in other for other in shown):
@@ -76,10 +76,11 @@ def find_holds(newest: NewestMessages) -> tuple[Hold, ...]:
 
 
 def _list_holds(newest: NewestMessages) -> Iterator[Hold]:
-    """Yield the holds: emergency stop, lost boards, then levels."""
+    """Yield the hold of an emergency stop, then those of lost boards, then those of levels."""
     segment = newest.segment
 
     def hold(level: str, since: int, why: str, release: str = "") -> Hold:
+        """Build a hold that began at tick `since`."""
         return Hold(level, since, since * segment.layout.clock_ns * 1e-9, why, release)
 
     arm, driving = next(newest.list_statuses("demand"), ("", None))
@@ -117,14 +118,14 @@ def _find_command_in_force(
     """Find the operator's command in force at a level.
 
     Returns:
-        Its tick, its serial and its text. The serial is 0 if its message has been overwritten.
+        Tick, serial and text of the command. The serial is 0 if its message has been overwritten.
     """
     rows = MailboxRing(segment, f"{level}.operator").read_new_rows().rows
     commands = rows["message"]
     is_candidate = (commands["what"] == status.standing) & (
         commands["id"] <= find_answered_serial(status)
     )
-    # A refused command has left the previous one in force.
+    # If the level refused the newest command, the previous one is still in force.
     if status.answer == Answer.REFUSED and is_candidate.sum() > 1:
         is_candidate &= commands["id"] != status.order
     candidates = rows[is_candidate]
@@ -142,10 +143,7 @@ def _find_command_in_force(
 
 
 class StandstillDetector:
-    """Reports each hold that lasts without motion and will not end by itself.
-
-    Each is reported once.
-    """
+    """Reports, once each, the holds during which nothing moves and that only a user can end."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -154,7 +152,7 @@ class StandstillDetector:
         self._reported: set[tuple[str, int]] = set()
 
     def list_events(self) -> Iterator[Event]:
-        """Yield an event for each unreported hold that a user must end."""
+        """Yield an event for each hold that is to be reported now."""
         # Import late: this imports the kinds of faults, which would slow down `rack status`.
         from rack.tools.faults.ending import read_arm
 
@@ -178,4 +176,5 @@ class StandstillDetector:
 
 
 def _field_names(message: Message) -> set[str]:
+    """Return the names of the fields of a message."""
     return {*(message.record.dtype.names or ())}

@@ -23,7 +23,7 @@ DONE = "done"
 
 @dataclass(frozen=True)
 class HostRow:
-    """A host board now.
+    """Current state of a host board.
 
     Attributes:
         pid: Process id. 0 without a process.
@@ -39,10 +39,10 @@ class HostRow:
 
 @dataclass(frozen=True)
 class EntryRow:
-    """An entry of a bus adapter, with its counts.
+    """An entry of a bus adapter, which passes messages to or from a host board, with its counts.
 
     Attributes:
-        age_ms: Age of its newest message in simulated time. None before the first message.
+        age_ms: Age of its newest message in ms of simulated time. None before the first message.
     """
 
     entry: str
@@ -56,7 +56,7 @@ class EntryRow:
 
 
 def list_host_rows(segment: Segment) -> tuple[HostRow, ...]:
-    """List the host boards."""
+    """Return the current state of every host board."""
     rows = []
     for host in segment.layout.hosts:
         block = segment.get_block(host.name)
@@ -80,12 +80,12 @@ def count_restarts(segment: Segment, writer: str) -> int:
 
 
 def _list_heads(segment: Segment, writer: str) -> list[memoryview]:
-    """List the words of the mailboxes that a task or host board writes."""
+    """Return the header words of each mailbox that a task or host board writes."""
     return [segment.get_box(box.name) for box in segment.layout.mailboxes if box.writer == writer]
 
 
 def list_entry_rows(newest: NewestMessages) -> tuple[EntryRow, ...]:
-    """List the entries of all bus adapters."""
+    """Return the entries of all bus adapters that have reported a status."""
     rows: list[EntryRow] = []
     segment = newest.segment
     tick_ms = segment.layout.clock_ns * 1e-6
@@ -105,7 +105,7 @@ def list_entries(layout: Layout, config: str) -> Iterator[tuple[str, str, str]]:
 
     Args:
         layout: Layout of the rack.
-        config: Its config, as TOML text.
+        config: Config of the rack as TOML text.
     """
     boxes = [box.name for box in layout.mailboxes if box.message == ADAPTER_STATUS]
     boards = load_toml(config)["board"] if boxes else {}

@@ -1,4 +1,4 @@
-"""Describes the interrupts of boards under protocol interrupt, live or in a run."""
+"""Describes interrupts of boards by messages, in a running rack or in a recorded run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NEVER_SERVED = np.iinfo(np.int64).max
 
 @dataclass(frozen=True)
 class InboxFill:
-    """The inbox of a board so far.
+    """State of a board's inbox, with counts since the start of the run.
 
     Attributes:
         served: Number of messages that interrupted the board.
@@ -41,7 +41,7 @@ class InboxFill:
 
     @property
     def line(self) -> str:
-        """The inbox as one line of text."""
+        """Description of the inbox in one line."""
         lost = f", {self.lost} lost" if self.lost else ""
         return (
             f"interrupts of {self.board}: {self.served} served, at most {self.waiting} of"
@@ -50,7 +50,7 @@ class InboxFill:
 
 
 def find_inbox_depths(layout: Layout) -> dict[int, int]:
-    """Return the depth of the inbox of every board that messages interrupt, by slot."""
+    """Return the inbox depth of every board that messages interrupt, by slot."""
     slots = dict.fromkeys(task.slot for task in layout.tasks)
     boxes = {slot: layout.list_interrupting_mailboxes(slot) for slot in slots}
     return {
@@ -61,7 +61,7 @@ def find_inbox_depths(layout: Layout) -> dict[int, int]:
 
 
 def list_inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
-    """Describe the current inbox of every board that messages interrupt."""
+    """Return the state of the inbox of every board that messages interrupt."""
     fills = []
     for slot, depth in find_inbox_depths(segment.layout).items():
         board = segment.layout.find_interrupt_task(slot)
@@ -72,7 +72,7 @@ def list_inbox_fills(segment: Segment) -> tuple[InboxFill, ...]:
 
 
 class Arrivals(NamedTuple):
-    """The messages that interrupted a board, mailbox after mailbox. Arrays have shape (n,).
+    """The messages that interrupted a board, grouped by mailbox. Arrays have shape (n,).
 
     Times are in ns of simulated time since tick 0.
     """
@@ -84,7 +84,7 @@ class Arrivals(NamedTuple):
 
 
 def replay_inbox(recording: Recording, slot: int) -> Arrivals:
-    """Recompute the inbox of the board in a slot from the messages of a run."""
+    """Reconstruct the inbox of the board in a slot from the recorded messages of a run."""
     layout = recording.layout
     boxes = layout.list_interrupting_mailboxes(slot)
     sent = []
@@ -108,9 +108,8 @@ def replay_inbox(recording: Recording, slot: int) -> Arrivals:
 def summarize_interrupts(recording: Recording) -> list[Document]:
     """Describe the interrupts of every board in a run, as plain data.
 
-    A latency, us, is the time from sending a message to the end of its service, when a level can
-    see
-    it.
+    Latencies in us are measured from the sending of a message to the end of its service. Only then
+    can a level see it.
     """
     layout = recording.layout
     documents = []

@@ -35,7 +35,12 @@ def list_mailboxes(segment: Segment) -> list[Document]:
 
 
 class MessageFormatter:
-    """Formats the messages of one mailbox. The ticks of its rack last `clock_ns`."""
+    """Formats the messages of one mailbox.
+
+    Args:
+        box: The mailbox.
+        clock_ns: Clock period of its rack.
+    """
 
     def __init__(self, box: MailboxSpec, clock_ns: int) -> None:
         self._box = box
@@ -60,7 +65,7 @@ class MessageFormatter:
         }
 
     def format_lines(self, document: Document) -> list[str]:
-        """Format the document of a message as lines for people."""
+        """Format the document of a message as readable lines."""
         age_ms = document["age_ticks"] * self._clock_ns * 1e-6
         head = (
             f"{self._box.name}: serial {document['serial']}, of tick {document['tick']},"

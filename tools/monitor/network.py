@@ -29,7 +29,7 @@ COUNTS = (
 
 @dataclass(frozen=True)
 class PeerRow:
-    """Another rack now.
+    """Current state of another rack.
 
     Attributes:
         clock_ms: Its clock minus the clock of this rack. None if unknown, or in lockstep.
@@ -47,11 +47,11 @@ class PeerRow:
 
 @dataclass(frozen=True)
 class ImportRow:
-    """An import now, with its counts.
+    """Current state of an import, with its counts.
 
     Attributes:
         age_ticks: Age of its information in ticks of this rack. None before the first message.
-        age_s: The same in simulated time.
+        age_s: The same age in s of simulated time.
     """
 
     entry: str
@@ -70,7 +70,7 @@ class ImportRow:
 
 @dataclass(frozen=True)
 class ExportRow:
-    """An export now."""
+    """Current state of an export."""
 
     entry: str
     source: str
@@ -87,7 +87,10 @@ class ExchangedEntries(NamedTuple):
 
 @cache
 def read_entries(config: str) -> ExchangedEntries | None:
-    """Read from a config, as TOML text, what a rack exchanges. None without a network adapter."""
+    """Read the exports, imports and partner racks from a config, given as TOML text.
+
+    Returns None for a rack without a network adapter.
+    """
     table: dict[str, Any] | None = load_toml(config).get("adapter", {}).get(ADAPTER)
     if table is None:
         return None
@@ -100,20 +103,20 @@ def read_entries(config: str) -> ExchangedEntries | None:
 
 
 def _find_entries(segment: Segment) -> ExchangedEntries:
-    """Return what a rack exchanges. Empty without a network adapter."""
+    """Return the exports, imports and partners of a rack. Empty without a network adapter."""
     has_adapter = any(task.name == ADAPTER for task in segment.layout.tasks)
     return (read_entries(segment.config) if has_adapter else None) or ExchangedEntries({}, {}, ())
 
 
 def list_peers(newest: NewestMessages) -> tuple[PeerRow, ...]:
-    """List the other racks with which a rack works."""
+    """Return the state of each partner rack that the network adapter has reported."""
     racks = _find_entries(newest.segment).peers
     peers = ((rack, newest.read_message(f"{ADAPTER}.{format_peer_port(rack)}")) for rack in racks)
     return tuple(_to_peer_row(rack, message) for rack, message in peers if message is not None)
 
 
 def list_imports(newest: NewestMessages) -> tuple[ImportRow, ...]:
-    """List the imports of a rack."""
+    """Return the state of each import of a rack."""
     rows = []
     for port, source, counts in _list_counts(
         newest, "import", _find_entries(newest.segment).imports
@@ -127,7 +130,7 @@ def list_imports(newest: NewestMessages) -> tuple[ImportRow, ...]:
 
 
 def list_exports(newest: NewestMessages) -> tuple[ExportRow, ...]:
-    """List the exports of a rack."""
+    """Return the state of each export of a rack."""
     return tuple(
         ExportRow(f"{ADAPTER}.{port}", source, int(counts["sent"]))
         for port, source, counts in _list_counts(
@@ -139,7 +142,9 @@ def list_exports(newest: NewestMessages) -> tuple[ExportRow, ...]:
 def _list_counts(
     newest: NewestMessages, kind: str, sources: Mapping[str, str]
 ) -> Iterator[tuple[str, str, Any]]:
-    """Yield port, source and counts of all imports or exports, once the adapter has counted.
+    """Yield port, source and counts of each import or export.
+
+    Yields nothing until the adapter has reported its first counts.
 
     Args:
         newest: Reads the status of the adapter.

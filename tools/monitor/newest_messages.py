@@ -12,7 +12,7 @@ from rack.backplane.segment import Segment
 
 
 class NewestMessages:
-    """Reads the newest message of any mailbox.
+    """Reads the newest message of any mailbox of a rack.
 
     Each mailbox is opened only once, because opening takes longer than many reads.
     """
@@ -24,7 +24,7 @@ class NewestMessages:
     def read_message(self, mailbox: str) -> AnyMessage | None:
         """Return the newest message of a mailbox.
 
-        None without a message, or without the mailbox.
+        None if the mailbox does not exist or has no message yet.
         """
         if mailbox not in self.segment.map.mailboxes:
             return None
@@ -42,7 +42,7 @@ class NewestMessages:
                 yield box.writer, message
 
     def list_statuses(self, field: str) -> Iterator[tuple[str, AnyMessage]]:
-        """Yield the level and the newest status of every level whose status has a field."""
+        """Yield level and newest status for every level whose status has a given field."""
         return self.list_messages(
             lambda box: (
                 box.name.endswith(".status")

@@ -19,12 +19,16 @@ from rack.tools.monitor.desk import LevelCommander
 from rack.tools.monitor.snapshot import RackMonitor
 
 CHECK_INTERVAL_S = 0.001
-"""Time between two checks whether the rack holds."""
+"""Time between two checks of whether the rack is held."""
 
 
 @dataclass(frozen=True)
 class HeldRack:
-    """A rack that is held. `levels` has a row for each level, with its state, row and reason."""
+    """A rack that is held between two ticks.
+
+    Attributes:
+        levels: For each level its state, the row of its state table if it has one, and its reason.
+    """
 
     rack: str
     tick: int
@@ -32,13 +36,16 @@ class HeldRack:
     levels: list[dict[str, str]]
 
     def format_lines(self) -> Iterator[str]:
-        """Yield the lines of the answer for people."""
+        """Yield lines of text: the tick, and a table of the levels."""
         yield f"{self.rack}: held before tick {self.tick}, {self.time_s:.3f} s"
         yield from format_fitted_records(self.levels)
 
 
 class Stepper:
-    """Steps one rack. Raises `Failure` if it does not run in lockstep."""
+    """Steps one rack in lockstep.
+
+    The constructor raises `Failure` for a rack that does not run in lockstep.
+    """
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -51,11 +58,11 @@ class Stepper:
             raise Failure(f"rack '{segment.rack}' runs in real time, which cannot be held; {hint}")
 
     def release(self) -> None:
-        """Let the rack run without holding."""
+        """Let the rack run on without being held again."""
         self._words[System.HOLD_AT] = 0
 
     def hold_rack(self) -> int:
-        """Hold the rack if it is not held yet. Returns the tick before which it holds."""
+        """Hold the rack if it is not held yet. Returns the tick before which it is held."""
         if not self._words[System.HOLD_AT]:
             self._words[System.HOLD_AT] = 1
         return self._await_hold_at(0)
@@ -66,7 +73,7 @@ class Stepper:
         self._await_hold_at(tick)
 
     def find_end_tick(self, at: int, cycles: int, level: str | None) -> int:
-        """Compute the tick after the release of the last of some cycles.
+        """Return the tick after the release of the last of the next `cycles` cycles.
 
         Args:
             at: The current tick.
@@ -86,7 +93,7 @@ class Stepper:
         return task.grid.find_tick(at) + (cycles - 1) * task.every + 1
 
     def describe_rack(self) -> HeldRack:
-        """Describe the rack as it is held."""
+        """Describe the held rack: its tick, and the state of each level."""
         levels = [
             {"level": row.task, "state": row.state, "row": row.row, "reason": row.reason}
             for row in RackMonitor(self._segment).take_snapshot().tasks
@@ -97,7 +104,7 @@ class Stepper:
         return HeldRack(self._segment.rack, tick, time_s, levels)
 
     def _await_hold_at(self, tick: int) -> int:
-        """Wait until the rack holds before `tick` or a later one, and return that tick."""
+        """Wait until the rack is held before `tick` or a later one, and return that tick."""
         while (held_tick := self._words[System.HELD] - 1) < tick:
             if self._segment.run_is_over:
                 raise Failure(
@@ -111,7 +118,8 @@ class Pause(NamedTuple):
     """A pause of a rack.
 
     Attributes:
-        tick: In lockstep the tick before which it holds, otherwise the tick of the hold.
+        tick: In lockstep the tick before which the rack is held, otherwise the tick at which the
+            hold was complete.
         levels: Levels that are held. Empty in lockstep.
     """
 

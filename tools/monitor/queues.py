@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class QueueFill:
-    """A queue now.
+    """Current state of a queue.
 
     Attributes:
-        unread: Number of messages in it.
-        capacity: Largest possible number.
+        unread: Number of messages in the queue.
+        capacity: Maximum number of messages.
         refused: Number of messages refused so far because the queue was full.
     """
 
@@ -33,13 +33,13 @@ class QueueFill:
 
     @property
     def line(self) -> str:
-        """The queue as one line of text."""
+        """Description of the queue in one line."""
         refused = f", {self.refused} refused" if self.refused else ""
         return f"queue {self.mailbox}: {self.unread} of {self.capacity} unread{refused}"
 
 
 def list_queue_fills(newest: NewestMessages) -> tuple[QueueFill, ...]:
-    """Describe every queue of a rack as it is now."""
+    """Return the current state of every queue of a rack."""
     fills = []
     for box in list_queues(newest.segment.layout):
         # Read the position first: messages taken after this still count as unread.
@@ -53,9 +53,8 @@ def list_queue_fills(newest: NewestMessages) -> tuple[QueueFill, ...]:
 def summarize_queues(recording: Recording) -> list[Document]:
     """Describe the traffic of every queue in a run, as plain data.
 
-    `waiting` is the largest number of messages that a read saw before it took any. `refused` is
-    None if
-    it was not recorded.
+    `waiting` is the largest number of messages in the queue at the beginning of a read. `refused`
+    is None if it was not recorded.
     """
     refused = recording.end_counts.get("refused", {})
     documents = []

@@ -21,7 +21,7 @@ One reads the command, one makes the reply visible, one may answer another opera
 under way.
 """
 NO_CYCLE_S = 1.0
-"""A level without a cycle for this simulated time is not waited for."""
+"""A level that completes no cycle for this simulated time is no longer waited for."""
 
 Fate = Literal["waiting", "given", "taken", "done", "refused", "superseded"]
 """State of a command."""
@@ -29,12 +29,12 @@ Fate = Literal["waiting", "given", "taken", "done", "refused", "superseded"]
 
 @dataclass(frozen=True)
 class Reply:
-    """A command and its fate.
+    """A command to a level, and what has become of it.
 
-    `given`, `taken_up` and `done` are ticks, or -1 if that has not happened.
+    `given`, `taken_up` and `done` are the ticks of these events, or -1 if they have not occurred.
 
     Attributes:
-        serial: Number of the command. 0 while it waits.
+        serial: Serial number of the command. 0 while it waits.
         fate: "waiting" for a command to a rack that is held. It stays "given" if the status of the
             level does not answer operators.
         objection: Why the command was refused.
@@ -63,7 +63,7 @@ class Reply:
 
     @property
     def line(self) -> str:
-        """The reply as one line of text."""
+        """Description of the reply in one line."""
         if self.fate == "waiting":
             return f"command to '{self.level}', {self.text}: {self.waits}"
         ends = {
@@ -80,7 +80,7 @@ class Reply:
 
 
 def find_answering_status(segment: Segment, level: str) -> MailboxSpec | None:
-    """Find the status mailbox of a level. None if the status does not answer operators."""
+    """Find the status mailbox of a level. None if it has no fields for replies to operators."""
     boxes = [box for box in segment.layout.mailboxes if box.name == f"{level}.status"]
     return next(
         (box for box in boxes if {"order", "answer", "objection"} <= {f.name for f in box.fields}),
@@ -91,9 +91,9 @@ def find_answering_status(segment: Segment, level: str) -> MailboxSpec | None:
 class ReplyReader:
     """Reads the statuses of a level for its reply to one command.
 
-    A newer command supersedes it once the level has accepted that one, except that settings
-    supersede
-    nothing, and commands to the drives supersede only each other.
+    As soon as the level has accepted a newer command, the newer one supersedes this one. There are
+    two exceptions: settings supersede nothing, and commands to the drives supersede only each
+    other.
 
     Attributes:
         reply: The reply according to the statuses read so far.
@@ -118,7 +118,7 @@ class ReplyReader:
         return self.reply
 
     def _update_reply(self, tick: int, status: np.void) -> Reply:
-        """Return the reply according to one status."""
+        """Return the reply updated by one status, which was written at `tick`."""
         reply = self.reply
         answer = status["answer"]
         if status["order"] == reply.serial:
@@ -145,7 +145,7 @@ class ReplyReader:
 
 
 class ReplyDeadline:
-    """Detects that a level should have answered a command by now.
+    """Detects that a level has failed to answer a command in time.
 
     It counts cycles instead of ticks, because a level on a busy machine skips some of its releases.
     """
@@ -159,7 +159,7 @@ class ReplyDeadline:
         self._silent = max(REPLY_CYCLES * status.every, shortest)
 
     def explain_silence(self, tick: int) -> str:
-        """Return why no answer will come, or an empty text while one may still come."""
+        """Return why no answer will come. Empty while an answer is still possible."""
         cycles = self._block[Block.CYCLES]
         if cycles != self._cycles:
             self._cycles = cycles

@@ -27,7 +27,7 @@ class WrittenMessages(NamedTuple):
     """Messages of one mailbox, oldest first, with the ticks at which they were released.
 
     Attributes:
-        lost: Number of messages before them that were overwritten.
+        lost: Number of earlier messages that were overwritten before they were read.
     """
 
     mailbox: str
@@ -46,7 +46,7 @@ class SignalReader:
     def read_new(self) -> Iterator[WrittenMessages]:
         """Yield the messages since the last call.
 
-        The first call yields what the rings hold: 2 s.
+        The first call yields the messages that the rings still hold, up to 2 s.
         """
         for name, ring in self._rings.items():
             rows, lost = ring.read_new_rows()
@@ -55,17 +55,17 @@ class SignalReader:
 
 
 class SignalHistory:
-    """The last values of some signals by tick. A signal keeps its value until its next message.
+    """Recent values of some signals by tick. A signal keeps its value until its next message.
 
     Attributes:
-        settles: Number of ticks after which everything released at a tick has been written.
-        lost: Number of messages that were overwritten before they were taken.
+        settling_ticks: Number of ticks after which everything released at a tick has been written.
+        lost: Number of messages that were overwritten before they were read.
 
     Args:
         segment: The rack.
-        signals: Signals to keep.
-        span: Number of ticks to keep, with one more message of each mailbox before them.
-        followed: Signals whose messages `read_new` returns without keeping them.
+        signals: Signals whose values are stored.
+        span: Number of ticks to store. One earlier message of each mailbox is stored as well.
+        followed: Signals whose messages `read_new` returns without storing them.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class SignalHistory:
         span: int,
         followed: Sequence[Signal] = (),
     ) -> None:
-        """Start to keep the signals."""
+        """Store the messages that the rings hold now."""
         specs = [segment.layout.find_mailbox(signal.mailbox) for signal in signals]
         self.signals = signals
         self.tick_s = segment.layout.clock_ns * 1e-9
@@ -92,7 +92,7 @@ class SignalHistory:
         self.lost = 0
 
     def read_new(self) -> list[WrittenMessages]:
-        """Read and return the messages since the last call."""
+        """Read, store and return the messages since the last call."""
         all_written = [*self._tap.read_new()]
         for written in all_written:
             self.lost += written.lost
@@ -129,7 +129,7 @@ class SignalHistory:
         return [*table.items()]
 
     def to_time_s(self, tick: int) -> float:
-        """Convert a tick to simulated time, s."""
+        """Convert a tick to simulated time in s."""
         return round(tick * self.tick_s, 9)
 
 
@@ -146,7 +146,7 @@ class SignalPrinter:
     """Prints signals as lines of text or JSON.
 
     Args:
-        strip: The signals.
+        strip: History of the signals.
         first: Tick of the first line.
         every: Number of ticks between two lines. 0 for a line at each tick with a release.
         as_json: True to print JSON documents.
@@ -166,6 +166,7 @@ class SignalPrinter:
                 self._next = tick + self._every
 
     def _print_line(self, tick: int, values: list[Any]) -> None:
+        """Print the values of all signals at a tick."""
         time_s = self._strip.to_time_s(tick)
         if self._as_json:
             names = [signal.name for signal in self._strip.signals]
@@ -179,7 +180,7 @@ class SignalPlot:
     """Draws signals as curves on the terminal. Raises `ImportError` without plotext.
 
     Args:
-        strip: The signals.
+        strip: History of the signals.
         span: Number of ticks that the plot covers.
         terminal: Where it is drawn.
     """
@@ -201,7 +202,7 @@ class SignalPlot:
         self._live.stop()
 
     def show_until(self, last: int) -> None:
-        """Draw the curves that end before the tick `last`."""
+        """Redraw the curves over the last `span` ticks up to tick `last`."""
         from rich.text import Text
 
         rows = self._strip.list_rows(last - self._span, last)
@@ -218,7 +219,7 @@ class SignalPlot:
         self._live.update(Text.from_ansi(plot.build()), refresh=True)
 
     def _list_curves(self, rows: EntityRows) -> dict[str, list[tuple[float, float]]]:
-        """Return points by the name of the curve.
+        """Return the points of each curve by its name, as simulated time in s and value.
 
         A signal with several numbers has a curve for each.
         """
@@ -231,7 +232,7 @@ class SignalPlot:
 
 
 def _list_numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
-    """Yield the numbers of a value, each with its name."""
+    """Yield each number of a value, under the name with its index in front."""
     if isinstance(value, list):
         for index, element in enumerate(value):
             yield from _list_numbers(f"[{index}] {name}", element)

@@ -50,17 +50,16 @@ TASK_STATUS = "task_status"
 
 @dataclass(frozen=True)
 class TaskRow:
-    """One task now.
+    """Current state of one task.
 
     Attributes:
         priority: SCHED_FIFO priority obtained. 0 for ordinary scheduling.
         exec_ms: Longest execution time of the cycles that `RackMonitor` covers. None without a
             cycle.
         lateness_ms: Longest lateness of these cycles.
-        row: Row of a state table that was executed.
+        row: State-table row that was executed.
         mode: "operator" while a command of an operator is in force, otherwise "automatic". Empty
-            for
-            tasks that take no commands.
+            for tasks that take no commands.
     """
 
     task: str
@@ -84,7 +83,7 @@ class TaskRow:
 
 @dataclass(frozen=True)
 class TaskProgress:
-    """Progress of the task: elemental moves and actions, done and in all."""
+    """Progress of the task: elemental moves and actions, completed and in total."""
 
     moves_done: int
     moves: int
@@ -96,22 +95,22 @@ class TaskProgress:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A rack now.
+    """State of a rack at one moment.
 
     Attributes:
         time_s: Simulated time.
         lines: Asserted utility lines, and warnings.
         demand: Safety demand on the arm, normally "none".
         faults: Active faults.
-        holds: Levels, or the arm, that are kept from their work.
+        holds: Levels, or the arm, that are prevented from doing their work.
         hosts: Boards of the host side.
-        entries: Messages that pass to and from the host boards.
+        entries: Traffic to and from the host boards.
         queues: All queues, including empty ones.
         inboxes: Inboxes of the boards that messages interrupt.
         exchanges: Ages of the messages in use by boards with an exchange, by board and port.
         peers: Other racks on the network.
-        imports: Messages from them.
-        exports: Messages to them.
+        imports: Messages from other racks.
+        exports: Messages to other racks.
     """
 
     rack: str
@@ -199,7 +198,7 @@ class RackMonitor:
         )
 
     def _list_active_faults(self) -> Iterator[str]:
-        """Yield a text for each active fault."""
+        """Yield a description of each active fault."""
         for fault in self._faults.list_entries((Stage.ACTIVE,)):
             # Import late: most racks have no faults, and the import takes a while.
             from rack.boards.faults.describe import describe_fault
@@ -208,12 +207,12 @@ class RackMonitor:
             if find_kind(fault) is UNKNOWN:
                 from rack.boards.config.published import PublishedRack
 
-                # Reading this registers the kinds that the levels of the rack add.
+                # This call also registers the kinds that the levels of the rack add.
                 PublishedRack.read_from_segment(self._segment)
             yield describe_fault(fault, self._segment.layout, self._joints)
 
     def _list_warnings(self) -> list[str]:
-        """Return the asserted utility lines, and warnings."""
+        """Return the names of asserted utility lines, and warnings about the rack."""
         lines = self._lines
         warnings = [f"SYSFAIL slot {slot}" for slot in lines.sysfail]
         single = {
@@ -235,7 +234,7 @@ class RackMonitor:
         return warnings
 
     def _describe_task(self, task: TaskSpec) -> TaskRow:
-        """Describe a task."""
+        """Return the current state of a task."""
         block = self._segment.get_block(task.name)
         exec_ms, lateness_ms = self._longest_times_ms(task.name)
         state = to_enum(TaskState, block[Block.STATE]).name.lower()
@@ -243,7 +242,7 @@ class RackMonitor:
         if block[Block.LOST]:
             state = LOST
         elif (status := self._newest.read_message(f"{task.name}.status")) is not None:
-            # For a user's level without a known state, show the state of its process.
+            # A user's level may report no known state. Show the state of its process instead.
             state = format_state(getattr(status, "state", None), state)
             reason = get_reason(status)
             row = format_table_row(status)
@@ -270,13 +269,14 @@ class RackMonitor:
         )
 
     def forget_times(self) -> None:
-        """Forget the longest times so far."""
+        """Reset the longest times of all tasks."""
         self._longest_ns.clear()
 
     def _longest_times_ms(self, task: str) -> list[float | None]:
-        """Return the longest execution time and lateness of a task.
+        """Return the longest execution time and lateness of a task in ms.
 
-        Without a new cycle they are those of the previous snapshot.
+        Without a new cycle the times of the previous snapshot are returned, or None before the
+        first.
         """
         self.cycles[task] = cycles = self._traces[task].read_new_rows().rows
         longest = self._longest_ns.get(task)
@@ -290,7 +290,7 @@ class RackMonitor:
         return [None, None] if longest is None else (longest * 1e-6).tolist()
 
     def _list_messages(self, message: str) -> Iterator[tuple[str, AnyMessage]]:
-        """Yield the writer and the newest message of every mailbox with a message type."""
+        """Yield the writer and the newest message of every mailbox of a message type."""
         return self._newest.list_messages(lambda box: box.message == message)
 
     def _find_progress(self) -> TaskProgress | None:
@@ -304,7 +304,7 @@ class RackMonitor:
 
 
 def format_table_row(status: AnyMessage) -> str:
-    """Format the row of a state table that a level executed in its newest cycle.
+    """Format the state-table row that a level executed in its newest cycle.
 
     Empty for a level without a state table.
     """

@@ -61,7 +61,7 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
         joints: Joints of the arm, base to tool. Empty to take all between base and tip.
 
     Raises:
-        RobotError: A name is unknown, the model has no arm, or nothing drives some of its joints.
+        RobotError: A name is unknown, the model has no arm, or some joints have no drive.
     """
     driven = find_driven_joints(model)
     scalar = np.isin(model.jnt_type, SCALAR_JOINTS)
@@ -84,7 +84,7 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
             chain = chain[: chain.index(cut)]
         # If no joint of the chain is driven, --torque states the limits of all of them.
         driven_in_chain = driven & {*chain} or {*chain}
-        # A mobile base does not move: skip passive joints and slides without limits.
+        # A mobile base is held still: skip passive joints and slides without limits.
         while chain and (chain[0] not in driven_in_chain or _is_endless(model, chain[0])):
             chain = chain[1:]
         joints = [_joint_name(model, joint) for joint in chain]
@@ -115,10 +115,10 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
 
 
 def find_driven_joints(model: mujoco.MjModel) -> set[int]:
-    """Return the ids of the joints for which a model states a drive.
+    """Return the ids of all joints that the model drives.
 
-    A drive is an actuator, directly or through a tendon, the effort of a URDF, or a coupling to
-    other joints.
+    A joint is driven by an actuator, directly or through a tendon, by the effort limit of a URDF,
+    or through a coupling to other joints.
     """
     every = np.arange(model.njnt)
     drives = compute_moments(model, every, model.qpos0[model.jnt_qposadr]).any(axis=0)
@@ -127,14 +127,14 @@ def find_driven_joints(model: mujoco.MjModel) -> set[int]:
 
 
 def fix_joints(path: Path, kept: Iterable[str]) -> list[str]:
-    """Fix all joints of an MJCF file except some, and remove free bodies.
+    """Fix all joints of an MJCF file except those to keep, and remove free bodies.
 
     Bodies moved from outside (mocap) and everything that refers to a removed element are removed
     as well.
 
     Args:
         path: The file, as MuJoCo writes it. It is overwritten.
-        kept: Names of the joints that stay.
+        kept: Names of the joints that remain movable.
 
     Returns:
         Names of the removed bodies.
@@ -164,7 +164,7 @@ def fix_joints(path: Path, kept: Iterable[str]) -> list[str]:
     for keys in root.findall("keyframe"):
         root.remove(keys)
     sections = [section for section in root if section.tag in REFERRING_SECTIONS]
-    # Repeat, because other elements may refer to those just removed.
+    # Repeat, because other elements may refer to the ones just removed.
     while referring := [
         (section, element)
         for section in parents + sections
@@ -233,8 +233,10 @@ def _find_longest_arm(
 
 
 def _is_endless(model: mujoco.MjModel, joint: int) -> bool:
+    """Return whether a joint is a slide without limits."""
     return bool(model.jnt_type[joint] == SCALAR_JOINTS[1] and not model.jnt_limited[joint])
 
 
 def _joint_name(model: mujoco.MjModel, joint: int) -> str:
+    """Return the name of a joint, given its id."""
     return str(model.joint(joint).name)

@@ -101,9 +101,10 @@ class Assignment:
 
 
 def find_assignment(draft: Draft) -> Assignment:
-    """Find a task for an arm. Raises `RobotError` if it cannot even tour poses.
+    """Find a task for an arm: blocks to move if possible, otherwise a tour of poses.
 
-    The draft's home is changed to suit the task, and its model gets table and blocks.
+    The draft's home is changed to suit the task, and its model gets table and blocks. Raises
+    `RobotError` if not even a tour is possible.
     """
     if draft.gripper is not None:
         result = _find_transfers(draft, draft.gripper)
@@ -166,14 +167,17 @@ def _find_transfers(draft: Draft, gripper: FittedGripper) -> Assignment | str:
 
 
 def _estimate_reach(cell: Cell) -> float:
-    """Estimate the largest distance of the tool from the base, m."""
+    """Estimate the largest distance of the tool from the base in m."""
     ik = InverseKinematics(cell, SEED)
     base = _locate_base(cell)
     return max(norm(ik.compute_tool_pose(q).position - base) for q in sample_poses(cell))
 
 
 def _locate_base(cell: Cell) -> Array:
-    """Return the base of the arm, (3,), m: below its first joint, at the height of its root."""
+    """Return the position of the arm's base, (3,), in m.
+
+    It is below the first joint, at the height of the body at the root of the arm.
+    """
     data = cell.build_start_data()
     joint = cell.model.dof_jntid[cell.dof[0]]
     root = cell.model.body_rootid[cell.model.jnt_bodyid[joint]]
@@ -181,7 +185,7 @@ def _locate_base(cell: Cell) -> Array:
 
 
 def _list_table_spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
-    """Yield places for a table until `SEARCH_S` is over."""
+    """Yield places to try for a table, for at most `SEARCH_S` of processor time."""
     base = _locate_base(cell)
     end = time.process_time() + SEARCH_S
     for height, distance, front in itertools.product(
@@ -197,12 +201,20 @@ def _list_table_spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
 
 
 def _can_reach_places(cell: Cell, spot: TableSpot, half: float, lift: float) -> bool:
-    """Return whether the tool can come down to every place from above."""
+    """Return whether the tool can come down from above to every place.
+
+    Args:
+        cell: The arm.
+        spot: The table and its places for blocks.
+        half: Half the height of a block in m.
+        lift: Height in m above each place from which the tool comes down.
+    """
     ik = InverseKinematics(cell, SEED)
     # An arm with fewer joints has fewer solutions, so search longer for one.
     restarts = MAX_RESTARTS if len(cell.qpos) >= FULL_ORIENTATION else LEANING_RESTARTS
 
     def is_reached(place: Array) -> bool:
+        """Return whether the tool can come down to a place, with the fingers in some direction."""
         for quarter in QUARTER_TURNS:
             orientation = build_pointing_quaternion(DOWN, -(spot.direction + 0.5 * np.pi * quarter))
             placed = make_pose([*place, spot.top + half], orientation)
@@ -223,8 +235,8 @@ def _add_furniture(
         spec: The model, which is changed.
         scene: Names of table and blocks.
         spot: Place of the table.
-        half: Half of the size of a block, (3,), m.
-        reach: Reach of the arm, m, by which the table is sized.
+        half: Half the size of a block, (3,), in m.
+        reach: Reach of the arm in m, which determines the size of the table.
 
     Returns:
         The added bodies.
@@ -243,7 +255,7 @@ def _add_furniture(
         block.add_freejoint(name=name)
         geom = block.add_geom(name=name, type=box, size=half, rgba=colour)
         geom.mass = DENSITY * float(np.prod(2.0 * half))
-        # MuJoCo infers inertia only from geoms of certain groups.
+        # MuJoCo infers inertia only from geoms in certain groups.
         geom.group = spec.compiler.inertiagrouprange[0]
         geom.condim = 4
         geom.friction[:] = [1.0, 0.02, 0.001]
@@ -256,24 +268,24 @@ def _add_furniture(
     bits = 1
     for geom in spec.geoms:
         bits |= geom.contype | geom.conaffinity
-    # Override the model's defaults. Blocks also touch pads that touch nothing else.
+    # Override the model's defaults, so that blocks also collide with pads that touch nothing else.
     for body, contact_bits in zip(added, (1, bits, bits), strict=True):
         body.geoms[0].contype = body.geoms[0].conaffinity = contact_bits
     return added
 
 
 class _TimedMotionPlanner(MotionPlanner):
-    """A motion planner that refuses to plan after `REHEARSAL_S`."""
+    """A motion planner that refuses to plan once `REHEARSAL_S` is used up."""
 
     def __init__(self, cell: Cell, scene: SceneConfig, seed: int) -> None:
         super().__init__(cell, scene, seed)
         self._end = time.process_time() + REHEARSAL_S
 
-    def plan(self, *args: Any, **wishes: Any) -> Path:
-        """Plan as the task level does. Also raises `Refused` when the time is over."""
+    def plan(self, *args: Any, **options: Any) -> Path:
+        """Plan as the task level does. Raises `Refused` also when the time is used up."""
         if time.process_time() > self._end:
             raise Refused(Error.NO_PATH, f"no way found in {REHEARSAL_S:g} s of processor time")
-        return super().plan(*args, **wishes)
+        return super().plan(*args, **options)
 
 
 def _rehearse_program(draft: Draft, scene: SceneConfig, actions: list[Document]) -> Rehearsal:

@@ -43,7 +43,7 @@ from rack.tools.robot.source import Source, copy_model
 CLOCK_NS = 2_500_000
 """Clock period of `nasrem`, whose levels and boards the arm gets."""
 GUESSED_SPEED = {mujoco.mjtJoint.mjJNT_HINGE: 1.5, mujoco.mjtJoint.mjJNT_SLIDE: 0.25}
-"""Guessed velocity limits by joint type, rad/s and m/s."""
+"""Guessed velocity limits by joint type, in rad/s and m/s."""
 SPEED_UP_S = 0.5
 """Time to full speed of planned motion, if the motors permit.
 
@@ -58,13 +58,13 @@ MAX_DRAG_FRACTION = 0.4
 MAX_REST_ERROR_RAD = 0.002
 """Largest error at which dry friction may hold a joint at rest. Tasks permit 0.003 rad."""
 MAX_BANDWIDTH = 100.0
-"""Upper bound for the bandwidth of the joint loop, rad/s."""
+"""Upper bound for the bandwidth of the joint loop in rad/s."""
 POSE_COUNT = 400
 """Number of poses that are sampled."""
 CONTACT_DISTANCE_M = 1e-4
-"""Bodies closer than this, m, count as touching, because the planner would reject such a pose."""
+"""Distance in m below which bodies count as touching, because the planner rejects such poses."""
 PREFERRED_CLEARANCE_M = 0.005
-"""Preferred clearance at home, m, because a linkage settles slightly off its equalities."""
+"""Preferred clearance at home in m, because a linkage settles slightly off its equalities."""
 OVERLAP_FRACTION = 0.95
 """Bodies in contact in this fraction of the poses are neighbours whose shapes overlap."""
 TOOL_NAMES = ("tcp", "tool", "grip_site", "attachment", "eef", "ee_", "pinch", "hand", "flange")
@@ -75,7 +75,7 @@ EMPTY_SCENE = SceneConfig()
 
 @dataclass(frozen=True)
 class ArmOptions:
-    """Options of the user. An empty one leaves the choice to the draft."""
+    """Options of the user. An empty option leaves the choice to the draft."""
 
     tip: str = ""
     joints: tuple[str, ...] = ()
@@ -86,7 +86,7 @@ class ArmOptions:
 
 
 class FittedGripper(NamedTuple):
-    """A gripper that can be used, and what its fingers can take."""
+    """A usable gripper, and the measures of what its fingers can grasp."""
 
     config: GripperConfig
     fingertips: Fingertips
@@ -125,7 +125,10 @@ class JointLimits:
 
 @dataclass
 class Draft:
-    """A drafted arm: one record for each step of `_run_steps`, composed to a table by `table`."""
+    """A drafted arm, with one record from each step of `_run_steps`.
+
+    `table` combines the records into the `[robot]` table.
+    """
 
     model: Path  # MJCF file of the draft
     spec: mujoco.MjSpec  # content of that file, possibly with changes not yet written
@@ -186,9 +189,9 @@ class Draft:
             raise RobotError(f"robot.{key} = {first['input']}: {first['msg'].lower()}") from None
 
     def cell(self, scene: SceneConfig = EMPTY_SCENE, **changes: Any) -> Cell:
-        """Build the cell of the arm as drafted so far, with changed keys of the table if given.
+        """Build the cell of the arm as drafted so far.
 
-        Raises `RobotError`.
+        Keyword arguments override keys of the table. Raises `RobotError`.
         """
         return build_unchecked_cell(self.robot.model_copy(update=changes), scene, CLOCK_NS)
 
@@ -205,12 +208,12 @@ def draft_arm(source: Source, options: ArmOptions, folder: Path, name: str) -> D
 
     Args:
         source: The user's model.
-        options: Options that the user stated.
-        folder: Folder to which the draft's own model is written.
+        options: Options that the user gave.
+        folder: Folder to which the draft's model is written.
         name: Name of that model file, without suffix.
 
     Raises:
-        RobotError: Nothing can be made of the model. The message is one line.
+        RobotError: No arm can be drafted from the model. The message is one line.
     """
     try:
         result = _run_steps(source, options, folder, name)
@@ -226,27 +229,27 @@ def draft_arm(source: Source, options: ArmOptions, folder: Path, name: str) -> D
     return result
 
 
-def _run_steps(source: Source, wishes: ArmOptions, folder: Path, name: str) -> Draft:
-    """Run the steps of a draft. Each returns a record that is computed from the draft so far."""
+def _run_steps(source: Source, options: ArmOptions, folder: Path, name: str) -> Draft:
+    """Run the steps of a draft. Each computes a record from the draft so far."""
     model = source.compile_model()
-    arm = find_arm(model, wishes.tip, wishes.joints)
-    # Equalities with joints that are fixed disappear with them, so check the couplings first.
+    arm = find_arm(model, options.tip, options.joints)
+    # Fixing a joint also removes its equalities, so check the couplings first.
     check_couplings(model, arm.joints, of_bodies=False)
     addresses = [model.joint(joint).qposadr[0] for joint in arm.joints]
     keyframes = {
         model.key(k).name or f"key {k}": model.key_qpos[k][addresses] for k in range(model.nkey)
     }
-    fingers = () if wishes.gripper == "none" else arm.fingers
+    fingers = () if options.gripper == "none" else arm.fingers
     path = folder / f"{name}.xml"
     copy_model(source, path)
     springs = [joint for joint in arm.passive if model.joint(joint).stiffness > 0.0]
     left_out = fix_joints(path, (*arm.joints, *fingers, *springs))
     notes = [*source.notes, *_describe_rest(model, arm, left_out)]
     spec = load_spec(path)
-    limits = _read_limits(source, model, spec, arm.joints, wishes.torque)
-    tool = ToolFrame(wishes.tool or _find_mount(compile_spec(spec, path), arm.tip))
+    limits = _read_limits(source, model, spec, arm.joints, options.torque)
+    tool = ToolFrame(options.tool or _find_mount(compile_spec(spec, path), arm.tip))
     home = HomePose([0.0] * len(arm.joints))
-    result = Draft(path, spec, wishes, arm, keyframes, notes, limits, tool, home)
+    result = Draft(path, spec, options, arm, keyframes, notes, limits, tool, home)
     if fingers:
         try:
             result.gripper = _fit_gripper(result)
@@ -256,7 +259,7 @@ def _run_steps(source: Source, wishes: ArmOptions, folder: Path, name: str) -> D
             result.write_model()
             fix_joints(path, arm.joints)
             result.spec = load_spec(path)
-    if not wishes.tool:
+    if not options.tool:
         result.tool = _choose_tool(result)
     result.exclude = _find_overlaps(result.cell())
     result.limits = limits = _compute_limits(result)
@@ -270,7 +273,7 @@ def _run_steps(source: Source, wishes: ArmOptions, folder: Path, name: str) -> D
 
 
 def _describe_rest(model: mujoco.MjModel, arm: ArmParts, left_out: list[str]) -> Iterator[str]:
-    """Yield notes about parts of the model that the draft leaves out, fixes or cannot limit."""
+    """Yield notes for the user about parts that are left out, fixed, or without limits."""
     if left_out:
         yield f"left out, because they are not attached: {format_names(left_out)}"
     if endless := [joint for joint in arm.joints if not model.joint(joint).limited]:
@@ -315,7 +318,7 @@ def _read_limits(
 
 
 def _find_mount(model: mujoco.MjModel, tip: str) -> str:
-    """Find the last body that is fixed to the tip of an arm, preferably one named like a tool."""
+    """Find the last body fixed to the tip of an arm, preferably one named like a tool."""
     carried = [model.body(tip).id]
     for body in range(carried[0] + 1, model.nbody):
         if model.body_parentid[body] in carried and not model.body_jntnum[body]:
@@ -381,7 +384,7 @@ def _find_overlaps(cell: Cell) -> tuple[tuple[str, str], ...]:
 
 
 def sample_poses(cell: Cell) -> list[Array]:
-    """Sample poses all over the joints' ranges, (joints,) each, rad."""
+    """Sample poses over the whole ranges of the joints, (joints,) each, in rad."""
     low, high = find_sampling_range(cell)
     edge = 0.1 * (high - low)
     drawn = np.random.default_rng(0).uniform(low + edge, high - edge, (POSE_COUNT, len(low)))
@@ -396,8 +399,9 @@ def find_touching_bodies(
     Args:
         cell: The arm and its surroundings.
         data: Simulation data of the cell. It is left at the pose.
-        q: Positions of the joints, (joints,), rad.
-        skin_m: Bodies closer than this, m, count as touching. The geoms need half of it as margin.
+        q: Positions of the joints, (joints,), in rad.
+        skin_m: Distance in m below which bodies count as touching. The geoms must have at least
+            half of it as margin.
 
     Returns:
         Names of the bodies, sorted within each pair.
@@ -411,10 +415,11 @@ def find_touching_bodies(
 
 
 def _compute_limits(draft: Draft) -> JointLimits:
-    """Compute the limits that the model does not state, and a loop stiff against dry friction.
+    """Compute the limits that the model does not state, and the bandwidth of the joint loop.
 
-    Torques carry weight, friction and inertia; guessed velocities and all accelerations are what
-    the torques permit.
+    Guessed torques suffice for weight, friction and inertia. Guessed velocities and all
+    accelerations are limited to what the torques permit. A bandwidth above the default is chosen if
+    dry friction needs it.
     """
     stated = draft.limits
     cell = draft.cell()
@@ -423,7 +428,7 @@ def _compute_limits(draft: Draft) -> JointLimits:
     weight, drag, inertia = np.zeros((3, len(velocity)))
     least_inertia = np.full(len(velocity), np.inf)
     for q in sample_poses(cell):
-        # The terms are views of one array.
+        # Copy, because `terms` returns views of one array.
         bias, still = (dynamics.terms(q, v).bias.copy() for v in (velocity, 0.0 * velocity))
         weight = np.maximum(weight, np.abs(still))
         drag = np.maximum(drag, np.abs(bias - still))
@@ -455,21 +460,22 @@ def _compute_limits(draft: Draft) -> JointLimits:
 
 
 def _round_values(values: Array) -> list[float]:
+    """Round values to three significant digits."""
     return [float(f"{value:.3g}") for value in values]
 
 
 def find_home(
     draft: Draft, scene: SceneConfig = EMPTY_SCENE, ends: Sequence[Array] = ()
 ) -> HomePose:
-    """Find a home in which the arm carries itself and touches nothing.
+    """Find a home pose in which the arm touches nothing and can hold its weight.
 
-    A keyframe that qualifies is preferred. The alternative is the best sampled pose.
+    A keyframe that qualifies is preferred. Otherwise the best of the sampled poses is chosen.
 
     Args:
         draft: The arm. Its `home` is not used.
         scene: Objects and supports beside the arm.
-        ends: Final positions of the objects, (3,) each, m. The pose is also free of contact after
-            the objects have been moved there.
+        ends: Final positions of the objects, (3,) each, in m. The pose must be free of contact also
+            after the objects have been moved there.
 
     Raises:
         RobotError: No sampled pose qualifies, or the keyframe that the user named is unknown.
@@ -485,8 +491,11 @@ def find_home(
     statics = Statics(cell)
     low, high = cell.limits.position.T
 
-    def left(q: Array) -> float:
-        """Return the fraction of torque that gravity leaves, or -1 for an unusable pose."""
+    def compute_spare_torque(q: Array) -> float:
+        """Return the least fraction of torque that gravity leaves to a joint, minus the minimum.
+
+        Returns -1 for a pose out of range or in contact.
+        """
         is_within = np.all(q >= low) and np.all(q <= high)
         if is_within and checker.is_free(q, 0.0) and (not ends or later.is_free(q)):
             return float(statics.compute_load_limits(q)[0].min()) - MIN_SPARE_TORQUE
@@ -502,17 +511,19 @@ def find_home(
             ) from None
     named = sorted(keyframes, key=lambda name: name != (wanted or "home"))
     for name in named:
-        if left(keyframes[name]) > 0:
+        if compute_spare_torque(keyframes[name]) > 0:
             return HomePose(keyframes[name].round(5).tolist())
     set_margins(cell.model, 0.5 * PREFERRED_CLEARANCE_M)
 
     def rate_pose(q: Array) -> float:
+        """Rate a pose by spare torque, downward tool and clearance. More is better."""
         # Forward kinematics at `q` is a side effect of `find_touching_bodies`.
         is_near = bool(find_touching_bodies(cell, data, q, PREFERRED_CLEARANCE_M))
         downward = -float(data.site_xmat[cell.tool, 8])
-        return left(q) + downward - 2.0 * is_near
+        return compute_spare_torque(q) + downward - 2.0 * is_near
 
-    best = max((q for q in sample_poses(cell) if left(q) > 0), key=rate_pose, default=None)
+    usable_poses = (q for q in sample_poses(cell) if compute_spare_torque(q) > 0)
+    best = max(usable_poses, key=rate_pose, default=None)
     if best is None:
         raise RobotError(
             "no pose was found that is free of contact and held by the motors; give one with --home"

@@ -20,7 +20,7 @@ from rack.tools.console.answer import Document
 from rack.tools.robot.draft import find_touching_bodies
 
 MAX_PHASE_RAD = 0.5
-"""Largest phase angle of a vibration in one step, rad, at which its simulation is trustworthy."""
+"""Largest phase angle of a vibration in one step, in rad, for a trustworthy simulation."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class ArmExamination:
 
 
 def examine_arm(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> ArmExamination:
-    """Examine an arm in its cell. Contacts at home are reported, not refused.
+    """Examine an arm in its cell. Contacts at home are reported instead of refused.
 
     Args:
         robot: Table of the arm.
@@ -60,7 +60,7 @@ def examine_arm(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> ArmExa
 
 
 def _list_joints(cell: Cell, robot: RobotConfig) -> Iterator[Document]:
-    """Yield a row of figures for each joint."""
+    """Yield a record of figures for each joint."""
     data = cell.build_start_data()
     left, _ = Statics(cell).compute_load_limits(cell.home)
     for k, name in enumerate(robot.joints):
@@ -78,9 +78,9 @@ def _list_joints(cell: Cell, robot: RobotConfig) -> Iterator[Document]:
 
 
 def _check_arm(
-    cell: Cell, robot: RobotConfig, scene: SceneConfig, able: Abilities
+    cell: Cell, robot: RobotConfig, scene: SceneConfig, abilities: Abilities
 ) -> Iterator[Observation]:
-    """Yield the result of each check."""
+    """Check the arm, its gripper and its objects, and yield one result per check."""
     model = cell.model
     data = cell.build_start_data()
     low, high = cell.limits.position.T
@@ -90,11 +90,10 @@ def _check_arm(
     yield Observation(
         "home", f"outside its limits: {', '.join(outside) or 'no joint'}", bool(outside)
     )
-    is_too_weak = able.torque_left < 0.0
-    weight_text = (
-        f"gravity takes {100 * (1 - able.torque_left):.0f} % of '{robot.joints[able.joint]}' "
-        "at worst"
-    )
+    is_too_weak = abilities.torque_left < 0.0
+    weakest_joint = robot.joints[abilities.joint]
+    load_percent = 100 * (1 - abilities.torque_left)
+    weight_text = f"gravity takes {load_percent:.0f} % of '{weakest_joint}' at worst"
     yield Observation("weight", weight_text, is_too_weak)
     pairs = sorted(" and ".join(pair) for pair in find_touching_bodies(cell, data, cell.home))
     yield Observation("contacts at home", ", ".join(pairs) or "none", bool(pairs))
@@ -134,13 +133,14 @@ def _check_arm(
 
 
 def _actuator_kind(actuator: mujoco.MjsActuator) -> str:
+    """Return the kind of an actuator: motor, position or velocity."""
     if actuator.biastype == mujoco.mjtBias.mjBIAS_NONE:
         return "motor"
     return "position" if actuator.biasprm[1] else "velocity"
 
 
 def _describe_fingers(cell: Cell, scene: SceneConfig) -> str:
-    """Describe what closes at the tool, and how far it opens."""
+    """Describe which fingers close at the tool, and how far they open."""
     payloads = Payloads(cell, scene.objects)
     if not payloads.jaws:
         return "none on both sides of the tool, along its y axis"
@@ -151,7 +151,7 @@ def _describe_fingers(cell: Cell, scene: SceneConfig) -> str:
 
 
 def _find_coupling_error(cell: Cell, config: GripperConfig) -> str:
-    """Return why the fingers do not settle where planning poses them, or an empty text."""
+    """Return why the fingers do not settle where planning poses them. Empty if they do."""
     try:
         check_fingers(cell, config)
     except RobotError as error:
@@ -160,10 +160,10 @@ def _find_coupling_error(cell: Cell, config: GripperConfig) -> str:
 
 
 def _find_fastest_vibration(cell: Cell) -> tuple[float, float]:
-    """Find the fastest vibration against springs and the loop of the gripper.
+    """Find the fastest natural vibration of the joints, with their springs and the gripper's loop.
 
     Returns:
-        Its phase angle in one step, rad, and its frequency, Hz.
+        Phase angle of the vibration in one step in rad, and its frequency in Hz.
     """
     model = cell.model
     data = cell.build_start_data()

@@ -1,4 +1,4 @@
-"""Measures by rays what the fingers of a gripper can take, and places the tool between them.
+"""Measures by ray casting what a gripper can grasp, and places the tool between its fingers.
 
 Two kinds are supported: fingers that close on each other, and one that closes on a fixed jaw.
 """
@@ -31,7 +31,7 @@ JAW_BLOCK_FRACTION = 0.35
 A finger that turns faces its jaw only when it is nearly closed.
 """
 MIN_GAP_M = 0.012
-"""A gripper that opens less than this cannot take a block."""
+"""Minimum opening of a gripper that can grasp a block."""
 NEARLY_CLOSED, NEARLY_CLOSED_ON_JAW = 0.6, 0.85
 """Fractions of the way to closed at which the meeting point is measured: two fingers, one finger.
 
@@ -52,7 +52,7 @@ LOOSELY_ALIGNED_COSINE = 0.9
 
 
 class Fingertips(NamedTuple):
-    """Measures of what two fingers, or a finger and a jaw, can take."""
+    """Measures of what two fingers, or a finger and a jaw, can grasp."""
 
     tool: ToolConfig  # z out of the hand, y across
     opening: float  # m or rad: the widest at which they face each other
@@ -63,7 +63,7 @@ class Fingertips(NamedTuple):
 
 
 def measure_fingertips(cell: Cell, tip: str, has_one_finger: bool = False) -> Fingertips:
-    """Measure what a gripper can take, and place the tool between its fingers.
+    """Measure what a gripper can grasp, and place the tool between its fingers.
 
     Args:
         cell: The arm with its gripper.
@@ -99,7 +99,7 @@ def measure_fingertips(cell: Cell, tip: str, has_one_finger: bool = False) -> Fi
     if fingers.is_one:
         block = JAW_BLOCK_FRACTION * width
         origin = origin + (0.5 * block - right) * across
-    # Fingers that turn reach farther as they close.
+    # Turning fingers reach farther out as they close.
     reaches = []
     for step in np.linspace(fraction, 1.0, 5):
         fingers.close(step)
@@ -112,7 +112,7 @@ def measure_fingertips(cell: Cell, tip: str, has_one_finger: bool = False) -> Fi
 
 
 class _Fingers:
-    """The solid geoms of a gripper, which can be closed by any fraction."""
+    """Solid geoms of a gripper that can be posed from open to closed."""
 
     def __init__(self, cell: Cell, tip: str, is_one: bool) -> None:
         assert cell.gripper is not None, "there are fingers"
@@ -153,23 +153,26 @@ class _Fingers:
         self.out = out  # (3,), of the hand
         self.across = _snap_to_axis(across - out * (across @ out), axes)  # (3,)
 
-    def to_joint_position(self, part: float) -> float:
-        """Return the position of the driven joint, m or rad, at a fraction of the way to closed."""
-        return self._gripper.open + part * (self._gripper.closed - self._gripper.open)
+    def to_joint_position(self, closed_fraction: float) -> float:
+        """Return the position of the driven joint in m or rad.
 
-    def close(self, part: float) -> Array:
-        """Close the gripper by a fraction, 0 to 1.
-
-        Returns the centres of its geoms, (geoms, 3), m.
+        `closed_fraction` is 0 for open and 1 for closed.
         """
-        self._gripper.linkage.set_opening(self.data.qpos, self.to_joint_position(part))
+        return self._gripper.open + closed_fraction * (self._gripper.closed - self._gripper.open)
+
+    def close(self, closed_fraction: float) -> Array:
+        """Close the gripper by a fraction from 0 to 1.
+
+        Returns the centres of its geoms, (geoms, 3), in m.
+        """
+        self._gripper.linkage.set_opening(self.data.qpos, self.to_joint_position(closed_fraction))
         mujoco.mj_forward(self._model, self.data)
         return np.array(self.data.geom_xpos[self.geoms])
 
     def measure_gap(self, at: Array) -> tuple[float, float]:
-        """Measure the distances from a point to the fingers on both sides, m.
+        """Measure the distances in m from a point to the fingers on both sides.
 
-        Infinite without a hit.
+        A distance is infinite if there is no finger in that direction.
         """
         other = JAW_GROUP if self.is_one else FINGER_GROUP
         return self._cast_ray(at, self.across, FINGER_GROUP), self._cast_ray(
@@ -189,7 +192,7 @@ class _Fingers:
         return [point - (at_tip.min() - JAW_CLEARANCE_M) * self.across for point in points]
 
     def _cast_ray(self, point: Array, direction: Array, group: NDArray[np.uint8]) -> float:
-        """Return the distance to the first geom of a group in a direction, m, or infinity."""
+        """Return the distance in m to the first geom of a group in a direction, or infinity."""
         starts = (point + aside * np.cross(self.across, self.out) for aside in RAY_OFFSETS_M)
         rays = (
             mujoco.mj_ray(self._model, self.data, start, direction, group, 1, -1, None)
@@ -199,7 +202,7 @@ class _Fingers:
 
 
 def choose_outward_tool(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
-    """Choose a tool frame whose z axis points along the last joint, away from the arm.
+    """Choose a tool frame whose z axis is along the last joint's axis, away from the arm.
 
     Args:
         cell: The arm.
@@ -229,29 +232,30 @@ def choose_outward_tool(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
     return body, _to_body_frame(data, model.body(body).id, at, side, out)
 
 
-def _snap_to_axis(way: Array, axes: Array, least: float = ALIGNED_COSINE) -> Array:
-    """Normalize a direction, and replace it by an axis that is nearly parallel to it.
+def _snap_to_axis(direction: Array, axes: Array, min_cosine: float = ALIGNED_COSINE) -> Array:
+    """Normalize a direction, and replace it by the nearest axis if they are almost parallel.
 
     Args:
-        way: The direction, (3,).
+        direction: The direction, (3,).
         axes: Candidates, (3, 3), one in each row.
-        least: Least cosine between direction and axis.
+        min_cosine: Minimum cosine of the angle to an axis that replaces the direction.
     """
-    way = way / norm(way)
-    along = axes @ way
+    direction = direction / norm(direction)
+    along = axes @ direction
     nearest = int(np.argmax(np.abs(along)))
-    return np.sign(along[nearest]) * axes[nearest] if abs(along[nearest]) > least else way
+    is_aligned = abs(along[nearest]) > min_cosine
+    return np.sign(along[nearest]) * axes[nearest] if is_aligned else direction
 
 
 def _to_body_frame(
     data: mujoco.MjData, body: int, origin: Array, across: Array, out: Array
 ) -> ToolConfig:
-    """Convert a frame in the world to a frame on a body.
+    """Convert a tool frame in the world to one on a body.
 
     Args:
         data: Simulation data with the pose of the body.
         body: Id of the body.
-        origin: Origin of the frame, (3,), m.
+        origin: Origin of the frame, (3,), in m.
         across: Its y axis, (3,).
         out: Its z axis, (3,).
     """

@@ -1,4 +1,4 @@
-"""Fits the gripper that an arm carries with one drive, which all its other joints follow."""
+"""Reduces a gripper to one drive, which all its other joints follow."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rack.tools.robot.arm import ArmParts
 MOTOR_NAME = "gripper"
 """Name of the motor of a gripper that has none."""
 DEFAULT_FORCE_N = 20.0
-"""Force at the fingers of a gripper whose model states none."""
+"""Force at the fingers in N, for a gripper whose model states none."""
 MAX_FORCE_N = 40.0
 """Upper bound for the force at the fingers beyond friction. More would push out a light block."""
 MIN_LEVER_M = 0.02
@@ -35,7 +35,7 @@ MIN_CLOSING_COSINE = 0.5
 
 
 class _Finger(NamedTuple):
-    """One joint of a gripper, with its ends in m or rad."""
+    """One joint of a gripper, with its open and its closed position in m or rad."""
 
     open: float
     closed: float
@@ -46,7 +46,7 @@ class _Finger(NamedTuple):
 def fit_gripper(
     spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, wanted: str
 ) -> tuple[GripperConfig, str]:
-    """Give a gripper one drive, which all joints follow that nothing couples to it.
+    """Give a gripper one drive, and make the joints that are not coupled to it followers.
 
     Args:
         spec: The model. Surplus actuators are removed, and a missing one is added.
@@ -83,7 +83,7 @@ def fit_gripper(
         for name in leaders
         if name in preferred[: len(drives)] or not model.jnt_stiffness[model.joint(name).id]
     )
-    # The one drive gives the sum of the forces of all drives that it replaces.
+    # The single drive exerts the sum of the forces of all drives that it replaces.
     moving_joints = [driven, *(follower.joint for follower in follow if follower.ratio)]
     actuators = [actuator for actuator, _ in drives]
     stated = [find_torque_limit(spec, name, actuators) for name in moving_joints]
@@ -158,7 +158,7 @@ def _measure_finger(
 
 
 def _compute_centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
-    """Compute the centre of the geoms of a body and those it carries, (3,), m."""
+    """Compute the centre of the geoms of a body and of those it carries, (3,), in m."""
     geoms = list_geoms(model, mark_descendants(model, np.array([body])))
     if not len(geoms):
         return np.asarray(data.xipos[body])
@@ -166,7 +166,7 @@ def _compute_centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Ar
 
 
 def _group_coupled_joints(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:
-    """Group the joints of the gripper such that equalities couple all joints of a group."""
+    """Group the joints of the gripper by the equalities that couple them."""
     groups = [{name} for name in arm.fingers]
     for equality in range(model.neq):
         tied = {model.joint(joint).name for joint in find_tied_joints(model, equality)} & {
@@ -182,10 +182,10 @@ def _group_coupled_joints(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]
 def _compute_ratio(
     model: mujoco.MjModel, leader: tuple[str, _Finger], follower: tuple[str, _Finger]
 ) -> float:
-    """Compute the ratio between the motions of a follower and of the driven joint.
+    """Compute how far a follower moves per motion of the driven joint.
 
-    Joints of the same kind move equally far. Others are mapped from range to range. The ratio is 0
-    for a follower that does not close the fingers.
+    Joints of the same kind move equally far. Otherwise the full range of the one corresponds to the
+    full range of the other. The ratio is 0 for a follower that does not close the fingers.
     """
     (driven, leader_finger), (name, finger) = leader, follower
     if finger.sideways:

@@ -25,12 +25,12 @@ INHERITED_ARRAYS = ("friction", "solref", "solimp", "rgba")
 
 
 def cut_meshes(spec: mujoco.MjSpec, cell: Cell, out: Array) -> int:
-    """Cut the solid meshes of a gripper into convex pieces. The whole meshes stay visible only.
+    """Cut the solid meshes of a gripper into convex pieces. The whole meshes remain visible.
 
     Args:
         spec: The model, which is changed.
         cell: The same model, compiled, with its arm at the start.
-        out: Direction out of the closed hand, (3,), across which the meshes are cut.
+        out: Direction out of the closed hand, (3,). The cuts are perpendicular to it.
 
     Returns:
         The number of pieces.
@@ -40,7 +40,7 @@ def cut_meshes(spec: mujoco.MjSpec, cell: Cell, out: Array) -> int:
     cell.gripper.linkage.set_opening(data.qpos, cell.gripper.closed)
     mujoco.mj_kinematics(cell.model, data)
     count = 0
-    # Take the ids of the geoms first, because adding geoms changes them.
+    # Collect the ids of the geoms first, because adding geoms changes them.
     for geom, geom_id in [(geom, geom.id) for geom in spec.geoms]:
         is_solid = geom.contype or geom.conaffinity
         is_mesh = geom.type == mujoco.mjtGeom.mjGEOM_MESH
@@ -68,7 +68,7 @@ def _read_surface(
     """Return the surface of a mesh in the frame of its body.
 
     Returns:
-        Vertices (n, 3), m, and faces (m, 3) of vertex numbers.
+        Vertices, (n, 3), in m, and the vertex numbers of the faces, (m, 3).
     """
     body = model.geom_bodyid[geom]
     world_to_body = data.xmat[body].reshape(3, 3).T
@@ -83,12 +83,18 @@ def _read_surface(
 
 
 def _slice_mesh(corners: Array, faces: NDArray[np.int32], out: Array) -> list[Array]:
-    """Cut a mesh into slices and return the vertices of each, (n, 3), m."""
+    """Cut a mesh into slices, and return the vertices of each, (n, 3), in m.
+
+    Args:
+        corners: Vertices of the mesh, (n, 3), in m.
+        faces: Vertex numbers of the triangles, (m, 3).
+        out: Direction along which slices follow each other, (3,).
+    """
     along = corners @ out
     edges = np.vstack((faces[:, :2], faces[:, 1:], faces[:, ::2]))
 
-    def crossed(place: float) -> Array:
-        """Return the points at which edges cross the plane at a place along `out`."""
+    def find_crossings(place: float) -> Array:
+        """Return where edges cross the plane at position `place` along `out`."""
         start, end = edges[np.prod(along[edges] - place, axis=1) < 0.0].T
         fraction = (place - along[start]) / (along[end] - along[start])
         return np.asarray(corners[start] + fraction[:, None] * (corners[end] - corners[start]))
@@ -97,7 +103,7 @@ def _slice_mesh(corners: Array, faces: NDArray[np.int32], out: Array) -> list[Ar
     pieces = []
     for low in np.arange(along.min(), along.max(), PIECE_M):
         inside = corners[(along >= low) & (along <= low + PIECE_M)]
-        points = np.vstack((inside, crossed(low), crossed(low + PIECE_M)))
+        points = np.vstack((inside, find_crossings(low), find_crossings(low + PIECE_M)))
         if not len(points):
             continue
         points = points[np.unique((points @ directions).argmax(axis=0))]

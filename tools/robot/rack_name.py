@@ -19,7 +19,7 @@ def derive_name(text: str, taken: Container[str]) -> str:
 
     Args:
         text: Any text.
-        taken: Names in use. If the derived name is one of them, it gets the ending `-arm`.
+        taken: Names in use. `-arm` is appended to a derived name that is in use.
     """
     plain = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode().lower()
     name = re.sub("[^a-z0-9_-]+", "-", plain).lstrip("-_")[:40].rstrip("-_") or "arm"

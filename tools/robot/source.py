@@ -27,7 +27,7 @@ UNBALANCED = "balanceinertia"
 DEFAULT_FRICTION_TIME_S = 0.02
 """MuJoCo's default time constant of dry friction.
 
-It makes a damper of dry friction: a light link behind a large gear hardly ever meets all of it.
+It turns dry friction into damping: a light link behind a large gear hardly ever gets all of it.
 """
 LARGE_M = 20.0
 """A model with larger parts than this is probably in millimetres."""
@@ -51,7 +51,7 @@ class Source:
 
 
 def read_source(path: Path) -> Source:
-    """Read a model file. Raises `RobotError` with a message of one line if that is impossible."""
+    """Read a model file. Raises `RobotError` with a one-line message if it cannot be read."""
     root = ModelReader(path).root
     if root.tag == "mujoco":
         source = Source(path, load_spec(path), {})
@@ -131,7 +131,7 @@ def _check_tree(path: Path, root: ElementTree.Element) -> None:
 
 
 def _find_shapes(path: Path, root: ElementTree.Element) -> list[str]:
-    """Give each link of a URDF collision shapes.
+    """Make sure that the links of a URDF have collision shapes.
 
     Returns notes for the user. Raises `RobotError` if no link has a shape that can be read.
     """
@@ -164,6 +164,7 @@ def _find_shapes(path: Path, root: ElementTree.Element) -> list[str]:
 
 
 def _is_only_visible(link: ElementTree.Element) -> bool:
+    """Return whether a link has visible shapes but no collision shapes."""
     return link.find("collision") is None and link.find("visual") is not None
 
 

@@ -42,7 +42,7 @@ def attach(rack: str) -> AttachedRack:
 
 
 class AttachedRack:
-    """A running rack. Use it as a context, or `close` it.
+    """A running rack. Use it as a context, or call `close` at the end.
 
     Every error is a `Failure` with the text that the command would print.
     """
@@ -81,7 +81,7 @@ class AttachedRack:
 
     @convert_errors()
     def read(self, mailbox: str) -> Reading[AnyMessage]:
-        """Read a copy of the newest message of a mailbox. This costs no board anything."""
+        """Read a copy of the newest message of a mailbox. This does not delay any board."""
         return open_observer(self._segment, find_mailbox(mailbox, self._boxes).name).peek()
 
     @convert_errors()
@@ -103,9 +103,8 @@ class AttachedRack:
         Args:
             level: Name of the level.
             what: The verb of the command.
-            wait_s: Wait until the command is done, for at most this wall-clock time. None to wait
-                only
-                until the level has taken it up.
+            wait_s: Maximum wall-clock time to wait until the command is done. None to wait only
+                until the level has accepted it.
             goal: Further keys of a `[[command]]` table.
 
         Returns:
@@ -127,11 +126,10 @@ class AttachedRack:
         """Inject a fault, as in `inject("servo", "sensor-bias", joint=2, size=0.05, lasts=0.2)`.
 
         Args:
-            board: Task to strike, or "clock".
+            board: Task to be disturbed, or "clock".
             kind: Kind of fault.
-            wait_s: Wait until the fault is over, for at most this wall-clock time. None to wait
-                only
-                until it has begun.
+            wait_s: Maximum wall-clock time to wait until the fault is over. None to wait only until
+                it has begun.
             fields: Further keys of a `[[fault]]` table, with `lasts` in place of `for`.
 
         Returns:
@@ -154,7 +152,7 @@ class AttachedRack:
 
     @convert_errors()
     def estop(self, reset: bool = False) -> None:
-        """Engage the brakes from the next tick on, or with `reset` let the arm move again."""
+        """Engage the brakes from the next tick on, or with `reset` allow the arm to move again."""
         lines = UtilityLines(self._segment)
         lines.reset_emergency_stop() if reset else lines.latch_emergency_stop()
 
@@ -164,10 +162,11 @@ class AttachedRack:
 
         Args:
             condition: A comparison of a signal with a number or a state.
-            timeout_s: Longest wait, wall-clock time.
+            timeout_s: Maximum wall-clock time to wait.
 
         Returns:
-            Tick of the first message, the newest one or a later one, for which it holds.
+            Tick of the first message for which the condition holds. The search begins with the
+            newest message.
         """
         trigger = Trigger.parse(condition, self._boxes)
         tap = SignalReader(self._segment, [trigger.signal])
@@ -184,15 +183,14 @@ class AttachedRack:
 
     @convert_errors()
     def wait_for(self, event: str, timeout_s: float) -> Event:
-        """Wait for an event since the rack was attached. Each event is returned once.
+        """Wait for an event, and return it. Events since the rack was attached count.
 
-        Events of a rack that misses many cycles are overwritten unless they are read within
-        seconds.
-        `Rack.events` has all of them.
+        Each event is returned once. Events of a rack that misses many cycles are overwritten unless
+        they are read within seconds. `Rack.events` has all of them.
 
         Args:
             event: Kind or code, as in `detection` or `rejoined`.
-            timeout_s: Longest wait, wall-clock time.
+            timeout_s: Maximum wall-clock time to wait.
         """
         for _ in self._poll_rack(timeout_s):
             self._events += [alarm.event for alarm in self._alarms.read_alarms()]
@@ -204,23 +202,23 @@ class AttachedRack:
         raise self._build_timeout(f"{event}{lost}", timeout_s)
 
     def _poll_rack(self, timeout_s: float) -> Iterator[None]:
-        """Yield at each reading of the rack, until the time or the run is over."""
+        """Yield before each reading of the rack, until the time-out or the end of the run."""
         deadline = time.monotonic() + timeout_s
         is_last = False
         while not is_last:
-            # Read this before the caller reads the rack, so that it sees all up to the end.
+            # Read this first, so that the caller's last reading includes the end of the run.
             is_last = self._segment.run_is_over or time.monotonic() > deadline
             yield
             time.sleep(READ_INTERVAL_S)
 
     def _build_timeout(self, awaited: str, timeout_s: float) -> Failure:
-        """Return the failure of a wait."""
+        """Return the `Failure` for a wait that ended without the awaited event."""
         why = "the run is over" if self._segment.run_is_over else f"not within {timeout_s:g} s"
         return Failure(f"rack '{self._segment.rack}', {awaited}: {why}")
 
     @convert_errors()
     def record(self, folder: str | Path | None = None) -> Path:
-        """Record the rack until it is closed, from the two seconds that its rings still hold.
+        """Record the rack until `close`, beginning with the two seconds that its rings still hold.
 
         Args:
             folder: Folder of the recording. None for runs/<rack>-<time>.
@@ -240,7 +238,7 @@ class AttachedRack:
 
 
 def _check_reply(reply: Reply) -> Reply:
-    """Return a reply. Raises `Failure` if the level refused the command."""
+    """Return a reply unchanged. Raises `Failure` if the level refused the command."""
     if not reply.worked:
         raise Failure(reply.line)
     return reply

@@ -47,15 +47,14 @@ class LaunchedRack(CrateRack):
             config: A config by name or path, or a loaded one.
             lockstep: Start a tick only when every due task has finished: exact and repeatable.
             settings: Values in place of the config's, by dotted keys or nested: {"clock.speed": 2}
-                or
-                {"clock": {"speed": 2}}. A key that contains a dot is quoted, as in TOML.
+                or {"clock": {"speed": 2}}. A key that contains a dot is quoted, as in TOML.
             faults: A fault script by name or path.
             out: New or empty folder into which the run is recorded, as `rack run` does. None to
                 record nothing.
             on_event: Called with every event when it happens.
 
         Raises:
-            ConfigError: The config, a setting or a fault has mistakes: all of them.
+            ConfigError: The config, a setting or a fault has mistakes, which are all listed.
             Failure: `out` is not empty.
         """
         overrides = [*list_settings(settings), *["clock.mode=lockstep"] * lockstep]
@@ -74,7 +73,7 @@ class LaunchedRack(CrateRack):
         return f"<rack '{self.config.name}': {end}, {where}>"
 
     def _handle_event(self, event: Event) -> None:
-        """Log an event, and pass it to the program."""
+        """Log an event, and pass it to the program's handler."""
         if self._record is not None:
             self._record.log.add_event(event)
         if self._on_event is not None:
@@ -146,7 +145,7 @@ class RunRecord:
         self._began_s = time.monotonic()
 
     def log_news(self) -> None:
-        """Log news of the recorder, and standstills.
+        """Log new messages of the recorder, and holds that have become standstills.
 
         Raises `Failure` if the recorder cannot write.
         """
@@ -156,7 +155,7 @@ class RunRecord:
             self.log.add_event(event)
 
     def await_begun(self) -> None:
-        """Wait until the recorder has begun, because it could not attach to a closed rack."""
+        """Wait until the recorder is attached, because it cannot attach to a closed rack."""
         self._recorder.wait_until_attached()
 
     def finish_files(self, rack: LaunchedRack) -> None:
@@ -170,4 +169,5 @@ class RunRecord:
                 self.log.write_outcome(asdict(result))
 
     def _log_text(self, text: str) -> None:
+        """Log a message of the recorder as an event."""
         self.log.add_event(Event(time.time_ns(), -1, "recorder", "", text))

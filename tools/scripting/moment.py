@@ -14,11 +14,10 @@ from rack.tools.recording.signal import Signal, find_mailbox
 
 
 class RecordedMoment:
-    """A run before the tasks released at `tick` begin.
+    """State of a recorded run just before the tasks released at `tick` begin.
 
-    Every error is a `Failure`. Messages come from the recording. For the objects of levels, and for
-    a
-    rack that continues from this tick, the run is repeated up to it.
+    Every error is a `Failure`. Messages come from the recording. To read the objects of levels, or
+    to continue the rack from this tick, the run is repeated up to it.
     """
 
     def __init__(self, recording: Recording, in_force: VisibleMessages, tick: int) -> None:
@@ -31,16 +30,16 @@ class RecordedMoment:
 
     @property
     def time_s(self) -> float:
-        """Simulated time of the tick, s."""
+        """Simulated time of the tick in s."""
         return round(self.tick * self._recording.layout.clock_ns * 1e-9, 9)
 
     def read(self, mailbox: str) -> AnyMessage:
-        """Return the message in force, as a task released at this tick would read it."""
+        """Return the message that a task released at this tick would read."""
         content = self.row(find_mailbox(mailbox, self._recording.layout.timed).name)["message"]
         return AnyMessage(content.dtype, memoryview(bytearray(content.tobytes())))
 
     def row(self, mailbox: str) -> Any:
-        """Return the message in force with its header, as a row of the ring. Raises `Failure`."""
+        """Return the message of `read` with its header, as a row of the ring. Raises `Failure`."""
         row = self._in_force.find_row(mailbox, self.tick)
         if row is None:
             raise Failure(f"{mailbox}: no message yet at {self.time_s:g} s", 2)
@@ -56,7 +55,7 @@ class RecordedMoment:
 
     @property
     def mailboxes(self) -> dict[str, AnyMessage]:
-        """The messages in force, by mailbox."""
+        """The messages that tasks released at this tick would read, by mailbox."""
         names = (box.name for box in self._recording.layout.timed)
         return {
             name: self.read(name)
@@ -65,7 +64,7 @@ class RecordedMoment:
         }
 
     def levels(self, anyway: bool = False) -> dict[str, Document]:
-        """Return the attributes of the levels' objects as plain data, by task.
+        """Return the attributes of each level's object as plain data, by task.
 
         Args:
             anyway: True to repeat the run even if its code or files have changed since.

@@ -37,9 +37,8 @@ class RecordedRun:
 
     Attributes:
         folder: Folder of the run.
-        signals: Every field of every mailbox, by name. A number of a field can be looked up as
-            well, as
-            in `servo.status.position[2]`.
+        signals: Every field of every mailbox, by name. One number of a field can be looked up as
+            well, as in `servo.status.position[2]`.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -54,7 +53,7 @@ class RecordedRun:
         return f"<run {self.folder} of rack '{rack}': {end}, {len(self.signals)} signals>"
 
     def at(self, time_s: float) -> RecordedMoment:
-        """Return the run at a simulated time, s. Raises `Failure` for a time outside the run."""
+        """Return the run at a simulated time in s. Raises `Failure` for a time outside the run."""
         tick = parse_tick(self._recording, str(time_s))
         return RecordedMoment(self._recording, self._in_force, tick)
 
@@ -69,7 +68,7 @@ class RecordedRun:
         return load_report(self.folder)[0]
 
     def to_pandas(self, mailbox: str) -> DataFrame:
-        """Return a table of all messages of a mailbox, as `RecordedSignal.to_pandas` does."""
+        """Return a table of all messages of a mailbox. See `RecordedSignal.to_pandas`."""
         box = find_mailbox(mailbox, self._recording.layout.mailboxes)
         return _build_table([self.signals[signal.name] for signal in list_signals(box)])
 
@@ -126,23 +125,25 @@ class RecordedSignal:
 
     @property
     def time_s(self) -> np.ndarray:
-        """Simulated times at which the messages were released, (messages,), s."""
+        """Simulated times in s at which the messages were released, (messages,)."""
         return self.ticks * (self._recording.layout.clock_ns * 1e-9)
 
     def to_pandas(self) -> DataFrame:
         """Return a table with a row for each message, indexed by time_s.
 
-        It has the tick, and a column for each number. States are given by name. Raises `Failure`
-        without
-        pandas.
+        Its columns are the tick and each number of the signal. States are given by name. Raises
+        `Failure` without pandas.
         """
         return _build_table([self])
 
     def plot(self, axes: Axes | None = None) -> Axes:
-        """Plot the signal over simulated time, with marks at the beginning of faults and at deaths.
+        """Plot the signal over simulated time, and mark where faults begin and processes die.
 
         Args:
-            axes: Axes of matplotlib to draw on. None for those of a new figure.
+            axes: Axes of matplotlib to draw on. None for a new figure.
+
+        Returns:
+            The axes.
 
         Raises:
             Failure: The signal is a text, or matplotlib is missing.
@@ -174,7 +175,7 @@ class RecordedSignal:
     def _list_marks(self) -> dict[int, str]:
         """Return the texts that a plot marks, by tick.
 
-        A death replaces the fault at the same tick.
+        If a process died at the tick at which a fault begins, the later event is marked.
         """
         marks: dict[int, str] = {}
         for event in _list_events(self._recording):

@@ -1,7 +1,7 @@
 """Navigation through a recorded run, tick by tick, with branches.
 
-`rack rewind` is the prompt for it. A tick is shown as the tasks released at it are about to find
-it. Messages come from the recording. Objects of levels are read in copies of their processes:
+`rack rewind` is its prompt. A tick is shown in the state that the tasks released at it are about to
+read. Messages come from the recording. Objects of levels are read in copies of their processes, the
 snapshots that a repeated run of the rack leaves.
 """
 
@@ -34,7 +34,7 @@ from rack.tools.scripting.moment import RecordedMoment
 
 @dataclass(frozen=True)
 class RewindAnswer:
-    """The answer to one step of the navigation, as plain data and as lines for people."""
+    """The answer to one command of the navigation, as plain data and as readable lines."""
 
     document: Document
     lines: Iterable[str]
@@ -43,7 +43,7 @@ class RewindAnswer:
 class RewoundRun:
     """A recorded run and the current `tick`.
 
-    Use it as a context, which repeats the run in the background and keeps snapshots of it.
+    Use it as a context, in which the run is repeated in the background and leaves snapshots.
     """
 
     def __init__(self, folder: Path, anyway: bool = False) -> None:
@@ -71,7 +71,7 @@ class RewoundRun:
             self._again.crate.end_crate()
 
     def _prepare_repeated_run(self) -> RepeatedRun:
-        """Return the repeated run, which is started again if its crate was lost."""
+        """Return the repeated run. It is started again if its crate was lost."""
         if self._again is None or self._again.crate.is_over:
             self._again = RepeatedRun(self.recording, anyway=self._anyway)
         return self._again
@@ -82,15 +82,15 @@ class RewoundRun:
         return [*self._tasks, *self._boxes, *self._signals]
 
     def to_time_s(self, tick: int) -> float:
-        """Convert a tick to simulated time, s."""
+        """Convert a tick to simulated time in s."""
         return round(tick * self._layout.clock_ns * 1e-9, 9)
 
     def go_to_time(self, time_s: str) -> RewindAnswer:
-        """Go to a simulated time, s. Raises `Failure` if it was not recorded."""
+        """Go to a simulated time, given in s. Raises `Failure` if it was not recorded."""
         return self._go_to_tick(parse_tick(self.recording, time_s))
 
     def step(self, ticks: int) -> RewindAnswer:
-        """Go forward by some ticks, or back if the number is negative."""
+        """Go forward by a number of ticks, or back if the number is negative."""
         return self._go_to_tick(parse_tick(self.recording, str(self.to_time_s(self.tick + ticks))))
 
     def go_to_condition(self, condition: str, back: bool = False) -> RewindAnswer:
@@ -110,18 +110,21 @@ class RewoundRun:
 
     @property
     def _moment(self) -> RecordedMoment:
+        """The recorded run at the current tick."""
         return RecordedMoment(self.recording, self._in_force, self.tick)
 
     @property
     def _time_text(self) -> str:
+        """Current time and tick as text."""
         return f"{self.to_time_s(self.tick):g} s, tick {self.tick}"
 
     def _go_to_tick(self, tick: int) -> RewindAnswer:
+        """Make a tick the current one, and return it as the answer."""
         self.tick = tick
         return RewindAnswer({"tick": tick, "time_s": self.to_time_s(tick)}, [self._time_text])
 
     def show_name(self, name: str) -> RewindAnswer:
-        """Show the attributes of a level, the message in force in a mailbox, or a signal.
+        """Show the attributes of a level, the message of a mailbox at this tick, or a signal.
 
         Raises `Failure` with the nearest names for an unknown one.
         """
@@ -145,17 +148,18 @@ class RewoundRun:
         )
 
     def _build_answer(self, name: str, value: Any, lines: Iterable[str]) -> RewindAnswer:
-        """Build the answer of `show_name`."""
+        """Combine plain data and lines into the answer of `show_name`."""
         where = {"tick": self.tick, "time_s": self.to_time_s(self.tick)}
         return RewindAnswer({**where, "name": name, "value": value}, lines)
 
     def _show_message(self, mailbox: str) -> RewindAnswer:
+        """Show the message of a mailbox that a task released at this tick would read."""
         text = MessageFormatter(self._boxes[mailbox], self._layout.clock_ns)
         document = text.to_document(self._moment.row(mailbox), self.tick)
         return self._build_answer(mailbox, document, text.format_lines(document))
 
     def _show_level(self, task: str) -> RewindAnswer:
-        """Show the attributes of a level. They are read once for each tick."""
+        """Show the attributes of a level. They are read again only when the tick has changed."""
         tick, levels = self._levels
         if tick != self.tick:
             with convert_errors():
@@ -167,7 +171,7 @@ class RewoundRun:
         )
 
     def list_events(self, around_s: float) -> RewindAnswer:
-        """Show the events within a time before and after this tick."""
+        """Show the events within `around_s` before and after this tick."""
         span = around_s * 1e9 / self._layout.clock_ns
         events = (event for event in self.recording.events if event.get("tick", -1) >= 0)
         nearby_events = [event for event in events if abs(event["tick"] - self.tick) <= span]
@@ -186,15 +190,14 @@ class RewoundRun:
         seconds: float | None,
         display: Display,
     ) -> RewindAnswer:
-        """Run the rack from this tick with other settings or faults, and record that.
+        """Run the rack from this tick with other settings or faults, and record the branch.
 
         Args:
             settings: Changed values, as KEY=VALUE.
             faults: A fault script by name or path, or None.
             out: Folder of the branch. None for runs/<rack>-<time>.
             seconds: Simulated time from the beginning of the recorded run. None for the duration of
-                that
-                run if it was limited, otherwise until the task ends.
+                that run if it was limited, otherwise until the task ends.
             display: Shows the branch while it runs.
 
         Raises:
@@ -226,7 +229,7 @@ class RewoundRun:
 def _flatten_attributes(
     attributes: Mapping[str, Any], outer: str = ""
 ) -> Iterable[tuple[str, Any]]:
-    """Yield attributes by dotted names, including the attributes of nested objects."""
+    """Yield attributes under dotted names. Nested objects are replaced by their attributes."""
     for name, value in attributes.items():
         if isinstance(value, dict):
             yield from _flatten_attributes(value, f"{outer}{name}.")

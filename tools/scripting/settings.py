@@ -13,11 +13,11 @@ from rack.boards.errors import ConfigError, Mistake
 
 
 def list_settings(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
-    """Yield the settings in tables of Python values, in the form that --set takes.
+    """Convert tables of Python values to settings, in the form that --set takes.
 
     Args:
         tables: Values by key. Keys may be dotted, and values may be tables.
-        outer: Dotted beginning of all keys.
+        outer: Dotted prefix of all keys.
 
     Raises:
         ConfigError: TOML cannot express a value.

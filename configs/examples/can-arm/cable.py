@@ -48,7 +48,7 @@ class Cable:
             send(self._bus, kind, self._node, data)
 
     def receive(self, take: Callable[[Frame], None]) -> None:
-        """Pass frames that have arrived to `take`, in order, stamped by CLOCK_MONOTONIC."""
+        """Pass frames that have arrived to `take`, in order, with CLOCK_MONOTONIC time stamps."""
         late_s = self._size if self.disturbance is Disturbance.LATE else 0.0
         # The kernel stamps frames at arrival, so it does not matter when this process reads them.
         epoch_s = time() - monotonic() - late_s
@@ -63,12 +63,13 @@ class Cable:
             take(self._coming.popleft())
 
     def _disturb(self, kind: int, seconds: float, size: float) -> None:
+        """Start a disturbance in place of the current one."""
         self._kind = next((known for known in Disturbance if known == kind), Disturbance.NONE)
         self._size = size
         self._until_s = monotonic() + seconds
 
     def _count_copies(self) -> int:
-        """Return how often a frame is delivered."""
+        """Return how many times a frame is delivered: 0 if it is lost."""
         kind = self.disturbance
         if kind in (Disturbance.UNPLUGGED, Disturbance.BUS_OFF):
             return 0

@@ -15,7 +15,7 @@ from rack.levels.robot.cell import Cell
 from rack.levels.tables import SceneConfig
 
 INCOMPLETE = 20
-"""Largest number of ticks with incomplete reports that are kept."""
+"""Maximum number of ticks whose incomplete reports are kept."""
 ANSWER_S = 5.0
 """Time within which drives must answer an enable request; they may still be booting."""
 ON = (Power.SWITCHED_ON, Power.OPERATION_ENABLED)
@@ -27,12 +27,11 @@ UP: dict[int, Control] = {
 
 
 class CanArm(Arm):
-    """Sends a SYNC and a command in every cycle, and reads the reports that have arrived. It never
-    blocks.
+    """Sends a SYNC and a command in every cycle, and reads the reports that have arrived.
 
-    A sample is complete when all drives have answered the same SYNC. The arm is enabled while all
-    drives are switched on. If a drive leaves this state, reports a fault or is silent, the arm has
-    a fault, and all other drives are switched off.
+    No method blocks. A sample is complete when all drives have answered the same SYNC. The arm is
+    enabled while all drives are switched on. If a drive leaves this state, reports a fault or is
+    silent, the arm has a fault, and all other drives are switched off.
     """
 
     def __init__(
@@ -57,7 +56,7 @@ class CanArm(Arm):
         return self._sample
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Command torques; brake if one is beyond its limit or NaN."""
+        """Command torques, or brake if one of them is NaN or beyond its limit."""
         finding = self.refused(torque)
         if finding is not None:
             self.brake()
@@ -75,7 +74,7 @@ class CanArm(Arm):
         self._send_command([self._next_control(joint) for joint in range(self._joints)])
 
     def step(self, ticks: int) -> None:
-        """Advance the time: read the frames that have arrived, and request the next sample."""
+        """Advance the time: read frames that have arrived, and request the next sample."""
         self.tick += ticks
         self.waited += ticks
         self.braked = self.braked or self.waited >= self.patience
@@ -89,7 +88,7 @@ class CanArm(Arm):
             wire.send(self._bus, wire.HEARTBEAT, wire.RACK, wire.OPERATIONAL)
 
     def enable(self) -> None:
-        """Request the drives to become ready for torque."""
+        """Ask the drives to get ready for torque."""
         self._request_power()
         self.state = DriveState.ENABLING
 
@@ -107,24 +106,28 @@ class CanArm(Arm):
             self._reset_until = self.tick + wire.SILENT_S * self._rate_hz
 
     def restore(self, state: ArmState) -> None:
-        """Continue after a restart of the board; the drives kept their states, or their watchdogs
-        braked."""
+        """Continue after a restart of the board.
+
+        Meanwhile the drives have kept their states, or have braked by their watchdogs.
+        """
         super().restore(state)
         if self.state is not DriveState.DISABLED:
             self._request_power()
 
     def _request_power(self) -> None:
+        """Note that the drives are to be enabled, and give them time to answer."""
         self._wanted = True
         self._newest.clear()  # silent drives have old reports
         self._heard = [self.tick + ANSWER_S * self._rate_hz] * self._joints
 
     def _send_command(self, control: list[Control]) -> None:
+        """Send the torques, with a control word for each drive."""
         wire.send(self._bus, wire.COMMAND, 0, wire.command(self.tick, control, self.torque))
 
     def _next_control(self, joint: int) -> Control:
-        """Return the control word that leads a braked drive to its wanted state."""
+        """Return the control word that brings a braked drive closer to the wanted state."""
         if self._wanted and joint not in self._newest:
-            # After a restart of the board it may be on. SWITCH_ON then only removes its torque.
+            # The drive may be on after a restart of the board. SWITCH_ON then only removes torque.
             return Control.SWITCH_ON
         power = self._newest[joint].power if joint in self._newest else Power.FAULT
         if power == Power.FAULT and self.tick < self._reset_until:
@@ -132,11 +135,12 @@ class CanArm(Arm):
         return UP.get(power, Control.DISABLE_VOLTAGE) if self._wanted else Control.DISABLE_VOLTAGE
 
     def _take_frame(self, joint: int, frame: wire.Frame) -> None:
+        """Process a frame from the drive of a joint. The last missing report completes a sample."""
         self._heard[joint] = self.tick
         if frame.kind != wire.STATUS:
             return
         report = Report(*wire.REPORT.unpack_from(frame.data))
-        # Ignore late reports, and reports of another run, which are from the future.
+        # Ignore late reports, and reports of another run, whose ticks may be in the future.
         if not self._sample.tick < report.tick <= self.tick:
             return
         self._newest[joint] = report
@@ -160,7 +164,7 @@ class CanArm(Arm):
             self.state = DriveState.ENABLED
 
     def _find_fault(self) -> str:
-        """Return the fault of the first faulty drive as text, empty without one."""
+        """Return the fault of the first faulty drive as text. Empty if there is none."""
         silent = self.tick - wire.SILENT_S * self._rate_hz
         for joint, heard in enumerate(self._heard):
             if self._wanted and heard < silent:

@@ -16,7 +16,7 @@ from rack.backplane.process import die_with_parent, name_process, set_priority
 PRIORITY = 79
 """Below the servo level, which must not wait for drives, and above all others."""
 LOOKS = 2
-"""Reads of the bus per tick. If every frame woke seven drives, they would take 1.5 cores."""
+"""Reads of the bus per tick. If every frame woke all seven drives, they would use 1.5 cores."""
 DRIFT_S = 1e-7
 """Largest drift per tick between the clocks of rack and drive."""
 WINDOW_S = 5e-3
@@ -42,15 +42,17 @@ def next_power(power: Power, control: int) -> Power:
 
 
 class TickClock:
-    """Estimates the times of the rack's ticks from SYNC frames, which may be late but never
-    early."""
+    """Estimates the times of the rack's ticks from SYNC frames.
+
+    SYNC frames may be late, but are never early.
+    """
 
     def __init__(self, tick_s: float) -> None:
         self._tick_s = tick_s
         self._start_s = 0.0
 
     def at(self, tick: int, came_s: float) -> float:
-        """Return the time, s, of a tick whose SYNC arrived at `came_s`."""
+        """Return the time in s of a tick whose SYNC arrived at `came_s`."""
         start_s = came_s - tick * self._tick_s
         # A very late SYNC, or one of another run, is accepted; the next timely one corrects it.
         if not self._start_s < start_s < self._start_s + WINDOW_S:
@@ -60,7 +62,7 @@ class TickClock:
 
 
 class Drive:
-    """Obeys and answers the frames for one node."""
+    """Processes the frames for one node, and answers them."""
 
     def __init__(
         self,
@@ -76,8 +78,8 @@ class Drive:
             node: Node on the bus.
             joint: The joint to drive.
             send: Sends a frame, given its kind and data.
-            times_s: Length of a tick, and time without a torque after which the brake engages, s.
-            now_s: Current time, s.
+            times_s: Length of a tick, and time without a torque after which the brake engages.
+            now_s: Current time.
         """
         self.power = Power.SWITCH_ON_DISABLED
         self.fault = 0
@@ -108,6 +110,7 @@ class Drive:
             self._heard_s = came_s
 
     def _obey(self, orders: wire.Orders, came_s: float) -> None:
+        """Execute the order for this drive in a command."""
         control = int(orders["control"][self._node - 1])
         power = next_power(self.power, control)
         if power is not self.power:
@@ -117,7 +120,12 @@ class Drive:
             self._joint.drive(orders["torque"] * wire.UNIT)
 
     def watch(self, now_s: float, trouble: Disturbance) -> None:
-        """Detect faults and time-outs at `now_s`, s, and send the heartbeat."""
+        """Detect faults and time-outs, and send the heartbeat.
+
+        Args:
+            now_s: Current time.
+            trouble: Current disturbance of the drive.
+        """
         fault = DEFECTS.get(trouble, 0)
         if now_s - self._heard_s > wire.SILENT_S:
             fault = fault or wire.NO_HEARTBEAT
@@ -126,13 +134,14 @@ class Drive:
         if now_s - self._driven_s > self._patience_s:
             if self.power is Power.OPERATION_ENABLED:
                 self._turn(Power.SWITCHED_ON)
-            # Not up to now, because the SYNC of an earlier time may still arrive.
+            # Leave out the last `WINDOW_S`, because a SYNC for that time may still arrive.
             self._joint.advance(now_s - WINDOW_S)
         if now_s - self._beat_s > wire.HEARTBEAT_S:
             self._beat_s = now_s
             self._send(wire.HEARTBEAT, wire.OPERATIONAL)
 
     def _turn(self, power: Power, fault: int = 0) -> None:
+        """Change the state and the fault, and brake unless the new state permits torque."""
         self.power = power
         self.fault = fault
         if power is not Power.OPERATION_ENABLED:

@@ -28,7 +28,7 @@ class Mechanics:
     """State of all joints."""
 
     def __init__(self, cell: Cell, now_s: float) -> None:
-        """Start at home, braked, at `now_s`, s."""
+        """Start at home at time `now_s`, with brakes engaged."""
         self.cell = cell
         joints = len(cell.home)
         memory = mmap.mmap(-1, ROWS * joints * 8)  # shared with forked processes
@@ -65,8 +65,8 @@ class Joint:
         """Release the brake and apply a torque.
 
         Args:
-            torque: Torques of all joints from the same command, (joints,), N m. With nearly
-                parallel axes, torques of different cycles would disturb a joint strongly.
+            torque: Torques of all joints from the same command, (joints,), in N m. Torques of
+                different cycles would disturb a joint strongly if axes are nearly parallel.
         """
         self._torque = torque
         self._all.braked[self._number] = 0.0
@@ -76,7 +76,7 @@ class Joint:
         self._all.braked[self._number] = 1.0
 
     def advance(self, until_s: float) -> None:
-        """Step the joint to the time `until_s`, s. Earlier times than the joint's are ignored."""
+        """Step the joint to the time `until_s`. Does nothing if the joint is already past it."""
         shared = self._all
         own = self._number
         time_s = shared.time[own]
@@ -95,7 +95,7 @@ class Joint:
         shared.time[own] = until_s
 
     def _acceleration(self, position: Array, velocity: Array, step_s: float) -> Array:
-        """Return the accelerations, rad/s2; braked joints come to rest whatever the load."""
+        """Return the accelerations in rad/s2. Braked joints come to rest whatever the load."""
         inertia, bias = self._dynamics.terms(position, velocity)
         braked = self._all.braked > 0.0
         stopping = np.clip(-velocity / step_s, -self._braking, self._braking) * braked

@@ -34,14 +34,14 @@ RACK = 127
 """Node of the rack, the highest. The nodes of the drives start at 1."""
 SYNC, STATUS, COMMAND, DISTURB, HEARTBEAT = 0x080, 0x180, 0x200, 0x600, 0x700
 BOOTED, OPERATIONAL = b"\x00", b"\x05"
-"""States of a node."""
+"""Heartbeat data: states of a node."""
 HEARTBEAT_S = 0.1
 SILENT_S = 0.5
 """Time without a heartbeat after which a node is lost."""
 LOCAL: dict[str, Any] = {"interface": "udp_multicast", "channel": "239.74.163.2", "hop_limit": 0}
 """Default bus: UDP multicast that does not leave this machine."""
 UNIT = 1e-6
-"""Resolution of the integers for positions, rad, velocities, rad/s, and torques, N m."""
+"""Resolution of the integers for positions (rad), velocities (rad/s) and torques (N m)."""
 MOST = 2**31 - 1
 TICK = struct.Struct("<I")
 ORDER = np.dtype([("control", "<u2"), ("torque", "<i4")])
@@ -119,7 +119,7 @@ def send(bus: can.BusABC, kind: int, node: int, data: bytes) -> None:
     Args:
         bus: The bus.
         kind: First identifier of this kind of frame, to which the node is added.
-        node: Node that sends the frame, or that it is for.
+        node: Node that sends the frame, or to which it is addressed.
         data: Content. More than 8 bytes need CAN FD.
     """
     is_fd = len(data) > 8
@@ -149,7 +149,7 @@ def command(tick: int, control: Sequence[int], torque: NDArray[np.float64]) -> b
     Args:
         tick: Tick of the command.
         control: Control word of each drive.
-        torque: Torque of each drive, (drives,), N m.
+        torque: Torque of each drive, (drives,), in N m.
     """
     orders = np.zeros(MOST_DRIVES, ORDER)
     orders["control"][: len(control)] = control

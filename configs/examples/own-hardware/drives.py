@@ -1,9 +1,8 @@
-"""Stand-in for the driver of your motion controller: drives with encoders, brakes, a time-out, and
-the states of CiA 402.
+"""Stand-in for the driver of a motion controller.
 
-Replace this file with calls of your fieldbus library. It simulates what real drives do: it
-integrates the equation of motion of the arm, and engages the brakes if no torque arrived for two
-cycles.
+It has drives with encoders, brakes, a time-out, and the states of CiA 402. Replace this file with
+calls of your fieldbus library. It simulates what real drives do: it integrates the equation of
+motion of the arm, and engages the brakes if no torque arrived for two cycles.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from rack.levels.robot.dynamics import Dynamics
 
 Array = NDArray[np.float64]
 STEPS = 5
-"""Steps of the integration per tick."""
+"""Integration steps per tick."""
 ENABLING_TICKS = 100
 HOMING_TICKS = 400
 """Ticks for enabling the drives, and for finding their reference before that."""
@@ -48,13 +47,13 @@ class Drives:
         self._waited_ticks = -HOMING_TICKS if self.zero.any() else 0
 
     def leave(self, state: DriveState, fault: str = "") -> None:
-        """Brake, and go to DISABLED or FAULT."""
+        """Brake, and change to state DISABLED or FAULT."""
         self.brake()
         self.state = state
         self.fault = fault
 
     def write(self, torque: Array) -> None:
-        """Release the brakes and apply torques, (joints,), N m."""
+        """Release the brakes and apply torques, (joints,), in N m."""
         self.torque[:] = torque
         self.braked = False
         self._silent_ticks = 0
@@ -76,6 +75,7 @@ class Drives:
             self._silent_ticks += 1
 
     def _move(self) -> None:
+        """Integrate the equation of motion over one tick."""
         for _ in range(STEPS):
             inertia, bias = self._dynamics.terms(self.position, self.velocity)
             friction = self._dynamics.friction(self.velocity)
@@ -83,6 +83,7 @@ class Drives:
             self.position += self._step_s * self.velocity
 
     def _make_ready(self) -> None:
+        """Advance homing and enabling by one tick."""
         self._waited_ticks += 1
         if self._waited_ticks == 0:
             self.zero[:] = 0.0

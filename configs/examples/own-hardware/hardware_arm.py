@@ -47,7 +47,7 @@ class HardwareArm(Arm):
             self.drives.leave(DriveState.FAULT, f"drive {most.argmin() + 1}: motor phase open")
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
-        """Pass on torques; brake if one is beyond its limit or NaN."""
+        """Pass on torques, or brake if one of them is NaN or beyond its limit."""
         finding = self.refused(torque)
         if finding is None:
             self.drives.write(torque)
@@ -65,7 +65,7 @@ class HardwareArm(Arm):
         self.braked = True
 
     def step(self, ticks: int) -> None:
-        """Advance the time."""
+        """Advance the simulated drives by some ticks."""
         self.drives.pass_ticks(ticks)
         self.tick += ticks
         self.waited += ticks

@@ -1,5 +1,7 @@
-"""A control modification that limits the torque which the servo law adds to the load torque, so
-that the arm yields."""
+"""A control modification that makes the arm yield.
+
+It limits the torque that the servo law adds to the load torque.
+"""
 
 from __future__ import annotations
 
@@ -30,6 +32,6 @@ class Gentle(Modification):
         )  # (joints,), N m
 
     def modify(self, sample: LawSample) -> None:
-        """Limit the law's torque."""
+        """Limit the torque that the law adds to the load torque."""
         added = np.minimum(np.maximum(sample.torque - sample.load, -self.most), self.most)
         sample.torque = sample.load + added

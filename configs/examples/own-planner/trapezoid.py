@@ -1,5 +1,4 @@
-"""A planner for the primitive level with trapezoidal speed profiles in place of jerk-limited
-trajectories."""
+"""A planner for the primitive level with trapezoidal instead of jerk-limited speed profiles."""
 
 from __future__ import annotations
 
@@ -20,8 +19,10 @@ SAMPLE_RAD = 0.02
 
 
 class TrapezoidPlanner(Planner):
-    """Accelerates, cruises and brakes along the path, with one speed and one acceleration between
-    stops."""
+    """Accelerates, cruises and brakes along the path.
+
+    Between two stops the speed limit and the acceleration are constant.
+    """
 
     above = Input(MoveCommand, "above.command")
     status = Input(PrimitiveStatus, "own.status")
@@ -33,14 +34,14 @@ class TrapezoidPlanner(Planner):
         self.made = (0, 0.0)  # newest plan: segment, and path parameter at its start, rad
 
     def wanted(self, tick: int) -> bool:
-        """Return whether the executor needs a trajectory that has not been planned."""
+        """Return whether the executor needs a trajectory that has not been planned yet."""
         status = self.status.message
         return (
             status.wants in window(self.above.message) and (status.wants, status.begin) != self.made
         )
 
     def plan(self, tick: int) -> None:
-        """Plan the trajectory of a segment, or report the reason for which it is impossible."""
+        """Plan the trajectory of a segment, or report why that is impossible."""
         status = self.status.message
         self.made = status.wants, status.begin
         self.output.clear()
@@ -63,15 +64,15 @@ class TrapezoidPlanner(Planner):
     def find_sections(
         self, path: BlendedPath, begin: float
     ) -> list[tuple[float, float, float, float, float]]:
-        """Return the sections of the trajectory, and its end.
+        """Return the sections of the trajectory, followed by its end point.
 
         Args:
             path: Path of the segment.
-            begin: Path parameter at the start, rad.
+            begin: Path parameter at the start in rad.
 
         Returns:
-            For each section the start time, s, then position, rad, velocity, acceleration and jerk
-            of the path parameter.
+            For each section the start time in s, then position (rad), velocity, acceleration and
+            jerk of the path parameter.
         """
         sections = []
         start_s = 0.0
@@ -90,15 +91,15 @@ class TrapezoidPlanner(Planner):
         return [*sections, (start_s, path.length, 0.0, 0.0, 0.0)]
 
     def find_limits(self, path: BlendedPath, first: float, last: float) -> tuple[float, float]:
-        """Compute the limits of the path parameter that all joints permit on a part of the path.
+        """Compute the speed and acceleration of the path parameter that all joints permit.
 
         Args:
             path: Path of the segment.
-            first: Path parameter at the beginning of the part, rad.
-            last: Path parameter at its end, rad.
+            first: Path parameter at the beginning of the part in rad.
+            last: Path parameter at the end of the part in rad.
 
         Returns:
-            Largest speed, rad/s, and acceleration, rad/s2.
+            Largest speed in rad/s and acceleration in rad/s2.
         """
         speeds = []
         accelerations = []

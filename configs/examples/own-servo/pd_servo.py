@@ -23,7 +23,7 @@ class PdServo(ServoLaw):
     settings: Gains
 
     def torques(self, set_point: Motion, sensed: SensedMotion) -> Array:
-        """Return the torques, (joints,), N m."""
+        """Return the torques, (joints,), in N m."""
         gains = self.settings
         error = set_point.position - sensed.position
         slip = set_point.velocity - sensed.velocity

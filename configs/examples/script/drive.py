@@ -20,8 +20,11 @@ SHOWN = {"command", "detection", "reaction", "recovery", "end"}
 
 
 def main(seconds: float | None = None) -> int:
-    """Run the rack to the end of its task, or for `seconds` of simulated time; return an exit
-    status."""
+    """Run the rack, and return an exit status.
+
+    Args:
+        seconds: Simulated duration of the run. None to run until the task ends.
+    """
     with Rack.from_file("nasrem", SETTINGS) as rack:
         rack.command("task", "hold", tick=2600)
         rack.command("task", "resume", tick=3000)
