@@ -159,7 +159,7 @@ def _call(argv: Sequence[str], lines: Iterable[str] = ()) -> str:
     """Run a command with these lines as its input, and return what it prints. Raises `Failure`."""
     called = f"network lab: {' '.join(argv)}"
     text = "".join(f"{line}\n" for line in lines)
-    done = run_program(called, argv, PATIENCE_S, text=text)
+    done = run_program(called, argv, PATIENCE_S, input_text=text)
     if done.returncode:
         why = " ".join(done.stderr.split()) or f"exit status {done.returncode}"
         raise Failure(f"{called}: {why}")
