@@ -14,13 +14,13 @@ Source = str | Mapping[str, str]
 """Source of an input port: the name of a mailbox, or several names by board."""
 
 
-EntityRows = Sequence[tuple[int, int, bytes]]
+MessageRows = Sequence[tuple[int, int, bytes]]
 """Messages of a mailbox in a recorded run, oldest first.
 
 Each row has the tick at which a message was written, the tick of the oldest information on which it
 depends, and its bytes. For a mailbox that is written in every cycle, only changes have rows.
 """
-ExchangedEntries = Mapping[str, EntityRows]
+RecordedEntries = Mapping[str, MessageRows]
 """Messages that an adapter wrote in a recorded run, by port."""
 
 
@@ -116,7 +116,7 @@ class TaskWiring:
     guards_clock: bool
     sent: tuple[str, ...]
     fails_self_test: bool
-    entries: ExchangedEntries | None
+    entries: RecordedEntries | None
     transfer: BusTimes
     exchange: Mapping[str, ExchangeSpec]
     reservation: Reservation | None

@@ -31,8 +31,8 @@ from rack.boards.faults.kind import KINDS
 from rack.boards.wiring import (
     BusTimes,
     ClockWiring,
-    ExchangedEntries,
     HostWiring,
+    RecordedEntries,
     TaskWiring,
     list_mailboxes,
 )
@@ -102,7 +102,7 @@ class Resolved:
     published: PublishedRack
     goals: Mapping[int, GoalConfig]
 
-    def for_run(self, repeats: str, entries: Mapping[str, ExchangedEntries] | None) -> Resolved:
+    def for_run(self, repeats: str, entries: Mapping[str, RecordedEntries] | None) -> Resolved:
         """Return a copy for one run.
 
         Args:

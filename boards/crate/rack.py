@@ -29,7 +29,7 @@ from rack.boards.crate.supervisor import STOP_S, Supervisor
 from rack.boards.errors import ConfigError, Mistake, SnapshotError
 from rack.boards.events import CONTINUATION_CODE, Event, Journal, Outcome
 from rack.boards.faults.kind import KINDS
-from rack.boards.wiring import Continuation, ExchangedEntries, SnapshotPolicy
+from rack.boards.wiring import Continuation, RecordedEntries, SnapshotPolicy
 
 LAUNCH_S = 60.0
 """Time limit for each step of the launch, such as preloading one class or starting all boards."""
@@ -69,7 +69,7 @@ class Rack:
         on_event: Callable[[Event], None] | None = None,
         share: bool = True,
         crate: CrateLine | None = None,
-        entries: Mapping[str, ExchangedEntries] | None = None,
+        entries: Mapping[str, RecordedEntries] | None = None,
         snapshots: SnapshotPolicy | None = None,
         continues: Continuation | None = None,
         requests: Sequence[Request] = (),

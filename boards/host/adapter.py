@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from rack.backplane.layout import Layout
 from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
-from rack.boards.wiring import ExchangedEntries
+from rack.boards.wiring import RecordedEntries
 from rack.levels.level import Executor, LevelContext, Reading
 
 STATUS = "status"
@@ -49,7 +49,7 @@ class Adapter(Executor):
         """
         return {}
 
-    def attach_segment(self, segment: Segment, entries: ExchangedEntries | None) -> None:
+    def attach_segment(self, segment: Segment, entries: RecordedEntries | None) -> None:
         """Open what the adapter needs in the segment. The board calls this before the self-test.
 
         Args:

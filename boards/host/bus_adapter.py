@@ -49,7 +49,7 @@ from rack.boards.host.entries import (
     ReplayedEntry,
     read_last_written,
 )
-from rack.boards.wiring import ExchangedEntries
+from rack.boards.wiring import RecordedEntries
 from rack.levels.errors import CannotGoOn
 from rack.levels.level import ConfiguredPorts, Input, LevelContext, Output, QueuedOutput, Sender
 from rack.levels.tables import read_params
@@ -121,7 +121,7 @@ class BusAdapter(Adapter):
         }
         return {**sent, STATUS: False}
 
-    def attach_segment(self, segment: Segment, entries: ExchangedEntries | None) -> None:
+    def attach_segment(self, segment: Segment, entries: RecordedEntries | None) -> None:
         """Open the mailboxes of the host side, or in a replay the recorded messages.
 
         Args:

@@ -17,7 +17,7 @@ from rack.backplane.message import AnyMessage, Message, field, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import get_wake_semaphore
 from rack.backplane.words import Block
-from rack.boards.wiring import EntityRows
+from rack.boards.wiring import MessageRows
 from rack.levels.tables import LAST_TICK, Table
 
 NEVER = -1
@@ -274,13 +274,13 @@ class ReplayedEntry:
     """Entry in a replay: writes the messages of the recorded run again, at the same ticks.
 
     Args:
-        rows: Recorded messages. See `rack.boards.wiring.EntityRows`.
+        rows: Recorded messages. See `rack.boards.wiring.MessageRows`.
         port: Port of the adapter.
         is_sent: Whether messages are sent one by one, in order, and none may be repeated.
         since: Tick up to which messages were already sent, before a restart of the adapter.
     """
 
-    def __init__(self, rows: EntityRows, port: str, is_sent: bool, since: int = NEVER) -> None:
+    def __init__(self, rows: MessageRows, port: str, is_sent: bool, since: int = NEVER) -> None:
         self._rows = rows
         self._port = port
         self._is_sent = is_sent

@@ -35,7 +35,7 @@ from rack.boards.lan.peers import Peers
 from rack.boards.lan.remote_estop import EstopResponder
 from rack.boards.lan.replayed import ReplayedNetwork
 from rack.boards.lan.status import build_status_class
-from rack.boards.wiring import ExchangedEntries
+from rack.boards.wiring import RecordedEntries
 from rack.levels.errors import LevelError
 from rack.levels.level import ConfiguredPorts, Input, LevelContext, Output, TimedOutput
 from rack.levels.peer import PeerPresence, format_peer_port
@@ -113,7 +113,7 @@ class LanAdapter(Adapter):
         imports = read_params(LanTable, params).imports
         return {port: port in imports for port in cls.build_ports(params, {}).outputs}
 
-    def attach_segment(self, segment: Segment, entries: ExchangedEntries | None) -> None:
+    def attach_segment(self, segment: Segment, entries: RecordedEntries | None) -> None:
         """Attach to the segment and continue from the state of the mailboxes.
 
         Args:

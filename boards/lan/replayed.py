@@ -15,7 +15,7 @@ from rack.boards.host.adapter import STATUS
 from rack.boards.host.entries import NEVER, ReplayedEntry, read_last_written
 from rack.boards.lan.entries import Import
 from rack.boards.lan.peers import NO_LAUNCH, Peers
-from rack.boards.wiring import EntityRows, ExchangedEntries
+from rack.boards.wiring import MessageRows, RecordedEntries
 from rack.levels.peer import PeerPresence, Presence, format_peer_port
 
 
@@ -26,7 +26,7 @@ class ReplayedNetwork:
         self,
         segment: Segment,
         board: str,
-        entries: ExchangedEntries,
+        entries: RecordedEntries,
         peers: Peers,
         imports: Mapping[str, Import],
     ) -> None:
@@ -75,7 +75,7 @@ class ReplayedNetwork:
             shown.exchange_messages({}, write, tick)
 
 
-def _list_presence_changes(rack: str, rows: EntityRows) -> Iterator[tuple[int, str, bool]]:
+def _list_presence_changes(rack: str, rows: MessageRows) -> Iterator[tuple[int, str, bool]]:
     """Yield each change of presence: tick, rack, and True if it appeared or False if lost."""
     message = PeerPresence.zeros({})
     last_presence = int(Presence.AWAITED)

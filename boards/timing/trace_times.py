@@ -38,39 +38,39 @@ UNDISTURBED = 10.0
 
 The median would be too large on a host that suspends the machine during nearly every plan.
 """
-EntityRows = np.ndarray
+TraceRows = np.ndarray
 """Trace records of one task, oldest first, (n,), of dtype `rack.backplane.trace.RECORD`."""
 Values = np.ndarray
 """One value per record, (n,), unless a function states otherwise."""
 Distribution = dict[str, float]
 
 
-def compute_lateness_ns(rows: EntityRows) -> Values:
+def compute_lateness_ns(rows: TraceRows) -> Values:
     """Return the time in ns from the release of each cycle to its start."""
     return np.asarray(rows["start_ns"] - rows["release_ns"])
 
 
-def compute_response_ns(rows: EntityRows) -> Values:
+def compute_response_ns(rows: TraceRows) -> Values:
     """Return the time in ns from the release of each cycle to its end."""
     return np.asarray(rows["end_ns"] - rows["release_ns"])
 
 
-def compute_duration_ns(rows: EntityRows) -> Values:
+def compute_duration_ns(rows: TraceRows) -> Values:
     """Return the time in ns from the start of each cycle to its end, including preemption."""
     return np.asarray(rows["end_ns"] - rows["start_ns"])
 
 
-def compute_execution_ns(rows: EntityRows) -> Values:
+def compute_execution_ns(rows: TraceRows) -> Values:
     """Return t_exec of eq. 3.5 or, for a planner, the planning time. Both include preemption."""
     return np.asarray(rows["process_ns"] - rows["read_ns"])
 
 
-def compute_communication_ns(rows: EntityRows) -> Values:
+def compute_communication_ns(rows: TraceRows) -> Values:
     """Return t_comm of eq. 3.5: the time in ns of each cycle that is not execution."""
     return np.asarray(rows["read_ns"] - rows["start_ns"] + rows["end_ns"] - rows["process_ns"])
 
 
-def compute_residual_ns(rows: EntityRows, slice_ns: int) -> Values:
+def compute_residual_ns(rows: TraceRows, slice_ns: int) -> Values:
     """Return t_residual: the time in ns from the end of each cycle to its deadline.
 
     It is negative if the deadline was missed. The deadline is `slice_ns` after the release.
@@ -78,7 +78,7 @@ def compute_residual_ns(rows: EntityRows, slice_ns: int) -> Values:
     return np.asarray(rows["release_ns"] + slice_ns - rows["end_ns"])
 
 
-def compute_gaps_ns(rows: EntityRows, stretches: Values | None = None) -> Values:
+def compute_gaps_ns(rows: TraceRows, stretches: Values | None = None) -> Values:
     """Return the time in ns from the start of each cycle to the next start, shape (n - 1,).
 
     Args:
@@ -90,22 +90,22 @@ def compute_gaps_ns(rows: EntityRows, stretches: Values | None = None) -> Values
     return gaps if stretches is None else gaps[np.diff(stretches) == 0]
 
 
-def find_missed(rows: EntityRows) -> Values:
+def find_missed(rows: TraceRows) -> Values:
     """Return for each cycle whether it missed its deadline or wrote a message too late."""
     return np.asarray((rows["flags"] & Flag.MISSED) > 0)
 
 
-def count_skipped(rows: EntityRows) -> Values:
+def count_skipped(rows: TraceRows) -> Values:
     """Return the number of releases that were skipped just before each cycle."""
     return np.asarray(rows["flags"] >> SKIPPED_SHIFT)
 
 
-def count_misses_and_skips(rows: EntityRows) -> tuple[int, int]:
+def count_misses_and_skips(rows: TraceRows) -> tuple[int, int]:
     """Return the number of missed cycles and the number of skipped releases."""
     return int(np.count_nonzero(find_missed(rows))), int(count_skipped(rows).sum())
 
 
-def select_plans(rows: EntityRows) -> Values:
+def select_plans(rows: TraceRows) -> Values:
     """Return the records of a planner that belong to a plan.
 
     A release at which the planner did not plan may also leave a record.
@@ -173,7 +173,7 @@ class Occupation:
         self._sums = np.cumsum(self.ends - self.starts)
 
     @classmethod
-    def from_records(cls, rows: EntityRows) -> Occupation:
+    def from_records(cls, rows: TraceRows) -> Occupation:
         """Return the times in which a task occupied its core, including wake-up and overhead."""
         half = compute_overhead_ns(rows) // 2
         return cls(rows["start_ns"] - half, rows["end_ns"] + half)
@@ -203,14 +203,14 @@ class Occupation:
         return np.asarray(np.where(begun > 0, self._sums[newest] - beyond, 0))
 
 
-def compute_waking_ns(rows: EntityRows) -> Values:
+def compute_waking_ns(rows: TraceRows) -> Values:
     """Return the processor time in ns that waking up took before the start of each cycle."""
     return np.asarray(
         np.clip(_compute_unstamped_ns(rows), 0, np.maximum(compute_lateness_ns(rows), 0))
     )
 
 
-def compute_overhead_ns(rows: EntityRows) -> int:
+def compute_overhead_ns(rows: TraceRows) -> int:
     """Return the median processor time in ns for waking up and for closing a cycle.
 
     0 if every cycle was disturbed.
@@ -220,7 +220,7 @@ def compute_overhead_ns(rows: EntityRows) -> int:
     return int(np.median(undisturbed)) if len(undisturbed) else 0
 
 
-def _compute_unstamped_ns(rows: EntityRows) -> Values:
+def _compute_unstamped_ns(rows: TraceRows) -> Values:
     """Return the processor time in ns of each cycle outside its time stamps.
 
     It is negative if the cycle was preempted.
@@ -228,7 +228,7 @@ def _compute_unstamped_ns(rows: EntityRows) -> Values:
     return np.asarray(rows["processor_ns"] - compute_duration_ns(rows))
 
 
-def compute_unit_times(rows: EntityRows, above: Occupation) -> Values:
+def compute_unit_times(rows: TraceRows, above: Occupation) -> Values:
     """Return the processor time in ns of each part of a cycle, shape (n, 4).
 
     The parts of an executor are C, R, X and W. Those of a planner are an unused one, reading, P

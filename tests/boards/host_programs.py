@@ -12,7 +12,7 @@ from rack.backplane.message import Command, State, Status, field
 from rack.backplane.segment import Segment
 from rack.boards.host import bus_adapter
 from rack.boards.host.bus_adapter import BusAdapter
-from rack.boards.wiring import ExchangedEntries
+from rack.boards.wiring import RecordedEntries
 from rack.levels.host_program import Bus, HostProgram, ProgramInput, ProgramOutput
 from rack.levels.level import Executor, Input, Output
 
@@ -150,7 +150,7 @@ class Lingering(Host):
 class HastyAdapter(BusAdapter):
     """A bus adapter that waits for a program for a second at most."""
 
-    def attach_segment(self, segment: Segment, entries: ExchangedEntries | None) -> None:
+    def attach_segment(self, segment: Segment, entries: RecordedEntries | None) -> None:
         bus_adapter.LONGEST_S = 1.0
         super().attach_segment(segment, entries)
 

@@ -21,7 +21,7 @@ PERIOD = 8
 TICK_S = CLOCK_NS * 1e-9
 START = np.array([[0.5, 0.3, 0.475], [0.6, 0.3, 0.475], [0.5, -0.3, 0.5]])
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
-PoseWriter = Callable[[float], tuple[Array, Array]]
+Poses = Callable[[float], tuple[Array, Array]]
 
 
 class WorldRig:
@@ -35,7 +35,7 @@ class WorldRig:
     def model(self) -> Message:
         return cast(Message, self.rack.tasks["world"].written["model"])
 
-    def run(self, seconds: float, poses: PoseWriter | None) -> list[int]:
+    def run(self, seconds: float, poses: Poses | None) -> list[int]:
         """Run for `seconds`, with a scene every tick while `poses` is given; return the revisions
         that were seen."""
         revisions = [self.model.revision]
@@ -54,7 +54,7 @@ def resting(_: float) -> tuple[Array, Array]:
     return START, np.tile(UPRIGHT, (3, 1))
 
 
-def sliding(begin_s: float, end_s: float, speed: float) -> PoseWriter:
+def sliding(begin_s: float, end_s: float, speed: float) -> Poses:
     """The first object slides along x between two times."""
 
     def poses(time_s: float) -> tuple[Array, Array]:

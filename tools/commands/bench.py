@@ -26,7 +26,7 @@ Against = Annotated[
         metavar="TREE", help="another checkout of rack, measured alternately with this one"
     ),
 ]
-TrialShare = Annotated[
+Share = Annotated[
     bool,
     typer.Option(
         "--share",
@@ -55,7 +55,7 @@ def machine(
     ),
     seconds: float = option("--seconds S", "time of one run", 5.0, min=0.1),
     rounds: Rounds = 2,
-    share: TrialShare = False,
+    share: Share = False,
     as_json: Json = False,
 ) -> None:
     r"""Is this machine fit for real time, and up to which rate?
@@ -107,7 +107,7 @@ def cycle(
     against: Against = None,
     seconds: float = option("--seconds S", "simulated seconds of one run", 6.0, min=2.0, max=1e9),
     rounds: Rounds = 3,
-    share: TrialShare = False,
+    share: Share = False,
     as_json: Json = False,
 ) -> None:
     """Measure the cost of a board's cycle, part by part.
@@ -154,7 +154,7 @@ def launch(
     rounds: Rounds = 10,
     kills: int = option("--kills N", "kills of the board", 10, min=1),
     against: Against = None,
-    share: TrialShare = False,
+    share: Share = False,
     as_json: Json = False,
 ) -> None:
     """Measure the duration of launches, commands and reactions.

@@ -17,10 +17,10 @@ from rack.tools.console.parameters import Json, RackName, argument, option
 from rack.tools.console.tables import create_console
 from rack.tools.monitor.polling import poll_run
 from rack.tools.monitor.signals import (
-    EntityRows,
     SignalHistory,
     SignalPlot,
     SignalPrinter,
+    SignalRows,
     format_value,
 )
 from rack.tools.recording.signal import Signal, Trigger
@@ -176,7 +176,7 @@ def _await_trigger(segment: Segment, strip: SignalHistory, trigger: Trigger, aft
     return tick
 
 
-def _save_csv(path: Path, strip: SignalHistory, rows: EntityRows) -> None:
+def _save_csv(path: Path, strip: SignalHistory, rows: SignalRows) -> None:
     """Write the captured values as CSV. Raises `Failure` if messages were lost on the way."""
     try:
         with path.open("w", newline="", encoding="utf-8") as file:

@@ -32,7 +32,7 @@ from rack.boards.crate.line import WarmCrate
 from rack.boards.crate.rack import build_cell_config
 from rack.boards.crate.requests import Preload
 from rack.boards.errors import NO_SNAPSHOTS_PREFIX
-from rack.boards.wiring import Continuation, ExchangedEntries, SnapshotPolicy
+from rack.boards.wiring import Continuation, RecordedEntries, SnapshotPolicy
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.launch.launch import Beginning, run_rack
@@ -106,7 +106,7 @@ class RepeatedRun:
         return RepeatedRun(Recording(folder), self._error_prefix, self.crate, self._anyway)
 
     @cached_property
-    def entries(self) -> Mapping[str, ExchangedEntries] | None:
+    def entries(self) -> Mapping[str, RecordedEntries] | None:
         """Messages that host boards and other racks sent in the run.
 
         None if its rack has neither.

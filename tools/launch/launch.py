@@ -16,7 +16,7 @@ from rack.boards import Rack
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import CrateLine
 from rack.boards.events import Event, Outcome
-from rack.boards.wiring import Continuation, ExchangedEntries
+from rack.boards.wiring import Continuation, RecordedEntries
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.faults.ending import Strike, list_strikes
@@ -70,7 +70,7 @@ class Beginning:
     continues: Continuation | None = None
     crate: CrateLine | None = None
     requests: tuple[Request, ...] = ()
-    entries: Mapping[str, ExchangedEntries] | None = None
+    entries: Mapping[str, RecordedEntries] | None = None
     origin: Origin | None = None
 
 

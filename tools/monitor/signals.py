@@ -19,7 +19,7 @@ from rack.tools.recording.signal import Signal
 if TYPE_CHECKING:
     from rich.console import Console
 
-EntityRows = list[tuple[int, list[Any]]]
+SignalRows = list[tuple[int, list[Any]]]
 """Ticks with the value of each signal. A value is None before the first message of its signal."""
 
 
@@ -112,7 +112,7 @@ class SignalHistory:
                     changes.popleft()
         return all_written
 
-    def list_rows(self, first: int, last: int) -> EntityRows:
+    def list_rows(self, first: int, last: int) -> SignalRows:
         """Return a row for each tick from `first` to `last` at which a signal was released."""
         changes = [
             change
@@ -218,7 +218,7 @@ class SignalPlot:
             plot.plot(times, values, label=name, marker="braille")
         self._live.update(Text.from_ansi(plot.build()), refresh=True)
 
-    def _list_curves(self, rows: EntityRows) -> dict[str, list[tuple[float, float]]]:
+    def _list_curves(self, rows: SignalRows) -> dict[str, list[tuple[float, float]]]:
         """Return the points of each curve by its name, as simulated time in s and value.
 
         A signal with several numbers has a curve for each.

@@ -18,12 +18,12 @@ from rack.boards.config.commands import build_requests
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.host.adapter import Adapter
-from rack.boards.wiring import EntityRows, ExchangedEntries
+from rack.boards.wiring import MessageRows, RecordedEntries
 from rack.tools.console.answer import Failure
 from rack.tools.recording.recording import Recording
 
 
-def load_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, ExchangedEntries]:
+def load_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, RecordedEntries]:
     """Load the messages that each adapter of a config wrote in a recorded run.
 
     Args:
@@ -50,7 +50,7 @@ def load_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Ex
             2,
         )
     recorded_boxes = {mailbox.name: mailbox for mailbox in recording.layout.mailboxes}
-    entries: dict[str, ExchangedEntries] = {}
+    entries: dict[str, RecordedEntries] = {}
     for task in plan.tasks:
         adapter_class = find_class(task.target, object)
         ports = (
@@ -163,7 +163,7 @@ def _check_complete(box: MailboxSpec, recording: Recording, asked: str) -> None:
         raise Failure(f"{asked}: {box.name}: its recorder lost {lost} messages", 2)
 
 
-def _load_rows(recording: Recording, box: MailboxSpec, is_sent: bool) -> EntityRows:
+def _load_rows(recording: Recording, box: MailboxSpec, is_sent: bool) -> MessageRows:
     """Load the messages of a mailbox in the form of `rack.boards.wiring`.
 
     Args:
