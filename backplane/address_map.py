@@ -122,7 +122,7 @@ def compute_mailbox_size(mailbox: MailboxSpec) -> int:
     return MAILBOX_HEAD_SIZE + mailbox.depth * compute_slot_stride(mailbox)
 
 
-def compute_oldest_kept(head: int, depth: int) -> int:
+def compute_oldest_intact(head: int, depth: int) -> int:
     """Return the number of the oldest record in a ring that the writer cannot be overwriting.
 
     The writer works at most one record ahead of `head`. A concurrent reader therefore copies a

@@ -170,7 +170,7 @@ class MailboxSpec:
     interrupt: InterruptSpec | None = None
 
     @property
-    def ahead(self) -> int:
+    def lead_ticks(self) -> int:
         """Ticks by which the release of a writing cycle precedes a tick of the mailbox's grid.
 
         A cycle writes the mailbox if its release tick plus this number is on the grid.
@@ -178,14 +178,14 @@ class MailboxSpec:
         return self.delay if self.interrupt is None else self.interrupt.ahead
 
     @property
-    def is_by_ticks(self) -> bool:
+    def is_tick_based(self) -> bool:
         """True if the tick at which a message becomes visible depends on ticks alone."""
         return self.protocol in TICK_PROTOCOLS
 
     @property
     def is_repeatable(self) -> bool:
         """True if ticks alone determine which message each reader gets at each read."""
-        return self.is_by_ticks and not any(exchange.asynchronous for exchange in self.exchanges)
+        return self.is_tick_based and not any(exchange.asynchronous for exchange in self.exchanges)
 
 
 @dataclass(frozen=True)

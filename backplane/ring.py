@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.address_map import compute_oldest_kept
+from rack.backplane.address_map import compute_oldest_intact
 from rack.backplane.errors import DamageError
 
 MAX_COUNT = 1 << 48
@@ -72,7 +72,7 @@ class Ring:
         first = max(self._taken + 1, head - self._depth + 1)
         rows = self._rows[np.arange(first, head + 1) % self._depth].view(self._dtype)
         # The writer may have overwritten the oldest rows during the copy.
-        torn = max(0, compute_oldest_kept(self._written_count, self._depth) - first)
+        torn = max(0, compute_oldest_intact(self._written_count, self._depth) - first)
         lost = first - self._taken - 1 + min(torn, len(rows))
         self._taken = head
         return NewRows(rows[torn:], lost)

@@ -18,7 +18,7 @@ from struct import Struct
 
 import numpy as np
 
-from rack.backplane.address_map import TRACE_RECORD_SIZE, compute_oldest_kept
+from rack.backplane.address_map import TRACE_RECORD_SIZE, compute_oldest_intact
 from rack.backplane.ring import Ring
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block
@@ -113,7 +113,7 @@ class CycleRecord:
         at = self._get_index(count)
         flags = self._words[at + _FLAGS]
         tick = self._words[at + _TICK]
-        return tick if count and not flags & _BUS_ERROR and self._is_kept(count) else -1
+        return tick if count and not flags & _BUS_ERROR and self._is_intact(count) else -1
 
     def find_end_ns(self, tick: int) -> int | None:
         """Return the end of the cycle released at `tick`, in ns of CLOCK_MONOTONIC.
@@ -125,15 +125,15 @@ class CycleRecord:
             at = self._get_index(number)
             record_tick = self._words[at + _TICK]
             ended_ns = self._words[at + _END]
-            if not self._is_kept(number) or record_tick < tick:
+            if not self._is_intact(number) or record_tick < tick:
                 return None
             if record_tick == tick:
                 return ended_ns
         return None
 
-    def _is_kept(self, number: int) -> bool:
+    def _is_intact(self, number: int) -> bool:
         """Check that the writer has not begun to overwrite the record with this number."""
-        return number >= compute_oldest_kept(self._block[Block.TRACE_HEAD], self._depth)
+        return number >= compute_oldest_intact(self._block[Block.TRACE_HEAD], self._depth)
 
     def _get_index(self, number: int) -> int:
         """Return the index in the segment's words at which the record with this number starts."""

@@ -51,7 +51,7 @@ class ActiveFault:
     joints: NDArray[np.bool_]  # (joints,), True for joints that the fault affects
     every: int  # length of the level's cycle in ticks
     # The sample with which each active fault began, by `key`. All active faults share this dict.
-    kept: dict[Key, Sample]
+    first_samples: dict[Key, Sample]
 
     @cached_property
     def key(self) -> Key:
@@ -71,10 +71,10 @@ class ActiveFault:
 
         This is a copy of the sample that was given in the first call.
         """
-        if self.key not in self.kept:
+        if self.key not in self.first_samples:
             copy = sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
-            self.kept[self.key] = copy
-        return self.kept[self.key]
+            self.first_samples[self.key] = copy
+        return self.first_samples[self.key]
 
 
 @dataclass(frozen=True)

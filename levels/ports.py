@@ -221,7 +221,7 @@ class ConfiguredPorts(NamedTuple):
 
     inputs: Mapping[str, InputPort[Any]] = MappingProxyType({})
     outputs: Mapping[str, Output[Any]] = MappingProxyType({})
-    is_whole: bool = True
+    is_complete: bool = True
 
 
 class FindingKind:

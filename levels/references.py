@@ -55,13 +55,13 @@ def resolve_moved(reference: str) -> str:
     return reference
 
 
-def import_reference(reference: str, is_tried: bool = True) -> tuple[ModuleType, str]:
+def import_reference(reference: str, in_child_first: bool = True) -> tuple[ModuleType, str]:
     """Import the module that "package.module:Name" names.
 
     Args:
         reference: The reference.
-        is_tried: True to try the import in a child process first, so that a user's module cannot
-            end or block this process.
+        in_child_first: True to try the import in a child process first, so that a user's module
+            cannot end or block this process.
 
     Returns:
         The module, and the name in it.
@@ -72,7 +72,7 @@ def import_reference(reference: str, is_tried: bool = True) -> tuple[ModuleType,
     module, _, name = resolve_moved(reference).partition(":")
     is_new = module not in sys.modules and not module.startswith("rack.")
     try:
-        if is_tried and is_new and (reason := _try_import(module)):
+        if in_child_first and is_new and (reason := _try_import(module)):
             raise ImportError(reason)
         return importlib.import_module(module), name
     # A user's module may raise anything while it is imported.
@@ -80,18 +80,18 @@ def import_reference(reference: str, is_tried: bool = True) -> tuple[ModuleType,
         raise LookupError(f"cannot import '{module}': {type(error).__name__}: {error}") from error
 
 
-def find_class(reference: str, base: type[T], is_tried: bool = True) -> type[T]:
+def find_class(reference: str, base: type[T], in_child_first: bool = True) -> type[T]:
     """Return the subclass of `base` that "package.module:Class" names.
 
     Args:
         reference: The reference.
         base: The required base class.
-        is_tried: As for `import_reference`.
+        in_child_first: As for `import_reference`.
 
     Raises:
         LookupError: The class is missing, abstract, or no subclass of `base`.
     """
-    module, name = import_reference(reference, is_tried)
+    module, name = import_reference(reference, in_child_first)
     named = getattr(module, name, None)
     if not isinstance(named, type) or not issubclass(named, base):
         kinds = [

@@ -47,16 +47,16 @@ def first(file: str, header: str, statement: str) -> tuple[str, str, str]:
 SLOTS, ARM = "backplane/mailbox/slots.py", "levels/arm/simulated.py"
 MAILBOX, WATCH = "backplane/mailbox/mailbox.py", "backplane/watch"
 MONITOR, RELEASED = "levels/servo/sensor_monitor.py", "backplane/clock/released_task.py"
-DAMAGED = "self._episodes.find(Alarm.DAMAGED, accesses, tick)"
-REPORT = "def _report(self, code: Alarm, tick: int, age: int) -> None:"
-HANGS = "def _hangs(self, task: ReleasedTask) -> bool:"
+DAMAGED = "self._episodes.record_finding(Alarm.DAMAGED, accesses, tick)"
+REPORT = "def _report_silence(self, code: Alarm, tick: int, age: int) -> None:"
+HANGS = "def _is_hanging(self, task: ReleasedTask) -> bool:"
 GATE = "def refused(self, torque: Array) -> Finding | None:"
 STEPS = "self.violations += int(steps.sum())"
 MUTANTS = (
     Mutant(
         "sensor monitor",
         "sensor-bias",
-        (first(MONITOR, "def _ring(self, finding: Finding) -> None:", "return"),),
+        (first(MONITOR, "def _report_fault(self, finding: Finding) -> None:", "return"),),
     ),
     Mutant(
         "motor monitor",
@@ -69,7 +69,7 @@ MUTANTS = (
         (
             (SLOTS, "self.chain == xxh3(self.covered, self.words[_CHAIN])", "True"),
             ("boards/run/compiled_mailbox.py", "if check != received.check:", "if False:"),
-            (f"{WATCH}/message_watch.py", "self._find(Alarm.DAMAGED, tick)", "pass"),
+            (f"{WATCH}/message_watch.py", "self._record_finding(Alarm.DAMAGED, tick)", "pass"),
             (f"{WATCH}/watched_reader.py", DAMAGED, "pass"),
         ),
     ),

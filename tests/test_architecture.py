@@ -9,6 +9,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -214,3 +215,34 @@ def test_the_core_needs_no_viewer_no_network_no_lab_and_no_other_system() -> Non
         found += needed
     outside = [name_of(path) for path in core if name_of(path).startswith(OUTSIDE)]
     assert not outside
+
+
+def test_names_used_of_modules_that_are_loaded_by_name_exist() -> None:
+    """Type checkers do not see them."""
+    missing = []
+    for path in SOURCES:
+        constants = {
+            node.targets[0].id: node.value.value
+            for node in nodes(path)
+            if isinstance(node, ast.Assign)
+            and isinstance(node.targets[0], ast.Name)
+            and isinstance(node.value, ast.Constant)
+        }
+        loaded = {}
+        for node in nodes(path):
+            match node:
+                case ast.Assign(
+                    [ast.Name(name)], ast.Call(ast.Name("import_module"), [ast.Name(c)])
+                ):
+                    loaded[name] = constants[c]
+        for node in nodes(path):
+            match node:
+                case ast.Attribute(ast.Call(ast.Name("import_module"), [ast.Name(c)]), attribute):
+                    module = constants[c]
+                case ast.Attribute(ast.Name(name), attribute) if name in loaded:
+                    module = loaded[name]
+                case _:
+                    continue
+            if not hasattr(import_module(module), attribute):
+                missing.append(f"{name_of(path)}:{node.lineno}: {module} has no '{attribute}'")
+    assert not missing

@@ -141,13 +141,13 @@ def _is_permitted(values: np.ndarray, field: FieldSpec) -> bool:
         return False
     if field.values and not np.isin(values, [number for _, number in field.values]).all():
         return False
-    if field.length and not _has_length(values, field.length, bool(field.shape)):
+    if field.length and not _is_length_within(values, field.length, bool(field.shape)):
         return False
     # In an array of groups, a group of zeros is an unused entry and is not checked.
     return not field.fields or is_proper(values[values != np.zeros_like(values)], field.fields)
 
 
-def _has_length(values: np.ndarray, limits: tuple[float, float], is_vector: bool) -> bool:
+def _is_length_within(values: np.ndarray, limits: tuple[float, float], is_vector: bool) -> bool:
     """Check whether the norm of each vector, or the magnitude of each number, is within limits.
 
     Args:

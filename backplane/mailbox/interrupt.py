@@ -32,7 +32,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from rack.backplane.address_map import compute_oldest_kept
+from rack.backplane.address_map import compute_oldest_intact
 from rack.backplane.layout import InterruptSpec, MailboxSpec
 from rack.backplane.mailbox.inbox import Inbox
 from rack.backplane.mailbox.mailbox import MAX_STEP_BACK, Reader, Reading, Writer
@@ -124,7 +124,7 @@ class InterruptLine:
         if serial > head:
             return
         self._slots.fence()
-        serial = max(serial, compute_oldest_kept(head, self._slots.depth))
+        serial = max(serial, compute_oldest_intact(head, self._slots.depth))
         while serial <= head:
             words = heads[serial & mask]
             if words[Slot.SERIAL] != serial:

@@ -236,9 +236,9 @@ class ReadStatistics:
 
 # A reader's state is private memory that the reader shares with compiled code. It consists of five
 # words and the last good message with its head: see `words.Slot`.
-JUDGED_SERIAL = 3
+CHECKED_SERIAL = 3
 """Index of a word in a reader's state: the newest serial that its `MessageWatch` has checked."""
-JUDGED_TICK = 4
+CHECKED_TICK = 4
 """Index of a word in a reader's state: the release tick of that message."""
 GOOD_OFFSET = 40
 """Byte offset of the last good message in a reader's state."""
@@ -323,7 +323,7 @@ class Reader:
 
         If the slot of the message is being overwritten, the read counts as timed out.
         """
-        if not self.slots.is_kept(serial):
+        if not self.slots.is_intact(serial):
             return self._count_timeout()
         self.statistics.bad_reads += 1
         self._count_bad_message(serial)
@@ -368,7 +368,7 @@ class Reader:
         `MessageWatch`.
         """
         slots = self.slots
-        if not slots.is_kept(serial):
+        if not slots.is_intact(serial):
             return
         if not slots.passes_check:
             # An empty slot, as at the start, has serial 0.

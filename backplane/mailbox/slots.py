@@ -39,7 +39,7 @@ from xxhash import xxh3_64_intdigest as xxh3
 from rack.backplane.address_map import (
     MAILBOX_HEAD_SIZE,
     SLOT_HEAD_SIZE,
-    compute_oldest_kept,
+    compute_oldest_intact,
     compute_slot_stride,
 )
 from rack.backplane.layout import FieldSpec, MailboxSpec
@@ -235,13 +235,13 @@ class Slots:
         """Check whether the slot of a serial contains its message, not an older or newer one."""
         return self.heads[serial & self.mask][_SERIAL] == serial
 
-    def is_kept(self, serial: int) -> bool:
+    def is_intact(self, serial: int) -> bool:
         """Check that the slot of a serial has not been reused for a newer message.
 
         If this returns True, a copy of the slot made before the call contains no newer message.
         """
         self.fence()
-        return serial >= compute_oldest_kept(self.box[0], self.depth)
+        return serial >= compute_oldest_intact(self.box[0], self.depth)
 
     def read_visible_tick(self, serial: int) -> int:
         """Return the tick from which the message in the slot of a serial is visible."""
@@ -281,7 +281,7 @@ class Slots:
             False if the slot was reused during the copy.
         """
         self.load_slot(serial)
-        return self.is_kept(serial)
+        return self.is_intact(serial)
 
     @property
     def passes_check(self) -> bool:

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from xxhash import xxh3_64_intdigest as xxh3
 
-from rack.backplane.address_map import compute_oldest_kept
-from rack.backplane.mailbox.mailbox import JUDGED_SERIAL, JUDGED_TICK, Reader
+from rack.backplane.address_map import compute_oldest_intact
+from rack.backplane.mailbox.mailbox import CHECKED_SERIAL, CHECKED_TICK, Reader
 from rack.backplane.mailbox.queue import QueueReader
 from rack.backplane.mailbox.slots import CHECKED_FROM, UNSIGNED
 from rack.backplane.segment import Segment
@@ -36,8 +36,8 @@ class MessageWatch:
             release.
     """
 
-    seen = Word(JUDGED_SERIAL)
-    newest = Word(JUDGED_TICK)
+    seen = Word(CHECKED_SERIAL)
+    newest = Word(CHECKED_TICK)
 
     def __init__(self, segment: Segment, reader: Reader, episodes: Episodes) -> None:
         self._reader = reader
@@ -48,12 +48,12 @@ class MessageWatch:
         self._slots = reader.slots
         self._cycles = CycleRecord(segment, reader.spec.writer)
         self.newest = LONG_AGO
-        self._is_sliced = reader.spec.is_by_ticks
+        self._is_sliced = reader.spec.is_tick_based
         # A message that is visible at once carries the tick at which it was written.
         self.late_from = self._spec.delay + self._is_sliced
         self._held_up = 0
 
-    def judge_messages(self, tick: int) -> None:
+    def check_messages(self, tick: int) -> None:
         """Check the messages that have become visible up to the read at `tick`."""
         newest_serial = self._reader.found
         if self.seen < 0:
@@ -62,7 +62,7 @@ class MessageWatch:
             if newest_serial - self.seen > 1 and self._is_babble(newest_serial, tick):
                 self._start_after(newest_serial)
             else:
-                self._judge_up_to(newest_serial, tick)
+                self._check_up_to(newest_serial, tick)
         if self._reader.statistics.held_up != self._held_up:
             self._held_up = self._reader.statistics.held_up
             self._record_finding(Alarm.LOCKED, tick)
@@ -79,7 +79,7 @@ class MessageWatch:
         Returns:
             False if the message is missing or damaged, or may have been overwritten meanwhile.
         """
-        return self._slots.fetch_message(serial) and self._slots.is_kept(serial)
+        return self._slots.fetch_message(serial) and self._slots.is_intact(serial)
 
     def _is_babble(self, newest_serial: int, tick: int) -> bool:
         """Check whether the writer has sent at least two messages more than its releases allow.
@@ -91,7 +91,7 @@ class MessageWatch:
             tick: Release tick of the reading cycle.
         """
         slots = self._slots
-        if not slots.is_kept(newest_serial):
+        if not slots.is_intact(newest_serial):
             # The message is already overwritten, which a writer of one message per cycle is too
             # slow to do. Use the newest message instead.
             newest_serial = slots.box[0]
@@ -104,7 +104,7 @@ class MessageWatch:
         self._record_finding(Alarm.BABBLE, tick, count / max(1, cycles))
         return True
 
-    def _judge_up_to(self, newest_serial: int, tick: int) -> None:
+    def _check_up_to(self, newest_serial: int, tick: int) -> None:
         """Check the messages one by one, up to the newest one found.
 
         Args:
@@ -117,7 +117,7 @@ class MessageWatch:
         late = self.late_from
         # Messages that are already overwritten, because the reader is late, cannot be checked.
         for serial in range(
-            max(self.seen + 1, compute_oldest_kept(slots.box[0], slots.depth)), newest_serial + 1
+            max(self.seen + 1, compute_oldest_intact(slots.box[0], slots.depth)), newest_serial + 1
         ):
             head = slots.heads[serial & mask]
             released = head[Slot.TICK]
@@ -130,14 +130,14 @@ class MessageWatch:
                     or xxh3(slots.places[serial & mask][CHECKED_FROM:], head[Slot.CHAIN] & UNSIGNED)
                     == head[Slot.CHECK] & UNSIGNED
                 )
-                and slots.is_kept(serial)
+                and slots.is_intact(serial)
             ):
                 self.newest = released
-            elif not self._judge_odd(serial, tick):
+            elif not self._check_unusual(serial, tick):
                 break
             self.seen = serial
 
-    def _judge_odd(self, serial: int, tick: int) -> bool:
+    def _check_unusual(self, serial: int, tick: int) -> bool:
         """Check a message that is lost, damaged, late or out of order, and record the finding.
 
         Returns:
@@ -149,7 +149,7 @@ class MessageWatch:
             return True
         expected = self.newest + self._spec.every
         if slots.serial == serial and slots.passes_check:
-            self._judge_time(slots.tick, slots.visible, tick)
+            self._check_timing(slots.tick, slots.visible, tick)
         elif slots.serial == 0 or slots.passes_check:
             # The slot is empty or contains another complete message, so this message is lost. That
             # is not reported before the first tick at which the message would have been visible.
@@ -164,7 +164,7 @@ class MessageWatch:
             self._record_finding(Alarm.DAMAGED, tick)
         return True
 
-    def _judge_time(self, released: int, visible: int, tick: int) -> None:
+    def _check_timing(self, released: int, visible: int, tick: int) -> None:
         """Check whether the message in the local record is out of order or was held back.
 
         Args:
@@ -203,7 +203,7 @@ class QueueWatch(MessageWatch):
         self._lost = 0
         self.seen = reader.taken
 
-    def judge_messages(self, tick: int) -> None:
+    def check_messages(self, tick: int) -> None:
         """Check the messages taken by the read at `tick`."""
         queue = self._queue
         slots = self._slots
@@ -216,7 +216,7 @@ class QueueWatch(MessageWatch):
             if self.newest <= released > head[Slot.VISIBLE_AT] - self.late_from:
                 self.newest = released
             elif slots.copy_slot(serial):
-                self._judge_time(released, head[Slot.VISIBLE_AT], tick)
+                self._check_timing(released, head[Slot.VISIBLE_AT], tick)
         self.seen = queue.taken
         if queue.statistics.lost != self._lost:
             lost = queue.statistics.lost - self._lost

@@ -130,7 +130,7 @@ class SilenceWatch(MessageWatch):
         head = slots.box[0]
         # A serial whose slot is not filled counts as written: the message was lost, not suppressed.
         spec = self._reader.spec
-        due = finished - (finished + spec.ahead - spec.phase) % spec.every
+        due = finished - (finished + spec.lead_ticks - spec.phase) % spec.every
         # There may be no such cycle, if the writer was dead, late, or not released by the clock.
         if self._cycles.find_end_ns(due) is None:
             return False

@@ -113,14 +113,14 @@ class WatchedReader(MailboxWatcher):
         """
         reader = self.reader
         reading = reader.read(tick)
-        return self.judge_reading(
+        return self.check_reading(
             tick,
             reading,
             is_odd=self._has_trouble or reader.found != self.watch.seen,
             is_silent=tick - reader.newest >= self.watch.quiet or self.writer[Block.LOST] > 0,
         )
 
-    def judge_reading(
+    def check_reading(
         self, tick: int, reading: Reading[AnyMessage], *, is_odd: bool, is_silent: bool
     ) -> Reading[AnyMessage]:
         """Make the checks that a read requires, and return the reading for the level.
@@ -135,7 +135,7 @@ class WatchedReader(MailboxWatcher):
             The given reading, with `is_lost` set if the writer is lost or silent for too long.
         """
         if is_odd:
-            self.watch.judge_messages(tick)
+            self.watch.check_messages(tick)
         if self._has_trouble:
             self._report_bad_read(tick)
         if is_silent and self.watch.is_lost(tick):
@@ -198,7 +198,7 @@ class WatchedQueue(MailboxWatcher):
         reader = self.reader
         reading = reader.take_messages(tick, self._room(), self._task.now())
         if self._has_trouble or reader.taken != self._messages.seen:
-            self._messages.judge_messages(tick)
+            self._messages.check_messages(tick)
         if self._has_trouble:
             self._report_bad_read(tick)
         return reading._replace(is_lost=True) if self.is_writer_lost(tick) else reading

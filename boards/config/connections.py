@@ -118,11 +118,13 @@ def _connect_ports(
         entry.name = port
         reads[port] = entry.source
     outputs = {**kind.outputs, **added_ports.outputs}
-    if exchange and added_ports.is_whole:
+    if exchange and added_ports.is_complete:
         # If the class has an output of this name, it stays, and a rule reports it.
         outputs.setdefault(EXCHANGE_PORT, Output(build_exchange_message(reads)))
     inputs = {**kind.inputs, **added_ports.inputs}
-    return TaskPorts(place, kind, inputs, outputs, reads, exchange, mistakes, added_ports.is_whole)
+    return TaskPorts(
+        place, kind, inputs, outputs, reads, exchange, mistakes, added_ports.is_complete
+    )
 
 
 def _find_class(place: TaskEntry) -> LevelClass:
@@ -199,12 +201,12 @@ class Wiring:
         self.config = config
         self.broken = broken
         kinds: dict[TaskEntry, LevelClass] = {}
-        self.missing: dict[TaskEntry, str] = {}
+        self.unusable_classes: dict[TaskEntry, str] = {}
         for place in (*config.list_tasks(), *config.list_hosts()):
             try:
                 kinds[place] = _find_class(place)
             except LookupError as error:
-                self.missing[place] = str(error.args[0])
+                self.unusable_classes[place] = str(error.args[0])
         types: dict[str, type[Message]] = {}
         while True:
             self.ports = {
@@ -246,7 +248,7 @@ class Wiring:
         return writers
 
     @cached_property
-    def reading(self) -> dict[str, list[tuple[TaskPorts, str]]]:
+    def reading_ports(self) -> dict[str, list[tuple[TaskPorts, str]]]:
         """For each mailbox, the tasks that read it, each with its port."""
         reading: dict[str, list[tuple[TaskPorts, str]]] = {}
         for ports in self.ports.values():
@@ -272,7 +274,7 @@ class Wiring:
         return ", ".join(self.types)
 
     @cached_property
-    def from_host(self) -> set[str]:
+    def mailboxes_from_host(self) -> set[str]:
         """Mailboxes that host boards write."""
         return {mailbox for ports in self.hosts for mailbox in ports.writes.values()}
 
@@ -287,19 +289,21 @@ class Wiring:
         }
 
     @cached_property
-    def to_host(self) -> set[str]:
+    def mailboxes_to_host(self) -> set[str]:
         """Mailboxes that bus adapters write for host boards."""
         return {
-            mailbox for mailbox, box in self.passed_mailboxes.items() if box not in self.from_host
+            mailbox
+            for mailbox, box in self.passed_mailboxes.items()
+            if box not in self.mailboxes_from_host
         }
 
     @property
-    def of_host(self) -> set[str]:
+    def host_side_mailboxes(self) -> set[str]:
         """Mailboxes of the host side. Only a bus adapter connects them with the real-time side."""
-        return self.from_host | self.to_host
+        return self.mailboxes_from_host | self.mailboxes_to_host
 
     @cached_property
-    def every(self) -> dict[str, int]:
+    def periods(self) -> dict[str, int]:
         """Periods of the boards in ticks. Boards with an invalid rate are left out."""
         periods: dict[str, int] = {}
         for name in self.config.board if "clock" not in self.broken else ():
@@ -313,7 +317,7 @@ class Wiring:
 
         Reading a mailbox of such a board is not reported as a further mistake.
         """
-        boards = {place.board for place in self.missing}
+        boards = {place.board for place in self.unusable_classes}
         boards |= {ports.place.board for ports in self.ports.values() if not ports.is_whole}
         boards |= {place.removeprefix("board.").removeprefix("host.") for place in self.broken}
         is_lan_unknown = "adapter" in self.broken or is_adapter_name_taken(self.config)
@@ -341,9 +345,9 @@ class Wiring:
 
     def list_readers(self, mailbox: str) -> tuple[str, ...]:
         """Return the names of the tasks and host boards that read a mailbox."""
-        return tuple(dict.fromkeys(ports.task for ports, _ in self.reading.get(mailbox, ())))
+        return tuple(dict.fromkeys(ports.task for ports, _ in self.reading_ports.get(mailbox, ())))
 
-    def is_of_network(self, name: str) -> bool:
+    def belongs_to_network_adapter(self, name: str) -> bool:
         """Return True for the network adapter's board and for the mailboxes that it writes.
 
         Args:
@@ -353,16 +357,16 @@ class Wiring:
 
     def find_protocol(self, mailbox: str) -> Protocol:
         """Return the protocol of a mailbox, which its writer and the config determine."""
-        if mailbox in self.to_host:
+        if mailbox in self.mailboxes_to_host:
             # Host boards always read the newest message at once.
             return "time-slice"
-        if mailbox in self.from_host or (
+        if mailbox in self.mailboxes_from_host or (
             mailbox in self.writers and self.writers[mailbox][1].queued
         ):
             return "queue"
         protocol = self.config.protocol.mailbox.get(mailbox, self.config.protocol.default)
         if protocol == "interrupt" and (
-            mailbox in self.operator_mailboxes or self.is_of_network(mailbox)
+            mailbox in self.operator_mailboxes or self.belongs_to_network_adapter(mailbox)
         ):
             # Messages of the clock and of the network adapter do not interrupt boards.
             return "time-slice"

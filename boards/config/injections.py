@@ -70,7 +70,7 @@ class FaultCheck:
     config: RackConfig
     levels: Levels
     layout: Layout | None
-    unspecified: Collection[str]
+    broken_boards: Collection[str]
 
     def find_mistakes(self) -> Mistakes:
         """Yield every mistake in the fault."""
@@ -90,7 +90,7 @@ class FaultCheck:
         else:
             yield from self._check_kind(kind)
         if fault.board != CLOCK and fault.board not in tasks:
-            if fault.board.partition(".")[0] not in self.unspecified:
+            if fault.board.partition(".")[0] not in self.broken_boards:
                 yield self._build_mistake(
                     "board", f"no such task; tasks: {', '.join([*tasks, CLOCK])}"
                 )
@@ -136,7 +136,7 @@ class FaultCheck:
         for name, value in self.fault.parameters.items():
             why = f"{kind.name} has no such parameter; parameters: {_format_names(known)}"
             if name in known:
-                why = _explain_value(known[name], value, self.config.robot)
+                why = _explain_invalid_value(known[name], value, self.config.robot)
             if why:
                 plain = int(value) if value.is_integer() else value
                 yield Mistake(format_place(self.place, name), plain, why)
@@ -148,12 +148,12 @@ class FaultCheck:
 
     def _check_target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
         """Yield a mistake if this kind of fault cannot affect the given task or mailbox."""
-        if why := self._explain_board(kind, tasks):
+        if why := self._explain_unsuitable_task(kind, tasks):
             yield self._build_mistake("board", why)
-        elif why := self._explain_mailbox(kind):
+        elif why := self._explain_unsuitable_mailbox(kind):
             yield self._build_mistake("mailbox", why)
 
-    def _explain_board(self, kind: Kind, tasks: Mapping[str, Role]) -> str:
+    def _explain_unsuitable_task(self, kind: Kind, tasks: Mapping[str, Role]) -> str:
         """Return the reason why this kind of fault cannot affect its task. Empty if it can.
 
         Args:
@@ -193,10 +193,10 @@ class FaultCheck:
         Args:
             place: Name of a task or mailbox, or a condition that begins with one.
         """
-        is_known = place.partition(".")[0].strip() not in self.unspecified
+        is_known = place.partition(".")[0].strip() not in self.broken_boards
         return self.layout if is_known else None
 
-    def _explain_mailbox(self, kind: Kind) -> str:
+    def _explain_unsuitable_mailbox(self, kind: Kind) -> str:
         """Return why this kind of fault cannot affect the task's mailboxes. Empty if it can."""
         board = self.fault.board
         mailbox = self.fault.mailbox
@@ -216,7 +216,7 @@ class FaultCheck:
             why = f"'{struck[0].name}' is a queue, which {kind.name} does not strike"
             return f"{why}: {kind.not_queued}"
         # If boards are missing from the layout, they may be the readers.
-        if kind.where == "bus" and mailbox is None and not self.unspecified:
+        if kind.where == "bus" and mailbox is None and not self.broken_boards:
             has_reader = any(m.readers for m in struck)
             return "" if has_reader else f"missing; no mailbox of '{board}' has a reader"
         locked = [m.name for m in written.values() if m.protocol == "lock"]
@@ -240,7 +240,7 @@ class FaultCheck:
         return Mistake(format_place(self.place, key), self._get_value(key), why)
 
 
-def _explain_value(parameter: Parameter, value: float, robot: RobotConfig | None) -> str:
+def _explain_invalid_value(parameter: Parameter, value: float, robot: RobotConfig | None) -> str:
     """Return why a value of the parameter is invalid. Empty if it is valid."""
     most = parameter.most
     if parameter.name == "joint" and robot is not None:

@@ -68,7 +68,7 @@ def list_replaced_cores(config: RackConfig) -> list[str]:
 def build_exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
     """Return the ticks at which an executor reads the ports of its `exchange` table, by port."""
     board = ports.place.board
-    every = wiring.every[board]
+    every = wiring.periods[board]
     phase = wiring.config.board[board].phase
     return {
         port: ExchangeSpec(
@@ -90,7 +90,7 @@ class LayoutBuilder:
         self._wiring = wiring
         self._config = wiring.config
         self._sizes = sizes
-        self._kept = round(RETAINED_S * 1e9 / wiring.config.clock_ns)
+        self._retained_ticks = round(RETAINED_S * 1e9 / wiring.config.clock_ns)
         self._tasks = {ports.task: self._build_task(ports.place) for ports in wiring.tasks}
         self._hosts = {ports.task: self._build_host(ports.place) for ports in wiring.hosts}
 
@@ -110,7 +110,7 @@ class LayoutBuilder:
         """Yield a mailbox and, for a queue, the mailbox with the position of its reader."""
         ports, output = self._wiring.writers[name]
         capacity = self._config.protocol.depth.get(name, UNREAD)
-        if name in self._wiring.from_host:
+        if name in self._wiring.mailboxes_from_host:
             # The ring of a host board is a queue that does not depend on ticks.
             depth = compute_depth(capacity + SPARE_SLOTS, 1)
             yield self._build_mailbox(
@@ -129,7 +129,7 @@ class LayoutBuilder:
             writer=writer.name,
             every=every,
             delay=delay,
-            depth=compute_depth(max(slowest + delay, self._kept), every),
+            depth=compute_depth(max(slowest + delay, self._retained_ticks), every),
             rests_on=tuple(
                 box
                 for box in ports.find_origin_mailboxes(name.partition(".")[2])
@@ -161,9 +161,11 @@ class LayoutBuilder:
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
         # The writer learns the reader's position after both delays. Until then it can send at most
         # as many messages as the capacity.
-        most = capacity * (1 + self._kept // (box.delay + delay))
+        most = capacity * (1 + self._retained_ticks // (box.delay + delay))
         # A deep queue retains fewer messages, to limit its memory.
-        slots = compute_depth(min(most, 2 * capacity + SUSTAINED * self._kept // box.every), 1)
+        slots = compute_depth(
+            min(most, 2 * capacity + SUSTAINED * self._retained_ticks // box.every), 1
+        )
         yield replace(box, capacity=capacity, depth=slots)
         yield self._build_mailbox(
             get_position_mailbox(box.name),
@@ -173,7 +175,7 @@ class LayoutBuilder:
             writer=reader.name,
             every=read.every,
             delay=delay,
-            depth=compute_depth(max(writer.slice + delay, self._kept), read.every),
+            depth=compute_depth(max(writer.slice + delay, self._retained_ticks), read.every),
             phase=(read.phase + delay) % read.every,
         )
 
@@ -195,7 +197,7 @@ class LayoutBuilder:
         uninterrupted = {
             task.slot
             for task in readers
-            if task.role == "host" or self._wiring.is_of_network(task.board)
+            if task.role == "host" or self._wiring.belongs_to_network_adapter(task.board)
         }
         words = -(-box.size // WORD_BYTES)
         service_ns = round((table.fixed_us + table.word_us * words) * NS_PER_US)
@@ -213,13 +215,13 @@ class LayoutBuilder:
         # A message must still be in its slot when the last pending interrupt is served.
         waits = -(-(table.depth + 1) * service_ns // clock_ns)
         slowest = max((reader.slice for reader in readers), default=0)
-        depth = compute_depth(max(slowest + delay + waits, self._kept), box.every)
+        depth = compute_depth(max(slowest + delay + waits, self._retained_ticks), box.every)
         return replace(box, delay=delay, depth=depth, interrupt=interrupt)
 
     def _build_task(self, place: TaskEntry) -> TaskSpec:
         """Return the record of an executor or a planner."""
         board = self._config.board[place.board]
-        every = self._wiring.every[place.board]
+        every = self._wiring.periods[place.board]
         wake = board.wake or self._config.clock.wake
         is_planner = place.role == "planner"
         return TaskSpec(
@@ -231,7 +233,7 @@ class LayoutBuilder:
             priority=place.priority,
             every=every,
             within_cycles=board.within_cycles if is_planner else 1,
-            depth=compute_depth(self._kept, every),
+            depth=compute_depth(self._retained_ticks, every),
             # The planner of a polling executor must not poll too.
             wake="timer" if is_planner and wake == "poll" else wake,
             phase=board.phase,
@@ -264,7 +266,7 @@ class LayoutBuilder:
         """
         wiring = self._wiring
         kind = kind or wiring.types[name]
-        reading = wiring.reading.get(name, ())
+        reading = wiring.reading_ports.get(name, ())
         derived = {
             "readers": wiring.list_readers(name),
             "protocol": wiring.find_protocol(name),

@@ -104,7 +104,7 @@ def _find_declaration(
     field = None
     is_name = False
     for key in keys:
-        models = [kind for kind in models if _may_be_of_kind(kind, table)] or models
+        models = [kind for kind in models if _matches_fixed_values(kind, table)] or models
         try:
             table = table[key]
         except (LookupError, TypeError):
@@ -123,7 +123,7 @@ def _find_declaration(
     return list(known), field
 
 
-def _may_be_of_kind(kind: type[BaseModel], table: Any) -> bool:
+def _matches_fixed_values(kind: type[BaseModel], table: Any) -> bool:
     """Return True if a table has the fixed values of a model, such as do = "goto"."""
     fixed = {
         key: get_args(f.annotation)

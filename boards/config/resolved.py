@@ -283,8 +283,8 @@ class Examination:
         spec = layout.find_task(ports.task)
         is_executor = spec.role == "executor"
         # A bus adapter exchanges the mailboxes of the host side itself.
-        of_host = self._wiring.of_host
-        from_host = self._wiring.from_host
+        of_host = self._wiring.host_side_mailboxes
+        from_host = self._wiring.mailboxes_from_host
         is_locked = not is_executor and is_critical(self._config, layout, spec.board)
         return TaskWiring(
             task=ports.task,
@@ -298,7 +298,7 @@ class Examination:
             context=self._contexts[spec.board],
             critical_priority=board.priority if is_locked else 0,
             sent=tuple(port for port, output in ports.outputs.items() if output.queued),
-            guards_clock=is_executor and spec.every == min(self._wiring.every.values()),
+            guards_clock=is_executor and spec.every == min(self._wiring.periods.values()),
             fails_self_test=fails_self_test,
             entries=None,
             exchange=build_exchanges(self._wiring, ports),
@@ -313,7 +313,7 @@ class Examination:
 
     def _build_board_contexts(self, wiring: Wiring) -> dict[str, LevelContext]:
         """Return the contexts of the levels by board."""
-        every = wiring.every
+        every = wiring.periods
         boards = wiring.config.board
         paces = {name: Pace(every[name], board.within_cycles) for name, board in boards.items()}
         return {

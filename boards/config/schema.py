@@ -543,9 +543,9 @@ class RackConfig(Table):
         for name, host in self.host.items():
             yield TaskEntry(name, name, "host", host.program, OUTSIDE, ANY_CORE, 0)
 
-    def get_table(self, of: TaskEntry | TaskSpec) -> BoardConfig | HostConfig:
+    def get_table(self, entry: TaskEntry | TaskSpec) -> BoardConfig | HostConfig:
         """Return the table of a task's board, or of a host board."""
-        return self.host[of.board] if of.role == "host" else self.board[of.board]
+        return self.host[entry.board] if entry.role == "host" else self.board[entry.board]
 
     def get_rewired_ports(self, place: TaskEntry) -> Mapping[str, Sources]:
         """Return the mailboxes to which the config connects ports of a task, by port."""

@@ -153,7 +153,7 @@ TEXTS: Mapping[About, Mapping[Alarm, str]] = {
 }
 
 
-class RungAlarm(NamedTuple):
+class ReadAlarm(NamedTuple):
     """An alarm that was read from a ring: its code, its subject (see `Alarm`) and its event."""
 
     alarm: Alarm
@@ -180,9 +180,9 @@ class AlarmReader:
         self._events = AlarmConverter(segment, config.joints, geom, levels)
         self.lost = 0
 
-    def read_alarms(self) -> list[RungAlarm]:
+    def read_alarms(self) -> list[ReadAlarm]:
         """Return the alarms since the last call, in the order of ticks and times."""
-        alarms: list[RungAlarm] = []
+        alarms: list[ReadAlarm] = []
         for owner, ring in self._rings.items():
             if not ring.waiting_count:
                 continue
@@ -191,7 +191,7 @@ class AlarmReader:
             for row in rows:
                 alarm = to_enum(Alarm, row["code"])
                 alarms.append(
-                    RungAlarm(alarm, int(row["subject"]), self._events.build_event(row, owner))
+                    ReadAlarm(alarm, int(row["subject"]), self._events.build_event(row, owner))
                 )
         return sorted(alarms, key=lambda rung: (rung.event.tick, rung.event.time_ns))
 

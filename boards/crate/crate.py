@@ -97,10 +97,10 @@ class Crate:
         self._boards: dict[int, tuple[str, int]] = {}
         self._shelf = SnapshotShelf()
         self._wirings: dict[str, TaskWiring | ClockWiring] = {}
-        self._to_go_on: dict[str, WaitingCopy] = {}
+        self._copies_to_continue: dict[str, WaitingCopy] = {}
         self._preloaded: set[str] = set()
         self._outputs: dict[str, HostOutput] = {}
-        self._resting: list[HostOutput] = []
+        self._paused_outputs: list[HostOutput] = []
         # A closed line is not enough to detect the end of the launcher: a process that it forked
         # may keep the other end open.
         self._launcher = os.pidfd_open(os.getppid())
@@ -114,17 +114,22 @@ class Crate:
     def run(self) -> None:
         """Serve requests until the Rack closes the line or ends, then end all boards and copies."""
         while True:
-            printing = [output for output in self._outputs.values() if output not in self._resting]
+            printing = [
+                output for output in self._outputs.values() if output not in self._paused_outputs
+            ]
             readers = [output.reader for output in printing]
             ready = self._reap_ended(
-                OUTPUT_PAUSE_S if self._resting else None, self._line, self._launcher, *readers
+                OUTPUT_PAUSE_S if self._paused_outputs else None,
+                self._line,
+                self._launcher,
+                *readers,
             )
             if not ready:
-                self._resting.clear()
+                self._paused_outputs.clear()
             for output in printing:
                 if output.reader in ready:
                     output.copy_output()
-                    self._resting.append(output)
+                    self._paused_outputs.append(output)
             is_gone = self._launcher in ready
             if is_gone or self._line in ready:
                 request = None if is_gone else receive_or_none(self._line)
@@ -179,14 +184,14 @@ class Crate:
         snapshot = None if opening.before is None else self._shelf.find_nearest(opening.before)
         if snapshot is not None:
             restore_memory(segment, snapshot.memory, snapshot.tick)
-            self._to_go_on = {**snapshot.copies}
+            self._copies_to_continue = {**snapshot.copies}
             self._publish_snapshots()
         self._line.send(Opened(-1 if snapshot is None else snapshot.tick))
 
     def _power_on(self, name: str, wiring: TaskWiring | ClockWiring) -> None:
         """Fork a task or the clock, or let its copy in the snapshot continue instead."""
         self._wirings[name] = wiring
-        copy = self._to_go_on.pop(name, None)
+        copy = self._copies_to_continue.pop(name, None)
         if copy is not None and copy.can_continue_as(wiring):
             try:
                 self._watch_process(name, copy.continue_as(wiring, self._segment.rack))
@@ -202,7 +207,7 @@ class Crate:
             self._segment.words[System.STATE] = Run.RUNNING
         self._fork_board(name, lambda segment: run_clock_board(segment, wiring, *lines))
 
-    def _take_note(self) -> None:
+    def _receive_copy_note(self) -> None:
         """Receive the note of a board that has forked a copy, and publish the new snapshots."""
         self._shelf.receive_note(self._wirings)
         self._publish_snapshots()
@@ -228,7 +233,7 @@ class Crate:
             with suppress(LookupError):
                 # The launcher tries the import first, because it survives a module that ends its
                 # process.
-                kind = find_class(reference, object, is_tried=False)
+                kind = find_class(reference, object, in_child_first=False)
                 try:
                     if issubclass(kind, Executor | Planner):
                         kind.preload()
@@ -350,13 +355,13 @@ class Crate:
             self._reap_ended(None)
         # Receive the notes that boards wrote about their copies before they ended.
         while wait_readable(self._shelf.line.fileno(), 0):
-            self._take_note()
+            self._receive_copy_note()
         self._reap_copies()
         for output in self._outputs.values():
             output.close()
         self._outputs.clear()
-        self._resting.clear()
-        self._to_go_on.clear()
+        self._paused_outputs.clear()
+        self._copies_to_continue.clear()
         self._wirings.clear()
         if self._opened is not None:
             self._opened.close()
@@ -391,7 +396,7 @@ class Crate:
             with suppress(OSError):
                 self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
         if self._shelf.line in ready:
-            self._take_note()
+            self._receive_copy_note()
         return ready
 
 

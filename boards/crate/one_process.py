@@ -58,8 +58,8 @@ class OneProcess:
             raise LaunchError(f"{names}: a host board, which needs a separate process")
         self.tick = 0
         self._clock_ns = plan.layout.clock_ns
-        self._posts = {spec.name: PrivateMailbox(spec) for spec in plan.layout.mailboxes}
-        self._tasks = [PrivateTask(plan.layout, wiring, self._posts) for wiring in plan.tasks]
+        self._mailboxes = {spec.name: PrivateMailbox(spec) for spec in plan.layout.mailboxes}
+        self._tasks = [PrivateTask(plan.layout, wiring, self._mailboxes) for wiring in plan.tasks]
         self._cycles = [(*task.spec.grid, task.cycle) for task in self._tasks]
 
     @classmethod
@@ -110,9 +110,9 @@ class OneProcess:
         Raises:
             LookupError: The mailbox does not exist, or no message was visible.
         """
-        post = self._posts.get(mailbox)
+        post = self._mailboxes.get(mailbox)
         if post is None:
-            raise LookupError(f"no mailbox '{mailbox}'; mailboxes: {', '.join(self._posts)}")
+            raise LookupError(f"no mailbox '{mailbox}'; mailboxes: {', '.join(self._mailboxes)}")
         newest = post.find_newest(self.tick - 1)
         if newest is None:
             raise LookupError(f"'{mailbox}' is empty at tick {self.tick - 1}")
@@ -123,7 +123,7 @@ class OneProcess:
     @property
     def serials(self) -> Mapping[str, int]:
         """Serial of the newest visible message of each mailbox that has one."""
-        newest = {name: post.find_newest(self.tick - 1) for name, post in self._posts.items()}
+        newest = {name: post.find_newest(self.tick - 1) for name, post in self._mailboxes.items()}
         return {name: entry[0] for name, entry in newest.items() if entry is not None}
 
 
@@ -144,7 +144,7 @@ class PrivateMailbox:
         self.dtype = build_message_dtype(spec.fields, spec.size)
         self.message = AnyMessage(self.dtype)
         self.serial = 0
-        self.kept: deque[tuple[int, int, bytes]] = deque(maxlen=spec.delay // spec.every + 2)
+        self.stored: deque[tuple[int, int, bytes]] = deque(maxlen=spec.delay // spec.every + 2)
 
     def write(self, tick: int, cycle: int) -> None:
         """Store the message if the mailbox is due at the end of the present cycle.
@@ -155,11 +155,11 @@ class PrivateMailbox:
         """
         if not (tick + cycle - self.spec.phase) % self.spec.every:
             self.serial += 1
-            self.kept.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
+            self.stored.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
 
     def find_newest(self, tick: int) -> tuple[int, bytes] | None:
         """Return serial and bytes of the newest message visible at `tick`. None without one."""
-        for visible_at, serial, data in reversed(self.kept):
+        for visible_at, serial, data in reversed(self.stored):
             if visible_at <= tick:
                 return serial, data
         return None

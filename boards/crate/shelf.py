@@ -100,7 +100,7 @@ class HeldSnapshot:
     copies: dict[str, WaitingCopy] = field(default_factory=dict)
     memory: int = -1
     private_bytes: int = 0
-    is_whole: bool = False
+    is_complete: bool = False
 
     def measure_memory(self) -> None:
         """Measure the memory that the snapshot does not share with other processes."""
@@ -137,7 +137,7 @@ class SnapshotShelf:
     @property
     def _whole_snapshots(self) -> list[HeldSnapshot]:
         """Snapshots with copies of all processes, in the order in which they were taken."""
-        return [snapshot for snapshot in self._snapshots if snapshot.is_whole]
+        return [snapshot for snapshot in self._snapshots if snapshot.is_complete]
 
     def receive_note(self, wirings: Mapping[str, Wiring]) -> None:
         """Receive the next note of a board about its copy.
@@ -151,7 +151,7 @@ class SnapshotShelf:
                 if snapshot.tick == note.tick:
                     snapshot.copies[note.name].pid = note.pid
             return
-        unfinished = next((held for held in self._snapshots if not held.is_whole), None)
+        unfinished = next((held for held in self._snapshots if not held.is_complete), None)
         if unfinished is not None and unfinished.tick != note.tick:
             self.drop_snapshot(unfinished)
             unfinished = None
@@ -175,14 +175,14 @@ class SnapshotShelf:
             # The pages that the rack has changed since are now private to the previous snapshot.
             before.measure_memory()
         self._snapshots.append(snapshot)
-        snapshot.is_whole = True
+        snapshot.is_complete = True
         snapshot.private_bytes = os.fstat(snapshot.memory).st_size
         while len(self) > MOST_SNAPSHOTS or (
             len(self) > 2 and self.private_bytes > self._most_bytes
         ):
-            self.drop_snapshot(self._choose_dispensable())
+            self.drop_snapshot(self._choose_snapshot_to_drop())
 
-    def _choose_dispensable(self) -> HeldSnapshot:
+    def _choose_snapshot_to_drop(self) -> HeldSnapshot:
         """Return the snapshot of the older half whose removal leaves the smallest gap.
 
         The newest snapshot and the one with the first tick are never chosen.

@@ -54,7 +54,7 @@ def compute_last_read_ticks(mailboxes: tuple[str, ...], layout: Layout) -> int:
     )
 
 
-def list_struck_mailboxes(layout: Layout, index: int, board: str) -> tuple[MailboxSpec, ...]:
+def list_affected_mailboxes(layout: Layout, index: int, board: str) -> tuple[MailboxSpec, ...]:
     """Return the mailboxes that a fault of a task affects.
 
     Args:
@@ -104,7 +104,7 @@ class BoundCase:
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
         """Affected mailboxes that the reader reads or, if no reader is given, any task reads."""
-        struck = list_struck_mailboxes(self.layout, self.injection.mailbox, self.board)
+        struck = list_affected_mailboxes(self.layout, self.injection.mailbox, self.board)
         if self.reader:
             return tuple(mailbox for mailbox in struck if self.reader in mailbox.readers)
         return tuple(mailbox for mailbox in struck if mailbox.readers)

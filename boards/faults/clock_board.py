@@ -23,7 +23,7 @@ from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
 from rack.backplane.words import Block, Run, System, TaskState
-from rack.boards.faults.bounds import list_struck_mailboxes
+from rack.boards.faults.bounds import list_affected_mailboxes
 from rack.boards.faults.describe import find_board
 from rack.boards.faults.kind import find_kind
 from rack.boards.faults.message_steps import Babble, forge_message
@@ -270,7 +270,7 @@ class FaultStage:
     def _is_over(self, entry: FaultEntry, tick: int) -> bool:
         """Return True if a fault has reached its end, has acted once, or has lost its process."""
         kind = find_kind(entry)
-        has_acted = kind.once and kind.is_of_task and entry.count > 0
+        has_acted = kind.once and kind.acts_in_task and entry.count > 0
         return entry.until <= tick or has_acted or _find_step(entry).is_void(self, entry)
 
     def _is_due(self, entry: FaultEntry, tick: int) -> bool:
@@ -292,7 +292,7 @@ class FaultStage:
         kind = find_kind(entry)
         entry.tick = tick
         duration_ticks = entry.ticks
-        if kind.once and not kind.is_of_task:
+        if kind.once and not kind.acts_in_task:
             # The clock's board carries the fault out at once, so one tick is enough. A fault that
             # acts in its task must stay active until the task's next cycle.
             duration_ticks = 1
@@ -309,5 +309,5 @@ class FaultStage:
         """Start to watch for the first new message in each mailbox that a fault has affected."""
         layout = self.segment.layout
         if find_kind(entry).takes_mailbox:
-            for box in list_struck_mailboxes(layout, entry.mailbox, find_board(entry, layout)):
+            for box in list_affected_mailboxes(layout, entry.mailbox, find_board(entry, layout)):
                 self._awaited[layout.mailboxes.index(box)] = entry.until

@@ -27,7 +27,7 @@ from rack.boards.faults.bounds import (
     Bound,
     BoundCase,
     cycle_ticks,
-    list_struck_mailboxes,
+    list_affected_mailboxes,
 )
 from rack.boards.faults.drawing import Draw, DrawTicks
 
@@ -150,12 +150,12 @@ class Kind:
         return self.where in ("writer", "bus", "lock")
 
     @property
-    def is_of_task(self) -> bool:
+    def acts_in_task(self) -> bool:
         """Whether the fault acts in the task's own process, during its cycles."""
         return self.where in ("load", "writer", "lock", "arm")
 
     @property
-    def is_over_when_found(self) -> bool:
+    def ends_when_detected(self) -> bool:
         """Whether the fault ends once it is detected, because the Rack then kills the process."""
         return self.consequence.ends_process and not self.once
 
@@ -220,7 +220,7 @@ class Kind:
         cycle = cycle_ticks(layout, board) if ends and board != CLOCK else 0
         if self.takes_mailbox:
             cycle += max(
-                (box.every + box.delay for box in list_struck_mailboxes(layout, -1, board)),
+                (box.every + box.delay for box in list_affected_mailboxes(layout, -1, board)),
                 default=0,
             )
         return cycle + ceil(

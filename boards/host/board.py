@@ -24,7 +24,7 @@ from rack.levels.host_program import HostProgram
 
 CLAIM_S = 2.0
 """Longest wait for the end of processes that the previous process of this board has forked."""
-LOOK_S = 0.01
+RETRY_S = 0.01
 """Time between two attempts to open the bus."""
 FAILED_STATUS = 1
 """Exit status of a host board whose program raised an exception."""
@@ -83,7 +83,7 @@ def _open_bus(segment: Segment, wiring: HostWiring) -> HostBus:
         except MailboxError:
             if time.monotonic() > deadline:
                 raise
-            time.sleep(LOOK_S)
+            time.sleep(RETRY_S)
 
 
 def _exit_on_signal(number: int, frame: FrameType | None) -> None:

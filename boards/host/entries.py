@@ -68,7 +68,7 @@ class EntryConfig(Table):
     """largest number of messages of a host board that one cycle processes; further ones wait"""
 
     @model_validator(mode="after")
-    def _check_mode(self) -> Self:
+    def _check_phase_and_every(self) -> Self:
         """Check that `phase` is below `every`, and that asynchronous entries have `every` = 1."""
         if self.phase >= self.every:
             raise ValueError(f"phase = {self.phase}: must be less than every, {self.every}")
@@ -90,7 +90,7 @@ class AdapterParams(Table):
     """mailboxes to pass, by port of the adapter"""
 
     @model_validator(mode="after")
-    def _check_ports(self) -> Self:
+    def _check_port_names(self) -> Self:
         """Check that all names of ports are valid and differ from the fields of a status."""
         for port in self.entries:
             if not PORT.fullmatch(port) or port in RESERVED:

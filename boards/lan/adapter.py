@@ -85,7 +85,7 @@ class LanAdapter(Adapter):
         """
         table = _read_table(params)
         if table is None:
-            return ConfiguredPorts(is_whole=False)
+            return ConfiguredPorts(is_complete=False)
         known_exports = {
             port: entry for port, entry in table.exports.items() if entry.source in types
         }
@@ -189,10 +189,10 @@ class LanAdapter(Adapter):
             barrier.open(link, self._launch)
             # The previous adapter may have died before its last step had left the machine, so
             # prepare that step again.
-            if barrier.done >= 0:
+            if barrier.last_done_tick >= 0:
                 for export in self._exports.values():
-                    export.resend_last(barrier.done, self.context.every)
-                barrier.prepare_step(barrier.done)
+                    export.resend_last(barrier.last_done_tick, self.context.every)
+                barrier.prepare_step(barrier.last_done_tick)
         self._peers.set_source(
             link.watch_tokens() if barrier is None else barrier.take_changes, barrier is not None
         )
@@ -239,7 +239,7 @@ class LanAdapter(Adapter):
             self._words[System.PEER_STOP] = encode_switch(since, must_stop)
         if self._peers.arrivals != arrivals:
             for export in self._exports.values():
-                export.is_asked = True
+                export.must_resend = True
 
     def _write_status(self, tick: int) -> None:
         """Write the status with all counters, and the presence and clock of each other rack."""

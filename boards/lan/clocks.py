@@ -151,7 +151,7 @@ class PeerClock:
     offset: ClockOffset = field(default_factory=ClockOffset)
     sent: dict[int, int] = field(default_factory=dict)
     due_ns: int = 0
-    met: tuple[int, int] = (NO_LAUNCH, 0)
+    launch_and_losses: tuple[int, int] = (NO_LAUNCH, 0)
     epoch_ns: int = 0
     period_ns: int = 1
     clock_ns: int = 0
@@ -159,8 +159,8 @@ class PeerClock:
     def discard_if_outdated(self) -> None:
         """Discard measurements that were made before a new launch or a loss of the rack."""
         launch_and_losses = (self.peer.launch, self.peer.losses)
-        if launch_and_losses != self.met:
-            self.met = launch_and_losses
+        if launch_and_losses != self.launch_and_losses:
+            self.launch_and_losses = launch_and_losses
             self.due_ns = 0
             self.epoch_ns = 0
             self.clock_ns = 0

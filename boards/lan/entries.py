@@ -103,7 +103,7 @@ class Export:
         self._key = out_key(segment.rack, table.source)
         self._grid = grid
         self.every = grid.compute_period_cycles(table.rate_hz)
-        self.is_asked = False
+        self.must_resend = False
         self.count = zero_counts(LanExport)
         self._put: Callable[[bytes, bytes], None]
 
@@ -145,9 +145,9 @@ class Export:
         if source.serial != count.serial:
             count.sent += 1
             count.serial = source.serial
-        elif not self.is_asked or grid.is_lockstep:
+        elif not self.must_resend or grid.is_lockstep:
             return
-        self.is_asked = False
+        self.must_resend = False
         written_tick = source.newest
         payload = bytes(reading.message.raw)
         times = written_tick, grid.time_ns(written_tick), grid.stamp_ns(written_tick)

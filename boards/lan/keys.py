@@ -42,7 +42,7 @@ def alive_key(rack: str, launch: int, cycle_ns: int = 0) -> str:
     return f"rack/{rack}/alive/{launch:016x}" + (f"-{cycle_ns}" if cycle_ns else "")
 
 
-def launch_and_cycle(alive: str) -> tuple[int, int] | None:
+def parse_alive_key(alive: str) -> tuple[int, int] | None:
     """Parse the key expression of a liveliness token.
 
     Returns:

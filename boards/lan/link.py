@@ -25,7 +25,7 @@ from rack.boards.lan.access import build_access_control
 from rack.boards.lan.config import CredentialError, LanTable
 from rack.boards.lan.endpoint import Endpoint, has_tls, list_endpoints
 from rack.boards.lan.envelope import MAX_ENVELOPE_BYTES, Sealer
-from rack.boards.lan.keys import ALL_ALIVE, alive_key, launch_and_cycle
+from rack.boards.lan.keys import ALL_ALIVE, alive_key, parse_alive_key
 from rack.levels.errors import LevelError
 
 if TYPE_CHECKING:
@@ -210,7 +210,7 @@ class LanLink:
             """Yield the changes in the buffer, oldest first."""
             for sample in waiting():
                 key = str(sample.key_expr)
-                if (parsed := launch_and_cycle(key)) is not None:
+                if (parsed := parse_alive_key(key)) is not None:
                     yield key.split("/")[1], parsed[0], sample.kind == zenoh.SampleKind.PUT
 
         return take_changes

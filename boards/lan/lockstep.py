@@ -34,7 +34,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.lan.awaited import GIVE_UP_S, WaitReason, encode_wait
 from rack.boards.lan.envelope import Envelope, Flaw
-from rack.boards.lan.keys import ALL_ALIVE, launch_and_cycle, step_key
+from rack.boards.lan.keys import ALL_ALIVE, parse_alive_key, step_key
 from rack.boards.lan.link import MAX_STEP_BYTES, LanLink, ReceivedMessage
 from rack.boards.lan.peers import NO_LAUNCH
 from rack.levels.errors import CannotGoOn
@@ -124,7 +124,7 @@ class Partner:
         self.launch = NO_LAUNCH
         self.time_ns = NEVER
         self.steps: deque[Step] = deque()
-        self.is_out = self.is_there = False
+        self.is_out = self.is_present = False
         self.gone_s: float | None = None
 
     @property
@@ -185,10 +185,10 @@ class Barrier:
             self._partners[rack].is_out = True
         self._tick_ns = segment.layout.clock_ns
         self.cycle_ns = segment.layout.find_task(board).every * self._tick_ns
-        self.done = self._block[Block.DONE]
-        self._is_restarted = self.done >= 0
+        self.last_done_tick = self._block[Block.DONE]
+        self._is_restarted = self.last_done_tick >= 0
         # Exports up to this time were delivered before the restart and are not delivered again.
-        self._passed_ns = self.done * self._tick_ns if self._is_restarted else NEVER
+        self._passed_ns = self.last_done_tick * self._tick_ns if self._is_restarted else NEVER
         self._is_first = True
         self._has_begun = self._is_restarted
         self._has_refused = False
@@ -327,7 +327,7 @@ class Barrier:
         if partner is None or partner.is_out:
             return
         if key != step_key(partner.rack):
-            if (parsed := launch_and_cycle(key)) is not None:
+            if (parsed := parse_alive_key(key)) is not None:
                 self._process_token(partner, *parsed, sample.kind == zenoh.SampleKind.PUT)
             return
         arrived = ReceivedMessage.from_sample(sample)
@@ -413,6 +413,6 @@ class Barrier:
                 if export.key.split("/")[1] == partner.rack and export.key in self._imports:
                     self._imports[export.key].append(export)
         is_present = partner.time_ns >= self._now_ns
-        if is_present != partner.is_there or self._is_first:
-            partner.is_there = is_present
+        if is_present != partner.is_present or self._is_first:
+            partner.is_present = is_present
             self._changes.append((partner.rack, partner.launch, is_present))

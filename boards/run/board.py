@@ -29,7 +29,7 @@ from rack.boards.errors import UNRECOVERABLE_STATUS
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.boards.run.copying import Copier
-from rack.boards.run.snapshots import TaskCopies, wants_snapshots
+from rack.boards.run.snapshots import TaskCopies, has_snapshots_enabled
 from rack.boards.run.system_controller import run_clock
 from rack.boards.wiring import ClockWiring, TaskWiring
 from rack.levels.errors import CannotGoOn, LevelError
@@ -121,7 +121,7 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies:
 def _run_level(segment: Segment, wiring: TaskWiring, attention: int, copies: socket) -> None:
     """Build and test the level of a task, then run its cycles. See `run_task_board`."""
     spec = segment.layout.find_task(wiring.task)
-    copier = Copier(segment, wiring.task, copies) if wants_snapshots(segment) else None
+    copier = Copier(segment, wiring.task, copies) if has_snapshots_enabled(segment) else None
     block = segment.get_block(wiring.task)
     kind: type[Executor] | type[Planner] = find_class(
         wiring.target, Executor if spec.role == "executor" else Planner
@@ -175,7 +175,7 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copie
     Returns:
         The exit status of the board.
     """
-    copier = Copier(segment, CLOCK, copies) if wants_snapshots(segment) else None
+    copier = Copier(segment, CLOCK, copies) if has_snapshots_enabled(segment) else None
     take_core(wiring.core, wiring.priority, wiring.reservation)
     # Memory is not touched in advance, because every board waits for the start of the clock. The
     # clock's lead over its grid points leaves enough time for a page fault.

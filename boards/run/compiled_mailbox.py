@@ -72,7 +72,7 @@ PORT = _build_dtype(
 _SIGNATURE = 8 * Slot.EPOCH
 _VISIBLE = 8 * Slot.VISIBLE_AT
 _PORT_SIZE = PORT.itemsize
-OLD_RESULT, NEW_RESULT, JUDGE_MESSAGES, JUDGE_SILENCE, READ_IN_PYTHON = 0, 1, 2, 4, 8
+OLD_RESULT, NEW_RESULT, CHECK_MESSAGES, CHECK_SILENCE, READ_IN_PYTHON = 0, 1, 2, 4, 8
 """Results of a read, of which the last three are bits that can be combined.
 
 They request that Python check the messages, check the writer's silence, or make the whole read.
@@ -154,9 +154,9 @@ def read_port(port: Any, tick: int) -> int:
             state.judged = serial
             state.judged_tick = state.tick
         elif serial != state.judged:
-            result |= JUDGE_MESSAGES
+            result |= CHECK_MESSAGES
         if tick - state.tick >= port.quiet or load(port.lost):
-            result |= JUDGE_SILENCE
+            result |= CHECK_SILENCE
     return result
 
 

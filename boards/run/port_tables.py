@@ -22,8 +22,8 @@ from rack.backplane.message import AnyMessage
 from rack.backplane.watch.watched_reader import MailboxWatcher, WatchedReader
 from rack.backplane.words import Block
 from rack.boards.run.compiled_mailbox import (
-    JUDGE_MESSAGES,
-    JUDGE_SILENCE,
+    CHECK_MESSAGES,
+    CHECK_SILENCE,
     MAX_PORTS,
     NEW_RESULT,
     PORT,
@@ -106,11 +106,11 @@ class ReadTable(PortTable):
                 else:
                     reading = watched.reader.get_reading(bool(result & NEW_RESULT))
                     if isinstance(watched, WatchedReader):
-                        reading = watched.judge_reading(
+                        reading = watched.check_reading(
                             tick,
                             reading,
-                            is_odd=bool(result & JUDGE_MESSAGES),
-                            is_silent=bool(result & JUDGE_SILENCE),
+                            is_odd=bool(result & CHECK_MESSAGES),
+                            is_silent=bool(result & CHECK_SILENCE),
                         )
                 line.values[line.key] = reading
         for line in self._others:
@@ -162,7 +162,7 @@ class WriteTable(PortTable):
             port["sources"] = sources.ctypes.data
             port["source_count"] = len(sources)
             port["every"] = spec.every
-            port["ahead"] = spec.ahead - spec.phase
+            port["ahead"] = spec.lead_ticks - spec.phase
             port["delay"] = writer.compute_visible_tick(0, None)
 
     def write(self, tick: int) -> bool:

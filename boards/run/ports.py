@@ -190,7 +190,7 @@ class OutputPort:
             self.value = Sender(writer.message, writer.send, writer.count_free_places)
         # A cycle is due to write if its message would become visible at a tick of the mailbox's
         # grid, so if (tick + this number) is a multiple of the mailbox's period.
-        self._ahead = spec.ahead - spec.phase
+        self._ahead = spec.lead_ticks - spec.phase
         self._index = segment.layout.find_mailbox_index(spec.name)
         self._episodes = Episodes(segment, spec.name, alarms)
         self._faulty: FaultyWriter | None = None

@@ -29,7 +29,7 @@ COPY_REFUSED = -1
 """Value of `Block.COPY` by which a task reports that it cannot be copied."""
 
 
-def wants_snapshots(segment: Segment) -> bool:
+def has_snapshots_enabled(segment: Segment) -> bool:
     """Check whether snapshots of this rack are to be taken."""
     words = segment.words
     return any(

@@ -288,7 +288,7 @@ class EndOfRun:
         self._phase = 0
         if self._reader is not None:
             self._writer = segment.get_block(self._reader.spec.writer)
-            if self._reader.spec.is_by_ticks:
+            if self._reader.spec.is_tick_based:
                 self._every = self._reader.spec.every
                 self._phase = self._reader.spec.phase
         self._next = 0

@@ -25,7 +25,7 @@ class InboxTiming:
     sources: tuple[InterruptSource, ...]
     depth: int
 
-    def cost_ns(self, span_ns: int) -> int:
+    def compute_cost_ns(self, span_ns: int) -> int:
         """Return the processor time in ns of all interrupts that can arrive within `span_ns`."""
         return sum(source.service_ns * -(-span_ns // source.every_ns) for source in self.sources)
 
@@ -40,7 +40,7 @@ class InboxTiming:
         return {
             "task": self.task,
             "mailboxes": list(self.mailboxes),
-            "cycle_cost_ns": self.cost_ns(cycle_ns),
+            "cycle_cost_ns": self.compute_cost_ns(cycle_ns),
             "load": burst.load,
             "depth": self.depth,
             "waiting": burst.waiting,

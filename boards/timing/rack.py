@@ -191,7 +191,11 @@ class RackTiming:
         0 if the task does not serve an inbox.
         """
         inbox = self.inboxes.get(task)
-        return 0 if inbox is None else inbox.cost_ns(self.find_slice_ticks(task) * self.clock_ns)
+        return (
+            0
+            if inbox is None
+            else inbox.compute_cost_ns(self.find_slice_ticks(task) * self.clock_ns)
+        )
 
     def find_slice_ticks(self, task: str) -> int:
         """Return the cycle of an executor, or the time slice of a planner's plan, in ticks."""

@@ -135,8 +135,8 @@ def _simulate_core(runners: list[_TaskSimulation], until_ns: int) -> None:
         if not ready:
             now = next_release
             continue
-        first = min(ready, key=_TaskSimulation.compute_rank)
-        now = first.compute_step(now, min(next_release, until_ns))
+        first = min(ready, key=_TaskSimulation.get_sort_key)
+        now = first.run_step(now, min(next_release, until_ns))
 
 
 class _TaskSimulation:
@@ -164,14 +164,14 @@ class _TaskSimulation:
         self._slack_ns = 0
         self._ends: dict[int, int | None] = {}
 
-    def compute_rank(self) -> tuple[int, bool, int, str]:
+    def get_sort_key(self) -> tuple[int, bool, int, str]:
         """Return a sort key for ready tasks. The task with the smallest key runs."""
         is_locked = self._spent_ns > 0 and not self._steps[0].preemptible
         priority = max(self.task.priority, self.task.ceiling) if is_locked else self.task.priority
         # A protected part that has begun precedes tasks of the same priority released since.
         return -priority, not is_locked, self.ready_at, self.task.name
 
-    def compute_step(self, now_ns: int, until_ns: int) -> int:
+    def run_step(self, now_ns: int, until_ns: int) -> int:
         """Run the task from `now_ns` until a part ends or `until_ns`, and return that time."""
         if not self._steps:
             self._begin_job(now_ns)

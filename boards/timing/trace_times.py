@@ -90,19 +90,19 @@ def compute_gaps_ns(rows: TraceRows, stretches: Values | None = None) -> Values:
     return gaps if stretches is None else gaps[np.diff(stretches) == 0]
 
 
-def find_missed(rows: TraceRows) -> Values:
+def find_missed_cycles(rows: TraceRows) -> Values:
     """Return for each cycle whether it missed its deadline or wrote a message too late."""
     return np.asarray((rows["flags"] & Flag.MISSED) > 0)
 
 
-def count_skipped(rows: TraceRows) -> Values:
+def count_skipped_releases(rows: TraceRows) -> Values:
     """Return the number of releases that were skipped just before each cycle."""
     return np.asarray(rows["flags"] >> SKIPPED_SHIFT)
 
 
 def count_misses_and_skips(rows: TraceRows) -> tuple[int, int]:
     """Return the number of missed cycles and the number of skipped releases."""
-    return int(np.count_nonzero(find_missed(rows))), int(count_skipped(rows).sum())
+    return int(np.count_nonzero(find_missed_cycles(rows))), int(count_skipped_releases(rows).sum())
 
 
 def select_plans(rows: TraceRows) -> Values:

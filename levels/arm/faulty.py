@@ -64,18 +64,18 @@ class FaultyLink:
         # Each with the fraction of its torque limit that the motor still provides.
         self._motors: list[tuple[float, ActiveFault]] = []
         self._commands: list[tuple[CommandStep, ActiveFault]] = []
-        self._kept: dict[Key, Sensed] = {}
+        self._first_samples: dict[Key, Sensed] = {}
         self._torque = np.zeros(len(limits))
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Replace the active faults. A fault of a joint that the arm lacks has no effect."""
         active = [
-            ActiveFault(place, fault, joints, self._arm.every, self._kept)
+            ActiveFault(place, fault, joints, self._arm.every, self._first_samples)
             for place, fault in enumerate(faults)
             if (joints := self._mark_joints(fault)).any()
         ]
-        for gone in self._kept.keys() - {a.key for a in active}:
-            del self._kept[gone]
+        for gone in self._first_samples.keys() - {a.key for a in active}:
+            del self._first_samples[gone]
         steps = [(a.fault.step, a) for a in active]
         self._sensors = [(step, a) for step, a in steps if isinstance(step, SensorStep)]
         self._motors = [(step.part(a), a) for step, a in steps if isinstance(step, MotorStep)]

@@ -108,7 +108,7 @@ class GuardedArm:
         is_new = self._state is None or state.tick != self._state.tick
         self._state = state
         if is_new:
-            self._judge_sample(state)
+            self._check_sample(state)
         return sample
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
@@ -136,7 +136,7 @@ class GuardedArm:
         passed = self._set_points.limit_set_point(target, state.position, state.velocity)
         return passed if isinstance(passed, Finding) else self._below.follow(passed, grip_force)
 
-    def _judge_sample(self, sample: Sensed) -> None:
+    def _check_sample(self, sample: Sensed) -> None:
         """Set the arm's `exceeded` to the limit that a sample exceeds, or to None.
 
         A violation while the drives are enabled is counted and reported.

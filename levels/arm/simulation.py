@@ -109,7 +109,7 @@ class Simulation(Plant):
         return self.tick * self._clock_ns * 1e-9
 
     @property
-    def _after_s(self) -> float:
+    def _tick_end_s(self) -> float:
         """Simulated time at the end of the tick, in s."""
         return (self.tick + 1) * self._clock_ns * 1e-9
 
@@ -119,7 +119,7 @@ class Simulation(Plant):
             self._data.mocap_pos[mocap] = compute_obstacle_position(start, moves, self._now_s)
         for body, pushes in self._pushes:
             self._data.xfrc_applied[body, :3] = compute_push_force(pushes, self._now_s)
-        steps_made = self._advance(0, self._after_s, *self._steps)
+        steps_made = self._advance(0, self._tick_end_s, *self._steps)
         if steps_made < 0:
             self._finish_failed_tick(-steps_made)
         elif self.struck:
@@ -133,7 +133,7 @@ class Simulation(Plant):
         touches = self.touches
         self._count_contacts()
         while steps_made < len(self._steps.seen):
-            steps_made = self._advance(steps_made, self._after_s, *self._steps)
+            steps_made = self._advance(steps_made, self._tick_end_s, *self._steps)
             if steps_made < 0:
                 steps_made = -steps_made
                 self._count_contacts()
@@ -147,7 +147,7 @@ class Simulation(Plant):
         if self.fault:
             restore_state(self._model, self._data, self._steps.states[0])
             self._read_joint_state()
-        self._data.time = self._after_s
+        self._data.time = self._tick_end_s
 
     def _count_contacts(self) -> None:
         """Count the unintended contacts of the last step. Store one that involves arm or load."""

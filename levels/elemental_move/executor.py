@@ -281,7 +281,7 @@ class ElementalMoveExecutor(Executor):
         report.echo = command.id
         report.state = self._find_state(command)
         waits = ""
-        if report.state == State.EXECUTING and (waits := self._reason_to_wait()):
+        if report.state == State.EXECUTING and (waits := self._find_wait_reason()):
             report.state = State.HOLDING
         report.error = self._error
         report.reason = self._reason if self._error else waits
@@ -321,7 +321,7 @@ class ElementalMoveExecutor(Executor):
             self._orders.report_done()
         self._orders.fill_status(self.status, above)
 
-    def _reason_to_wait(self) -> str:
+    def _find_wait_reason(self) -> str:
         """Return why the level waits and what ends the wait. Empty if it does not wait."""
         command = self.above
         below = self.below

@@ -90,7 +90,7 @@ class BlendedPath:
         self._corners = np.concatenate(([0.0], np.cumsum(lengths)))
         self.length = float(self._corners[-1])  # rad
         self.stops: list[float] = []  # s of the corners where motion must come to rest, rad
-        pieces, breaks = self._lay_pieces()
+        pieces, breaks = self._divide_into_pieces()
         self.breaks = np.array(breaks)  # (pieces + 1,), rad: s where each piece begins, and the end
         at, radius = (np.array(column) for column in zip(*pieces, strict=True))
         before = at - (radius > 0.0)
@@ -133,7 +133,7 @@ class BlendedPath:
             self._marks, self._table, np.linspace(0.0, self.length, count)
         )
 
-    def _lay_pieces(self) -> tuple[list[tuple[int, float]], list[float]]:
+    def _divide_into_pieces(self) -> tuple[list[tuple[int, float]], list[float]]:
         """Divide the path into lines and corners.
 
         Returns:

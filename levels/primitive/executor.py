@@ -26,9 +26,9 @@ from rack.levels.primitive.motion_segment import (
     Memory,
     MotionSegment,
     SegmentFault,
+    list_serials,
     read_segment,
     restore_memory,
-    window,
 )
 from rack.levels.primitive.path_guard import PathGuard, SceneWatch
 from rack.levels.primitive.path_motion import JointSetPoint
@@ -118,7 +118,7 @@ class PrimitiveExecutor(Executor):
         self._tick = tick
         servo = self.below.message
         self._orders.take_commands(self.operator)
-        serials = window(self.above.message)
+        serials = list_serials(self.above.message)
         self._plans.accept_plan(self.plan, serials)
         if servo.error == Error.DISABLED:
             # While the arm is not enabled it may be moved by hand, so plan from where it is.
@@ -129,7 +129,7 @@ class PrimitiveExecutor(Executor):
             self._resume_motion(servo, tick)
         self._sight.update_scene(self.world, servo.position, tick)
         if self._tracking.in_step:
-            self._do_segments(serials, tick, passed_s)
+            self._run_segment(serials, tick, passed_s)
         elif self._tracking.silent_cycles > self._silent_cycles:
             reason = f"no status from below for {self._tracking.silent_cycles} cycles"
             self._fault = SegmentFault(Error.BELOW, reason)
@@ -165,7 +165,7 @@ class PrimitiveExecutor(Executor):
         """
         self._sight.carry_object(row, tick - SEEN_CYCLES * self.context.every)
 
-    def _do_segments(self, serials: list[int], tick: int, passed_s: float) -> None:
+    def _run_segment(self, serials: list[int], tick: int, passed_s: float) -> None:
         """Run one cycle of the current segment: finish, withdraw, begin or advance it.
 
         Args:
@@ -193,7 +193,7 @@ class PrimitiveExecutor(Executor):
                 or withdrawn
                 or self._fault is not None
                 or self._straying.is_straying
-                or bool(self._sight.reason_to_wait)
+                or bool(self._sight.wait_reason)
             )
             plan = self._plans.find_trajectory(work.segment.id, work.motion.s)
             due_s = (tick + (LEAD_CYCLES - 1) * self.context.every) * self.context.tick_s
@@ -265,7 +265,7 @@ class PrimitiveExecutor(Executor):
             segment: The segment.
             memory: State with the interrupted segment and its progress.
         """
-        path = segment.path()
+        path = segment.build_path()
         self._guard.watch_path(segment, path, self.below.message.opening, self.world.message)
         work = PathWork(segment, path, self._guard, self._rules)
         if segment.id == memory.interrupted:
@@ -325,7 +325,7 @@ class PrimitiveExecutor(Executor):
         work = self._work
         status.echo = self.above.message.id
         status.state = self._find_state(serials)
-        reason = self._reason_to_wait() if status.state == State.EXECUTING else ""
+        reason = self._find_wait_reason() if status.state == State.EXECUTING else ""
         if reason:
             status.state = State.HOLDING
         status.error, status.reason, status.earliest = self._fault or (0, reason, 0.0)
@@ -352,7 +352,7 @@ class PrimitiveExecutor(Executor):
             status.ends = work.compute_end_s(self._compute_due_tick(tick) * self.context.tick_s)
         status.wants, status.begin = self._find_wanted_trajectory(serials)
 
-    def _reason_to_wait(self) -> str:
+    def _find_wait_reason(self) -> str:
         """Return why the level waits and what ends the wait. Empty if it does not wait."""
         work = self._work
         command = self.above
@@ -364,7 +364,7 @@ class PrimitiveExecutor(Executor):
             return self._orders.format_reason(self.context.board)
         if work is not None:
             blocked = f"blocked: {work.obstacle}" if work.blocked else ""
-            if reason := self._straying.place or blocked or self._sight.reason_to_wait:
+            if reason := self._straying.description or blocked or self._sight.wait_reason:
                 return reason
         if command.is_lost:
             return ABOVE_LOST

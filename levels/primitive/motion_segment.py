@@ -31,7 +31,7 @@ class SegmentFault(NamedTuple):
 class MotionSegment(MoveSegment):
     """A copy of one segment of a `MoveCommand`."""
 
-    def path(self) -> BlendedPath:
+    def build_path(self) -> BlendedPath:
         """Build the path of the segment.
 
         Raises:
@@ -49,7 +49,7 @@ class MotionSegment(MoveSegment):
         return SegmentFault(Error.TOO_LATE, reason, earliest_s)
 
 
-def window(command: MoveCommand) -> list[int]:
+def list_serials(command: MoveCommand) -> list[int]:
     """Return the serials of the segments in a `MoveCommand`, oldest first."""
     serials: list[int] = command.segments["id"][: command.count].tolist()
     return serials
@@ -65,7 +65,7 @@ def read_segment(command: MoveCommand, serial: int) -> MotionSegment:
     Raises:
         ValueError: The kind of the segment is unknown, or a number is not finite.
     """
-    record = command.segments[window(command).index(serial)]
+    record = command.segments[list_serials(command).index(serial)]
     segment = MotionSegment(record.dtype)
     segment.record[...] = record
     if segment.kind not in (SegmentKind.PATH, SegmentKind.GRIPPER):

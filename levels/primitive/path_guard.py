@@ -122,12 +122,12 @@ class PathGuard:
         obstacles = world.velocity[self._objects : self._rows]
         still = bool((np.abs(obstacles) < MAX_REST_M_S).all())
         self._checker.place_bodies(world.position, world.quaternion)
-        far_clear = self._is_far_clear(path, begin)
+        far_clear = self._is_remainder_clear(path, begin)
         moving = None if still else world
-        near_clear = self._is_near_clear(path, trajectory, time_s, moving)
+        near_clear = self._is_lookahead_clear(path, trajectory, time_s, moving)
         return near_clear and (far_clear or not still)
 
-    def _is_near_clear(
+    def _is_lookahead_clear(
         self, path: BlendedPath, trajectory: Trajectory, time_s: float, moving: WorldState | None
     ) -> bool:
         """Return True if the path within the look-ahead is clear.
@@ -152,7 +152,7 @@ class PathGuard:
                 break
         return True
 
-    def _is_far_clear(self, path: BlendedPath, begin: float) -> bool:
+    def _is_remainder_clear(self, path: BlendedPath, begin: float) -> bool:
         """Return True if the remaining path is clear where this cycle checks it.
 
         It checks the configuration that was blocked last, then the next few of the remaining path.
@@ -230,7 +230,7 @@ class SceneWatch:
             self._waiting = None
 
     @property
-    def reason_to_wait(self) -> str:
+    def wait_reason(self) -> str:
         """Why motion must wait for a new scene. Empty if it need not wait."""
         if self._blind:
             return "world model is stale: waiting for a new scene"

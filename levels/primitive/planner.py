@@ -10,7 +10,12 @@ from rack.levels.level import Input, LevelContext, Output, Planner, Reading
 from rack.levels.messages import Error, MoveCommand, PrimitiveStatus, TrajectoryPlan
 from rack.levels.motion.path import BlendedPath
 from rack.levels.motion.trajectory import Trajectory, make_trajectory
-from rack.levels.primitive.motion_segment import MotionSegment, SegmentFault, read_segment, window
+from rack.levels.primitive.motion_segment import (
+    MotionSegment,
+    SegmentFault,
+    list_serials,
+    read_segment,
+)
 from rack.levels.primitive.segment_work import PrimitiveParams, WorkRules
 from rack.levels.robot.cell import build_level_cell
 
@@ -38,7 +43,7 @@ class PrimitivePlanner(Planner):
     def wanted(self, tick: int) -> bool:
         """Return True if the executor wants a trajectory that it has not received."""
         status = self.status.message
-        if status.wants not in window(self.above.message):
+        if status.wants not in list_serials(self.above.message):
             return False
         # The status shows the effect of a plan one cycle later. If the plan is still wanted after
         # that, it was lost in a restart of the board.
@@ -81,7 +86,7 @@ class PrimitivePlanner(Planner):
         Raises:
             ValueError: The path is invalid or leaves the range of a joint.
         """
-        path = segment.path()
+        path = segment.build_path()
         low, high = self._positions.T
         outside = np.argwhere((path.waypoints < low) | (path.waypoints > high))
         if len(outside):

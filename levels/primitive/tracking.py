@@ -108,7 +108,7 @@ class DeviationMonitor:
         self._permitted_rad = permitted_rad
         self._permitted_cycles = permitted_cycles
         self._cycles = 0
-        self.place = ""
+        self.description = ""
         self.fault: SegmentFault | None = None
 
     @property
@@ -119,7 +119,7 @@ class DeviationMonitor:
     def reset_count(self) -> None:
         """Reset the count, and clear `place` and `fault`."""
         self._cycles = 0
-        self.place = ""
+        self.description = ""
         self.fault = None
 
     def update_status(self, servo: DrivenArm) -> None:
@@ -130,8 +130,10 @@ class DeviationMonitor:
             return
         self._cycles += 1
         joint = int(errors.argmax())
-        self.place = f"joint '{self._joints[joint]}' is {errors[joint]:.4f} rad from its set point"
+        self.description = (
+            f"joint '{self._joints[joint]}' is {errors[joint]:.4f} rad from its set point"
+        )
         if self._cycles > self._permitted_cycles:
             self.fault = SegmentFault(
-                Error.FOLLOWING, f"{self.place}; valid: at most {self._permitted_rad} rad"
+                Error.FOLLOWING, f"{self.description}; valid: at most {self._permitted_rad} rad"
             )

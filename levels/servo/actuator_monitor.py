@@ -128,7 +128,7 @@ class ActuatorMonitor:
         self._begun = self._pushed = False
         self._cycles = 0
 
-    def judge_cycle(self, wanted: Array, state: Array, terms: Terms, holds: bool) -> Finding | None:
+    def check_cycle(self, wanted: Array, state: Array, terms: Terms, holds: bool) -> Finding | None:
         """Judge the cycle that ends now. Its final state becomes the initial state of the next one.
 
         Args:

@@ -316,7 +316,7 @@ class ArmDriver(Executor):
         if wanted is None:
             return self.brake_arm()
         self.terms = self.find_terms()
-        failed = self.motors.judge_cycle(
+        failed = self.motors.check_cycle(
             wanted.table, self.sensors.state, self.terms, self.holds_part
         )
         if failed is not None:

@@ -190,7 +190,7 @@ class ServoLaw(ArmDriver):
             return reference.ramp_to_rest(tick)
         return (
             self.operator_control.compute_motion(reference, tick)
-            if self.operator_control.stands
+            if self.operator_control.is_in_control
             else reference.compute_motion(tick)
         )
 
@@ -202,7 +202,7 @@ class ServoLaw(ArmDriver):
         )
         # For set points the torques are predicted, as if the arm were at its set point.
         state = self._sensed if self.set_point_law is None else SensedMotion(wanted.table[:2])
-        if not self._modified.exists:
+        if not self._modified.has_modifications:
             return self._compute_limited_torque(wanted, state), grip_force
         terms = self.terms
         inputs = LawInputs(
@@ -248,7 +248,7 @@ class ServoLaw(ArmDriver):
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
         """Return how the level follows its set points. The status reports it."""
         operator = self.operator_control
-        stands = operator.stands
+        stands = operator.is_in_control
         cut = self.reference.refused + self._cut
         reason = self.stopping.reason
         if stands and not reason:

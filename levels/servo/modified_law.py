@@ -110,7 +110,7 @@ class ModifiedLaw:
         """
         joints = context.robot.joints
         period_s = context.period_s
-        self.exists = bool(params.modifications)
+        self.has_modifications = bool(params.modifications)
         self._all = {
             name: ModificationState(
                 number,

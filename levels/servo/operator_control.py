@@ -54,7 +54,7 @@ class OperatorControl:
                 empty text.
         """
         self.orders = Orders(commands)
-        self.stands = False
+        self.is_in_control = False
         self._driven = np.full(len(joints), True) if driven is None else driven
         self._joints = [name for name, drives in zip(joints, self._driven, strict=True) if drives]
         self._ranges = ranges[self._driven]
@@ -73,11 +73,11 @@ class OperatorControl:
             position: Position of the arm, (joints,), rad.
         """
         self._position[:] = position
-        if not self.orders.take_commands(operator, self._judge_command):
+        if not self.orders.take_commands(operator, self._process_command):
             return
         if not self.orders.is_in_force and self._way:
             self.orders.report_under_way()
-        self.stands = self.orders.is_in_force or bool(self._way)
+        self.is_in_control = self.orders.is_in_force or bool(self._way)
 
     def forget_return_path(self) -> None:
         """Discard the return path, so that the level above continues from where the arm is."""
@@ -86,14 +86,14 @@ class OperatorControl:
     @property
     def reason(self) -> str:
         """Why the arm does not follow the level above. Empty if it does."""
-        if not self.stands:
+        if not self.is_in_control:
             return ""
         if not self.orders.is_in_force:
             return "returning to where the operator took over, then follows the level above"
         state = "held" if self.orders.is_holding else f"at the {self.orders.standing.name.lower()}"
         return f"{state} by the operator; `resume` releases it"
 
-    def _judge_command(self, command: OperatorCommand) -> None:
+    def _process_command(self, command: OperatorCommand) -> None:
         """Accept or refuse the goal of a SETPOINT, a setting or a command to the drives."""
         if command.what in (*SETTINGS, *DRIVE_OPERATIONS):
             if refusal := self._obey(command):
@@ -125,6 +125,6 @@ class OperatorControl:
             if returns:
                 self._way.pop()
             if self.orders.is_in_force or not self._way:
-                self.stands = self.orders.is_in_force
+                self.is_in_control = self.orders.is_in_force
                 self.orders.report_done()
         return motion

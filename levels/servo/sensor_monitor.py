@@ -210,7 +210,7 @@ class SensorMonitor:
         self._late = self._late + 1 if sampled > self._sampled and not self.fresh else 0
         self._sampled = sampled
         if not self.fresh:
-            self._estimate_blind(passed_s, tick - sampled)
+            self._estimate_without_sample(passed_s, tick - sampled)
             return
         # The arm was driven, then braked, so it may have been faster than in both samples.
         braked_s = 4.0 * self._every * self._tick_s if passed > self._every else 0.0
@@ -230,7 +230,7 @@ class SensorMonitor:
             offset = joints["position"] - self.position - joints["way"]
             fitting = fitting | (np.abs(offset) <= joints["allowed"] + self.doubt)
         fastest = blow * joints["fastest"] if struck else joints["fastest"]
-        self._judge_doubtful_sample(fitting & (np.abs(joints["velocity"]) <= fastest), passed_s)
+        self._process_doubtful_sample(fitting & (np.abs(joints["velocity"]) <= fastest), passed_s)
 
     def _accept_sample(self, tolerance: Array) -> None:
         """Accept the sample as the new estimate.
@@ -256,7 +256,7 @@ class SensorMonitor:
         for field in ("position", "velocity"):
             self._joints[f"last_{field}"] = self._joints[field]
 
-    def _judge_doubtful_sample(self, fits: Mask, passed_s: float) -> None:
+    def _process_doubtful_sample(self, fits: Mask, passed_s: float) -> None:
         """Report the faults of a sample, accept its good joints, and estimate the others.
 
         Args:
@@ -334,7 +334,7 @@ class SensorMonitor:
         np.add(self.position, travel, out=self.position, where=coasting)
         np.copyto(self.velocity, qd, where=known)
 
-    def _estimate_blind(self, passed_s: float, age: int) -> None:
+    def _estimate_without_sample(self, passed_s: float, age: int) -> None:
         """Estimate all joints in a cycle without a current sample.
 
         Args:

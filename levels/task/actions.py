@@ -69,7 +69,7 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
         if isinstance(action, Transfer):
             rehearsal = rehearse_transfer(rehearsal, k, action, scene)
             continue
-        with _refusals_named(k, str(action)):
+        with _label_refusals(k, str(action)):
             if isinstance(action, Goto):
                 rehearsal = rehearse_goto(rehearsal, k, action)
             elif isinstance(action, Home):
@@ -80,7 +80,7 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
 
 
 @contextmanager
-def _refusals_named(k: int, step: str) -> Iterator[None]:
+def _label_refusals(k: int, step: str) -> Iterator[None]:
     """Add the step, and the number `k` of its action, to a refusal that is raised in the block."""
     try:
         yield
@@ -143,10 +143,10 @@ def rehearse_transfer(
     Raises:
         Refused: The transfer cannot be done. The reason names the step, pick or place.
     """
-    planner = Handling(rehearsal, scene.objects.index(action.object), action.lift)
+    planner = TransferPlanner(rehearsal, scene.objects.index(action.object), action.lift)
     pick = f"pick {action.object}"
     place = f"place {action.object} at [{', '.join(f'{value:.4g}' for value in action.to)}]"
-    with _refusals_named(k, place):
+    with _label_refusals(k, place):
         situation = rehearsal.situation
         row = planner.row
         cell = rehearsal.motion.cell
@@ -161,27 +161,27 @@ def rehearse_transfer(
 
     def pair_takes_with_goals() -> Iterator[tuple[list[Spot], list[Pose]]]:
         """Yield each group of spots to take the object with each group of goals, in that order."""
-        with _refusals_named(k, pick):
+        with _label_refusals(k, pick):
             for takes in planner.find_takes():
                 yield from ((takes, group) for group in standing_goals)
 
     def rehearse_pair(pair: tuple[list[Spot], list[Pose]]) -> Rehearsal:
         """Rehearse the quickest feasible way from a group of spots to a group of goals."""
-        with _refusals_named(k, place):
+        with _label_refusals(k, place):
             ways = planner.find_ways(*pair)
         return _rehearse_first(ways[:MAX_WAYS], rehearse_way)
 
     def rehearse_way(way: Way) -> Rehearsal:
         """Rehearse the moves that take the object and put it down."""
-        with _refusals_named(k, pick):
+        with _label_refusals(k, pick):
             taken = planner.rehearse_moves(rehearsal, k, way.take, Verb.GRASP)
-        with _refusals_named(k, place):
+        with _label_refusals(k, place):
             return planner.rehearse_moves(taken, k, way.put, Verb.RELEASE)
 
     return _rehearse_first(pair_takes_with_goals(), rehearse_pair)
 
 
-class Handling(NamedTuple):
+class TransferPlanner(NamedTuple):
     """Plans one transfer of an object.
 
     The tool moves straight down to the object and straight up again.

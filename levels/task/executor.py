@@ -65,7 +65,7 @@ class TaskExecutor(Executor):
             self._restore_state()
         self._orders.take_commands(
             self.operator,
-            lambda command: self._judge_command(
+            lambda command: self._check_command(
                 command, find_answered_serial(self.last_status.message)
             ),
         )
@@ -110,7 +110,7 @@ class TaskExecutor(Executor):
             self._window = ShownWindow(last.first, self.last_command.message.id, before)
             self._detour = Detour(self.context.robot, self._orders, self._window, last.detour)
 
-    def _judge_command(self, command: OperatorCommand, answered: int) -> None:
+    def _check_command(self, command: OperatorCommand, answered: int) -> None:
         """Accept or refuse a goto. Other commands need no check.
 
         A goto up to serial `answered` was answered before a restart of this board, and is not new.
@@ -195,10 +195,10 @@ class TaskExecutor(Executor):
             self._window.show_one(detour.to_move(self._count_done_actions(plan)), command)
         else:
             is_stopped = self._error or detour.move
-            until = 0 if is_stopped else self._find_last_move(plan)
+            until = 0 if is_stopped else self._find_first_barred_move(plan)
             self._window.show_moves(plan, self._done, command, until)
 
-    def _find_last_move(self, plan: TaskPlan) -> int:
+    def _find_first_barred_move(self, plan: TaskPlan) -> int:
         """Return the number of the first move of the plan that must not begin yet."""
         return plan.count if self._detour.until is None else self._detour.until
 

@@ -94,7 +94,7 @@ def check(
         print("the timing does not fit; looking for changes that help", file=sys.stderr)
     fitting = find_repair(judged)
     if fix:
-        _print_fixed(fitting, as_json)
+        _print_repaired_config(fitting, as_json)
         if fitting.remaining_failures:
             sys.exit(1)
         return
@@ -173,7 +173,7 @@ def _compute_abilities(config: RackConfig) -> Abilities | None:
     return compute_abilities(build_rack_cell(config))
 
 
-def _print_fixed(fitting: Repair, as_json: bool) -> None:
+def _print_repaired_config(fitting: Repair, as_json: bool) -> None:
     """Print the repaired config on stdout and its changes on stderr, or both as JSON."""
     config = None if fitting.remaining_failures else fitting.end.config.to_toml_text()
     if as_json:

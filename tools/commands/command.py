@@ -128,7 +128,7 @@ def command(
             return
         reply = desk.give_command(request, wait, timeout)
     print_reply(reply, as_json)
-    if reply.is_standing and Operation[what.upper()] in EFFECTS and not as_json:
+    if reply.is_in_force and Operation[what.upper()] in EFFECTS and not as_json:
         print(f"in force until: {format_resume_command(rack, level)}")
 
 

@@ -144,7 +144,7 @@ def merge_runs(runs: Sequence[Path], out: Path, place: Places = place_on_time_li
             why = "not the folder of a run" if run.exists() else "no such folder"
             raise Failure(f"{run}: {why}", 2)
     placed = place([Recording(run) for run in runs])
-    tick_s = placed[0].own.clock_ns * 1e-9
+    tick_s = placed[0].grid.clock_ns * 1e-9
     marks = [mark for recording in placed for mark in recording.marks]
     notes = [f"{tick * tick_s:g} s: {text}" if tick else text for tick, text in marks]
     # Import late, because this takes half a second.

@@ -111,7 +111,7 @@ def check(
         from rack.tools.robot.picture import draw_arm
 
         picture = draw_arm(examined.cell, out or Path(f"{name}.png"))
-    able = examined.able
+    able = examined.abilities
     document = {
         "robot": name,
         "joints": examined.joints,

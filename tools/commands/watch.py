@@ -147,12 +147,12 @@ def _show_signals(
         raise Failure(f"{strip.lost} messages were overwritten before they could be shown")
 
 
-def _await_trigger(segment: Segment, strip: SignalHistory, trigger: Trigger, after: int) -> int:
+def _await_trigger(segment: Segment, history: SignalHistory, trigger: Trigger, after: int) -> int:
     """Wait until a condition holds, and then for `after` more ticks.
 
     Args:
         segment: The rack.
-        strip: History of the signals, which this function updates.
+        history: History of the signals, which this function updates.
         trigger: The condition.
         after: Number of ticks to wait for afterwards.
 
@@ -164,11 +164,11 @@ def _await_trigger(segment: Segment, strip: SignalHistory, trigger: Trigger, aft
     """
     tick = -1
     for _ in poll_run(segment, READ_INTERVAL_S):
-        for written in strip.read_new():
+        for written in history.read_new():
             if tick < 0 and written.mailbox == trigger.signal.mailbox:
                 holding_ticks = written.ticks[trigger.evaluate_messages(written.messages)]
                 tick = int(holding_ticks[0]) if len(holding_ticks) else -1
-        if tick >= 0 and segment.words[System.TICK] > tick + after + strip.settling_ticks:
+        if tick >= 0 and segment.words[System.TICK] > tick + after + history.settling_ticks:
             break
     if tick < 0:
         why = "was interrupted" if INTERRUPT.number else "the run is over"
@@ -176,16 +176,16 @@ def _await_trigger(segment: Segment, strip: SignalHistory, trigger: Trigger, aft
     return tick
 
 
-def _save_csv(path: Path, strip: SignalHistory, rows: SignalRows) -> None:
+def _save_csv(path: Path, history: SignalHistory, rows: SignalRows) -> None:
     """Write the captured values as CSV. Raises `Failure` if messages were lost on the way."""
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(["time, s", "tick", *(signal.heading for signal in strip.signals)])
+            writer.writerow(["time, s", "tick", *(signal.heading for signal in history.signals)])
             writer.writerows(
-                [strip.to_time_s(tick), tick, *map(format_value, row)] for tick, row in rows
+                [history.to_time_s(tick), tick, *map(format_value, row)] for tick, row in rows
             )
     except OSError as error:
         raise Failure(f"{path}: {error.strerror}: cut off") from None
-    if strip.lost:
-        raise Failure(f"{path}: {strip.lost} messages were overwritten before they were taken")
+    if history.lost:
+        raise Failure(f"{path}: {history.lost} messages were overwritten before they were taken")

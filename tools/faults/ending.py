@@ -12,7 +12,7 @@ from rack.backplane.fault_table import FaultEntry, FaultTable, Injection, Stage
 from rack.backplane.layout import Layout
 from rack.backplane.segment import Segment
 from rack.boards.events import iterate_arm_states, iterate_statuses
-from rack.boards.faults.bounds import list_struck_mailboxes
+from rack.boards.faults.bounds import list_affected_mailboxes
 from rack.boards.faults.describe import find_board
 from rack.boards.faults.kind import KINDS, Kind, find_kind
 from rack.tools.console.answer import Failure
@@ -144,7 +144,7 @@ def _build_strike(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> S
         time_ns=entry.struck_ns,
         count=entry.count,
         hidden=entry.hidden,
-        mailboxes=tuple(box.name for box in list_struck_mailboxes(layout, entry.mailbox, board)),
+        mailboxes=tuple(box.name for box in list_affected_mailboxes(layout, entry.mailbox, board)),
         joint=joint_name,
         size=values.get("size"),
         injection=Injection(

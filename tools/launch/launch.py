@@ -175,7 +175,7 @@ def run_rack(
             if recorder is not None:
                 news.append(recorder.read_news)
                 create_run_folder(recorder.folder, config, log, beginning.origin)
-                port = import_module(VIEWER).free_port() if view else None
+                port = import_module(VIEWER).find_free_port() if view else None
                 if not recorder.attach(config.name, port, segment.words):
                     log.add_event(Event(time.time_ns(), -1, "recorder", "", NO_RECORDER))
                 if port is not None:
@@ -286,7 +286,7 @@ def _open_viewer(port: int) -> News:
     """Open the viewer on the recorder. The returned function also reports a missing viewer."""
     window = import_module(VIEWER)
     try:
-        opened: News = window.ViewerWindow(window.url(port)).news
+        opened: News = window.ViewerWindow(window.format_url(port)).read_news
         return opened
     except Failure as failure:
         news = [f"no viewer: {failure}"]

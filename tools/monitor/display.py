@@ -222,7 +222,11 @@ def format_line(snapshot: Snapshot) -> str:
     parts += [f"task {at.state} {at.moves_done}/{at.moves}"] if at is not None else []
     # Keep only the part of a warning before the colon. The details are for the table.
     return "  ".join(
-        [*parts, *(line.partition(":")[0] for line in snapshot.lines), *_list_demands(snapshot)]
+        [
+            *parts,
+            *(line.partition(":")[0] for line in snapshot.lines),
+            *_list_active_demand(snapshot),
+        ]
     )
 
 
@@ -235,12 +239,12 @@ def _format_head(snapshot: Snapshot) -> Text:
         line.append("; its launcher is gone: 'rack clean' removes it", style="bold red")
     if snapshot.clock_skipped:
         line.append(f", clock skipped {snapshot.clock_skipped} ticks", style="yellow")
-    for name in [*snapshot.lines, *_list_demands(snapshot)]:
+    for name in [*snapshot.lines, *_list_active_demand(snapshot)]:
         line.append(f"  {name}", style="bold red")
     return line
 
 
-def _list_demands(snapshot: Snapshot) -> list[str]:
+def _list_active_demand(snapshot: Snapshot) -> list[str]:
     """Return the safety demand on the arm as a list of one text. Empty without a stop or brake."""
     return [f"arm: {snapshot.demand}"] if snapshot.demand != NO_DEMAND else []
 

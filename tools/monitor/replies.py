@@ -57,7 +57,7 @@ class Reply:
         return self.fate != "refused"
 
     @property
-    def is_standing(self) -> bool:
+    def is_in_force(self) -> bool:
         """True if the command is known to be in force."""
         return self.fate in ("taken", "done")
 

@@ -152,8 +152,8 @@ class SignalPrinter:
         as_json: True to print JSON documents.
     """
 
-    def __init__(self, strip: SignalHistory, first: int, every: int, as_json: bool) -> None:
-        self._strip = strip
+    def __init__(self, history: SignalHistory, first: int, every: int, as_json: bool) -> None:
+        self._strip = history
         self._next = first
         self._every = max(every, 1)
         self._as_json = as_json
@@ -185,12 +185,12 @@ class SignalPlot:
         terminal: Where it is drawn.
     """
 
-    def __init__(self, strip: SignalHistory, span: int, terminal: Console) -> None:
+    def __init__(self, history: SignalHistory, span: int, terminal: Console) -> None:
         import plotext
         from rich.live import Live
 
         self._plotext = plotext
-        self._strip = strip
+        self._strip = history
         self._span = span
         self._live = Live(console=terminal, auto_refresh=False, vertical_overflow="crop")
 

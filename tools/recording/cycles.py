@@ -60,7 +60,7 @@ class Cycles:
     process_ns: np.ndarray
     write_ns: np.ndarray
     is_judged: np.ndarray
-    stalled: int
+    stalled_count: int
     overhead_ns: int
     stretches: np.ndarray
 
@@ -114,7 +114,7 @@ def read_cycles(recording: Recording) -> dict[str, Cycles]:
                 process_ns=process_ns,
                 write_ns=write_ns,
                 is_judged=judged,
-                stalled=int(settled.sum() - judged.sum()),
+                stalled_count=int(settled.sum() - judged.sum()),
                 overhead_ns=compute_overhead_ns(rows),
                 stretches=recording.find_stretches(rows["tick"]),
             )

@@ -14,8 +14,8 @@ from rack.backplane.message import State
 from rack.boards.timing.trace_times import (
     compute_duration_ns,
     compute_lateness_ns,
-    count_skipped,
-    find_missed,
+    count_skipped_releases,
+    find_missed_cycles,
 )
 from rack.levels.operator import Operation
 from rack.tools.console.answer import Document
@@ -52,12 +52,12 @@ def list_misses(recording: Recording) -> list[Document]:
 
 def _list_task_misses(task: TaskSpec, cycles: np.ndarray) -> list[Document]:
     """Return the late cycles and skipped releases in the trace of one task."""
-    rows = cycles[find_missed(cycles) | (count_skipped(cycles) > 0)]
+    rows = cycles[find_missed_cycles(cycles) | (count_skipped_releases(cycles) > 0)]
     entries = []
     columns = (
         rows["tick"],
-        count_skipped(rows),
-        find_missed(rows),
+        count_skipped_releases(rows),
+        find_missed_cycles(rows),
         compute_lateness_ns(rows) * 1e-6,
         compute_duration_ns(rows) * 1e-6,
     )
@@ -171,7 +171,7 @@ def _list_level_holds(recording: Recording, level: str) -> Iterator[Document]:
     )
     # An operator's command takes precedence over the level's own state.
     hold_codes = np.where(standing_commands > 0, standing_commands, -is_level_holding.astype(int))
-    for first, end in _split_equal_runs(hold_codes):
+    for first, end in _find_equal_runs(hold_codes):
         is_operators = hold_codes[first] > 0
         why = (
             Operation(hold_codes[first]).name.lower()
@@ -189,7 +189,7 @@ def _list_level_holds(recording: Recording, level: str) -> Iterator[Document]:
         }
 
 
-def _split_equal_runs(numbers: np.ndarray) -> list[tuple[int, int]]:
+def _find_equal_runs(numbers: np.ndarray) -> list[tuple[int, int]]:
     """Find the runs of equal consecutive numbers in an array. Runs of 0 are left out.
 
     Returns:

@@ -17,7 +17,7 @@ from rack.backplane.message import State
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, open_alarm_ring
 from rack.boards.config.record import RecordConfig
-from rack.boards.timing.trace_times import count_skipped, find_missed
+from rack.boards.timing.trace_times import count_skipped_releases, find_missed_cycles
 
 ORDINARY_ALARMS = (Alarm.COMMANDED,)
 """Alarms that are not occasions. All others are: faults, detections, brakes, restarts."""
@@ -67,7 +67,7 @@ class Retention(NamedTuple):
             kept: Ticks that were kept, as ranges [first, end).
             ticks: Length of the run in ticks.
         """
-        occasions = Occasions(segment).find_in_alarms()
+        occasions = Occasions(segment).find_alarm_ticks()
         windows = [
             TickRange(max(0, ticks - self.keep), ticks - 1),
             *map(self.find_window, occasions),
@@ -97,7 +97,7 @@ class Occasions:
             if box.name.endswith(".status") and any(field.name == "state" for field in box.fields)
         }
 
-    def find_in_alarms(self) -> Iterator[int]:
+    def find_alarm_ticks(self) -> Iterator[int]:
         """Yield the ticks of alarms that are occasions and were raised since the last call.
 
         The first call yields all alarms that the alarm rings still contain.
@@ -106,7 +106,7 @@ class Occasions:
             rows = ring.read_new_rows().rows
             yield from rows["tick"][~np.isin(rows["code"], ORDINARY_ALARMS)].tolist()
 
-    def find_in_rows(self, ring: str, rows: np.ndarray) -> Iterator[int]:
+    def find_occasion_ticks(self, ring: str, rows: np.ndarray) -> Iterator[int]:
         """Yield the ticks of occasions in new rows of a ring.
 
         Args:
@@ -115,7 +115,7 @@ class Occasions:
         """
         ticks = rows["tick"]
         if ring in self._tasks:
-            yield from ticks[find_missed(rows) | (count_skipped(rows) > 0)].tolist()
+            yield from ticks[find_missed_cycles(rows) | (count_skipped_releases(rows) > 0)].tolist()
         elif ring in self._holding and len(rows):
             holding = rows["message"]["state"] == State.HOLDING
             held_before = np.concatenate(([self._holding[ring]], holding[:-1]))

@@ -91,7 +91,7 @@ class Recording:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._require_file(CONFIG)
-        with _name_file_in_errors(folder):
+        with _convert_read_errors(folder):
             is_flight = (folder / STRETCHES).is_dir()
             if rebuild_files(folder) and not is_flight:
                 _print_note(
@@ -104,7 +104,7 @@ class Recording:
         self.config = self._read_text(CONFIG)
         path = self._require_file(CYCLES)
         self._cycles = self._open_parquet(path, ("task", *FIELDS))
-        with _name_file_in_errors(path):
+        with _convert_read_errors(path):
             metadata = self._cycles.metadata.metadata
             self.layout = restore_layout(json.loads(metadata[b"layout"]))
             self.launch = Launch(*json.loads(metadata[b"launch"]))
@@ -138,13 +138,13 @@ class Recording:
         path = self.folder / PUBLISHED
         if path.exists():
             self.checksums.verify(PUBLISHED)
-            with _name_file_in_errors(path):
+            with _convert_read_errors(path):
                 PublishedRack.read(self._read_text(PUBLISHED))
 
     def _open_table(self, mailbox: str) -> list[pq.ParquetFile]:
         """Open the parts of a mailbox's table, oldest first."""
         path = self._require_file(f"{SIGNALS}/{TABLE_NAME.format(mailbox)}")
-        with _name_file_in_errors(path):
+        with _convert_read_errors(path):
             count = max(len([*path.iterdir()]), 1)
         parts = [path / PART_NAME.format(number) for number in range(1, count + 1)]
         if missing := [part.name for part in parts if not part.exists()]:
@@ -158,7 +158,7 @@ class Recording:
             Failure: The file is damaged, or lacks one of these columns.
         """
         self.checksums.verify(str(path.relative_to(self.folder)))
-        with _name_file_in_errors(path):
+        with _convert_read_errors(path):
             file = pq.ParquetFile(path, page_checksum_verification=True)
         names = file.schema_arrow.names
         if missing := [column for column in columns if column not in names]:
@@ -310,7 +310,7 @@ class Recording:
     @cached_property
     def cycles(self) -> dict[str, np.ndarray]:
         """Trace records of each task, of type `rack.backplane.trace.RECORD`, oldest first."""
-        with _name_file_in_errors(self.folder / CYCLES):
+        with _convert_read_errors(self.folder / CYCLES):
             table = self._cycles.read()
             tasks = table["task"].to_numpy()
             rows = np.empty(len(tasks), dtype=RECORD)
@@ -350,7 +350,7 @@ class Recording:
             KeyError: The messages have no such field.
         """
         shape = () if field in HEAD_COLUMNS else self._shapes[mailbox][field]
-        with _name_file_in_errors(self.folder / SIGNALS / TABLE_NAME.format(mailbox)):
+        with _convert_read_errors(self.folder / SIGNALS / TABLE_NAME.format(mailbox)):
             tables = [file.read(columns=[field]) for file in self._tables.get(mailbox, ())]
         if not any(map(len, tables)):
             return np.empty((0, *shape))
@@ -387,7 +387,7 @@ class Recording:
 
 
 @contextmanager
-def _name_file_in_errors(path: Path) -> Iterator[None]:
+def _convert_read_errors(path: Path) -> Iterator[None]:
     """Convert an error while reading a file to a `Failure` that names the file."""
     try:
         yield

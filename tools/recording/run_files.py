@@ -104,7 +104,7 @@ class Tally:
         self.taken = {**self.lost, **(before or {})}
         self.rows = dict(self.lost)
         self.kept: list[tuple[int, int]] = []
-        self.number = 0
+        self.stretch_number = 0
         self._newest = -1
 
     def count_part(self, part: Part) -> None:
@@ -120,7 +120,7 @@ class Tally:
 
     def begin_stretch(self, stretch: StretchHead) -> None:
         """Continue with the counts at the head of a stretch. Earlier stretches may be deleted."""
-        follows = stretch.number == self.number + 1
+        follows = stretch.number == self.stretch_number + 1
         if follows:
             # Rows are missing here only if the file of the previous stretch is damaged.
             for name, rows in stretch.rows.items():
@@ -132,7 +132,7 @@ class Tally:
         else:
             self.end_stretch()
             self.kept.append((stretch.begin, OPEN_END))
-        self.number = stretch.number
+        self.stretch_number = stretch.number
 
     def add_rows(self, name: str, rows: np.ndarray, lost: int) -> None:
         """Add rows of a ring to the counts.
@@ -197,7 +197,7 @@ class RunFiles(Tally):
 
     def begin_stretch(self, stretch: StretchHead) -> None:
         """Begin a stretch. Rows of deleted stretches before it do not count as lost."""
-        if stretch.number != self.number + 1:
+        if stretch.number != self.stretch_number + 1:
             self._reached = {name: (stretch.begin - 1, lost) for name, lost in self.lost.items()}
         super().begin_stretch(stretch)
 

@@ -183,7 +183,7 @@ class Trigger:
     """
 
     signal: Signal
-    sign: str
+    comparison: str
     number: float
 
     @classmethod
@@ -214,4 +214,6 @@ class Trigger:
 
     def evaluate_messages(self, messages: np.ndarray) -> np.ndarray:
         """Return True for each message that meets the condition, shape (messages,)."""
-        return np.asarray(COMPARISONS[self.sign](self.signal.extract_values(messages), self.number))
+        return np.asarray(
+            COMPARISONS[self.comparison](self.signal.extract_values(messages), self.number)
+        )

@@ -19,7 +19,12 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.driver import LATE_DIVISOR
 from rack.backplane.trace import Flag
 from rack.boards.config.layout import find_core
-from rack.boards.timing.trace_times import STAMPS, Occupation, count_skipped, find_missed
+from rack.boards.timing.trace_times import (
+    STAMPS,
+    Occupation,
+    count_skipped_releases,
+    find_missed_cycles,
+)
 from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
 
@@ -155,11 +160,11 @@ class _CycleTable:
         self.core, priority, every = np.repeat(places, [len(trace) for trace in traces], axis=0).T
         self.is_urgent = priority > 0
         self.grid_ns = recording.rack_config.tick_ns
-        self.due_ns = rows["release_ns"] - count_skipped(rows) * every * self.grid_ns
+        self.due_ns = rows["release_ns"] - count_skipped_releases(rows) * every * self.grid_ns
         # The cause of skipped releases had ended when the next cycle began. The cause of a late
         # cycle may have occurred during that cycle.
-        self.resumed_ns = np.where(find_missed(rows), rows["end_ns"], rows["start_ns"])
-        self.lost = count_skipped(rows) + find_missed(rows)
+        self.resumed_ns = np.where(find_missed_cycles(rows), rows["end_ns"], rows["start_ns"])
+        self.lost = count_skipped_releases(rows) + find_missed_cycles(rows)
 
     def count_lost_during(self, occupied: Occupation, among: np.ndarray) -> int:
         """Count the cycles that were lost while their core was occupied.

@@ -133,10 +133,10 @@ class RackPlace:
         marks: Notes to the user. Empty for the first rack.
     """
 
-    own: RackGrid
-    line: RackGrid
+    grid: RackGrid
+    reference_grid: RackGrid
     offsets: tuple[TimeShift, ...] = ()
-    by_ticks: bool = False
+    is_tick_aligned: bool = False
     marks: tuple[TimeLineNote, ...] = ()
 
     @property
@@ -147,13 +147,21 @@ class RackPlace:
     @property
     def note(self) -> str:
         """Sentence that says at which time of the time line the rack begins, and how exactly."""
-        text = f"rack '{self.own.rack}' is on the time line of '{self.line.rack}'"
-        if self.own.is_lockstep:
+        text = f"rack '{self.grid.rack}' is on the time line of '{self.reference_grid.rack}'"
+        if self.grid.is_lockstep:
             return f"{text}: both ran in lockstep, tick by tick"
         begin = (
-            self.line.convert_stamps(self.convert_stamps(np.array([self.own.epoch_ns])))[0] * 1e-9
+            self.reference_grid.convert_stamps(self.convert_stamps(np.array([self.grid.epoch_ns])))[
+                0
+            ]
+            * 1e-9
         )
-        uncertain_ms = self.uncertainty_ns * self.line.clock_ns / self.line.period_ns * 1e-6
+        uncertain_ms = (
+            self.uncertainty_ns
+            * self.reference_grid.clock_ns
+            / self.reference_grid.period_ns
+            * 1e-6
+        )
         return (
             f"{text}: it begins at {begin:+.6f} s; its times are uncertain by {uncertain_ms:.3f} ms"
         )
@@ -172,9 +180,9 @@ class RackPlace:
             within_ns: Simulated time of the rack since each tick, which is added.
         """
         if not self.offsets:
-            return ticks * self.own.clock_ns + within_ns
-        return self.line.convert_stamps(
-            self.convert_stamps(self.own.convert_ticks(ticks, within_ns))
+            return ticks * self.grid.clock_ns + within_ns
+        return self.reference_grid.convert_stamps(
+            self.convert_stamps(self.grid.convert_ticks(ticks, within_ns))
         )
 
     def convert_to_wall_clock(self, stamps_ns: Ints) -> Ints:
@@ -182,7 +190,7 @@ class RackPlace:
 
         Without offsets they are converted to the wall clock of the rack's own machine.
         """
-        launch = self.line.launch if self.offsets else self.own.launch
+        launch = self.reference_grid.launch if self.offsets else self.grid.launch
         return self.convert_stamps(stamps_ns) + launch.wall_offset_ns
 
 
@@ -248,8 +256,8 @@ def place_side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
     marks = marks or [TimeLineNote(0, f"all that {names[0]} and {names[1]} both wrote is equal")]
     line = grids[0]
     return [
-        RackPlace(line, line, by_ticks=True),
-        RackPlace(grids[1], line, by_ticks=True, marks=tuple(marks)),
+        RackPlace(line, line, is_tick_aligned=True),
+        RackPlace(grids[1], line, is_tick_aligned=True, marks=tuple(marks)),
     ]
 
 

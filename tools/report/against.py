@@ -41,7 +41,9 @@ def compare_runs(recording: Recording, other_run: OtherRun) -> Document:
     )
     first = next(iter(divergence.divergent.values()), None)
     chain = divergence.trace_cause(other_run.mailbox)
-    repetition = _try_repetition(divergence, chain[-1], other_run.may_repeat) if chain else ""
+    repetition = (
+        _repeat_if_unexplained(divergence, chain[-1], other_run.may_repeat) if chain else ""
+    )
     other_folder = str(other_run.folder)
     lines = [line for cycle in chain for line in _format_cycle(cycle, other_folder)]
     why_not = ""
@@ -63,7 +65,7 @@ def compare_runs(recording: Recording, other_run: OtherRun) -> Document:
     }
 
 
-def _try_repetition(
+def _repeat_if_unexplained(
     divergence: Divergence, last: DivergentCycle, is_wanted: bool
 ) -> Repetition | str:
     """Repeat the cycle that diverged, if its cause is still unknown.

@@ -94,7 +94,7 @@ class Analysis:
     predicted: RackTiming
     measured: RackTiming
     pairs: tuple[EquationPair, ...]
-    mostly: tuple[EquationPair, ...]
+    typical_pairs: tuple[EquationPair, ...]
 
     @classmethod
     def from_recording(
@@ -224,14 +224,14 @@ def _judge_tasks(
             every_ns = compute_cycle_ns(rack, cycles.task)
             # Use the number of skipped releases in the trace, not gaps between rows: a restart or a
             # row lost by the recorder also causes a gap, but is not a skipped release.
-            steps_ns = (1 + trace_times.count_skipped(rows)) * every_ns
+            steps_ns = (1 + trace_times.count_skipped_releases(rows)) * every_ns
             step_ns = compute_percentile(steps_ns[cycles.is_judged], percentile)
             yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
             deadline_ns = compute_slice_ns(rack, cycles.task)
             # A cycle marked as missed in the trace counts as beyond its deadline, even if its
             # measured response is shorter.
-            least_ns = np.where(trace_times.find_missed(rows), deadline_ns + 1, 0)
+            least_ns = np.where(trace_times.find_missed_cycles(rows), deadline_ns + 1, 0)
             response_ns = np.maximum(trace_times.compute_response_ns(rows), least_ns)
             worst_ns = compute_percentile(response_ns[cycles.is_judged], percentile)
             meaning = "measured response <= deadline"

@@ -56,7 +56,7 @@ class _RepeatedCycle(NamedTuple):
     """
 
     attributes: Mapping[str, Any]
-    unlike: tuple[str, ...]
+    differing_mailboxes: tuple[str, ...]
     is_equal: bool
 
 
@@ -74,13 +74,15 @@ def repeat_cycle(divergence: Divergence, cycle: DivergentCycle) -> Repetition:
     until = divergence.divergent[cycle.mailbox].visible_at + 1
     with INTERRUPT.raise_interrupted(), convert_errors():
         again_by_run = {run: _repeat_in_run(run, cycle, until) for run in divergence.runs}
-    not_repeating = [run for run in divergence.runs if cycle.mailbox in again_by_run[run].unlike]
+    not_repeating = [
+        run for run in divergence.runs if cycle.mailbox in again_by_run[run].differing_mailboxes
+    ]
     is_chance = not all(again_by_run[run].is_equal for run in not_repeating)
     layout = divergence.runs[0].layout
     strays = {
         str(run.folder): tuple(
             name
-            for name in again_by_run[run].unlike
+            for name in again_by_run[run].differing_mailboxes
             if layout.find_mailbox(name).writer != cycle.writer
         )
         for run in divergence.runs

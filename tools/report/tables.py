@@ -64,7 +64,7 @@ def build_document(analysis: Analysis) -> Document:
             "percentile": MOST_CYCLES_PERCENTILE,
             "failed": [
                 {"equation": p.equation, "subject": p.subject}
-                for p in analysis.mostly
+                for p in analysis.typical_pairs
                 if p.is_failed
             ],
         },
@@ -94,8 +94,8 @@ def build_task_document(cycles: Cycles, rack: RackTiming) -> Document:
         "core": cycles.core,
         "priority": cycles.priority,
         "cycles": len(rows),
-        "start_up": len(cycles.rows) - len(rows) - cycles.stalled,
-        "stalled": cycles.stalled,
+        "start_up": len(cycles.rows) - len(rows) - cycles.stalled_count,
+        "stalled": cycles.stalled_count,
         "missed": missed,
         "skipped": skipped,
         "used_ms": compute_distribution(cycles.used_ns[judged] * MS_PER_NS),
@@ -166,7 +166,7 @@ def _format_summary(analysis: Analysis) -> Iterator[str]:
         yield f"{len(pairs) - len(failing)} of {len(pairs)} equations held"
         yield f"failed: {_join_equations(failing)}"
         if analysis.percentile > MOST_CYCLES_PERCENTILE:
-            mostly = [pair for pair in analysis.mostly if pair.is_failed]
+            mostly = [pair for pair in analysis.typical_pairs if pair.is_failed]
             yield f"failed in more than 1 of 100 cycles: {_join_equations(mostly) or 'none'}"
     if differing := [pair for pair in pairs if pair.is_contradicted]:
         yield f"not as predicted: {_join_equations(differing)}"
@@ -198,7 +198,9 @@ def _list_unjudged(analysis: Analysis) -> Iterator[str]:
         f" {config.timing.context_switch_ms:g} ms"
     )
     if stalled := ", ".join(
-        f"{name} {cycles.stalled}" for name, cycles in analysis.cycles.items() if cycles.stalled
+        f"{name} {cycles.stalled_count}"
+        for name, cycles in analysis.cycles.items()
+        if cycles.stalled_count
     ):
         yield f"stalled cycles are not judged: {stalled}"
     for name, (traced, ran) in analysis.recording.count_untraced().items():
@@ -233,7 +235,7 @@ def _choose_advice(analysis: Analysis, failing: list[EquationPair]) -> str:
         if outcome.get("faults") or outcome["cause"] not in ("task done", "time over"):
             return f"to do: rack report {folder} says why the run failed; its timing held"
         return "to do: nothing"
-    if any(pair.is_failed for pair in analysis.mostly):
+    if any(pair.is_failed for pair in analysis.typical_pairs):
         if all(verdict.holds for verdict in judge_rack(analysis.measured)):
             return "to do: nothing about the config: its levels' own times fit; see --verbose"
         return (

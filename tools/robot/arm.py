@@ -126,7 +126,7 @@ def find_driven_joints(model: mujoco.MjModel) -> set[int]:
     return set(driven.tolist()).union(*(find_tied_joints(model, k) for k in range(model.neq)))
 
 
-def fix_joints(path: Path, kept: Iterable[str]) -> list[str]:
+def fix_joints(path: Path, moving_joints: Iterable[str]) -> list[str]:
     """Fix all joints of an MJCF file except those to keep, and remove free bodies.
 
     Bodies moved from outside (mocap) and everything that refers to a removed element are removed
@@ -134,14 +134,14 @@ def fix_joints(path: Path, kept: Iterable[str]) -> list[str]:
 
     Args:
         path: The file, as MuJoCo writes it. It is overwritten.
-        kept: Names of the joints that remain movable.
+        moving_joints: Names of the joints that remain movable.
 
     Returns:
         Names of the removed bodies.
     """
     tree = ElementTree.parse(path)
     root = tree.getroot()
-    moving = {("joint", name) for name in kept}
+    moving = {("joint", name) for name in moving_joints}
     removed = set[tuple[str, str]]()
     free_bodies = []
     world = root.find("worldbody")

@@ -200,13 +200,13 @@ def _list_table_spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
         yield TableSpot(round(base[2] + height * reach, 3), front, places, middle)
 
 
-def _can_reach_places(cell: Cell, spot: TableSpot, half: float, lift: float) -> bool:
+def _can_reach_places(cell: Cell, spot: TableSpot, half_height: float, lift: float) -> bool:
     """Return whether the tool can come down from above to every place.
 
     Args:
         cell: The arm.
         spot: The table and its places for blocks.
-        half: Half the height of a block in m.
+        half_height: Half the height of a block in m.
         lift: Height in m above each place from which the tool comes down.
     """
     ik = InverseKinematics(cell, SEED)
@@ -217,7 +217,7 @@ def _can_reach_places(cell: Cell, spot: TableSpot, half: float, lift: float) -> 
         """Return whether the tool can come down to a place, with the fingers in some direction."""
         for quarter in QUARTER_TURNS:
             orientation = build_pointing_quaternion(DOWN, -(spot.direction + 0.5 * np.pi * quarter))
-            placed = make_pose([*place, spot.top + half], orientation)
+            placed = make_pose([*place, spot.top + half_height], orientation)
             raised = ik.find_solutions(placed.raise_by(lift), cell.home, restarts=restarts)
             if any(ik.find_nearby(placed, q) is not None for q in raised):
                 return True

@@ -244,7 +244,7 @@ def _run_steps(source: Source, options: ArmOptions, folder: Path, name: str) -> 
     copy_model(source, path)
     springs = [joint for joint in arm.passive if model.joint(joint).stiffness > 0.0]
     left_out = fix_joints(path, (*arm.joints, *fingers, *springs))
-    notes = [*source.notes, *_describe_rest(model, arm, left_out)]
+    notes = [*source.notes, *_describe_omissions(model, arm, left_out)]
     spec = load_spec(path)
     limits = _read_limits(source, model, spec, arm.joints, options.torque)
     tool = ToolFrame(options.tool or _find_mount(compile_spec(spec, path), arm.tip))
@@ -272,7 +272,7 @@ def _run_steps(source: Source, options: ArmOptions, folder: Path, name: str) -> 
     return result
 
 
-def _describe_rest(model: mujoco.MjModel, arm: ArmParts, left_out: list[str]) -> Iterator[str]:
+def _describe_omissions(model: mujoco.MjModel, arm: ArmParts, left_out: list[str]) -> Iterator[str]:
     """Yield notes for the user about parts that are left out, fixed, or without limits."""
     if left_out:
         yield f"left out, because they are not attached: {format_names(left_out)}"

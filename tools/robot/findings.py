@@ -38,7 +38,7 @@ class ArmExamination:
 
     cell: Cell
     joints: list[Document]
-    able: Abilities
+    abilities: Abilities
     findings: list[Observation]
 
 

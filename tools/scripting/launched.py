@@ -112,7 +112,7 @@ class LaunchedRack(CrateRack):
         """End all processes of the rack, remove its segment, and finish the recording."""
         record = self._record
         if record is not None and self.outcome is not None:
-            record.await_begun()
+            record.await_recorder()
         super().close()
         self._record = None
         if record is not None:
@@ -154,7 +154,7 @@ class RunRecord:
         for event in () if self._standstill is None else self._standstill.list_events():
             self.log.add_event(event)
 
-    def await_begun(self) -> None:
+    def await_recorder(self) -> None:
         """Wait until the recorder is attached, because it cannot attach to a closed rack."""
         self._recorder.wait_until_attached()
 

@@ -98,13 +98,13 @@ class JudgedConfig:
         cores = {f"core {core}" for core in self.timing.find_cores(board)}
         return own or {v.key for v in self.failures if v.equation == LOAD and v.subject in cores}
 
-    def cures_board(self, board: str, before: JudgedConfig) -> bool:
+    def repairs_board(self, board: str, before: JudgedConfig) -> bool:
         """Return True if all failures of `board` in `before` are gone and none was added."""
         failing = {verdict.key for verdict in self.failures}
         old = {verdict.key for verdict in before.failures}
         return failing < old and not failing & before.find_failures(board)
 
-    def is_sound(self, changed: RackTiming, board: str) -> bool:
+    def is_acceptable_change(self, changed: RackTiming, board: str) -> bool:
         """Return True if a changed board meets its equations and adds no failure of the system.
 
         This check is quick and ignores the effect on other tasks of the core.

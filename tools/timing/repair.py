@@ -229,7 +229,9 @@ def _list_longer_cycles(
             changed = {"within_cycles": cycles}
         # Filter before the search, because soundness is not monotonic: a longer cycle may fit the
         # grid of the other levels less well, or leave too few cycles for plans.
-        if rack.is_sound(timing.replace_board(board, every=longer, within_cycles=cycles), board):
+        if rack.is_acceptable_change(
+            timing.replace_board(board, every=longer, within_cycles=cycles), board
+        ):
             longer_settings.append({**changed, **(place or {}), "every": longer, "rate_hz": None})
     return longer_settings
 
@@ -285,7 +287,7 @@ def _try_change(
     """
     change = rack.try_change(board, settings)
     return (
-        change if change is not None and change.after.cures_board(target or board, rack) else None
+        change if change is not None and change.after.repairs_board(target or board, rack) else None
     )
 
 

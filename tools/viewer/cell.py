@@ -18,7 +18,7 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import view_state
 from rack.tools.viewer.forces import list_contacts
 from rack.tools.viewer.levels import format_enum
-from rack.tools.viewer.shapes import build_shape, to_xyzw
+from rack.tools.viewer.shapes import build_shape, convert_to_xyzw
 from rack.tools.viewer.stream import (
     Moment,
     RowBlock,
@@ -122,7 +122,7 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
         name = name_frame(model, body)
         pose = rr.Transform3D(
             translation=data.xpos[body],
-            quaternion=rr.Quaternion(xyzw=to_xyzw(data.xquat[body])),
+            quaternion=rr.Quaternion(xyzw=convert_to_xyzw(data.xquat[body])),
             parent_frame=stream.format_frame(WORLD),
             child_frame=stream.format_frame(name),
         )
@@ -184,7 +184,7 @@ class PoseWriter:
         )
         poses = rr.Transform3D.columns(
             translation=positions.reshape(-1, 3),
-            quaternion=to_xyzw(quaternions).reshape(-1, 4),
+            quaternion=convert_to_xyzw(quaternions).reshape(-1, 4),
             parent_frame=[self._world] * (len(chosen) * count),
             child_frame=self._frames * len(chosen),
         )

@@ -13,7 +13,7 @@ import rerun as rr
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.message import State, decode_text
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.trace_times import find_missed
+from rack.boards.timing.trace_times import find_missed_cycles
 from rack.levels.messages import Verb
 from rack.levels.systems.hand.messages import GraspKind
 from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart, build_change_finder
@@ -182,7 +182,7 @@ class Hierarchy:
 def _name_states(rows: np.ndarray) -> np.ndarray:
     """Return the state of the level in each trace record, or "missed" for a missed cycle."""
     names = np.array([state.name.lower() for state in State] + ["missed"])
-    indices = np.where(find_missed(rows), len(names) - 1, rows["state"])
+    indices = np.where(find_missed_cycles(rows), len(names) - 1, rows["state"])
     return np.asarray(names[indices])
 
 

@@ -40,26 +40,26 @@ def write_merged(
     roots: dict[str, tuple[str, ...]] = {}
     views = {}
     for place in placed:
-        run = place.own.recording
-        rack = place.own.rack
+        run = place.grid.recording
+        rack = place.grid.rack
         ran[rack] = of = RunContext.from_config(run.layout, run.config, run.folder)
         roots[rack] = (rack,) if len(placed) > 1 else ()
         views[rack] = RackViews(of.layout, of.config, of.cell, roots[rack])
     name = ", ".join(ran)
-    if placed[0].by_ticks:
+    if placed[0].is_tick_aligned:
         root = build_comparison_view(views)
     else:
         root = build_common_view(views) if len(placed) > 1 else views[name].build_all_views()
-    launches = "-".join(str(place.own.launch.created_ns) for place in placed)
+    launches = "-".join(str(place.grid.launch.created_ns) for place in placed)
     recording = open_recording(name, f"{name}-{launches}", file, build_blueprint(root))
-    first = placed[0].own
+    first = placed[0].grid
     log = Stream(recording, Timelines(first.clock_ns, first.launch))
     for place in placed:
         for tick, text in place.marks:
             stamp_ns = int(first.convert_ticks(np.array([tick]))[0])
             log.log_line(Moment(tick, stamp_ns), "time line", text, "INFO")
     for index, place in enumerate(placed):
-        grid = place.own
+        grid = place.grid
         stream = Stream(recording, Timelines(grid.clock_ns, grid.launch, place), roots[grid.rack])
         writer = RackWriter(stream, ran[grid.rack])
         last = grid.ticks[1] + 1

@@ -62,7 +62,7 @@ class Picture(NamedTuple):
         complaints: Reports shown in the views, and warnings and errors in the viewer's log.
     """
 
-    picture: bytes
+    png: bytes
     complaints: tuple[str, ...]
 
 
@@ -193,7 +193,7 @@ def main() -> int:
     except Failure as failure:
         print(failure, file=sys.stderr)
         return failure.status
-    options.out.write_bytes(look.picture)
+    options.out.write_bytes(look.png)
     for complaint in look.complaints:
         print(complaint, file=sys.stderr)
     return 1 if look.complaints else 0

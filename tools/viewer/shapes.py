@@ -22,7 +22,7 @@ def build_shape(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
     size = model.geom_size[geom]
     radius, half, _ = size
     solid: dict[str, Any] = {
-        "quaternions": [to_xyzw(model.geom_quat[geom])],
+        "quaternions": [convert_to_xyzw(model.geom_quat[geom])],
         "colors": [rgba],
         "fill_mode": "solid",
     }
@@ -56,7 +56,7 @@ def read_colour(model: mujoco.MjModel, geom: int) -> NDArray[np.uint8]:
     return np.asarray(np.round(rgba * 255), dtype=np.uint8)
 
 
-def to_xyzw(quaternions: Array) -> Array:
+def convert_to_xyzw(quaternions: Array) -> Array:
     """Convert quaternions of shape (..., 4) from MuJoCo's order, w first, to rerun's, w last."""
     return np.roll(quaternions, -1, axis=-1)
 

@@ -79,7 +79,7 @@ class Timelines:
         """
         if (placed := self._placed) is None:
             return RowTimes(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
-        released = placed.convert_ticks(ticks, 0) // placed.line.clock_ns
+        released = placed.convert_ticks(ticks, 0) // placed.reference_grid.clock_ns
         return RowTimes(
             placed.convert_ticks(ticks, within_ns),
             released,

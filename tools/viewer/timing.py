@@ -11,7 +11,7 @@ from rack.boards.timing.trace_times import (
     compute_execution_ns,
     compute_lateness_ns,
     compute_response_ns,
-    find_missed,
+    find_missed_cycles,
     find_newest_visible,
 )
 from rack.tools.viewer.levels import LEVELS
@@ -69,7 +69,7 @@ def build_cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: boo
             within = np.minimum(within, last_ns + np.arange(len(MOMENTS)))
         ticks = np.repeat(block.ticks, len(MOMENTS))
         states = np.array([["read", work, "write", "wait"]] * len(rows))
-        states[find_missed(rows), :3] = MISSED
+        states[find_missed_cycles(rows), :3] = MISSED
         times = stream.times.build_columns(ticks, moments.ravel(), within.ravel())
         write_spans(stream, lane, times, states.ravel().tolist())
 
@@ -139,7 +139,7 @@ def build_miss_lane(stream: Stream, task: TaskSpec) -> ViewPart:
 
     def write(block: RowBlock) -> None:
         """Write the missed cycles of a block to the lane and to the log."""
-        missed = np.flatnonzero(find_missed(block.rows))
+        missed = np.flatnonzero(find_missed_cycles(block.rows))
         if not len(missed):
             return
         style_lane(stream, lane, {MISSED: PHASES[MISSED]})

@@ -167,7 +167,7 @@ def check_slots(wiring: Wiring) -> Mistakes:
                 taken[slot] = place
 
 
-def check_ends(wiring: Wiring) -> Mistakes:
+def check_run_end(wiring: Wiring) -> Mistakes:
     """Check that at most one board ends the run."""
     ending = [name for name, board in wiring.config.board.items() if board.ends_run]
     for name in ending[1:]:
@@ -178,7 +178,7 @@ def check_ends(wiring: Wiring) -> Mistakes:
         )
 
 
-def check_record(wiring: Wiring) -> Mistakes:
+def check_record_windows(wiring: Wiring) -> Mistakes:
     """Check that `before` and `after` are given only for a flight recorder."""
     table = wiring.config.record
     if table.keep is None:
@@ -319,7 +319,7 @@ def _check_cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
     fitting = [
         minor * number for number in range(1, major // minor + 1) if major % (minor * number) == 0
     ]
-    for name, every in wiring.every.items():
+    for name, every in wiring.periods.items():
         if every in fitting:
             continue
         board = wiring.config.board[name]

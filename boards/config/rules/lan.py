@@ -41,7 +41,7 @@ def check_network(wiring: Wiring, table: LanConfig) -> Mistakes:
     else:
         yield from _check_board(wiring, table)
     for port, export in table.exports.items():
-        for why in _explain_export(wiring, export.source):
+        for why in _explain_invalid_export(wiring, export.source):
             yield Mistake(f"{PLACE}.export.{port}.from", export.source, why)
     for port, entry in table.imports.items():
         try:
@@ -54,8 +54,8 @@ def _check_board(wiring: Wiring, table: LanConfig) -> Mistakes:
     """Check the rates, the priority and the names of the adapter's board."""
     config = wiring.config
     yield from _check_names(table, config.name)
-    if LAN in wiring.every:
-        cycle_ns = wiring.every[LAN] * config.clock_ns
+    if LAN in wiring.periods:
+        cycle_ns = wiring.periods[LAN] * config.clock_ns
         for key, entries in (("export", table.exports), ("import", table.imports)):
             for port, entry in entries.items():
                 yield from _check_rate(f"{PLACE}.{key}.{port}", entry, cycle_ns)
@@ -155,7 +155,7 @@ def _check_priority(config: RackConfig, table: LanConfig) -> Mistakes:
         yield Mistake(f"{PLACE}.priority", table.priority, why)
 
 
-def _explain_export(wiring: Wiring, source: str) -> Iterator[str]:
+def _explain_invalid_export(wiring: Wiring, source: str) -> Iterator[str]:
     """Yield the reason why a mailbox cannot be exported. Nothing if it can.
 
     Exported queues are reported by the rule for queues instead.
@@ -167,8 +167,8 @@ def _explain_export(wiring: Wiring, source: str) -> Iterator[str]:
         yield "operator commands stay in their rack; only mailboxes of levels can be exported"
     elif not wiring.is_known(source):
         yield f"no such mailbox; mailboxes: {wiring.mailbox_names}"
-    elif source in wiring.writers and board in wiring.every:
-        every = wiring.every[board] * wiring.writers[source][1].cycles
+    elif source in wiring.writers and board in wiring.periods:
+        every = wiring.periods[board] * wiring.writers[source][1].cycles
         rate_hz = 1e9 / (every * wiring.config.clock_ns)
         if rate_hz > FASTEST_HZ * (1 + 1e-9):
             why = f"written at {rate_hz:g} Hz, too fast for a loop over a network, which can run at"
@@ -202,7 +202,9 @@ def _check_endpoints(table: LanTable) -> Mistakes:
     for key in ("listen", "connect"):
         for at, text in enumerate(getattr(table, key)):
             try:
-                why = _explain_endpoint(Endpoint.from_text(text), table, connects=key == "connect")
+                why = _explain_unsafe_endpoint(
+                    Endpoint.from_text(text), table, connects=key == "connect"
+                )
             except ValueError as error:
                 why = str(error)
             if why:
@@ -233,7 +235,7 @@ def _list_open_endpoints(table: LanTable) -> list[str]:
     return [str(end) for end in list_endpoints(table) if not (end.has_tls or end.is_private)]
 
 
-def _explain_endpoint(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
+def _explain_unsafe_endpoint(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
     """Return why an endpoint is not protected well enough. Empty if it is.
 
     Args:

@@ -17,7 +17,7 @@ PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
 
 def check_ports(wiring: Wiring) -> Mistakes:
     """Check that the levels' classes exist and that their inputs are connected as declared."""
-    for place, why in wiring.missing.items():
+    for place, why in wiring.unusable_classes.items():
         yield Mistake(f"{place.table}.{place.class_key}", place.target, why)
     for place, ports in wiring.ports.items():
         table = place.table
@@ -43,7 +43,7 @@ def check_writers(wiring: Wiring) -> Mistakes:
                 yield Mistake(f"mailbox {mailbox}", ports.task, f"{first.task} already writes it")
 
 
-def check_reads(wiring: Wiring) -> Mistakes:
+def check_read_mailboxes(wiring: Wiring) -> Mistakes:
     """Check that every mailbox that is read exists and carries the port's type of message."""
     for ports in wiring.ports.values():
         for port, mailbox in ports.sources:
@@ -72,7 +72,7 @@ def _find_place(ports: TaskPorts, port: str) -> str:
     return f"{place.table}.{key}.{port}"
 
 
-def check_statuses(wiring: Wiring) -> Mistakes:
+def check_ending_status(wiring: Wiring) -> Mistakes:
     """Check that the board that ends the run writes a status with a state."""
     for name, board in wiring.config.board.items():
         if not board.ends_run:
@@ -92,17 +92,17 @@ def check_sides(wiring: Wiring) -> Mistakes:
     for task in wiring.ports.values():
         for port, mailbox in task.sources:
             if mailbox.partition(".")[0] not in wiring.unknown_boards and (
-                why := _explain_side(wiring, task, mailbox)
+                why := _explain_wrong_side(wiring, task, mailbox)
             ):
                 yield Mistake(_find_place(task, port), mailbox, why)
 
 
-def _explain_side(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
+def _explain_wrong_side(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
     """Return why a task or host board must not read a mailbox. Empty if it may."""
     is_host = task.place.role == "host"
-    is_of_host = mailbox in wiring.of_host
+    is_of_host = mailbox in wiring.host_side_mailboxes
     if task.joins_sides:
-        return "it is already on the host side" if mailbox in wiring.to_host else ""
+        return "it is already on the host side" if mailbox in wiring.mailboxes_to_host else ""
     if is_host == is_of_host:
         return ""
     if (source := wiring.passed_mailboxes.get(mailbox)) is None:
@@ -116,7 +116,7 @@ def _explain_side(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
     )
 
 
-NOT_OPERATED = {
+WHY_NOT_FOR_OPERATORS = {
     "lock": "the clock writes it and must not wait",
     "queue": "it already keeps every command",
     "interrupt": "the clock writes it, not a board",
@@ -173,7 +173,7 @@ def check_exchange(wiring: Wiring) -> Mistakes:
             yield Mistake(f"board.{ports.task}.exchange", None, why)
 
 
-def check_operated(wiring: Wiring) -> Mistakes:
+def check_operator_mailboxes(wiring: Wiring) -> Mistakes:
     """Check that only the clock writes operators' mailboxes, with a protocol that never waits."""
     for mailbox in wiring.operator_mailboxes:
         if mailbox in wiring.writers:
@@ -182,7 +182,7 @@ def check_operated(wiring: Wiring) -> Mistakes:
                 f"mailbox {mailbox}", first, "only the clock writes an operator's mailbox"
             )
         protocol = wiring.config.protocol.mailbox.get(mailbox)
-        if why := NOT_OPERATED.get(protocol or ""):
+        if why := WHY_NOT_FOR_OPERATORS.get(protocol or ""):
             yield Mistake(
                 f"protocol.mailbox.{mailbox}",
                 protocol,
@@ -237,7 +237,7 @@ def _check_queue(wiring: Wiring, mailbox: str) -> Mistakes:
         yield Mistake(f"mailbox {get_position_mailbox(mailbox)}", None, why)
     reading = [
         (task.task, port)
-        for task, port in wiring.reading.get(mailbox, ())
+        for task, port in wiring.reading_ports.get(mailbox, ())
         if task.place.role != "host"
     ]
     readers = [f"{task} ({port})" for task, port in reading]
@@ -281,9 +281,9 @@ def check_interrupts(wiring: Wiring) -> Mistakes:
         if protocol != "interrupt":
             continue
         place = f"protocol.mailbox.{mailbox}"
-        if mailbox in wiring.of_host:
+        if mailbox in wiring.host_side_mailboxes:
             why = "it is on the host side, where nothing is interrupted; remove this entry"
             yield Mistake(place, protocol, why)
-        elif wiring.is_of_network(mailbox):
+        elif wiring.belongs_to_network_adapter(mailbox):
             why = "the network adapter writes it; must be time-slice or double-buffer"
             yield Mistake(place, protocol, why)

@@ -9,7 +9,7 @@ import numpy as np
 from rack.levels import Error, Input, LevelContext, Output, Planner
 from rack.levels.messages import MoveCommand, PrimitiveStatus, TrajectoryPlan
 from rack.levels.motion.path import BlendedPath
-from rack.levels.primitive.motion_segment import read_segment, window
+from rack.levels.primitive.motion_segment import list_serials, read_segment
 from rack.levels.robot.cell import build_cell
 
 SHARE = 0.7
@@ -37,7 +37,8 @@ class TrapezoidPlanner(Planner):
         """Return whether the executor needs a trajectory that has not been planned yet."""
         status = self.status.message
         return (
-            status.wants in window(self.above.message) and (status.wants, status.begin) != self.made
+            status.wants in list_serials(self.above.message)
+            and (status.wants, status.begin) != self.made
         )
 
     def plan(self, tick: int) -> None:
@@ -47,7 +48,7 @@ class TrapezoidPlanner(Planner):
         self.output.clear()
         self.output.segment, self.output.begin = self.made
         try:
-            path = read_segment(self.above.message, status.wants).path()
+            path = read_segment(self.above.message, status.wants).build_path()
         except ValueError as error:
             self.output.error = Error.LIMIT
             self.output.reason = str(error)

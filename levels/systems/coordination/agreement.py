@@ -295,7 +295,7 @@ class TakenOrder:
                 self.reason = report.reason
 
     @property
-    def is_asked(self) -> bool:
+    def needs_answer(self) -> bool:
         """Whether the order still needs an answer."""
         return self.order > 0 and self.response is Response.NONE
 
@@ -328,7 +328,7 @@ class TakenOrder:
             self.set_response(Response.CANCELLED)
         elif verb == OrderVerb.DO and self.response is Response.POSSIBLE:
             self.set_response(Response.DOING)
-        elif verb == OrderVerb.DO and self.is_asked:
+        elif verb == OrderVerb.DO and self.needs_answer:
             self.set_response(Response.FAILED)
         if self.response is Response.FAILED and not self.error:
             self.error = Error.GIVEN_UP
@@ -336,7 +336,7 @@ class TakenOrder:
 
     def fail_order(self, error: Error, reason: str) -> None:
         """Answer REFUSED if the order still needs an answer, otherwise FAILED."""
-        response = Response.REFUSED if self.is_asked else Response.FAILED
+        response = Response.REFUSED if self.needs_answer else Response.FAILED
         self.set_response(response, reason, error)
 
     def set_response(

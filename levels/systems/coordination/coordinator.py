@@ -189,7 +189,7 @@ class Coordinator(Executor):
         try:
             arms = CoordinatorParams.model_validate(params).arms
         except ValidationError:
-            return ConfiguredPorts(is_whole=False)
+            return ConfiguredPorts(is_complete=False)
         reports = {f"report_{arm}": Input(CellReport, mailbox) for arm, mailbox in arms.items()}
         return ConfiguredPorts(reports, {f"order_{arm}": Output(CellOrder) for arm in arms})
 

@@ -100,7 +100,7 @@ class OrderedTaskExecutor(TaskExecutor):
         try:
             table = OrderedTaskParams.model_validate(params)
         except ValidationError:
-            return ConfiguredPorts(is_whole=False)
+            return ConfiguredPorts(is_complete=False)
         ports: dict[str, Input[Any]] = {"order": Input(CellOrder, table.orders)}
         if table.coordinator:
             ports["peer"] = Input(PeerPresence, f"lan.{format_peer_port(table.coordinator)}")
@@ -136,7 +136,7 @@ class OrderedTaskExecutor(TaskExecutor):
         taken = self._taken
         request = self.request
         plan = self.plan.message
-        if taken.is_asked:
+        if taken.needs_answer:
             self._answer_order(request, tick)
         elif taken.is_under_way and not self._begun:
             self._begin_plan(request)
@@ -265,9 +265,9 @@ class OrderedTaskExecutor(TaskExecutor):
                 self._halted = True
         return done
 
-    def _find_last_move(self, plan: TaskPlan) -> int:
+    def _find_first_barred_move(self, plan: TaskPlan) -> int:
         """Return the first move of the plan that must not begin."""
-        until = super()._find_last_move(plan)
+        until = super()._find_first_barred_move(plan)
         return until if self._breaking_off is None else min(until, self._breaking_off)
 
     def _find_reason_to_wait(self, below: Reading[MoveStatus]) -> str:
@@ -329,7 +329,7 @@ class OrderedTaskExecutor(TaskExecutor):
         order.
         """
         taken = self._taken
-        if self._error and (taken.is_asked or taken.is_under_way):
+        if self._error and (taken.needs_answer or taken.is_under_way):
             if self._absent and self._error is Error.STALLED:
                 return
             taken.fail_order(self._error, self._reason)
@@ -353,7 +353,7 @@ class OrderedTaskExecutor(TaskExecutor):
             return State.ERROR
         if self._taken.response is Response.ENDED:
             return State.DONE if self._is_end_reported else State.EXECUTING
-        waits = self._taken.is_asked or self._taken.is_under_way or self._absent
+        waits = self._taken.needs_answer or self._taken.is_under_way or self._absent
         return State.EXECUTING if waits else State.IDLE
 
 

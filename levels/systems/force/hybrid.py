@@ -64,7 +64,7 @@ class ComplianceWatch:
         self.axis = -1
         self.sensed = -1
         self.felt = np.zeros(AXES)
-        self.rests = False
+        self.must_rest = False
         self.reason = ""
 
     def restore_guard(self, last: Reading[ForceStatus]) -> None:
@@ -79,7 +79,7 @@ class ComplianceWatch:
             self.struck = last.message.struck
             self.axis = last.message.axis
 
-    def judge_cycle(
+    def check_cycle(
         self,
         compliance: Reading[Compliance],
         wrench: Reading[Wrench],
@@ -96,7 +96,7 @@ class ComplianceWatch:
         """
         wanted = compliance.message
         self.task = None
-        self.rests = False
+        self.must_rest = False
         self.reason = ""
         self.sensed = wrench.message.tick if wrench.has_message else -1
         reason = find_objection(wanted) if wanted.active else ""
@@ -108,7 +108,7 @@ class ComplianceWatch:
             self._require_rest(reason)
         elif wanted.active:
             # Rest if the contact is not known or a level above is lost.
-            blind = self._explain_blindness(wrench, tick)
+            blind = self._explain_missing_wrench(wrench, tick)
             if blind or above_is_lost or compliance.is_lost:
                 self._require_rest(blind or ABOVE_LOST)
             self._take_force_axes(wanted, rotation)
@@ -117,10 +117,10 @@ class ComplianceWatch:
 
     def _require_rest(self, reason: str) -> None:
         """Let the motion end, for `reason`."""
-        self.rests = True
+        self.must_rest = True
         self.reason = reason
 
-    def _explain_blindness(self, wrench: Reading[Wrench], tick: int) -> str:
+    def _explain_missing_wrench(self, wrench: Reading[Wrench], tick: int) -> str:
         """Return why the present contact is unknown, or an empty text if it is known."""
         if not wrench.has_message or wrench.is_lost:
             return "no wrench from the board of the arm: waiting for it"
@@ -140,7 +140,7 @@ class ComplianceWatch:
         selected = compliance.selected.astype(bool)
         if selected.any():
             wanted = self._limit_wrench(np.where(selected, compliance.wrench, 0.0))
-            exerted = None if self.rests else -self.felt
+            exerted = None if self.must_rest else -self.felt
             self.task = ForceTask(rotation, selected, wanted, exerted, compliance.speed)
 
     def _limit_wrench(self, wanted: Array) -> Array:
@@ -240,7 +240,7 @@ class HybridExecutor(WristLevel):
             self._begin_at_rest(self._boards.position, tick)
         if self.above.is_new:
             self._reference.take_command(self.above.message)
-        self._watch.judge_cycle(self.compliance, self.wrench, self.above.is_lost, tick)
+        self._watch.check_cycle(self.compliance, self.wrench, self.above.is_lost, tick)
         self.command.id = tick // self.context.every + 1
         for name in FORWARDED_FIELDS:
             setattr(self.command, name, getattr(self.above.message, name))
@@ -275,7 +275,7 @@ class HybridExecutor(WristLevel):
         """Write the reference that is due `LEAD_CYCLES` cycles later."""
         watch = self._watch
         reference = self._reference
-        motion = reference.ramp_to_rest(tick) if watch.rests else reference.compute_motion(tick)
+        motion = reference.ramp_to_rest(tick) if watch.must_rest else reference.compute_motion(tick)
         payload = Payload(command.payload_mass, command.payload_offset)
         joints = self._law.step(motion, watch.task, passed_s, payload)
         command.due = tick + LEAD_CYCLES * self.context.every

@@ -92,7 +92,7 @@ class ServerWork(RequestWork):
         """
         super().step(time_s, hold)
         if self.contact.is_compliant:
-            self._judge_forces()
+            self._check_forces()
         else:
             self._on_s = self._off_s = 0.0
 
@@ -144,7 +144,7 @@ class ServerWork(RequestWork):
         assert isinstance(params, ServerParams)
         return params
 
-    def _judge_forces(self) -> None:
+    def _check_forces(self) -> None:
         """Count how long forces have been within tolerance. End compliance if they never settle."""
         errors = self.compute_force_errors()
         current = self.agenda.current

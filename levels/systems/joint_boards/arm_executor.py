@@ -136,9 +136,9 @@ class ArmExecutor(ArmDriver):
     def take_messages(self) -> None:
         """Read the torques of the boards above and the commands of the operator."""
         self._torques = self.joint_torques
-        self.orders.take_commands(self.operator, self._judge_command)
+        self.orders.take_commands(self.operator, self._process_command)
 
-    def _judge_command(self, command: OperatorCommand) -> None:
+    def _process_command(self, command: OperatorCommand) -> None:
         """Carry out or refuse a command to the drives. Ignore other commands."""
         if command.what in DRIVE_OPERATIONS and (refusal := self.obey_drive_command(command)):
             self.orders.refuse_newest(refusal)

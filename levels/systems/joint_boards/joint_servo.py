@@ -130,7 +130,7 @@ class JointServo(Executor):
     def process(self, tick: int) -> None:
         """Run one cycle: compute the torques that act from the next cycle on."""
         arm = self.below.message
-        if not self._met and not self._meet_arm(self.below.has_message, arm):
+        if not self._met and not self._initialize_from_status(self.below.has_message, arm):
             return
         self._take_messages()
         sampled = arm.tick
@@ -147,11 +147,11 @@ class JointServo(Executor):
         else:
             wanted = (
                 operator.compute_motion(reference, tick)
-                if operator.stands
+                if operator.is_in_control
                 else reference.compute_motion(tick)
             )
         # Use the inertia and the load of the reference that is followed, else compute them.
-        if stopped or operator.stands or reference.holding:
+        if stopped or operator.is_in_control or reference.holding:
             self.loads.compute_at_rest(arm.position)
         elif self._offered is not None:
             self.loads.take_reference(self._offered, tick)
@@ -161,7 +161,7 @@ class JointServo(Executor):
         age_s = min(tick + every - sampled, self._oldest + every) * tick_s
         times = self.loads.compute_passed_part(tick), every * tick_s, age_s
         self._servo(*times, self._sample, wanted.table, *self._shown_numbers)
-        if self._modified.exists:
+        if self._modified.has_modifications:
             self._apply_modifications(times, wanted, tick)
         torque = self.command
         torque.sampled = sampled
@@ -208,7 +208,7 @@ class JointServo(Executor):
         np.copyto(command[:joints], modified, where=self._driven)
         np.copyto(shown_status[3 * joints :], modified, where=self._driven)
 
-    def _meet_arm(self, has_status: bool, arm: ArmStatus) -> bool:
+    def _initialize_from_status(self, has_status: bool, arm: ArmStatus) -> bool:
         """Initialise from the first status of the arm.
 
         Args:
@@ -281,7 +281,7 @@ class JointServo(Executor):
         status.driven = self._driven
         status.echo = self._command
         status.holding = holding
-        status.stopped = stopped or operator.stands
+        status.stopped = stopped or operator.is_in_control
         status.due = self._due
         status.reason = reason or self._refused or self._modified.reason
         status.error = error

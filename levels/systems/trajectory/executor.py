@@ -164,7 +164,7 @@ class TrajectoryExecutor(Executor):
         is_steady = cycles == 1 and leg is not None and self._motion.leg_s >= leg.law.half_blend_s
         if current is None or current.kind != MotionKind.POSE or not current.touch or not is_steady:
             self._guard.clear_window()
-        elif self._guard.is_struck(self.boards, current.touch):
+        elif self._guard.detect_contact(self.boards, current.touch):
             self._work.end_at_guard()
 
     def _compute_due_tick(self, tick: int) -> int:
@@ -254,7 +254,7 @@ class TouchGuard:
         """Forget all torques so far."""
         self._torques.clear()
 
-    def is_struck(self, boards: Mapping[str, Reading[JointStatus]], max_change: float) -> bool:
+    def detect_contact(self, boards: Mapping[str, Reading[JointStatus]], max_change: float) -> bool:
         """Add the torques of this cycle, and check whether they have changed.
 
         Args:

@@ -79,7 +79,7 @@ def test_interrupts_are_part_of_reading_and_of_a_plan(small: Path) -> None:
     timing = build_rack_timing(config, layout)
     inbox = timing.inboxes["lower"]
     assert set(inbox.mailboxes) == {"upper.command", "lower.plan"}
-    cost = inbox.cost_ns(layout.find_task("lower").every * layout.clock_ns)
+    cost = inbox.compute_cost_ns(layout.find_task("lower").every * layout.clock_ns)
     assert cost == sum(source.service_ns for source in inbox.sources)
     level = timing.build_level("lower")
     assert level.read_ns == 100_000 + cost

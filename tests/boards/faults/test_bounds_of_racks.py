@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from rack.backplane.fault_table import Injection
 from rack.backplane.layout import Layout
 from rack.boards.config import load, resolve_layout
-from rack.boards.faults.bounds import compute_last_read_ticks, list_struck_mailboxes
+from rack.boards.faults.bounds import compute_last_read_ticks, list_affected_mailboxes
 from rack.boards.faults.kind import KINDS, Kind
 from tests.snapshots import ROOT, Snapshots, each_shipped_rack
 
@@ -38,7 +38,7 @@ def test_the_bounds_of_a_shipped_rack_are_as_before(name: str) -> None:
         found: list[object] = []
         for injection in injections(kind, layout):
             board = layout.processes[injection.task].name
-            struck = list_struck_mailboxes(layout, injection.mailbox, board)
+            struck = list_affected_mailboxes(layout, injection.mailbox, board)
             readers = sorted({reader for box in struck for reader in box.readers})
             if kind.tasks and layout.find_task(board).role not in kind.tasks:
                 continue

@@ -17,7 +17,7 @@ from rack.boards.lan.access import (
     build_access_control,
 )
 from rack.boards.lan.config import LanTable
-from rack.boards.lan.keys import alive_key, launch_and_cycle
+from rack.boards.lan.keys import alive_key, parse_alive_key
 
 TLS, TCP = "tls/10.0.0.1:7447", "tcp/127.0.0.1:7447"
 QUERIES = ("query", "reply")
@@ -106,11 +106,11 @@ def test_an_operator_with_the_right_to_stop_has_no_other_right() -> None:
 
 @pytest.mark.parametrize("cycle_ns", [0, 20_000_000])
 def test_a_token_names_launch_and_cycle(cycle_ns: int) -> None:
-    assert launch_and_cycle(alive_key("home", 0xAB, cycle_ns)) == (0xAB, cycle_ns)
+    assert parse_alive_key(alive_key("home", 0xAB, cycle_ns)) == (0xAB, cycle_ns)
 
 
 @pytest.mark.parametrize(
     "launch", ["x", "ab", "-20", f"{1:016x}-", f"{1:016x}-x", f"{1:016x}-{10**18}", f"{1:017x}"]
 )
 def test_a_token_that_no_adapter_declares_is_not_parsed(launch: str) -> None:
-    assert launch_and_cycle(f"rack/home/alive/{launch}") is None
+    assert parse_alive_key(f"rack/home/alive/{launch}") is None

@@ -107,12 +107,12 @@ def test_a_rack_that_joins_is_sent_every_newest_message(make: MakeAdapter) -> No
     changes: list[Change] = []
     adapter, _ = make(changes)
     (export,) = adapter._exports.values()
-    export.is_asked = False
+    export.must_resend = False
     adapter._update_presence(8)
-    assert not export.is_asked
+    assert not export.must_resend
     changes.append(("stranger", FIRST, True))
     adapter._update_presence(16)
-    assert export.is_asked
+    assert export.must_resend
 
 
 class Sent(Message, version=1):

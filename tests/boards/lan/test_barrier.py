@@ -145,12 +145,12 @@ def test_a_partner_that_is_reset_is_awaited_as_at_first() -> None:
     partner = Partner("b", 3)
     partner.launch = 7
     partner.gone_s = 1.0
-    partner.is_there = True
+    partner.is_present = True
     partner.add_step(step(8, StepFlag.OVER))
     partner.reset_state()
     assert (partner.launch, partner.time_ns, partner.gone_s) == (NO_LAUNCH, NEVER, None)
     assert not partner.steps
-    assert [partner.is_out, partner.is_there, partner.has_reached(0)] == [False] * 3
+    assert [partner.is_out, partner.is_present, partner.has_reached(0)] == [False] * 3
 
 
 HEAD = Envelope(STEP_KIND, 11, 1, 1, 40, 100_000_000, 0, StepFlag.OVER)

@@ -81,7 +81,7 @@ def test_a_rack_that_joins_gets_the_newest_message_again(segment: Segment) -> No
     exporting = Exporting(segment)
     exporting.writer.write(0)
     exporting.entry.send_newest(8)
-    exporting.entry.is_asked = True
+    exporting.entry.must_resend = True
     exporting.entry.send_newest(16)
     exporting.entry.send_newest(24)
     # In lockstep nobody comes late, and nothing may depend on when a token comes.

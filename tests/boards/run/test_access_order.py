@@ -116,7 +116,7 @@ def of_python(segment: Segment, accesses: list[str]) -> dict[str, tuple[str, ...
     writer.write(1)
     found |= {
         "read": made(lambda: reader.read(2)),
-        "judge": made(lambda: reader.slots.is_kept(2)),
+        "judge": made(lambda: reader.slots.is_intact(2)),
         "lose": made(writer.lose_message),
     }
     # A writer that dies before it publishes what it has filled.

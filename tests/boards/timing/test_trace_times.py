@@ -68,8 +68,8 @@ def test_flags_say_which_cycles_missed_skipped_or_planned() -> None:
     skips = 3 << SKIPPED_SHIFT
     flags = (0, Flag.MISSED, Flag.PLANNED, Flag.SKIPPED | skips, Flag.MISSED | Flag.PLANNED)
     rows = records(*({"tick": tick, "flags": int(flag)} for tick, flag in enumerate(flags)))
-    assert trace_times.find_missed(rows).tolist() == [False, True, False, False, True]
-    assert trace_times.count_skipped(rows).tolist() == [0, 0, 0, 3, 0]
+    assert trace_times.find_missed_cycles(rows).tolist() == [False, True, False, False, True]
+    assert trace_times.count_skipped_releases(rows).tolist() == [0, 0, 0, 3, 0]
     assert trace_times.count_misses_and_skips(rows) == (2, 3)
     assert trace_times.select_plans(rows)["tick"].tolist() == [2, 4]
 

@@ -14,7 +14,7 @@ from rack.levels.planning.payload import GAP_M, FixedJaw, Payloads, find_fixed_j
 from rack.levels.planning.pose import Pose, build_pointing_quaternion
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import SceneConfig
-from rack.levels.task.actions import Handling
+from rack.levels.task.actions import TransferPlanner
 from rack.levels.task.program import DOWN
 from rack.levels.task.rehearsal import Rehearsal
 from tests.levels.arms import CLOCK_NS, cell, pendulum
@@ -58,7 +58,7 @@ def lowest_grasp(folder: Path, length: float) -> float:
     poses = made.build_start_data().qpos[made.object_qpos[:, None] + np.arange(7)]
     situation = Situation(poses[:, :3].copy(), poses[:, 3:].copy())
     rehearsal = Rehearsal(MotionPlanner(made, scene, 1), made.home, situation)
-    takes = next(Handling(rehearsal, 0, 0.1).find_takes())
+    takes = next(TransferPlanner(rehearsal, 0, 0.1).find_takes())
     return float(takes[0].tool.position[2] - situation.positions[0, 2])
 
 

@@ -153,7 +153,7 @@ class Bench:
     def __init__(self) -> None:
         self.monitor = ActuatorMonitor(CELL, following=0.02, period_s=TICK_S)
         self.terms = Dynamics(CELL).terms(CELL.home, REST)
-        self.monitor.judge_cycle(RESTING, RESTING, self.terms, False)
+        self.monitor.check_cycle(RESTING, RESTING, self.terms, False)
 
     def leave(self, cycles: int, holds: bool = False, **left: float) -> list[Finding]:
         """Leave these torques over, N m, by joint from `j1` on, for some cycles; return what is
@@ -166,7 +166,7 @@ class Bench:
             taken = np.where(over, np.copysign(HELD_BY_FRICTION, over), 0.0)
             self.monitor.torque[:] = self.terms.bias + over + taken
             self.monitor.begin_cycle()
-            found.append(self.monitor.judge_cycle(RESTING, RESTING, self.terms, holds))
+            found.append(self.monitor.check_cycle(RESTING, RESTING, self.terms, holds))
         return [finding for finding in found if finding is not None]
 
 

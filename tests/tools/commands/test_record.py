@@ -157,7 +157,7 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
     place = place_on_time_line(recordings)[1]
     assert place.note == note
     # The two were on one clock: what that showed is the truth.
-    true_ns = place.line.convert_stamps(np.array([place.own.epoch_ns]))[0]
+    true_ns = place.reference_grid.convert_stamps(np.array([place.grid.epoch_ns]))[0]
     assert abs(place.convert_ticks(np.zeros(1, dtype=int), 0)[0] - true_ns) <= place.uncertainty_ns
     assert (
         len(read_component(folder / "run.rrd", f"/{names[0]}/signals/pulse.status/count").ticks) > 0

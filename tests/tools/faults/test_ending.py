@@ -13,7 +13,7 @@ from rack.backplane.segment import Segment
 from rack.boards.config.layout import build_field_specs
 from rack.boards.faults.kind import KINDS
 from rack.levels.messages import ArmState, Error, ServoStatus, TaskStatus
-from rack.tools.faults.campaigns.trial import build_outside_kill, format_levels, is_late
+from rack.tools.faults.campaigns.trial import build_external_kill, format_levels, is_late
 from rack.tools.faults.ending import EXTERNAL, REST_VELOCITY, list_strikes, read_arm
 from tests.backplane.bus import mailbox, task
 from tests.backplane.conftest import MakeBus, make_bus  # noqa: F401  a fixture
@@ -114,7 +114,7 @@ def test_strikes_come_from_the_fault_table_and_from_outside_kills(
     # It waits, so it has not begun.
     assert (second.kind, second.began, second.tick, second.count) == ("mute", -1, -1, 0)
     assert (second.fault, second.joint) == (waits.index, "")
-    kill = build_outside_kill(segment.layout, "task", 60, 5_000)
+    kill = build_external_kill(segment.layout, "task", 60, 5_000)
     assert (kill.fault, kill.kind, kill.board) == (-1, EXTERNAL, "task")
     assert (kill.began, kill.ends, kill.tick) == (60, 60, 60)
     assert (kill.time_ns, kill.mailboxes) == (5_000, ("task.status",))

@@ -31,25 +31,29 @@ def test_misses_holds_and_alarms_except_commands_are_occasions(small: Path, rack
     with Rack(load(small, [f"name={rack_name}", record])) as rack:
         segment = rack.segment
         occasions = Occasions(segment)
-        assert list(occasions.find_in_alarms()) == []
-        assert list(occasions.find_in_rows("lower", build_trace([0, 0]))) == []
+        assert list(occasions.find_alarm_ticks()) == []
+        assert list(occasions.find_occasion_ticks("lower", build_trace([0, 0]))) == []
         missed = build_trace([0, Flag.MISSED, 0, 1 << SKIPPED_SHIFT])
-        assert list(occasions.find_in_rows("lower", missed)) == [101, 103]
+        assert list(occasions.find_occasion_ticks("lower", missed)) == [101, 103]
         rack.run(0.1)
         status = open_rings(segment)["lower.status"].read_new_rows().rows.copy()
         status["message"]["state"] = State.EXECUTING
-        assert list(occasions.find_in_rows("lower.status", status)) == []
+        assert list(occasions.find_occasion_ticks("lower.status", status)) == []
         # A hold begins, lasts beyond the end of the drained rows, and ends.
         status["message"]["state"][-3:] = State.HOLDING
-        assert list(occasions.find_in_rows("lower.status", status)) == [int(status["tick"][-3])]
+        assert list(occasions.find_occasion_ticks("lower.status", status)) == [
+            int(status["tick"][-3])
+        ]
         status["message"]["state"][:2] = State.HOLDING
         status["message"]["state"][-3:] = State.EXECUTING
-        assert list(occasions.find_in_rows("lower.status", status)) == [int(status["tick"][2])]
+        assert list(occasions.find_occasion_ticks("lower.status", status)) == [
+            int(status["tick"][2])
+        ]
         bell = AlarmWriter(segment, "upper")
         for tick, alarm in ((7, Alarm.COLLISION), (8, Alarm.COMMANDED), (9, Alarm.REJOINED)):
             bell.raise_alarm(tick, alarm)
-        assert list(occasions.find_in_alarms()) == [7, 9]
-        assert list(occasions.find_in_alarms()) == []
+        assert list(occasions.find_alarm_ticks()) == [7, 9]
+        assert list(occasions.find_alarm_ticks()) == []
         keeping = Retention.from_config(segment)
         assert keeping is not None
         assert keeping.find_window(100) == (0, 900)

@@ -188,7 +188,7 @@ def test_a_task_without_real_time_priority_shows_no_absence(
     late = late_clock(52, since=50, late_ms=5.9)
     refused = run(tmp_path / "refused", config, absence_trace() | long, late, priority=0)
     assert not find_stalls(refused).absences
-    assert [cycles.stalled for cycles in read_cycles(refused).values()] == [0, 0]
+    assert [cycles.stalled_count for cycles in read_cycles(refused).values()] == [0, 0]
 
 
 def test_counted_steal_is_not_reported_as_an_absence_again(
@@ -212,7 +212,7 @@ def test_lockstep_has_no_stalls(small: Path, tmp_path: Path) -> None:
     long = {"lower.planner": [Cycle(SETTLED, (0.0, 0.1, 60.0, 0.1), flags=PLANNED)]}
     recording = run(tmp_path / "run", load(small), absence_trace() | long)
     assert find_stalls(recording) == Stalls(2, 0, [], None)
-    assert [cycles.stalled for cycles in read_cycles(recording).values()] == [0, 0]
+    assert [cycles.stalled_count for cycles in read_cycles(recording).values()] == [0, 0]
 
 
 def test_stalled_cycles_do_not_count_towards_a_budget(config: RackConfig, tmp_path: Path) -> None:
@@ -227,7 +227,7 @@ def test_stalled_cycles_do_not_count_towards_a_budget(config: RackConfig, tmp_pa
     }
     computed = run(tmp_path / "computed", config, trace)
     assert measure_budgets(computed)["lower"].process_ns == round(6.3 * MS)
-    assert read_cycles(computed)["lower"].stalled == 0
+    assert read_cycles(computed)["lower"].stalled_count == 0
     stolen = run(tmp_path / "stolen", config, trace)
     stolen.cores = CoreRecord(200 * MS, (Stolen(126 * MS, 130 * MS, OTHER, 10),))
     # The clock board was away at that time, so the whole machine may have been.

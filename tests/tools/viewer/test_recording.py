@@ -138,4 +138,4 @@ def test_no_view_fails_in_the_viewer(run: Recording) -> None:
     except NoViewerError as error:
         pytest.skip(str(error))
     assert look.complaints == ()
-    assert look.picture.startswith(b"\x89PNG")
+    assert look.png.startswith(b"\x89PNG")

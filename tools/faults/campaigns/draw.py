@@ -96,7 +96,7 @@ class RackUnderTest:
         values = tuple(parameters.get(p.name, p.default or 0.0) for p in kind.parameters)
         entry = Injection(kind.number, task, box, parameters=values)
         duration = kind.compute_bound_ticks(entry, layout) or 0
-        if not kind.is_over_when_found:
+        if not kind.ends_when_detected:
             min_duration = 2 * target.cycle + target.reader if target.mailbox else MIN_TICKS
             duration = max(duration, ticks, min_duration)
         recovery = kind.compute_recovery_ticks(target.board, layout, self.restart_s)

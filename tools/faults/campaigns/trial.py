@@ -21,7 +21,7 @@ from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate
 from rack.boards.errors import BoardError, ConfigError
 from rack.boards.events import Event, Outcome, iterate_statuses
-from rack.boards.faults.bounds import list_struck_mailboxes
+from rack.boards.faults.bounds import list_affected_mailboxes
 from rack.levels.messages import Error
 from rack.tools.faults.campaigns.base import BaseRack, Start
 from rack.tools.faults.campaigns.certainty import EarlyEnd
@@ -102,7 +102,7 @@ class Killer:
         if not is_alive(pid):
             return False
         tick = self._words[System.TICK]
-        kill = build_outside_kill(self._segment.layout, board, tick, time.monotonic_ns())
+        kill = build_external_kill(self._segment.layout, board, tick, time.monotonic_ns())
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
             self.done.append(kill)
@@ -118,7 +118,7 @@ class Killer:
         return block[Block.PID] if is_up else 0
 
 
-def build_outside_kill(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
+def build_external_kill(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
     """Return the record of an external kill.
 
     Args:
@@ -135,7 +135,7 @@ def build_outside_kill(layout: Layout, board: str, tick: int, time_ns: int) -> S
         ends=tick,
         tick=tick,
         time_ns=time_ns,
-        mailboxes=tuple(box.name for box in list_struck_mailboxes(layout, -1, board)),
+        mailboxes=tuple(box.name for box in list_affected_mailboxes(layout, -1, board)),
     )
 
 

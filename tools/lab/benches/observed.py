@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rack.boards.config.schema import CommandConfig, RackConfig
-from rack.boards.timing.trace_times import compute_lateness_ns, count_skipped
+from rack.boards.timing.trace_times import compute_lateness_ns, count_skipped_releases
 from rack.tools.launch.launch import RunResult, run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
@@ -80,7 +80,7 @@ def compute_lateness_us(recording: Recording, task: str) -> np.ndarray:
     if len(rows):
         rows = rows[rows["release_ns"] >= rows["release_ns"][0] + SETTLE_NS]
     period_ns = recording.layout.find_task(task).every * recording.layout.clock_ns
-    return np.asarray(compute_lateness_ns(rows) + count_skipped(rows) * period_ns) * 1e-3
+    return np.asarray(compute_lateness_ns(rows) + count_skipped_releases(rows) * period_ns) * 1e-3
 
 
 class CycleCount(NamedTuple):

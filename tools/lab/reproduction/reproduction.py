@@ -17,7 +17,7 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     compute_program_checksum,
     describe_machine,
     load_result,
-    make_and_store,
+    run_and_store,
 )
 from rack.tools.lab.reproduction.page import (
     LABELS,
@@ -86,7 +86,7 @@ def reproduce_paper(
         progress.begin_run(f"{number} of {len(needed)}: {experiment.about}")
         try:
             with convert_errors():
-                result = make_and_store(experiment, workshop)
+                result = run_and_store(experiment, workshop)
         except Failure as error:
             results[experiment.name] = str(error)
             progress.end_run(experiment.seconds, "failed", [f"{experiment.name}: {error}"])

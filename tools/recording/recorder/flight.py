@@ -52,7 +52,7 @@ class FlightRecorder:
         self._sealed: deque[FinishedStretch] = deque()
         self._kept_until = -1
         self._began = 0
-        if tally.number:
+        if tally.stretch_number:
             # Rows may have been lost while no recorder was running.
             self._keep_around(self._words[System.TICK])
         self._path = self._begin_stretch(self._began, self._began)
@@ -67,7 +67,7 @@ class FlightRecorder:
                 content of the lost rows is unknown.
         """
         loss_ticks = [self._words[System.TICK]] if lost else []
-        for tick in (*loss_ticks, *self._occasions.find_in_rows(ring, rows)):
+        for tick in (*loss_ticks, *self._occasions.find_occasion_ticks(ring, rows)):
             self._keep_around(tick)
 
     def advance_to(self, tick: int) -> None:
@@ -75,7 +75,7 @@ class FlightRecorder:
 
         Call this when all rows written before `tick` are in the spool.
         """
-        for alarm_tick in self._occasions.find_in_alarms():
+        for alarm_tick in self._occasions.find_alarm_ticks():
             self._keep_around(alarm_tick)
         if tick - self._began < self._length:
             return
@@ -106,7 +106,7 @@ class FlightRecorder:
             File of the new stretch.
         """
         tally = self._tally
-        stretch = StretchHead(tally.number + 1, begin, dict(tally.taken), dict(tally.rows))
+        stretch = StretchHead(tally.stretch_number + 1, begin, dict(tally.taken), dict(tally.rows))
         tally.begin_stretch(stretch)
         return self._spool.begin_stretch(stretch, end)
 

@@ -19,7 +19,7 @@ from rack.boards.timing.trace_times import (
     UNITS,
     compute_response_ns,
     compute_waking_ns,
-    count_skipped,
+    count_skipped_releases,
     select_plans,
 )
 from rack.tools.recording.recording import Recording
@@ -176,7 +176,7 @@ class _TaskTrace:
         """Yield the jobs. A release that an executor skipped is a job without an end."""
         every = self.task.every_ns
         period = self.task.period_ns
-        skipped_counts = count_skipped(self.rows) * (self.task.role == "executor")
+        skipped_counts = count_skipped_releases(self.rows) * (self.task.role == "executor")
         for release, count, end in zip(
             self._compute_times("release_ns"),
             skipped_counts.tolist(),

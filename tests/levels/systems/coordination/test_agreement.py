@@ -59,9 +59,9 @@ class PlayedArm:
     def cycle(self, order: tuple[int, OrderVerb, str], now_s: float) -> Reading:
         """Take up what is said; return the report."""
         taken = self.taken
-        asked, was_under_way = taken.is_asked, taken.is_under_way
+        asked, was_under_way = taken.needs_answer, taken.is_under_way
         taken.process_order(PROGRAM if order[0] else 0, *order)
-        if taken.is_asked and asked:
+        if taken.needs_answer and asked:
             self._plan(now_s)
         elif taken.is_under_way:
             self._move(is_first=not was_under_way)

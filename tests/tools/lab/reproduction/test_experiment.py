@@ -18,7 +18,7 @@ from rack.tools.lab.reproduction.experiments.experiment import (
     describe_dependencies,
     list_program_files,
     load_result,
-    make_and_store,
+    run_and_store,
 )
 
 
@@ -55,7 +55,7 @@ def test_a_result_is_valid_until_the_program_changes(
 ) -> None:
     one = Counted().experiment()
     assert load_result(one, workshop.folder) is None
-    first = make_and_store(one, workshop)
+    first = run_and_store(one, workshop)
     assert load_result(one, workshop.folder) == first
     # The dependencies are stored with the result.
     document = json.loads((workshop.folder / RESULTS_FOLDER / "counted.json").read_text())
@@ -63,7 +63,7 @@ def test_a_result_is_valid_until_the_program_changes(
     assert {"program", "machine"} <= set(document["depends"])
     monkeypatch.setattr(experiment, "compute_program_checksum", lambda: "another")
     assert load_result(one, workshop.folder) is None
-    assert make_and_store(one, workshop).found["times"] == 2
+    assert run_and_store(one, workshop).found["times"] == 2
 
 
 @pytest.mark.parametrize(
@@ -84,12 +84,12 @@ def test_a_missing_requirement_is_stored_as_a_reason_and_a_failure_is_not(
         raise Failure("the rack did not run")
 
     lacking, failing = (Experiment(make.__name__, "", 1.0, Times, make) for make in (lack, fail))
-    make_and_store(lacking, workshop)
+    run_and_store(lacking, workshop)
     found = load_result(lacking, workshop.folder)
     assert found is not None
     assert found.lacking == "no second processor"
     with pytest.raises(Failure, match="did not run"):
-        make_and_store(failing, workshop)
+        run_and_store(failing, workshop)
     assert load_result(failing, workshop.folder) is None
 
 

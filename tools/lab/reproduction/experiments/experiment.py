@@ -204,7 +204,7 @@ def load_result(experiment: Experiment[Any], folder: Path) -> StoredResult | Non
     return result if result.depends == describe_dependencies() else None
 
 
-def make_and_store(experiment: Experiment[Any], workshop: Workshop) -> StoredResult:
+def run_and_store(experiment: Experiment[Any], workshop: Workshop) -> StoredResult:
     """Run an experiment and store its result. Raises `Failure` and the exceptions of a rack."""
     start_s = time.monotonic()
     dependencies = describe_dependencies()

@@ -95,7 +95,9 @@ def _measure_task(workshop: Workshop) -> NasremRun:
     """Run the whole task in real time and apply every equation to the run."""
     result, recording = workshop.run(NAME, workshop.load_config(NAME))
     analysis = Analysis.from_recording(recording)
-    failing = {pair.measured.key for pair in analysis.mostly if pair.measured and pair.is_failed}
+    failing = {
+        pair.measured.key for pair in analysis.typical_pairs if pair.measured and pair.is_failed
+    }
     ticks = result.outcome.ticks
     layout = recording.layout
     return NasremRun(
