@@ -45,7 +45,7 @@ M_co = TypeVar("M_co", bound=Message, covariant=True)
 
 
 class Bus(Protocol):
-    """What a host program may do on the bus besides using its ports."""
+    """Operations of a host program on the bus, apart from its ports."""
 
     @property
     def tick(self) -> int:

@@ -78,3 +78,37 @@ def test_each_pattern_is_noticed(source: str) -> None:
 
 def test_a_question_is_no_hit() -> None:
     assert not hits('"""What does a cycle cost?"""')
+
+
+def missing_attributes(source: str) -> list[str]:
+    """Return names in `Attributes:` sections that their classes do not have."""
+    missing = []
+    for owner in ast.walk(ast.parse(source)):
+        if not isinstance(owner, ast.ClassDef):
+            continue
+        names = {node.name for node in ast.walk(owner) if isinstance(node, ast.FunctionDef)}
+        for node in ast.walk(owner):
+            match node:
+                case ast.Attribute(_, name, ast.Store()) | ast.Name(name, ast.Store()):
+                    names.add(name)
+        _, _, section = (ast.get_docstring(owner) or "").partition("Attributes:\n")
+        listed = re.findall(r"^    (\w+)(?:, (\w+))?:", section.partition("\n\n")[0], re.MULTILINE)
+        missing += [
+            f"{owner.name}.{name}" for pair in listed for name in pair if name and name not in names
+        ]
+    return missing
+
+
+@pytest.mark.slow
+def test_docstrings_of_classes_list_attributes_that_exist() -> None:
+    assert not [
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in SOURCES
+        for name in missing_attributes(path.read_text())
+    ]
+
+
+def test_an_attribute_that_is_documented_but_missing_is_noticed() -> None:
+    section = "Attributes:\n        a: One.\n        b, c: Two.\n"
+    source = f'class A:\n    """B.\n\n    {section}    """\n    a = 1\n    b = 1\n'
+    assert missing_attributes(source) == ["A.c"]

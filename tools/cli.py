@@ -84,7 +84,7 @@ COMMAND_SOURCES = {
     "robot": "rack.tools.commands.robot:app",
     "lan": "rack.tools.network.group:app",
 }
-"""Where commands are found, as "module:attribute" of a function or a `typer.Typer`.
+"""Sources of commands, as "module:attribute" of a function or a `typer.Typer`.
 
 A command that is not listed is the function of the same name in the module of that name.
 """

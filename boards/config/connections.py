@@ -194,7 +194,8 @@ class Wiring:
         config: The config of the rack.
         broken: Tables that were removed from the config because of mistakes, as in "board.servo".
         ports: Ports of every task and host board whose class exists, in order.
-        missing: For every other task and host board, the reason why its class cannot be used.
+        unusable_classes: For every other task and host board, the reason why its class cannot be
+            used.
     """
 
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:

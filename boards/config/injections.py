@@ -62,7 +62,7 @@ class FaultCheck:
         config: The config of the rack.
         levels: Its levels.
         layout: Its layout. None skips the checks that need one.
-        unspecified: Boards with known mistakes. Checks that depend on them are skipped.
+        broken_boards: Boards with known mistakes. Checks that depend on them are skipped.
     """
 
     place: str

@@ -145,7 +145,7 @@ class Resolved:
         # faster than waking up another core. A polling board never yields its core.
         if config.is_lockstep and (yielding := [t for t in executors if t.wake != "poll"]):
             core = min(yielding, key=lambda task: (task.every, task.slot)).core
-        # What the arm must do while a board is lost: nothing if the level below it holds.
+        # Reaction of the arm to the loss of a board. None if the level below the board holds.
         demands = {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}
         return ClockWiring(
             lockstep=config.is_lockstep,

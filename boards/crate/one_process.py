@@ -135,7 +135,7 @@ class PrivateMailbox:
         dtype: numpy type of its messages.
         message: Message that the writer fills.
         serial: Serial of the last written message.
-        kept: Written messages that are not visible yet, and the newest visible one. Each has the
+        stored: Written messages that are not visible yet, and the newest visible one. Each has the
             tick at which it becomes visible, its serial and its bytes.
     """
 

@@ -93,7 +93,7 @@ class HeldSnapshot:
         copies: Copies of all processes, by name.
         memory: Descriptor of a file with a copy of the segment. -1 until it is received.
         private_bytes: Memory that it does not share with other processes, as last measured.
-        is_whole: Whether all copies are present.
+        is_complete: Whether all copies are present.
     """
 
     tick: int

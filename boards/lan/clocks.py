@@ -139,7 +139,7 @@ class PeerClock:
         offset: Offset of the rack's clock.
         sent: Time in ns at which each unanswered ping was sent, by the serial of the ping.
         due_ns: Time in ns at which the next ping is due.
-        met: Launch and number of losses of the rack when the measurements began.
+        launch_and_losses: Launch and number of losses of the rack when the measurements began.
         epoch_ns: CLOCK_MONOTONIC of the rack's machine at the rack's tick 0, in ns. 0 if the rack
             has not started or has not answered yet.
         period_ns: Real length of the rack's tick in ns.

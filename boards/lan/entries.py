@@ -88,7 +88,7 @@ class Export:
 
     Attributes:
         every: Period of the exchange in cycles of the adapter.
-        is_asked: Whether a rack has joined since the last message was sent, so that the newest
+        must_resend: Whether a rack has joined since the last message was sent, so that the newest
             message must be sent even if it was sent before.
         count: Counters of the export.
     """

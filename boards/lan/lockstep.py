@@ -109,7 +109,7 @@ class Partner:
         time_ns: Simulated time of its newest step in ns. `NEVER` if none has arrived.
         steps: Steps whose exports are not yet delivered.
         is_out: Whether the rack no longer takes part, so that nobody waits for it.
-        is_there: Whether the rack was present in the last cycle.
+        is_present: Whether the rack was present in the last cycle.
         gone_s: CLOCK_MONOTONIC in s at which its adapter was noticed to have ended. None if the
             adapter is present or was never seen.
     """
@@ -163,8 +163,8 @@ class Barrier:
     Attributes:
         cycle_ns: Length of the adapter's cycle in ns of simulated time. It must be equal in all
             racks.
-        done: Release tick of the last cycle that the previous adapter finished. -1 if there was
-            none.
+        last_done_tick: Release tick of the last cycle that the previous adapter finished. -1 if
+            there was none.
     """
 
     def __init__(

@@ -91,7 +91,7 @@ class DeviationMonitor:
     A few such cycles are permitted; motion holds during them.
 
     Attributes:
-        place: Text with the joint and its distance. Empty if no joint is too far away.
+        description: Text with the joint and its distance. Empty if no joint is too far away.
         fault: Set when a joint has been too far away for too long, else None.
     """
 

@@ -31,7 +31,7 @@ class OperatorControl:
 
     Attributes:
         orders: Commands of the operator and the answers to them.
-        stands: The level follows the operator instead of the level above.
+        is_in_control: The level follows the operator instead of the level above.
     """
 
     def __init__(

@@ -46,7 +46,8 @@ class Cycles:
         write_ns: W of an executor, U of a planner.
         is_judged: False for cycles that are left out of all verdicts: those of a process's
             start-up, and those in which the core may have been taken away.
-        stalled: Number of cycles in which the core may have been taken away, see `analyze_stalls`.
+        stalled_count: Number of cycles in which the core may have been taken away, see
+            `analyze_stalls`.
         overhead_ns: Time per cycle outside these functions, for waking up and closing the cycle.
         stretches: Number of the recorded stretch that contains each cycle, see `find_stretches`.
     """

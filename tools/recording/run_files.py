@@ -94,7 +94,7 @@ class Tally:
         rows: Number of rows read, by ring.
         kept: Ranges of ticks [first, end) that were not deleted. Consecutive stretches are one
             range.
-        number: Number of the newest stretch.
+        stretch_number: Number of the newest stretch.
     """
 
     def __init__(self, layout: Layout, before: Mapping[str, int] | None = None) -> None:

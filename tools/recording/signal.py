@@ -178,7 +178,7 @@ class Trigger:
 
     Attributes:
         signal: The signal, which is a single number.
-        sign: The comparison operator.
+        comparison: The comparison operator.
         number: The constant.
     """
 

@@ -124,12 +124,12 @@ class RackPlace:
     """Conversion of a recorded rack's times to the time line, which is the first rack's time.
 
     Attributes:
-        own: Grid of the rack.
-        line: Grid of the first rack.
+        grid: Grid of the rack.
+        reference_grid: Grid of the first rack.
         offsets: Clock offsets that convert, one after the other, from the rack's machine to the
             first rack's machine. Empty if both racks have the same ticks, as in lockstep, and for
             the first rack itself.
-        by_ticks: True if two runs of the same rack are aligned tick by tick.
+        is_tick_aligned: True if two runs of the same rack are aligned tick by tick.
         marks: Notes to the user. Empty for the first rack.
     """
 

@@ -83,8 +83,8 @@ class Analysis:
         predicted: Timing of the rack with the budgets of its config.
         measured: Timing of the rack with the measured budgets.
         pairs: Verdicts on all equations at `percentile`.
-        mostly: Verdicts on all equations at `MOST_CYCLES_PERCENTILE`, or at `percentile` if that is
-            lower.
+        typical_pairs: Verdicts on all equations at `MOST_CYCLES_PERCENTILE`, or at `percentile` if
+            that is lower.
     """
 
     recording: Recording

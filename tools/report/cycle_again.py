@@ -51,7 +51,7 @@ class _RepeatedCycle(NamedTuple):
 
     Attributes:
         attributes: Attributes of the level before the cycle.
-        unlike: Mailboxes whose messages differ from the recording.
+        differing_mailboxes: Mailboxes whose messages differ from the recording.
         is_equal: True if all repetitions wrote the same message.
     """
 

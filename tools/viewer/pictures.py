@@ -58,7 +58,7 @@ class Picture(NamedTuple):
     """A picture, and the complaints of the viewer that drew it.
 
     Attributes:
-        picture: The picture in PNG format.
+        png: The picture in PNG format.
         complaints: Reports shown in the views, and warnings and errors in the viewer's log.
     """
 

@@ -46,7 +46,7 @@ class ComplianceWatch:
         axis: Axis of that guard, or -1.
         sensed: Tick of the newest wrench, or -1.
         felt: Wrench of the contact on the tool, in the task frame, (6,), N, N m.
-        rests: The motion must end.
+        must_rest: The motion must end.
         reason: Why the motion must end, or why the applied force is not the wanted one. Else empty.
     """
 
