@@ -9,7 +9,7 @@ loads the serial with acquire before it copies the slot, so it sees all of the s
 still be torn by a writer that laps the reader, which the checksum detects. The checksum does not
 cover the signature. The signature is stored after the message and loaded before it, so that a
 forged message that is being overwritten never carries the signature of the true writer. A reader
-completes its copy before it loads the head to check that the slot has not been reused (`is_kept`),
+completes its copy before it loads the head to check that the slot has not been reused (`is_intact`),
 and the writer fills no slot before it has stored the head for the previous one. Words are aligned
 to 8 bytes, so they are never torn.
 

@@ -176,7 +176,7 @@ PYTHON_MUTANTS: dict[str, tuple[type, str, str, str]] = {
     "signature before message": (Slots, "publish_message", "[SIGNED_FROM:]", "[:SIGNED_FROM]"),
     "relaxed load of the head": (Reader, "read", "slots.fence()\n", "pass\n"),
     "signature loaded after the message": (Slots, "load_slot", FENCE, "pass\n"),
-    "no fence before a copy is judged": (Slots, "is_kept", FENCE, "pass\n"),
+    "no fence before a copy is judged": (Slots, "is_intact", FENCE, "pass\n"),
     "slots of a dead writer left filled": (
         Slots,
         "clear_unpublished",
