@@ -67,7 +67,7 @@ class MessageType:
     def _build_column(
         self, field: Field, sizes: Mapping[str, int]
     ) -> tuple[str, Any, tuple[int, ...]]:
-        """Return name, numpy type and shape of one field, with symbolic sizes replaced."""
+        """Return name, numpy type and shape of one field, with symbolic sizes as numbers."""
         kind = (
             field.kind.build_dtype(sizes)
             if isinstance(field.kind, MessageType)

@@ -394,7 +394,7 @@ class Ending:
         The result is empty if no level senses objects.
 
         Args:
-            goals: Goals by the row of the object in the scene message.
+            goals: A dictionary from the row of an object in the scene message to its goal.
         """
         for box in self._segment.layout.mailboxes:
             if (
@@ -409,7 +409,7 @@ class Ending:
         return ()
 
     def find_cause(self) -> Cause:
-        """Return why a run has ended. Call this only if no one has stopped the run."""
+        """Return the cause for which a run has ended. Call this only if it was not stopped."""
         if self._observer is None or self._ends_run is None:
             return "time over"
         status = self._observer.peek().message

@@ -32,7 +32,8 @@ class Task(ABC):
     Attributes:
         spec: Description of the task from the layout.
         block: Control block of the task.
-        serve: Serves the interrupts of the board in each cycle, None if this task does not.
+        serve: Function that serves the board's interrupts in each cycle. None if nothing
+            interrupts the board, or another of its tasks serves the interrupts.
     """
 
     def __init__(
@@ -100,8 +101,8 @@ class Task(ABC):
 class ClockGuard:
     """Reports ticks that the clock has skipped or begun late, for one of the fastest tasks.
 
-    Even the fastest task need not cycle in every tick. It then loses no release by most skipped
-    ticks, and none of its cycles is late, so skipped ticks are found by the clock's count.
+    Even the fastest task need not cycle in every tick. Most skipped ticks then neither cost it a
+    release nor delay its cycles, so it finds skipped ticks from the clock's count.
 
     Attributes:
         reported: Number of skipped ticks that this task has reported, including earlier
@@ -135,7 +136,7 @@ class ClockGuard:
             self.reported = self._block[Block.CLOCK_SKIPPED] = counted
 
     def check_release(self, tick: int) -> None:
-        """Check, in a cycle that begins late, whether this is because the clock was late.
+        """Raise an alarm if a cycle began late because the clock was late, once per episode.
 
         Args:
             tick: Release tick of the cycle.
