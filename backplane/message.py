@@ -194,7 +194,7 @@ class Message:
         """Create a message of this class with all bytes 0.
 
         Args:
-            sizes: Symbolic sizes by name.
+            sizes: Values of the symbolic sizes, keyed by name.
 
         Raises:
             MailboxError: A size is missing.

@@ -57,7 +57,7 @@ class MessageType:
         Equal messages have equal bytes, because padding is zeroed at creation and never written.
 
         Args:
-            sizes: Symbolic sizes by name.
+            sizes: Values of the symbolic sizes, keyed by name.
 
         Raises:
             MailboxError: `sizes` does not contain a size that a field uses.

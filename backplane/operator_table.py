@@ -197,7 +197,7 @@ class OperatorTable:
         return entry.ticket == ticket and entry.client == Client.LEASES
 
     def release_lease(self, entry: RequestEntry) -> None:
-        """Release the lease of a request, so that the level need not hold when its client ends."""
+        """Release the lease of a request. The level then continues even if the client ends."""
         entry.client = Client.WAITS
 
     def list_waiting(self) -> list[RequestEntry]:

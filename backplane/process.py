@@ -145,7 +145,7 @@ class Reservation(NamedTuple):
 def take_core(core: int, priority: int, reservation: Reservation | None = None) -> int:
     """Pin the calling process to a core and raise its priority, if allowed.
 
-    With a reservation the process is not pinned if the kernel grants it only without pinning.
+    If the kernel grants the reservation only to an unpinned process, the process is not pinned.
 
     Args:
         core: Processor core.
@@ -224,7 +224,7 @@ def read_memory_sizes(pid: int) -> tuple[int, int]:
 
 
 def describe_refusal(error: OSError) -> str:
-    """Describe an error. If a limit on processes or open files was reached, state the limit."""
+    """Describe an error, including the limit on processes or open files if one was reached."""
     limits = {
         errno.EAGAIN: ("processes", "u", RLIMIT_NPROC),
         errno.EMFILE: ("open files", "n", RLIMIT_NOFILE),
@@ -237,7 +237,7 @@ def describe_refusal(error: OSError) -> str:
 
 
 def set_priority(priority: int) -> bool:
-    """Switch the calling process to a SCHED_FIFO priority, or to ordinary scheduling if it is 0.
+    """Set the SCHED_FIFO priority of the calling process. 0 selects ordinary scheduling.
 
     Returns:
         False if the system refuses.

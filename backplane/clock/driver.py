@@ -60,16 +60,16 @@ class Controller(Protocol):
 
 
 class ClockDriver(ABC):
-    """Part common to both clock modes: ticks, releases and the end of the run.
+    """Base class of both clock modes: advances ticks, releases tasks and ends the run.
 
     Attributes:
         controller: Other work of the system controller, set by the clock's board. None if there
             is no such work.
-        skip: Number of ticks, from the next one on, that a fault makes the clock skip.
+        skip: Number of ticks that the clock has yet to skip because of a fault.
         tasks: Tasks in the order of their release.
         processes: Tasks and host boards. The clock does not release host boards.
-        is_flooded: True if a fault makes a task write more messages than its mailboxes can hold
-            for the usual time.
+        is_flooded: True while a fault makes a task flood its mailboxes, so that messages are
+            overwritten earlier than usual.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class ClockDriver(ABC):
         return False
 
     def count_skipped(self, first: int, ticks: int) -> None:
-        """Publish that the clock skips `ticks` ticks, of which `first` is the first.
+        """Publish that the clock skips `ticks` ticks, beginning with `first`.
 
         The count is increased last, once for all these ticks. A late task therefore never reports
         only some of them, nor ticks that were skipped after its release.
@@ -148,7 +148,7 @@ class ClockDriver(ABC):
 
     @property
     def first_end_tick(self) -> int:
-        """Earliest permitted end of the run, as the first tick that is not run."""
+        """Earliest tick at which the run can end. The tick at which a run ends is not run."""
         return 0
 
     def wait_until_settled(self) -> None:
@@ -159,7 +159,7 @@ class ClockDriver(ABC):
         """
 
     def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
-        """In lockstep, wait until a condition on a task's state holds. In real time, do not wait.
+        """In lockstep, wait until a condition on a task's state is true. In real time, do not wait.
 
         Args:
             task: Task on whose state the condition depends.
@@ -183,7 +183,7 @@ class ClockDriver(ABC):
         if stop and tick >= stop:
             return True
         # Call this even if the end of this run is known. It also determines the end of the task,
-        # with which a run that continues this one may end.
+        # at which a run that continues this one may end.
         end_tick = self._ended(tick)
         if not stop and end_tick is not None:
             stop = words[System.STOP_TICK] = max(end_tick, self.first_end_tick, 1)
@@ -277,7 +277,7 @@ class RealtimeDriver(ClockDriver):
             time.sleep(wait * 1e-9)
 
     def _sleep_until_next(self, tick: int) -> int:
-        """Sleep until the tick after `tick` begins.
+        """Sleep until the next tick after `tick` begins.
 
         The clock has the highest priority on its core. If it wakes up late, the core was taken away
         from the rack, and an alarm is raised.

@@ -83,7 +83,7 @@ class LockstepDriver(ClockDriver):
 
     @property
     def first_end_tick(self) -> int:
-        """Earliest permitted end of the run, as the first tick that is not run: the next tick.
+        """Earliest tick at which the run can end: the next tick.
 
         A run that continues another may have a configured end before its own first tick. It then
         ends at once.
@@ -184,7 +184,7 @@ class LockstepDriver(ClockDriver):
             self.await_state(task, task.is_settled)
 
     def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
-        """Wait until a condition on the state of a task holds.
+        """Wait until a condition on the state of a task is true.
 
         Args:
             task: Task on whose state the condition depends.
@@ -202,10 +202,11 @@ class LockstepDriver(ClockDriver):
         return True
 
     def _check_after_timeout(self, task: ReleasedTask) -> bool:
-        """After a wait without a report, update `is_stopped` of the task, and check the host.
+        """After a wait without a report, update `is_stopped` of the task.
 
         Returns:
-            False if the host requests the end of the run or the launcher has ended.
+            False if the wait must end, because the host requests the end of the run or the launcher
+                has ended.
         """
         if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
             return False
@@ -217,7 +218,7 @@ class LockstepDriver(ClockDriver):
     def _wait_for_follower(self, tick: int) -> bool:
         """Wait for the recorder if its rings would otherwise overflow in `tick`.
 
-        No simulated time passes, so the wait has no time limit, except that a recorder that is
+        The wait has no time limit, because no simulated time passes. Only a recorder that is
         stopped or dead is abandoned after `MAX_RECORDER_WAIT_S`.
 
         Returns:

@@ -95,7 +95,7 @@ class ReleasedTask:
         block[Block.RELEASED] = newest
 
     def find_next_event(self, tick: int) -> int:
-        """Return the first tick after `tick` that must wait for this task or that releases it."""
+        """Return the next tick that cannot begin before the task finishes, or that releases it."""
         if self.deadline > tick:
             return self.deadline
         return tick + 1 + (self._phase - tick - 1) % self._every
@@ -106,7 +106,7 @@ class ReleasedTask:
         return block[Block.DONE] == block[Block.RELEASED] or self.is_lost or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
-        """Check whether `tick` may begin: the task is settled, or its deadline is later."""
+        """Check whether the task lets `tick` begin: it is settled, or its deadline is later."""
         self.deadline = self.block[Block.DEADLINE] - self._early
         return self.deadline > tick or self.is_settled()
 

@@ -46,8 +46,8 @@ class NextCycle:
 
     An executor's release expires at the task's next release, except that the releases of a batch in
     lockstep are all taken, one after the other. A planner's release expires at the end of the
-    plan's time slice. Until then the planner takes it late, but reads as of its tick, so that its
-    plan depends on ticks alone.
+    plan's time slice. A planner that takes its release late still reads as of the release tick, so
+    that the plan depends on ticks alone.
 
     Attributes:
         skipped: Number of releases skipped just before the last one taken.
@@ -118,7 +118,7 @@ class NextCycle:
             if newest >= self._due:
                 if is_posted and newest != self._newest:
                     # The task did not have to wait for this release or batch, so its post is still
-                    # pending. Take it, or the semaphore would overflow within weeks.
+                    # pending. Consume it, because the semaphore would overflow within weeks.
                     self._semaphore.try_acquire()
                 self._newest = newest
                 return self._take_release(newest)
@@ -263,7 +263,7 @@ class SilentClock:
         return late if late > 0 else CLOCK_PATIENCE_TICKS * self._clock.period_ns
 
     def check(self) -> None:
-        """Raise an alarm, once each time, if the clock's process is stopped, dead or blocked."""
+        """Raise an alarm, once per stop, if the clock's process is stopped, dead or blocked."""
         now = self._clock.compute_tick()
         newest = self._words[System.TICK]
         if now - newest < CLOCK_PATIENCE_TICKS:

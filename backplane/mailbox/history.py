@@ -131,7 +131,8 @@ def compute_digest(segment: Segment, until: int | None = None) -> str:
 
     Args:
         segment: Memory of the rack.
-        until: Tick at which the digest ends. None for the tick at which the run stopped.
+        until: Only messages that were visible before this tick count. None for the tick at which
+            the run stopped.
     """
     stop = segment.words[System.STOP_TICK] if until is None else until
     total = blake2b(digest_size=16)

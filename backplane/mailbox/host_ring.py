@@ -108,7 +108,7 @@ class HostReader:
         return None
 
     def _fetch_good(self, serial: int) -> AnyMessage | None:
-        """Return the message with a serial. If it must be rejected, count it and return None."""
+        """Return the message with the given serial. If it is bad, count it and return None."""
         slots = self._slots
         if (
             slots.fetch_message(serial)

@@ -156,7 +156,7 @@ class BoardInbox:
     """Inbox of the board in a slot, as computed by one of its tasks.
 
     Attributes:
-        lines: Mailboxes that interrupt the board, by name.
+        lines: Mailboxes that interrupt the board, keyed by name.
         inbox: Model of the inbox, which computes when messages are served.
     """
 

@@ -191,9 +191,9 @@ class Writer:
         self.slots.publish_gap()
 
     def iterate_outgoing(self) -> Iterator[None]:
-        """Copy one message of this cycle after the other into `message`, for the caller to publish.
+        """Copy each message of this cycle into `message`, and yield for the caller to publish it.
 
-        Yields once for each message. Only a queue has more than one.
+        Only a queue can have more than one message in a cycle.
         """
         yield
 

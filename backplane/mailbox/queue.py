@@ -155,9 +155,9 @@ class QueueWriter(Writer):
         return self._shown_at
 
     def iterate_outgoing(self) -> Iterator[None]:
-        """Copy one message of this cycle after the other into `message`, for the caller to publish.
+        """Copy each message of this cycle into `message`, and yield for the caller to publish it.
 
-        Yields once for each message. At the end, the original content of `message` is restored.
+        At the end, the original content of `message` is restored.
         """
         slots = self.slots
         present = bytes(self.message.raw)

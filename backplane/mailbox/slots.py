@@ -108,7 +108,7 @@ class Slots:
     Attributes:
         box: Head of the mailbox, with the words of `words.Box`.
         depth: Number of slots.
-        mask: Serial & `mask` is the index of the slot of a serial.
+        mask: `serial & mask` is the index of the slot for a serial.
         record: The local record, a copy of one slot: the eight words of its head (`words.Slot`)
             and the message.
         message: The message in the local record, also called the local message.
@@ -250,7 +250,7 @@ class Slots:
     def load_slot(self, serial: int) -> None:
         """Copy the slot of a serial into the local record, without any check."""
         place = self.places[serial & self.mask]
-        # Load the signature first. If it is the one of the wanted message, the slot already
+        # Load the signature first. If it belongs to the wanted message, the slot already
         # contains all of the message.
         self.record[:SIGNED_FROM] = place[:SIGNED_FROM]
         self.fence()

@@ -228,7 +228,7 @@ class Episodes:
     def raise_alarm(
         self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None
     ) -> None:
-        """Raise an alarm in any case. Call this only when a new episode is known to begin.
+        """Raise an alarm unconditionally. Call this only when a new episode is known to begin.
 
         Args:
             code: Kind of alarm.

@@ -141,7 +141,7 @@ class MessageWatch:
         """Record whether a message is lost, damaged, late or out of order.
 
         Returns:
-            False if it is too early to check the message. It must then be checked again later.
+            False if it is too early to decide. The message must then be checked again later.
         """
         slots = self._slots
         # If the copy is torn, copy again: the true message may be overwriting a forged one.

@@ -110,7 +110,7 @@ class SilenceWatch(MessageWatch):
         return self.is_writer_lost(tick)
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Check whether the writer has been found dead or hanging, at any age of its messages."""
+        """Check whether the writer has been found dead or hanging. Its silence does not count."""
         # A loss counts from the tick after it was found. Within that tick, the result would depend
         # on which process is faster.
         return self._reader.newest != NO_MESSAGE_TICK and 0 < self._block[Block.LOST] <= tick

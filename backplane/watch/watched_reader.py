@@ -117,7 +117,7 @@ class WatchedReader(MailboxWatcher):
     def check_reading(
         self, tick: int, reading: Reading[AnyMessage], *, is_odd: bool, is_silent: bool
     ) -> Reading[AnyMessage]:
-        """Make the checks that a read requires, and return the reading for the level.
+        """Run the checks that are requested for a read, and return the reading for the level.
 
         Args:
             tick: Release tick of the reading cycle.

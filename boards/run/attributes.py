@@ -37,7 +37,8 @@ class ObjectAttributes(dict[str, Any]):
 class AttributeView:
     """View of a level's attributes.
 
-    Create it as soon as the level is built, because changes are found by comparison with that time.
+    Create it as soon as the level is built, because changes are found by comparison with the
+    attributes at that time.
     """
 
     def __init__(self, level: object) -> None:

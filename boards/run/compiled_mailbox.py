@@ -234,7 +234,7 @@ def order() -> None:
 
 
 def load_machine_code() -> None:
-    """Load the compiled functions of this module, and replace `Slots.fence` by one of them.
+    """Load the compiled functions of this module, and replace `Slots.fence` with one of them.
 
     The crate calls this before it forks boards.
     """

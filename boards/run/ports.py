@@ -197,7 +197,7 @@ class OutputPort:
         self._held_up = self._refused = 0
 
     def _mark_sent(self, basis: int | None = None) -> bool:
-        """Request that this cycle writes the message, which is written only on demand.
+        """Request that the message is written in this cycle. Used for mailboxes written on demand.
 
         Args:
             basis: Tick of the oldest information on which the message depends. None to derive it

@@ -68,9 +68,9 @@ class _SettingsChange:
                     object.__setattr__(live, name, changed)
 
     def _merge_values(self, now: Any, old: Any, new: Any) -> Any:
-        """Return the value that an attribute of the live object must have.
+        """Return the new value of an attribute of the live object.
 
-        This is `new` if the settings change the attribute and the live object has not changed it,
+        It is `new` if the settings change the attribute and the live object has not changed it,
         otherwise `now`. Objects and collections are changed in place.
 
         Args:

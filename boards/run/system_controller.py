@@ -83,7 +83,7 @@ class SystemController:
         self._faults.act_within_tick(tick)
 
     def find_next_work_tick(self, tick: int) -> int:
-        """Return the first tick after `tick` that needs `begin_tick` or may end the run."""
+        """Return the first tick after `tick` at which `begin_tick` has work or the run may end."""
         if self._settled is None:
             return tick + 1
         return min(self._faults.next_tick, self._desk.next_tick, self._end_of_run.next_tick)
@@ -119,7 +119,7 @@ class SystemController:
             words[System.DEMAND] = demand
             self._driver.alarms.raise_alarm(tick, Alarm.DEMAND, subject, demand)
         # Call this again at the next tick while a board is lost, a switch is set for a later tick,
-        # or the crate is just recording a loss.
+        # or the crate is in the middle of recording a loss.
         is_settled = not lost and peer >> 1 <= tick and seen[0] % 2 == 0
         self._settled = (*seen, emergency, peer) if is_settled else None
 

@@ -136,7 +136,7 @@ class ClockGuard:
             self.reported = self._block[Block.CLOCK_SKIPPED] = counted
 
     def check_release(self, tick: int) -> None:
-        """Raise an alarm if a cycle began late because the clock was late, once per episode.
+        """Raise an alarm, once per episode, if the cycle began late because the clock was late.
 
         Args:
             tick: Release tick of the cycle.
@@ -159,7 +159,7 @@ class InterruptHandler:
     It takes processor time for each interrupt, counts interrupts, and reports lost ones. On the
     original boards the handler ran whenever a message arrived. Here the first task of the board
     does its work just before it reads, and takes as much processor time as the handler would have
-    used since the last cycle. Reading, t_comm of eq. 3.5, takes longer by this time, and tasks of
+    used since the last cycle. This adds to the time of reading (t_comm of eq. 3.5), and tasks of
     lower priority on the same core have to wait. In lockstep, where no task waits for a processor,
     the handler takes no time.
     """
@@ -207,8 +207,8 @@ def chain_accesses(*accesses: Callable[[int], None] | None) -> Callable[[int], N
     """Return a function that makes several accesses one after the other.
 
     Args:
-        accesses: Functions to call with the release tick, or None for those to leave out. If there
-            is only one, it is returned unchanged.
+        accesses: Functions to call with the release tick. None is ignored. A single function is
+            returned unchanged.
     """
     present = [access for access in accesses if access is not None]
 
