@@ -87,11 +87,11 @@ class AddressMap:
         return address
 
     def _end_window(self, board: str, writers: set[str], layout: Layout) -> None:
-        """Add the mailboxes that a board writes, and end the board's window on a page boundary.
+        """Reserve memory for the mailboxes of a board, and end its window on a page boundary.
 
         Args:
             board: Board that owns the window.
-            writers: Names of the board's tasks.
+            writers: Names of the board's tasks, which write these mailboxes.
             layout: Layout of the backplane.
         """
         for mailbox in layout.mailboxes:

@@ -35,7 +35,11 @@ class ByteLock:
         self._unlock = _pack_lock_request(fcntl.F_UNLCK, address)
 
     def reopen(self, fd: int) -> None:
-        """Use the same byte of another segment, open as `fd`, without taking the lock there."""
+        """Switch to the same byte of another segment, without taking the lock there.
+
+        Args:
+            fd: Descriptor of the other segment.
+        """
         self._fd = os.open(f"/proc/self/fd/{fd}", os.O_RDWR | os.O_CLOEXEC)
 
     def take(self) -> bool:
@@ -56,7 +60,7 @@ class ByteLock:
         self.close_file()
 
     def close_file(self) -> None:
-        """Close the descriptor until `reopen` is called.
+        """Close the descriptor. `reopen` opens one again.
 
         The lock is released unless another process, such as the parent of a fork, also has the file
         description open.
@@ -105,13 +109,17 @@ os.register_at_fork(after_in_child=_close_inherited)
 
 
 def close_all() -> None:
-    """Close the descriptors of all locks of a forked process until `reopen_all` is called."""
+    """Close the descriptors of all locks in a forked process. `reopen_all` opens them again."""
     for lock in _OPEN:
         lock.close_file()
 
 
 def reopen_all(fd: int) -> None:
-    """Switch all locks to another segment, open as `fd`, without taking any of them."""
+    """Switch all locks to another segment, without taking any of them.
+
+    Args:
+        fd: Descriptor of the other segment.
+    """
     for lock in _OPEN:
         lock.reopen(fd)
 

@@ -102,7 +102,7 @@ def detach_segment(segment: Segment) -> None:
 
 
 def switch_segment(segment: Segment, rack: str) -> None:
-    """Make the views of `segment` show the segment of another rack with the same layout.
+    """Make the views of `segment` refer to the segment of another rack with the same layout.
 
     The caller must take its locks and claim its mailboxes again.
     """
@@ -115,7 +115,7 @@ def switch_segment(segment: Segment, rack: str) -> None:
 
 
 def _map_memory(segment: Segment, flags: int, rights: int, fd: int) -> None:
-    """Map a file, or anonymous memory for `fd` -1, at the address of a segment's memory."""
+    """Map a file, or anonymous memory if `fd` is -1, in place of a segment's memory."""
     place = ctypes.addressof(ctypes.c_char.from_buffer(segment.bytes))
     size = segment.map.size
     if _libc.mmap(place, size, rights, flags | _MAP_FIXED, fd, 0) != place:

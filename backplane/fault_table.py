@@ -159,7 +159,7 @@ class FaultTable:
         """Free the entry of a disarmed fault.
 
         Returns:
-            False if the fault had already begun. Its entry is then left as it is.
+            False if the fault had already begun. In that case the entry is not changed.
         """
         if entry.stage != Stage.WAITING:
             return False

@@ -319,7 +319,7 @@ class Layout:
         return min([task.every, *sent])
 
     def list_interrupting_mailboxes(self, slot: int) -> list[MailboxSpec]:
-        """Return the mailboxes that interrupt the board in a slot, by the slot of their writer."""
+        """Return the mailboxes that interrupt the board in a slot, sorted by writer slot."""
         mailboxes = [
             m for m in self.mailboxes if m.interrupt is not None and slot in m.interrupt.slots
         ]

@@ -106,7 +106,9 @@ def _iterate_mappings() -> Iterator[tuple[tuple[int, int], str, list[tuple[int, 
 
 
 def _iterate_resident(pagemap: int, start: int, end: int) -> Iterator[tuple[int, int]]:
-    """Yield start and end address of each part of a mapping that is in memory.
+    """Yield the start and end address of each resident range of a mapping.
+
+    Ranges separated by a short gap (`MAX_GAP_PAGES`) are joined.
 
     Args:
         pagemap: Descriptor of /proc/self/pagemap.

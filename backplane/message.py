@@ -86,7 +86,7 @@ def field(
 
 
 def _complete_field(declared: Field, name: str, hint: Any) -> Field:
-    """Add the name of a declared field, and the type and unit that follow from its annotation.
+    """Complete a declared field with its name, and with the type and unit from its annotation.
 
     Args:
         declared: Result of `field`.
@@ -122,8 +122,8 @@ def make_message(name: str, version: int, base: type[B], fields: Mapping[str, An
         name: Name of the message.
         version: Version of the message.
         base: Class whose fields come first.
-        fields: Fields to add after those of `base`, by name. Each value is what `field` returned,
-            for an integer or a group.
+        fields: Fields to add after those of `base`: a dictionary from the name of a field to the
+            result of `field`. Each must be an integer or a group.
     """
     body = {**fields, "__annotations__": dict.fromkeys(fields, int), "__module__": __name__}
     message_class: Any = type(name, (base,), body, version=version, message=name)
@@ -194,7 +194,7 @@ class Message:
         """Create a message of this class with all bytes 0.
 
         Args:
-            sizes: Symbolic sizes by name.
+            sizes: Values of the symbolic sizes, keyed by name.
 
         Raises:
             MailboxError: A size is missing.
@@ -206,7 +206,7 @@ class Message:
         self.raw[:] = bytes(len(self.raw))
 
     def copy_from(self, other: Message) -> None:
-        """Copy the bytes of a message of the same type."""
+        """Copy the content of another message of the same type into this one."""
         self.raw[:] = other.raw
 
     if not TYPE_CHECKING:
@@ -224,7 +224,7 @@ class Message:
             raise AttributeError(self._describe_unknown_field(name))
 
     def _describe_unknown_field(self, name: str) -> str:
-        """Return the error text for an unknown field, which suggests the most similar name."""
+        """Return the error text for an unknown field, with the most similar name or all names."""
         names = self.record.dtype.names or ()
         near = get_close_matches(name, names, 1)
         hint = f"did you mean '{near[0]}'?" if near else f"fields: {', '.join(names)}"
@@ -254,7 +254,7 @@ def decode_text(content: bytes | bytearray) -> str:
 
 
 def escape_text(text: str) -> str:
-    """Replace control characters in a text by printable escape sequences.
+    """Replace control characters in a text with printable escape sequences.
 
     Texts from other racks and from users' levels are printed on terminals, which would execute the
     control sequences in them.
@@ -265,7 +265,7 @@ def escape_text(text: str) -> str:
 
 
 def get_reason(status: Message) -> str:
-    """Return the `reason` of a status. Empty if a user-defined status has no such field."""
+    """Return the `reason` of a status, or an empty string if the status has no such field."""
     return str(getattr(status, "reason", ""))
 
 
@@ -273,7 +273,7 @@ def format_state(state: int | None, otherwise: str = "") -> str:
     """Return the name of a level's state in lower case.
 
     Args:
-        state: Number of the state. None, if there is no state, counts as undefined.
+        state: Number of the state. None, for no state, counts as one that `State` does not define.
         otherwise: Result for a state that `State` does not define. If it is empty, the result is
             `state` itself as text.
     """

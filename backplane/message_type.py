@@ -57,7 +57,7 @@ class MessageType:
         Equal messages have equal bytes, because padding is zeroed at creation and never written.
 
         Args:
-            sizes: Symbolic sizes by name.
+            sizes: Values of the symbolic sizes, keyed by name.
 
         Raises:
             MailboxError: `sizes` does not contain a size that a field uses.
@@ -67,7 +67,7 @@ class MessageType:
     def _build_column(
         self, field: Field, sizes: Mapping[str, int]
     ) -> tuple[str, Any, tuple[int, ...]]:
-        """Return name, numpy type and shape of one field, with symbolic sizes replaced."""
+        """Return name, numpy type and shape of one field, with symbolic sizes as numbers."""
         kind = (
             field.kind.build_dtype(sizes)
             if isinstance(field.kind, MessageType)

@@ -49,7 +49,7 @@ class Client(IntEnum):
 
     NONE = 0  # the request belongs to the run
     WAITS = 1  # issued only if its client is alive
-    LEASES = 2  # the same; afterwards the level holds when the client ends or falls silent
+    LEASES = 2  # the same; once issued, the level holds if the client ends or sends no heartbeats
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class OperatorTable:
             ticket: Number of the request, in case the entry has been reused.
 
         Returns:
-            False if the request is no longer waiting or is just being issued.
+            False if the request is no longer waiting or is being issued at this moment.
         """
         if entry.ticket != ticket or entry.stage != RequestStage.WAITING:
             return False
@@ -170,13 +170,13 @@ class OperatorTable:
         return entry.given_tick < 0
 
     def is_waiting(self, entry: RequestEntry) -> bool:
-        """Check whether a request waits for its tick. One whose client has ended does not count."""
+        """Check whether a request waits for its tick and its client, if it has one, is alive."""
         if entry.stage != RequestStage.WAITING:
             return False
         return not entry.client or self.is_client_alive(entry)
 
     def is_client_alive(self, entry: RequestEntry) -> bool:
-        """Check whether the client of a request is alive, by its kernel lock."""
+        """Check whether the client of a request is alive, which means that it holds its lock."""
         return self._segment.is_locked(_CLAIMS + entry.ticket)
 
     def list_leased(self) -> list[RequestEntry]:
@@ -197,7 +197,7 @@ class OperatorTable:
         return entry.ticket == ticket and entry.client == Client.LEASES
 
     def release_lease(self, entry: RequestEntry) -> None:
-        """Release the lease of a request. Its client may end from now on without any effect."""
+        """Release the lease of a request. The level then continues even if the client ends."""
         entry.client = Client.WAITS
 
     def list_waiting(self) -> list[RequestEntry]:
@@ -244,7 +244,7 @@ class OperatorTable:
         entry.given_tick = -1
         entry.heard = -1
         entry.message[: len(request.message)] = request.message
-        # From now on the clock may issue the command.
+        # Store the stage last, because the clock may then issue the command.
         entry.stage = RequestStage.WAITING
         self._words[System.REQUESTED] += 1
         return entry

@@ -145,6 +145,8 @@ class Reservation(NamedTuple):
 def take_core(core: int, priority: int, reservation: Reservation | None = None) -> int:
     """Pin the calling process to a core and raise its priority, if allowed.
 
+    If the kernel grants the reservation only to an unpinned process, the process is not pinned.
+
     Args:
         core: Processor core.
         priority: SCHED_FIFO priority, used if there is no reservation or the system refuses it.
@@ -222,7 +224,7 @@ def read_memory_sizes(pid: int) -> tuple[int, int]:
 
 
 def describe_refusal(error: OSError) -> str:
-    """Return the text of an error, with the limit on processes or open files that was reached."""
+    """Describe an error, including the limit on processes or open files if one was reached."""
     limits = {
         errno.EAGAIN: ("processes", "u", RLIMIT_NPROC),
         errno.EMFILE: ("open files", "n", RLIMIT_NOFILE),
@@ -235,7 +237,7 @@ def describe_refusal(error: OSError) -> str:
 
 
 def set_priority(priority: int) -> bool:
-    """Switch the calling process to a SCHED_FIFO priority, or to ordinary scheduling for 0.
+    """Set the SCHED_FIFO priority of the calling process. 0 selects ordinary scheduling.
 
     Returns:
         False if the system refuses.
@@ -258,7 +260,7 @@ def name_process(name: str) -> None:
 
 
 def die_with_parent(parent: int) -> None:
-    """Let the kernel kill the calling process when its parent ends, for whatever reason."""
+    """Have the kernel kill the calling process when its parent ends for any reason."""
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     # The parent may have ended between fork and prctl.
     if os.getppid() != parent:

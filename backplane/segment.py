@@ -56,7 +56,7 @@ Rings and control blocks need this order, and so do mailboxes where Python acces
 `rack.backplane.mailbox.slots`). Racks have not been tested on other architectures.
 """
 TRY_VARIABLE = "RACK_TRY_PROCESSOR"
-"""Environment variable that permits other processors with 64 bits, for a trial."""
+"""Environment variable that permits a trial on other processors with 64 bits."""
 
 
 class Launch(NamedTuple):
@@ -255,7 +255,7 @@ class Segment:
     def open(cls, rack: str) -> Self:
         """Open a rack's segment of any version, without reading its layout and config.
 
-        Of the result, only properties that need no layout can be used, such as `launcher`.
+        Only properties that need no layout, such as `launcher`, can be used on the result.
 
         Raises:
             SegmentError: There is no such segment, it belongs to another user, or it is not a
@@ -389,14 +389,14 @@ class Segment:
 
     @property
     def run_is_over(self) -> bool:
-        """True if the run has ended regularly or its launcher has ended."""
+        """True if the run has ended normally, or the launcher has ended."""
         return self.words[System.STATE] == Run.STOPPED or not self.launcher_is_alive
 
     @property
     def is_named(self) -> bool:
         """True if this is still the segment with the rack's name.
 
-        It is not if the segment was unlinked, or if the rack has been launched again since.
+        False if the segment was unlinked, or if the rack has been launched again since.
         """
         try:
             named = get_shm_path(self.rack).stat()
@@ -473,7 +473,7 @@ def _shm_name(rack: str) -> str:
 def restore_layout(plain: dict[str, Any]) -> Layout:
     """Restore a layout from plain data made by `dataclasses.asdict`.
 
-    Recordings of earlier versions lack some fields, which then get their defaults.
+    Fields that are missing, as in recordings of earlier versions, get their defaults.
     """
     layout: Layout = _restore_value(Layout, plain)
     return layout
@@ -499,5 +499,5 @@ def _restore_value(kind: Any, plain: Any) -> Any:
 
 @cache
 def _get_types(record: type) -> dict[str, Any]:
-    """Return the types of a dataclass's fields by name."""
+    """Return a dictionary from the names of a dataclass's fields to their types."""
     return get_type_hints(record)

@@ -74,7 +74,7 @@ class TraceWriter:
         self._count = self._block[Block.TRACE_HEAD]
 
     def write(self, *record: int) -> None:
-        """Append a record. Its numbers are in the order of the fields of `RECORD`."""
+        """Append a record, given as one number for each field of `RECORD`, in order."""
         self._count = count = self._count + 1
         _PACK(self._ring, (count & self._mask) * TRACE_RECORD_SIZE, *record)
         self._block[Block.TRACE_HEAD] = count

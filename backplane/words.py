@@ -45,7 +45,7 @@ def encode_switch(tick: int, is_on: bool) -> int:
 
 
 def is_switched_on(word: int, tick: int) -> bool:
-    """Return the state at `tick` that a word made by `encode_switch` stands for."""
+    """Return the state at `tick`, decoded from a word made by `encode_switch`."""
     return bool(word & 1) == (tick >= word >> 1)
 
 
@@ -214,8 +214,8 @@ class Box:
     # `slots.build_signature`.
     CLAIMANT = 5
     REFUSED = 6  # number of messages refused because the queue was full
-    # Of a queue: serial of the newest message of its lawful writer. HEAD is greater after an
-    # intruder has published.
+    # Of a queue: serial of the newest message of the writer that holds the claim. HEAD is greater
+    # after an intruder has published.
     SENT = 7
     # Of a host board's mailbox: serial of the newest message that its bus adapter has taken.
     TAKEN = 8

@@ -20,7 +20,7 @@ UNRECOVERABLE_STATUS = 4
 """Exit status of a board whose failure would occur again after a restart."""
 
 NO_SNAPSHOTS_PREFIX = "no snapshots: "
-"""Prefix of the note of a run that takes no snapshots. The reason follows."""
+"""Prefix of the message that a run takes no snapshots. The reason follows."""
 
 
 class Failure(Exception):

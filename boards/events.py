@@ -169,7 +169,8 @@ class Outcome:
             and levels that lost too many cycles.
         brakings: Engagements of the brakes after the start.
         objects: Final positions of objects with goals.
-        excused: A line for each level that lost too many cycles, but because of injected faults.
+        excused: A line for each level that lost too many cycles because of injected faults, which
+            is not a failure.
     """
 
     cause: Cause
@@ -265,7 +266,7 @@ class Journal:
 
 
 def iterate_statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
-    """Yield board and last status of every level whose status has a given field.
+    """Yield the board and the last status of every level whose status has a given field.
 
     Levels that have not written a status are left out.
     """
@@ -319,7 +320,7 @@ class Ending:
         """Return one line for each level or arm with a latched fault.
 
         A level has a latched fault if its last status reports an error. The level that ends the run
-        is left out. An arm has one if it has exceeded limits or had unintended contacts; it is left
+        is left out. An arm has one if it has exceeded limits or had unintended contacts. It is left
         out if its level reports an error.
         """
         reported = {
@@ -394,7 +395,7 @@ class Ending:
         The result is empty if no level senses objects.
 
         Args:
-            goals: Goals by the row of the object in the scene message.
+            goals: A dictionary from the row of an object in the scene message to its goal.
         """
         for box in self._segment.layout.mailboxes:
             if (
@@ -409,7 +410,7 @@ class Ending:
         return ()
 
     def find_cause(self) -> Cause:
-        """Return why a run has ended. Call this only if no one has stopped the run."""
+        """Return the cause of the end of a run. Call this only if the run was not stopped."""
         if self._observer is None or self._ends_run is None:
             return "time over"
         status = self._observer.peek().message

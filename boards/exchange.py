@@ -65,7 +65,8 @@ def list_port_ages(exchange: Message) -> dict[str, PortAge]:
         exchange: Exchange record of a board.
 
     Returns:
-        Ages and arrivals by label: the port, or "<port>_<board>" for a port with several mailboxes.
+        A dictionary from input to age and arrival. The key is the port, or "<port>_<board>" for a
+            port with several mailboxes.
     """
     names = exchange.record.dtype.names or ()
     values = iter(exchange.raw.cast("q"))

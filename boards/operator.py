@@ -26,7 +26,7 @@ def copy_request_message(entry: RequestEntry, layout: Layout) -> OperatorCommand
 
 
 def _find_mailbox(entry: RequestEntry, layout: Layout) -> MailboxSpec:
-    """Return the mailbox into which a request's command goes.
+    """Return the mailbox to which a request's command is written.
 
     Raises:
         DamageError: The mailbox is not for operators' commands.

@@ -11,7 +11,7 @@ from rack.backplane.words import Demand
 from rack.levels.level import LevelContext
 
 Source = str | Mapping[str, str]
-"""Source of an input port: the name of a mailbox, or several names by board."""
+"""Source of an input port: the name of a mailbox, or a dictionary from board to name."""
 
 
 MessageRows = Sequence[tuple[int, int, bytes]]
@@ -21,7 +21,7 @@ Each row has the tick at which a message was written, the tick of the oldest inf
 depends, and its bytes. For a mailbox that is written in every cycle, only changes have rows.
 """
 RecordedEntries = Mapping[str, MessageRows]
-"""Messages that an adapter wrote in a recorded run, by port."""
+"""Messages that an adapter wrote in a recorded run, keyed by port."""
 
 
 def list_mailboxes(source: Source) -> tuple[str, ...]:
@@ -164,7 +164,7 @@ class ClockWiring:
         priority: SCHED_FIFO priority.
         keeps_awake: True if idle cores must not sleep.
         restart_ticks: In lockstep, time from the loss of a board until it rejoins.
-        on_loss: Stop required of the arm while a task is lost, by task.
+        on_loss: Stop required of the arm while a task is lost, keyed by task.
         reservation: Processor time to reserve instead of a priority, None for none.
     """
 

@@ -56,19 +56,20 @@ class Controller(Protocol):
         """Do the work that is due after the tasks of `tick` were released."""
 
     def find_next_work_tick(self, tick: int) -> int:
-        """Return the first tick after `tick` for which `begin_tick` has work, as far as known."""
+        """Return the first tick after `tick` at which `begin_tick` is known to have work."""
 
 
 class ClockDriver(ABC):
-    """Part common to both clock modes: ticks, releases and the end of the run.
+    """Base class of both clock modes: advances ticks, releases tasks and ends the run.
 
     Attributes:
-        controller: The system controller's other work, set by the clock's board. None without it.
-        skip: Number of ticks, from the next one on, that a fault makes the clock skip.
+        controller: Other work of the system controller, set by the clock's board. None if there
+            is no such work.
+        skip: Number of ticks that the clock has yet to skip because of a fault.
         tasks: Tasks in the order of their release.
         processes: Tasks and host boards. The clock does not release host boards.
-        is_flooded: True if a fault makes a task write more messages than its mailboxes can hold
-            for the usual time.
+        is_flooded: True while a fault makes a task flood its mailboxes, so that messages are
+            overwritten earlier than usual.
     """
 
     def __init__(
@@ -107,19 +108,19 @@ class ClockDriver(ABC):
         return False
 
     def count_skipped(self, first: int, ticks: int) -> None:
-        """Publish that the clock skips `ticks` ticks from `first` on.
+        """Publish that the clock skips `ticks` ticks, beginning with `first`.
 
-        The count is written last, once for all these ticks, so that a late task sees neither half a
-        skip nor a skip that began after its release.
+        The count is increased last, once for all these ticks. A late task therefore never reports
+        only some of them, nor ticks that were skipped after its release.
         """
         self.words[System.SKIPPED_FROM] = first
         self.words[System.CLOCK_SKIPPED] += ticks
 
     def list_due_tasks(self, tick: int, last: int) -> list[ReleasedTask]:
-        """Return the tasks that have a release after tick `last` and up to `tick`.
+        """Return the tasks to be released at `tick`, in the order of their release.
 
-        They are in the order in which the clock releases them. Tasks that are lost, or that work on
-        a plan, are left out.
+        These are the tasks with a release tick after `last` and not after `tick`, except tasks that
+        are lost or still working on a plan.
         """
         due_tasks: list[ReleasedTask] = []
         for every, phase, tasks in self._groups:
@@ -129,7 +130,7 @@ class ClockDriver(ABC):
         return due_tasks
 
     def check_tasks(self, released: list[ReleasedTask], tick: int) -> None:
-        """Check the released tasks for missed releases, then let the controller finish the tick."""
+        """Pass tasks that missed releases to the watchdog, and let the controller finish `tick`."""
         for task in released:
             if task.missed:
                 self.watchdog.check(task, tick)
@@ -138,16 +139,16 @@ class ClockDriver(ABC):
 
     @property
     def first_tick(self) -> int:
-        """First tick of this clock process: 0, or after a restart the last tick, repeated.
+        """First tick of this clock process: 0, or after a restart the last tick, which is repeated.
 
-        Tasks already released at that tick are recognised by their deadlines and are not released
-        again.
+        Tasks that were already released at that tick are recognised by their deadlines and are not
+        released again.
         """
         return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
     @property
     def first_end_tick(self) -> int:
-        """Earliest tick before which the run can end."""
+        """Earliest tick at which the run can end. The tick at which a run ends is not run."""
         return 0
 
     def wait_until_settled(self) -> None:
@@ -158,7 +159,7 @@ class ClockDriver(ABC):
         """
 
     def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
-        """In lockstep, wait until a condition on a task's state holds. In real time, do not wait.
+        """In lockstep, wait until a condition on a task's state is true. In real time, do not wait.
 
         Args:
             task: Task on whose state the condition depends.
@@ -174,15 +175,15 @@ class ClockDriver(ABC):
         """Run tick after tick until the run is over or the launcher has ended."""
 
     def is_over(self, tick: int) -> bool:
-        """Decide whether the run ends before `tick`, and publish its end once it is known."""
+        """Return True if the run ends before `tick`. Publishes the end once it is known."""
         words = self.words
         stop = words[System.STOP_TICK]
         if words[System.STOP_REQUEST] and (not stop or stop > tick):
             stop = words[System.STOP_TICK] = max(tick, 1)
         if stop and tick >= stop:
             return True
-        # Call this even if the end is known. It also records the end of the task, by which a run
-        # that continues this one may end.
+        # Call this even if the end of this run is known. It also determines the end of the task,
+        # at which a run that continues this one may end.
         end_tick = self._ended(tick)
         if not stop and end_tick is not None:
             stop = words[System.STOP_TICK] = max(end_tick, self.first_end_tick, 1)
@@ -276,13 +277,13 @@ class RealtimeDriver(ClockDriver):
             time.sleep(wait * 1e-9)
 
     def _sleep_until_next(self, tick: int) -> int:
-        """Sleep until the tick after `tick` begins.
+        """Sleep until the next tick after `tick` begins.
 
         The clock has the highest priority on its core. If it wakes up late, the core was taken away
-        from the rack, which an alarm reports.
+        from the rack, and an alarm is raised.
 
         Returns:
-            The newest tick that is due, at least `tick` + 1. It is greater if ticks were skipped.
+            The newest tick that is due: `tick` + 1, or a later tick if ticks were skipped.
         """
         due_ns = self._compute_grid_point(tick + 1)
         has_ticked = self._woke_ns
@@ -290,7 +291,7 @@ class RealtimeDriver(ClockDriver):
         self._woke_ns = time.monotonic_ns()
         now = (self._woke_ns + self._lead_ns - self._epoch_ns) // self._period_ns
         if stop := self.words[System.STOP_TICK]:
-            # Even a late clock makes the run's last tick, so that tasks late for it are noticed.
+            # Even a late clock begins the run's last tick, so that tasks late for it are noticed.
             now = min(now, stop - 1)
         next_tick = max(tick + 1, now)
         skipped = next_tick - tick - 1

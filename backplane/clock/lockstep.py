@@ -83,10 +83,10 @@ class LockstepDriver(ClockDriver):
 
     @property
     def first_end_tick(self) -> int:
-        """Earliest tick before which the run can end: the next tick.
+        """Earliest tick at which the run can end: the next tick.
 
-        It matters for a run that continues another: its config may set an end before its first
-        tick.
+        A run that continues another may have a configured end before its own first tick. It then
+        ends at once.
         """
         return self._next
 
@@ -108,7 +108,7 @@ class LockstepDriver(ClockDriver):
         self.end_run()
 
     def _wait_for_tick(self, tick: int) -> bool:
-        """Take a due snapshot, then wait for single-stepping and for the recorder.
+        """Take a snapshot if one is due, then wait until the host and the recorder permit `tick`.
 
         Returns:
             False if the run ends before `tick`.
@@ -123,14 +123,14 @@ class LockstepDriver(ClockDriver):
     def _find_batch_end(self, due: list[ReleasedTask], tick: int) -> int:
         """Return the first tick after the batch that begins at `tick`.
 
-        Until then nothing happens except the cycles of the one executor that is due. If there is
-        more to do, the batch consists of `tick` alone.
+        During a batch nothing is due except the cycles of one executor. If anything else is due,
+        the batch consists of `tick` alone.
         """
         controller = self.controller
         if len(due) != 1 or controller is None or self._one_at_a_time:
             return tick + 1
         (alone,) = due
-        # A slower executor's cycle lasts several ticks, and these need not wait for its end.
+        # The cycle of a slower executor lasts several ticks, which may begin before it ends.
         if alone.spec.every > 1 or alone.spec.role != "executor" or alone.is_stopped:
             return tick + 1
         words = self.words
@@ -167,7 +167,7 @@ class LockstepDriver(ClockDriver):
             if task.deadline > end:
                 continue
             if task.is_finished(end):
-                # Take the post of its report, or the semaphore would overflow in the end.
+                # Consume the post of its report, because the semaphore would eventually overflow.
                 task.done.try_acquire()
             else:
                 slowest = task
@@ -184,7 +184,7 @@ class LockstepDriver(ClockDriver):
             self.await_state(task, task.is_settled)
 
     def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
-        """Wait until a condition on the state of a task holds.
+        """Wait until a condition on the state of a task is true.
 
         Args:
             task: Task on whose state the condition depends.
@@ -202,14 +202,15 @@ class LockstepDriver(ClockDriver):
         return True
 
     def _check_after_timeout(self, task: ReleasedTask) -> bool:
-        """After a wait without a report, check whether a signal has stopped the task.
+        """After a wait without a report, update `is_stopped` of the task.
 
         Returns:
-            False if the host requests the end of the run or the launcher has ended.
+            False if the wait must end, because the host requests the end of the run or the launcher
+                has ended.
         """
         if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
             return False
-        # Lockstep does not wait for a process that a signal has stopped.
+        # Lockstep does not wait for a process that has been stopped by a signal.
         task.check_stopped()
         task.done.set_deadline(time.monotonic_ns() + int(CHECK_S * 1e9))
         return True
@@ -217,8 +218,8 @@ class LockstepDriver(ClockDriver):
     def _wait_for_follower(self, tick: int) -> bool:
         """Wait for the recorder if its rings would otherwise overflow in `tick`.
 
-        The wait may take any time, because no simulated time passes. A recorder that is stopped or
-        dead is given up after `MAX_RECORDER_WAIT_S`.
+        The wait has no time limit, because no simulated time passes. Only a recorder that is
+        stopped or dead is abandoned after `MAX_RECORDER_WAIT_S`.
 
         Returns:
             False if the host requests the end of the run or the launcher has ended.
@@ -236,9 +237,9 @@ class LockstepDriver(ClockDriver):
         return True
 
     def _is_recorder_behind(self, tick: int) -> bool:
-        """Check whether the recorder must catch up before `tick`.
+        """Check whether the rings would overflow if `tick` began before the recorder catches up.
 
-        While a mailbox is flooded, its ring holds the messages of little more than one tick.
+        While a mailbox is flooded, its ring has room for the messages of little more than one tick.
         """
         if self.is_flooded and self.words[System.FOLLOWER_DRAINED] < tick - 1:
             return True

@@ -38,8 +38,8 @@ class ReleasedTask:
         missed: Number of releases in a row that it has missed. While it still finishes releases,
             each one late, the number stays at 2.
         deadline: Tick before which it must finish its release or plan, or send its messages if
-            that is earlier. As last read from the control block, where the task moves it to a
-            later tick when it begins a plan.
+            that is earlier. This is the value last read from the control block, in which the
+            task postpones it when it begins a plan.
         is_stopped: True if a signal has stopped its process, so that lockstep must not wait for
             it.
     """
@@ -95,7 +95,7 @@ class ReleasedTask:
         block[Block.RELEASED] = newest
 
     def find_next_event(self, tick: int) -> int:
-        """Return the first tick after `tick` that waits for this task or releases it."""
+        """Return the next tick that cannot begin before the task finishes, or that releases it."""
         if self.deadline > tick:
             return self.deadline
         return tick + 1 + (self._phase - tick - 1) % self._every
@@ -106,12 +106,12 @@ class ReleasedTask:
         return block[Block.DONE] == block[Block.RELEASED] or self.is_lost or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
-        """Check whether `tick` may begin: the task is settled, or its deadline is later."""
+        """Check whether the task lets `tick` begin: it is settled, or its deadline is later."""
         self.deadline = self.block[Block.DEADLINE] - self._early
         return self.deadline > tick or self.is_settled()
 
     def check_stopped(self) -> None:
-        """Set `is_stopped`: whether a signal has stopped the task's process."""
+        """Update `is_stopped` from the state of the task's process."""
         self.is_stopped = read_state(self.block[Block.PID]) in STOPPED_STATES
 
     @property
@@ -121,7 +121,7 @@ class ReleasedTask:
 
     @property
     def lost_tick(self) -> int:
-        """Tick at which the loss of the task was found, -1 if it is not lost."""
+        """Tick at which the task was found lost, -1 if it is not lost."""
         return self.block[Block.LOST] - 1
 
     @property
@@ -155,7 +155,7 @@ class ReleasedTask:
 def sort_by_priority(layout: Layout) -> list[TaskSpec]:
     """Return the tasks in the order in which the clock releases them.
 
-    Executors come first, by rate, followed by planners.
+    Executors come first, then planners, each sorted from the highest rate to the lowest.
     """
     return sorted(layout.tasks, key=lambda t: (t.role == "planner", t.every, t.phase, t.slot))
 
@@ -172,8 +172,8 @@ class Watchdog:
     def check(self, task: ReleasedTask, tick: int) -> None:
         """Check a task that has missed releases, and raise alarms about it.
 
-        An alarm reports the first missed release. After `RELEASES_MISSED` of them, the task is
-        either marked as lost, if it hangs, or reported as starved.
+        The first missed release raises an alarm. After `RELEASES_MISSED` of them, a task that hangs
+        is marked as lost, and any other task is reported once as starved.
         """
         missed = task.missed
         spec = task.spec
@@ -196,7 +196,7 @@ class Watchdog:
             )
 
     def _is_hanging(self, task: ReleasedTask) -> bool:
-        """Check for proof that a task hangs: it is stopped, waits, or has computed too long."""
+        """Check for proof that a task hangs: it is stopped, or has waited or computed too long."""
         spec = task.spec
         pid = task.block[Block.PID]
         state = read_state(pid)

@@ -59,8 +59,8 @@ def compute_period_ticks(
     Args:
         rate_hz: Rate, rounded to four digits or more, such as 57.14 Hz for 400 Hz / 7.
         clock_ns: Length of a tick.
-        subject: Name of what has the rate, for the error message.
-        of: Words of the error message for what is divided and for one of its periods.
+        subject: Beginning of the error message, which names what has this rate.
+        of: Nouns for the error message: what is divided, and one of its periods.
         fastest_hz: Highest rate that the error message may suggest.
 
     Raises:

@@ -46,8 +46,8 @@ class NextCycle:
 
     An executor's release expires at the task's next release, except that the releases of a batch in
     lockstep are all taken, one after the other. A planner's release expires at the end of the
-    plan's time slice. Until then the planner takes it late, but reads as of its tick, so that its
-    plan depends on ticks alone.
+    plan's time slice. A planner that takes its release late still reads as of the release tick, so
+    that the plan depends on ticks alone.
 
     Attributes:
         skipped: Number of releases skipped just before the last one taken.
@@ -98,7 +98,8 @@ class NextCycle:
         """Wait for the next release, and set `skipped`.
 
         Returns:
-            The release tick. None if the run is over and every release has been taken.
+            The release tick. None if every release has been taken and the run is over, or if the
+                launcher has ended.
         """
         words = self._words
         block = self._block
@@ -117,7 +118,7 @@ class NextCycle:
             if newest >= self._due:
                 if is_posted and newest != self._newest:
                     # The task did not have to wait for this release or batch, so its post is still
-                    # pending. Take it, or the semaphore would overflow within weeks.
+                    # pending. Consume it, because the semaphore would overflow within weeks.
                     self._semaphore.try_acquire()
                 self._newest = newest
                 return self._take_release(newest)
@@ -153,8 +154,8 @@ class NextCycle:
     def _sleep_until_release(self) -> bool:
         """Sleep until the grid point of the next release.
 
-        If that grid point has passed, sleep until the task's following one, or until the late clock
-        posts the semaphore.
+        If that grid point has passed, sleep until the task's first grid point in the future, or
+        until the late clock posts the semaphore.
 
         Returns:
             False if the launcher has ended.
@@ -163,7 +164,7 @@ class NextCycle:
         now = monotonic_ns()
         deadline = bound = now + int(CHECK_S * 1e9)
         is_due = False
-        # The grid is unknown until the clock starts, which then wakes every task once.
+        # The grid is unknown until the clock starts. The clock then wakes every task once.
         if epoch := words[System.EPOCH_NS]:
             point = epoch + self._due * words[System.PERIOD_NS]
             step = self._spec.every * words[System.PERIOD_NS]
@@ -207,7 +208,7 @@ class NextCycle:
         return self._segment.launcher_is_alive
 
     def _check_after_timeout(self) -> bool:
-        """Check the clock after a wait without a release.
+        """After a wait without a release, check whether the clock has stopped.
 
         Returns:
             False if the launcher has ended.
@@ -222,7 +223,7 @@ class NextCycle:
         return self._due > self._spec.phase
 
     def skip_until(self, tick: int) -> None:
-        """Take no release before `tick`. A planner calls this to reserve its plan's time slice."""
+        """Ignore releases before `tick`. A planner calls this to reserve its plan's time slice."""
         self._due = max(self._due, self._spec.grid.find_tick(tick))
 
 
@@ -236,9 +237,9 @@ This is longer than a clock ever waits for its next tick.
 
 
 class SilentClock:
-    """Detects, for one task, that the clock has stopped making ticks.
+    """Detects, on behalf of one task, that the clock has stopped.
 
-    A silence of the clock is reported once. A clock that is only late is not reported.
+    An alarm is raised once each time the clock stops, and never for a clock that is merely late.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
@@ -249,11 +250,11 @@ class SilentClock:
         self._waited_at = -1
 
     def end_silence(self) -> None:
-        """Record that a release has come, which ends a silence of the clock."""
+        """Record that a release was received, so that the next stop of the clock is reported."""
         self._is_reported = False
 
     def compute_patience_ns(self, expected: int) -> int:
-        """Return how long to wait for a release before the clock is checked, in ns.
+        """Return the time to wait for a release before the clock is checked, in ns.
 
         Args:
             expected: Tick of the release.
@@ -262,7 +263,7 @@ class SilentClock:
         return late if late > 0 else CLOCK_PATIENCE_TICKS * self._clock.period_ns
 
     def check(self) -> None:
-        """Raise one alarm per silence if the clock's process is stopped, dead, or blocked."""
+        """Raise an alarm, once per stop, if the clock's process is stopped, dead or blocked."""
         now = self._clock.compute_tick()
         newest = self._words[System.TICK]
         if now - newest < CLOCK_PATIENCE_TICKS:
@@ -271,8 +272,8 @@ class SilentClock:
         silent_s = (now - newest) * self._clock.period_ns * 1e-9
         clock = self._words[System.CLOCK_PID]
         state = read_state(clock)
-        # A clock whose process could run is only late. If the process is blocked, check twice,
-        # because after a pause of the whole machine it may be about to wake.
+        # If the process is runnable, the clock is merely late. If it is blocked, check twice,
+        # because after a pause of the whole machine it may be about to wake up.
         waits = silent_s > CLOCK_SILENT_S and state in WAITING_STATES
         has_stopped = state in STOPPED_STATES + ENDED_STATES or (
             waits and self._waited_at == newest

@@ -106,7 +106,8 @@ def find_chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
         until: Only messages that were visible before this tick count.
 
     Returns:
-        Serial and chained checksum of that message by mailbox. Both are 0 without a message.
+        A dictionary from mailbox to serial and chained checksum of that message. Both are 0 if
+            there is no such message.
     """
     chain_by_mailbox = {}
     for spec in segment.layout.timed:
@@ -130,7 +131,8 @@ def compute_digest(segment: Segment, until: int | None = None) -> str:
 
     Args:
         segment: Memory of the rack.
-        until: Tick at which the digest ends. None for the tick at which the run stopped.
+        until: Only messages that were visible before this tick count. None for the tick at which
+            the run stopped.
     """
     stop = segment.words[System.STOP_TICK] if until is None else until
     total = blake2b(digest_size=16)

@@ -38,7 +38,7 @@ class HostWriter(DoubleBufferWriter):
             tick: Current tick, stored with the message.
 
         Returns:
-            False if the ring is full. The message is then refused, which is counted.
+            False if the ring is full. The message is dropped and counted as refused.
         """
         if self._box[Box.HEAD] - self._box[Box.TAKEN] >= self.spec.capacity:
             self._box[Box.REFUSED] += 1
@@ -70,7 +70,7 @@ class HostReader:
 
     @property
     def written_tick(self) -> int:
-        """Tick at which the last message taken was written."""
+        """Tick at which the message taken last was written."""
         return self._slots.tick
 
     def take_oldest(self) -> AnyMessage | None:
@@ -95,7 +95,8 @@ class HostReader:
             most: Maximum number of messages to check.
 
         Returns:
-            The message, which is valid until the next call. None if all checked ones were rejected.
+            The message, which is valid until the next call. None if no message is waiting, or all
+                checked ones were rejected.
         """
         waiting = self.waiting_count
         head = self._box[Box.HEAD]
@@ -107,7 +108,7 @@ class HostReader:
         return None
 
     def _fetch_good(self, serial: int) -> AnyMessage | None:
-        """Return the message with a serial. If it must be rejected, count it and return None."""
+        """Return the message with the given serial. If it is bad, count it and return None."""
         slots = self._slots
         if (
             slots.fetch_message(serial)
@@ -126,14 +127,14 @@ def is_proper(record: np.ndarray | np.void, fields: Sequence[FieldSpec]) -> bool
     and texts ASCII.
 
     Args:
-        record: The message, or an array of groups of one of its fields.
+        record: The message, or an array with the groups of one of its fields.
         fields: Fields of the message or group.
     """
     return all(_is_permitted(record[field.name], field) for field in fields)
 
 
 def _is_permitted(values: np.ndarray, field: FieldSpec) -> bool:
-    """Check whether all values of one field are permitted. See `is_proper`."""
+    """Check whether all values of one field are permitted. See `has_permitted_values`."""
     kind = values.dtype.kind
     if kind == "f" and not np.isfinite(values).all():
         return False

@@ -56,7 +56,7 @@ class Inbox:
 
 
 FULL_LOAD = 0.999
-"""Load of a handler from which its inbox counts as overloaded.
+"""Smallest load of a handler at which its inbox counts as overloaded.
 
 It is below 1, so that the simulation of a burst stays short.
 """
@@ -72,7 +72,7 @@ class InterruptSource(NamedTuple):
 class Burst(NamedTuple):
     """Worst case of an inbox: all sources send at the same time, and then once in each period.
 
-    The burst ends when no message waits. From a load of `FULL_LOAD` on, it need not end, and
+    The burst ends when no message waits. At a load of `FULL_LOAD` or more it may never end, and
     `waiting` and `longest_ns` are None.
 
     Attributes:
@@ -86,7 +86,7 @@ class Burst(NamedTuple):
     longest_ns: int | None
 
     def fits_depth(self, depth: int) -> bool:
-        """Check whether an inbox in which `depth` messages can wait never loses a message."""
+        """Check whether an inbox with room for `depth` waiting messages never loses one."""
         return self.waiting is not None and self.waiting <= depth
 
 

@@ -49,9 +49,9 @@ def get_interrupt_spec(spec: MailboxSpec) -> InterruptSpec:
 
 
 def compute_send_offset_ns(spec: MailboxSpec, clock_ns: int) -> int:
-    """Return the time from the earliest tick at which a message is visible to its sending, in ns.
+    """Return the time of sending relative to the earliest tick at which a message is visible.
 
-    The result is negative, because a message is sent before it is visible.
+    The result is in ns. It is negative, because a message is sent before it is visible.
     """
     return get_interrupt_spec(spec).sent_ns - spec.delay * clock_ns
 
@@ -80,7 +80,7 @@ class InterruptWriter(Writer):
 
 
 class InterruptLine:
-    """One of the mailboxes that interrupt a board, as one of the board's tasks sees it."""
+    """Mailbox that interrupts a board, with its arrivals as computed by one task of the board."""
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.service_ns = get_interrupt_spec(spec).service_ns
@@ -109,7 +109,7 @@ class InterruptLine:
     def collect_arrivals(
         self, until_ns: int, number: int, arrivals: list[tuple[int, int, int]]
     ) -> None:
-        """Append the messages that were sent since the last call to `arrivals`.
+        """Append to `arrivals` the messages that were sent since the last call.
 
         Args:
             until_ns: Time up to which messages are collected.
@@ -144,7 +144,7 @@ class InterruptLine:
         self._passed = serial - 1
 
     def _accept_writer(self, serial: int) -> bool:
-        """Check whether a message is from a lawful writer, and remember its signature if so."""
+        """Check whether a message's writer held the claim. If so, store the writer's signature."""
         slots = self._slots
         if not slots.copy_slot(serial) or not slots.is_lawful(self._signature):
             return False
@@ -156,7 +156,7 @@ class BoardInbox:
     """Inbox of the board in a slot, as computed by one of its tasks.
 
     Attributes:
-        lines: Mailboxes that interrupt the board, by name.
+        lines: Mailboxes that interrupt the board, keyed by name.
         inbox: Model of the inbox, which computes when messages are served.
     """
 
@@ -196,7 +196,7 @@ class BoardInbox:
             self.service_ns += line.service_ns
 
     def _add_arrival(self, at_ns: int, line: InterruptLine, serial: int) -> None:
-        """Add the arrival of a message to the inbox, or count the message as lost."""
+        """Add the arrival of a message to the inbox. If too many wait, the message is lost."""
         # A late message cannot be inserted before messages that have already been added.
         self._newest_ns = max(self._newest_ns, at_ns)
         end_ns = self.inbox.add_message(self._newest_ns, line.service_ns)
@@ -232,6 +232,9 @@ class InterruptReader(Reader):
         Args:
             serial: Serial of the bad message.
             tick: Release tick of the reading cycle.
+
+        Returns:
+            The reading with this message or, if there is none, with the last good one again.
         """
         for older in reversed(self._line.served):
             if self.serial < older < serial:

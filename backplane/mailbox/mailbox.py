@@ -4,7 +4,7 @@ The writer fills `writer.message` and calls `write(tick)`. A reader calls `read(
 `Reading` with message and verdict. `tick` is the release tick of the calling cycle. A message
 written in the cycle released at tick T becomes visible at T + delay, the end of that cycle, however
 early it was written. The result of a read therefore depends on ticks alone. A good message is one
-that was written completely by the lawful writer and not damaged since.
+that was written completely, by a process that held the claim, and not damaged since.
 
 Alternatives considered: a sequence lock (a writer killed inside a write would leave its readers
 spinning for ever), a kernel lock (as in the paper, at 3 to 4 times the cost: protocol `lock`), and
@@ -57,8 +57,8 @@ class Reading(NamedTuple, Generic[M]):
         message: The message. All bytes are zero before the first one.
         verdict: Whether the message is new or old, or none has been received yet.
         is_lost: True if the writer is dead or hanging, or has not written for too long.
-        earlier: Other messages that this read received, older than `message`, oldest first. Only
-            for queues and operators' commands, of which every message must be received.
+        earlier: Other messages that this read received, older than `message`, oldest first. Used
+            only for queues and operators' commands, because no message of these may be skipped.
     """
 
     message: M
@@ -191,9 +191,9 @@ class Writer:
         self.slots.publish_gap()
 
     def iterate_outgoing(self) -> Iterator[None]:
-        """Put each message of this cycle into `message` in turn, for the caller to publish.
+        """Copy each message of this cycle into `message`, and yield for the caller to publish it.
 
-        Only a queue has more than one.
+        Only a queue can have more than one message in a cycle.
         """
         yield
 
@@ -307,7 +307,7 @@ class Reader:
         return self._accept(serial, tick)
 
     def _accept(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Return the reading for the message found by a read, or for an older one if it is bad.
+        """Accept the message found by a read or, if it is bad, an older one. Returns the reading.
 
         Args:
             serial: Serial of the message.
@@ -319,7 +319,7 @@ class Reader:
         return self._new if self._fetch_good(serial) else self._accept_older(serial, tick)
 
     def _accept_older(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Count the fault of a bad message, and accept the newest good one before it.
+        """Count a bad message, and accept the newest unread good message before it.
 
         If the slot of the message is being overwritten, the read counts as timed out.
         """
@@ -348,6 +348,9 @@ class Reader:
         Args:
             serial: Serial of the bad message.
             tick: Release tick of the reading cycle.
+
+        Returns:
+            The reading with this message or, if there is none, with the last good one again.
         """
         slots = self.slots
         tries = MAX_STEP_BACK
@@ -389,9 +392,13 @@ class Reader:
         return self._readings[verdict]
 
     def add_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
-        """Add the good messages after serial `before` to `reading.earlier`, oldest first.
+        """Return the reading with all unread messages before its own in `earlier`, oldest first.
 
-        Messages whose slots have been reused are left out.
+        Bad messages and messages whose slots have been reused are left out.
+
+        Args:
+            reading: Result of a read.
+            before: Serial of the last good message before that read.
         """
         if self.serial <= before + 1:
             return reading
@@ -416,7 +423,7 @@ class DoubleBufferReader(Reader):
     """Reader under protocol double-buffer (section 3.3 of the paper).
 
     It gets the newest complete message, so it reacts faster than under time-slice. In real time,
-    which message it gets does not depend on ticks alone.
+    the result of a read does not depend on ticks alone.
     """
 
     def read(self, tick: int) -> Reading[AnyMessage]:

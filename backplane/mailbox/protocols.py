@@ -32,7 +32,7 @@ from rack.backplane.words import Box
 LOCK_WAIT_S = 0.002
 """Maximum time to wait for the lock.
 
-A process holds it for a microsecond or two, or for some hundred if it is preempted meanwhile.
+A process holds it for one or two microseconds, or for some hundred if it is preempted.
 """
 
 
@@ -52,7 +52,7 @@ class MailboxLock:
         self.held_up = 0
 
     def acquire(self) -> bool:
-        """Take the lock. Returns False on timeout, if another live process holds it."""
+        """Wait a bounded time for the lock. Returns False if another process still holds it."""
         if not self._semaphore.acquire(self._wait_s):
             holder = self._box[Box.OWNER]
             # The holder may have released the lock and ended since the wait.

@@ -54,7 +54,7 @@ class QueueTaken(Message, version=1):
 # Plain integers for the hot path.
 _PUT_POSITION = Struct("@2q").pack_into
 UNLIMITED = 1 << 62
-"""Number of messages to take that stands for all of them."""
+"""Number of messages to take if there is no limit."""
 
 
 def get_position_mailbox(queue: str) -> str:
@@ -145,7 +145,7 @@ class QueueWriter(Writer):
     def compute_visible_tick(self, tick: int, now: int | None) -> int:
         """Return the tick from which the messages of a cycle are visible.
 
-        The tick is remembered for `lose_message`.
+        The tick is also stored for `lose_message`.
 
         Args:
             tick: Release tick of the cycle that writes.
@@ -155,9 +155,9 @@ class QueueWriter(Writer):
         return self._shown_at
 
     def iterate_outgoing(self) -> Iterator[None]:
-        """Put each message sent in this cycle into `message` in turn, for the caller to publish.
+        """Copy each message of this cycle into `message`, and yield for the caller to publish it.
 
-        At the end, `message` has the same content as before.
+        At the end, the original content of `message` is restored.
         """
         slots = self.slots
         present = bytes(self.message.raw)
@@ -197,7 +197,7 @@ class QueueWriter(Writer):
         slots.publish_gap()
 
     def show_published(self) -> None:
-        """Publish the messages in the slots: one store for observers, and one for the reader."""
+        """Publish all messages written to the slots, first to observers and then to the reader."""
         self._shared[Box.HEAD] = serial = self.serial
         self._shared[Box.SENT] = serial
 
@@ -223,7 +223,7 @@ class QueueReader(Reader):
             self.transfers = 0
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Take every message visible at `tick`."""
+        """Take all messages visible at `tick`, and return them as `take_messages` does."""
         return self.take_messages(tick, UNLIMITED)
 
     def take_messages(self, tick: int, most: int, now: int | None = None) -> Reading[AnyMessage]:
@@ -280,9 +280,10 @@ class QueueReader(Reader):
         return self._new._replace(earlier=tuple(earlier)) if earlier else self._new
 
     def _can_take(self, serial: int, last: int, tick: int) -> bool:
-        """Check whether the message with a serial can be taken, or skipped as bad, at `tick`.
+        """Check whether the message with a given serial can be taken or skipped at `tick`.
 
-        A bad message that claims to become visible later than a good one could is not waited for.
+        A message is skipped if it is bad and its slot states a later visible tick than a good
+        message can have.
 
         Args:
             serial: Serial of the message.

@@ -9,9 +9,9 @@ loads the serial with acquire before it copies the slot, so it sees all of the s
 still be torn by a writer that laps the reader, which the checksum detects. The checksum does not
 cover the signature. The signature is stored after the message and loaded before it, so that a
 forged message that is being overwritten never carries the signature of the true writer. A reader
-completes its copy before it loads the head to check that the slot has not been reused (`is_intact`),
-and the writer fills no slot before it has stored the head for the previous one. Words are aligned
-to 8 bytes, so they are never torn.
+completes its copy before it loads the head to check that the slot has not been reused
+(`is_intact`), and the writer fills no slot before it has stored the head for the previous one.
+Words are aligned to 8 bytes, so they are never torn.
 
 On x86-64 plain loads and stores of aligned words have this order, and Python uses such loads and
 stores. Boards get the order from machine code (`rack.boards.run.compiled_mailbox`), which also
@@ -108,7 +108,7 @@ class Slots:
     Attributes:
         box: Head of the mailbox, with the words of `words.Box`.
         depth: Number of slots.
-        mask: Serial & `mask` is the index of the slot of a serial.
+        mask: `serial & mask` is the index of the slot for a serial.
         record: The local record, a copy of one slot: the eight words of its head (`words.Slot`)
             and the message.
         message: The message in the local record, also called the local message.
@@ -250,14 +250,14 @@ class Slots:
     def load_slot(self, serial: int) -> None:
         """Copy the slot of a serial into the local record, without any check."""
         place = self.places[serial & self.mask]
-        # Load the signature first. If it is the one of the wanted message, the slot already
+        # Load the signature first. If it belongs to the wanted message, the slot already
         # contains all of the message.
         self.record[:SIGNED_FROM] = place[:SIGNED_FROM]
         self.fence()
         self.record[SIGNED_FROM:] = place[SIGNED_FROM:]
 
     def fetch_message(self, serial: int) -> bool:
-        """Copy the message with a serial into the local record.
+        """Copy the message with the given serial into the local record.
 
         Returns:
             False if the copy is damaged or incomplete, or the slot contains another message.
@@ -275,7 +275,7 @@ class Slots:
                 yield copy_message(self.message)
 
     def copy_slot(self, serial: int) -> bool:
-        """Copy the slot of a serial as `load_slot` does.
+        """Copy the slot of a serial into the local record, and check that it was not reused.
 
         Returns:
             False if the slot was reused during the copy.
@@ -289,11 +289,11 @@ class Slots:
         return self.chain == xxh3(self.covered, self.words[_CHAIN])
 
     def is_lawful(self, known: int) -> bool:
-        """Check whether the local message was written by a process that claimed the mailbox.
+        """Check whether the writer of the local message held the claim on the mailbox.
 
         Args:
-            known: Signature of the last message accepted by the caller, 0 for none. A message from
-                an earlier epoch than this one is not lawful.
+            known: Signature of the last message accepted by the caller, 0 for none. Messages from
+                earlier epochs than this one are rejected.
         """
         signature = self.signature
         holder = self.box[Box.CLAIMANT]

@@ -131,11 +131,11 @@ All other alarms report faults or reactions to them.
 
 
 class AlarmWriter:
-    """Writing end of the alarm ring of a task or, by the name "clock", of the clock.
+    """Writing end of the alarm ring of a task or of the clock.
 
     Args:
         segment: Memory of the rack.
-        task: Name of the task.
+        task: Name of the task, "clock" for the clock.
         attention: eventfd that wakes the Rack. None to wake no process.
     """
 
@@ -193,7 +193,7 @@ def open_alarm_ring(segment: Segment, task: str) -> Ring:
 
 
 CLEAN_READS = 20
-"""An episode ends after this many accesses and writer's cycles without a finding."""
+"""Number of accesses, and of cycles of the writer, without a finding that end an episode."""
 
 
 class Episodes:
@@ -228,7 +228,7 @@ class Episodes:
     def raise_alarm(
         self, code: Alarm, tick: int, value: float = 0.0, since: int | None = None
     ) -> None:
-        """Raise an alarm in any case. Call this only when a new episode is known to begin.
+        """Raise an alarm unconditionally. Call this only when a new episode is known to begin.
 
         Args:
             code: Kind of alarm.
@@ -239,7 +239,7 @@ class Episodes:
         self._alarms.raise_alarm(tick, code, self._subject, value, since)
 
     def is_open(self, code: Alarm, access: int, tick: int) -> bool:
-        """Check whether an episode has begun and not ended.
+        """Check whether an episode of this kind has begun and not yet ended.
 
         Args:
             code: Kind of alarm.

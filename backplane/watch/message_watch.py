@@ -4,7 +4,7 @@ Messages are checked in the order of their serials. A fault is reported only on 
 machine cannot produce: a serial whose slot was never filled, a later serial with an earlier tick,
 two messages for one release, or a message published after the end of the cycle that made it. The
 reader may be delayed too. Therefore a message is copied first, then its slot is checked for reuse
-(`Slots.is_kept`), and only then is the copy evaluated.
+(`Slots.is_intact`), and only then is the copy evaluated.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class MessageWatch:
         """Copy the message with a serial into the local record of the slots.
 
         Returns:
-            False if the message is missing or damaged, or may have been overwritten meanwhile.
+            False if the message is missing, damaged, or possibly overwritten during the copy.
         """
         return self._slots.fetch_message(serial) and self._slots.is_intact(serial)
 
@@ -138,13 +138,13 @@ class MessageWatch:
             self.seen = serial
 
     def _check_unusual(self, serial: int, tick: int) -> bool:
-        """Check a message that is lost, damaged, late or out of order, and record the finding.
+        """Record whether a message is lost, damaged, late or out of order.
 
         Returns:
-            False if it is too early to check the message. It must then be checked again later.
+            False if it is too early to decide. The message must then be checked again later.
         """
         slots = self._slots
-        # Copy a torn message twice, because the true message may be overwriting a forged one.
+        # If the copy is torn, copy again: the true message may be overwriting a forged one.
         if not slots.copy_slot(serial) or not (slots.passes_check or slots.copy_slot(serial)):
             return True
         expected = self.newest + self._spec.every
@@ -165,7 +165,7 @@ class MessageWatch:
         return True
 
     def _check_timing(self, released: int, visible: int, tick: int) -> None:
-        """Check whether the message in the local record is out of order or was held back.
+        """Record a finding if the message in the local record is out of order or was held back.
 
         Args:
             released: Release tick of the message.

@@ -4,8 +4,8 @@ Executors write in every cycle, so there is a limit to the age of their messages
 plans. Silence alone is a reason for the reading level to hold (`is_lost`), but does not prove a
 fault. An alarm is raised only if the writer is dead or stopped, or is mute: it has finished cycles
 without writing its message. For a mailbox that is written on demand, there is a limit to the age of
-its information instead. Its writer can also declare the writer lost, or the last message valid at
-any age (see `words.Box`).
+its information instead. If its messages come from another rack, its head can also state that this
+rack counts as lost, or that the last message is valid at any age (see `words.Box`).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class ReadingTask:
         self._step = NO_MESSAGE_TICK
 
     def record_read(self, tick: int) -> None:
-        """Record a read at `tick`. A longer interval than usual since the last read is a pause."""
+        """Record a read at `tick`. An interval longer than the usual one counts as a pause."""
         step = tick - self._last
         if step != self._step:
             if step > self._step:
@@ -66,7 +66,7 @@ class SilenceWatch(MessageWatch):
     """Checks the messages of one mailbox and the silence of its writer, for one reader.
 
     Attributes:
-        quiet: Age of the newest message in ticks from which `is_lost` must be called.
+        quiet: Smallest age of the newest message, in ticks, at which `is_lost` must be called.
     """
 
     def __init__(
@@ -110,7 +110,7 @@ class SilenceWatch(MessageWatch):
         return self.is_writer_lost(tick)
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Check whether the writer has been found dead or hanging, whatever its messages' age."""
+        """Check whether the writer has been found dead or hanging. Its silence does not count."""
         # A loss counts from the tick after it was found. Within that tick, the result would depend
         # on which process is faster.
         return self._reader.newest != NO_MESSAGE_TICK and 0 < self._block[Block.LOST] <= tick

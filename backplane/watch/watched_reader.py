@@ -65,10 +65,7 @@ class MailboxWatcher(ABC):
 
     @abstractmethod
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message visible at `tick`, with its verdict.
-
-        The reading also tells whether the writer is lost.
-        """
+        """Return the newest message visible at `tick`, with its verdict and `is_lost`."""
 
     @abstractmethod
     def is_writer_lost(self, tick: int) -> bool:
@@ -107,10 +104,7 @@ class WatchedReader(MailboxWatcher):
         self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message visible at `tick`, with its verdict.
-
-        The reading also tells whether the writer is lost.
-        """
+        """Return the newest message visible at `tick`, with its verdict and `is_lost`."""
         reader = self.reader
         reading = reader.read(tick)
         return self.check_reading(
@@ -123,7 +117,7 @@ class WatchedReader(MailboxWatcher):
     def check_reading(
         self, tick: int, reading: Reading[AnyMessage], *, is_odd: bool, is_silent: bool
     ) -> Reading[AnyMessage]:
-        """Make the checks that a read requires, and return the reading for the level.
+        """Run the checks that are requested for a read, and return the reading for the level.
 
         Args:
             tick: Release tick of the reading cycle.
@@ -171,8 +165,8 @@ class SporadicReader(MailboxWatcher):
 class WatchedQueue(MailboxWatcher):
     """Reader of a queue, which takes as many messages as the level has room for.
 
-    A queue is written on demand, so silence of its writer means nothing. Only a writer found dead
-    or hanging counts as lost.
+    A queue is written on demand, so the silence of its writer is not checked. Only a writer that
+    was found dead or hanging counts as lost.
     """
 
     reader: QueueReader
@@ -191,9 +185,11 @@ class WatchedQueue(MailboxWatcher):
         self._writer = segment.get_block(reader.spec.writer)
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Take the messages visible at `tick`.
+        """Take as many messages visible at `tick` as the level has room for.
 
-        The reading also tells whether the writer is lost.
+        Returns:
+            The newest message taken, its verdict, and whether the writer is lost. Other messages
+                taken are in `earlier`.
         """
         reader = self.reader
         reading = reader.take_messages(tick, self._room(), self._task.now())

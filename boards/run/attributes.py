@@ -37,7 +37,8 @@ class ObjectAttributes(dict[str, Any]):
 class AttributeView:
     """View of a level's attributes.
 
-    Create it as soon as the level is built, because changes are found by comparison with that time.
+    Create it as soon as the level is built, because changes are found by comparison with the
+    attributes at that time.
     """
 
     def __init__(self, level: object) -> None:
@@ -45,7 +46,7 @@ class AttributeView:
         self._built = _AttributeReader().read_attributes(level, MAX_DEPTH)
 
     def read_attributes(self) -> Mapping[str, Any]:
-        """Return the present values of the attributes by name, as values that JSON can represent.
+        """Return the current values of the attributes, keyed by name, as data that JSON can store.
 
         Objects are represented by dictionaries of the attributes that have changed.
         """
@@ -59,10 +60,10 @@ class AttributeView:
 
 
 def _find_changes(now: Any, built: Any) -> Any:
-    """Return a value or, for an object, those of its attributes that have changed.
+    """Return a value if it has changed or, for an object, the attributes that have changed.
 
     Args:
-        now: Present value as plain data.
+        now: Current value as plain data.
         built: Value when the level was built.
 
     Returns:
@@ -82,7 +83,7 @@ def _omit_missing(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class _AttributeReader:
-    """Reads a tree of objects once. An object found in several places is shown at the first one."""
+    """Reads a tree of objects once. An object referred to several times is shown only once."""
 
     def __init__(self) -> None:
         self._seen: set[int] = set()

@@ -100,7 +100,7 @@ def run_task_board(segment: Segment, wiring: TaskWiring, attention: int, copies:
         segment: Memory of the rack.
         wiring: Wiring of the task.
         attention: eventfd that wakes the Rack when the board is ready or raises an alarm.
-        copies: Socket for notes to the crate about copies of this process.
+        copies: Socket to the crate, on which copies of this process are reported.
 
     Returns:
         The exit status of the board.
@@ -170,7 +170,7 @@ def run_clock_board(segment: Segment, wiring: ClockWiring, attention: int, copie
         segment: Memory of the rack.
         wiring: Wiring of the clock.
         attention: eventfd that wakes the Rack when the clock raises an alarm.
-        copies: Socket for notes to the crate about copies of this process.
+        copies: Socket to the crate, on which copies of this process are reported.
 
     Returns:
         The exit status of the board.

@@ -50,7 +50,7 @@ PORT = _build_dtype(
     "depth",
     "size",
     # To read: addresses of the reader's state and of the word that marks the writer as lost,
-    # whether messages are visible by ticks, and whether compiled code takes and judges them.
+    # whether visibility depends on ticks, and whether compiled code accepts and checks messages.
     "state",
     "lost",
     "is_sliced",
@@ -89,14 +89,14 @@ slot_at = instruction(to_pointer, SLOT)
 
 @compiled
 def slot_of(port: Any, serial: int) -> int:
-    """Return the address of the slot of a serial in the mailbox of a port."""
+    """Return the address of the slot for a serial, in the mailbox of a port."""
     slot: int = port.slots + (serial & (port.depth - 1)) * port.stride
     return slot
 
 
 @compiled
 def take(port: Any, serial: int) -> bool:
-    """Accept a message as `Reader._fetch_good` does, if it is good and from the same writer.
+    """Accept a message as `Reader._fetch_good` does, if it is good and its writer is known.
 
     Args:
         port: Port to read, a record of type `PORT`.
@@ -210,7 +210,8 @@ def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
         stamp: Time stamp of written messages, in ns of CLOCK_MONOTONIC.
 
     Returns:
-        A bit for each port that Python must handle, because its result is new or unusual.
+        A bit for each port that Python must handle, because its result has changed or requests a
+            check.
     """
     touched = 0
     for at in range(count):
@@ -233,7 +234,7 @@ def order() -> None:
 
 
 def load_machine_code() -> None:
-    """Load the compiled functions of this module, and replace `Slots.fence` by one of them.
+    """Load the compiled functions of this module, and replace `Slots.fence` with one of them.
 
     The crate calls this before it forks boards.
     """

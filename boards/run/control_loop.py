@@ -92,9 +92,9 @@ class VirtualControlLoop(Task):
         watch.finish_cycle(in_time, deadline, done=tick)
 
     def _handle_delay(self, tick: int) -> None:
-        """React to a cycle that begins late: record a pause in reading, and check the clock.
+        """Record a pause in reading if releases were skipped, and check whether the clock was late.
 
-        The first cycle counts as the end of a pause too.
+        Called in a cycle that begins late. The first cycle counts as the end of a pause too.
         """
         if self.next_cycle.skipped or not self._has_cycled:
             self.inputs.task.since = tick
@@ -132,7 +132,8 @@ class VirtualControlLoop(Task):
             tick: Release tick of the cycle.
 
         Returns:
-            True if the finding begins an episode, because there was none of this kind for a while.
+            True if the finding begins an episode, because the last one of this kind is more than
+                `CLEAN_READS` cycles ago.
         """
         last = self._raised.get(number)
         self._raised[number] = tick
@@ -164,7 +165,7 @@ class PlannerLoop(Task):
         self._priority = self.block[Block.PRIORITY]
 
     def cycle(self, tick: int) -> None:
-        """Run the cycle released at `tick`, in which a plan is made if the level wants one."""
+        """Run the cycle released at `tick`. It makes a plan if one is wanted."""
         watch = self.stopwatch
         watch.start_cycle(tick, self.next_cycle.skipped)
         self.read(tick)

@@ -5,7 +5,7 @@ if they are open for reading, the copy opens them again at the same position. A 
 copied if it has resources that cannot be duplicated: files open for writing, sockets or threads.
 
 A copy that is requested to continue first forks a successor, which waits in its place for further
-requests, and then continues itself. By that time its parent is the crate, because the board from
+requests. Only then does it continue. By that time its parent is the crate, because the board from
 which it was forked has ended. A copy waits on a pipe whose other end only the crate has open, so it
 ends when the crate ends.
 """
@@ -35,19 +35,19 @@ from rack.boards.errors import SnapshotError
 from rack.levels.level import LevelContext
 
 MAX_NOTE_BYTES = 4096
-"""Maximum size of a `CopyNote` as JSON."""
+"""Maximum size of a `CopyMessage` as JSON."""
 MAX_NOTE_FILES = 2
-"""Maximum number of descriptors sent with a note."""
+"""Maximum number of descriptors sent with a `CopyMessage`."""
 _DESCRIPTORS = Path("/proc/self/fd")
 _THREADS = Path("/proc/self/task")
 
 
 @dataclass(frozen=True)
 class CopyNote:
-    """Note from a board to the crate that there is a copy of it, which waits for requests.
+    """Message to the crate that a copy of a task or of the clock exists and waits for requests.
 
-    The crate's end of the copy's pipe is sent with the note and, by the clock, the file with the
-    segment's memory. No pipe is sent for the successor of a copy, which uses the copy's pipe.
+    The crate's end of the copy's pipe is sent with the message. The clock also sends the file with
+    the segment's memory. The successor of a copy uses the copy's pipe, so no pipe is sent.
 
     Attributes:
         tick: First tick that the copy will run.
@@ -60,7 +60,7 @@ class CopyNote:
     pid: int
 
     def send_note(self, line: socket, *files: int) -> None:
-        """Send the note with open files.
+        """Send the message and the descriptors of open files.
 
         Args:
             line: Socket to the crate.
@@ -73,7 +73,7 @@ class CopyNote:
 
 
 def receive_note(line: socket) -> tuple[CopyNote, list[int]]:
-    """Wait for the next note. Returns the note and the descriptors sent with it."""
+    """Wait for the next `CopyMessage`. Returns it with the descriptors that were sent along."""
     data, files, *_ = recv_fds(line, MAX_NOTE_BYTES, MAX_NOTE_FILES)
     return CopyNote(**json.loads(data)), files
 
@@ -112,7 +112,7 @@ class Copier:
     def fork_copy(
         self, tick: int, *memory: int, show: Callable[[], Mapping[str, Any]] = dict
     ) -> ContinueRequest | None:
-        """Fork a copy of this process, which waits in this call until a rack continues from it.
+        """Fork a copy of this process. The copy waits in this call until a rack continues from it.
 
         Args:
             tick: First tick that the copy will run.
@@ -123,7 +123,7 @@ class Copier:
             None in this process. In a copy, the request to continue.
 
         Raises:
-            SnapshotError: The process cannot be copied, with the reason.
+            SnapshotError: The process cannot be copied. The error states the reason.
         """
         if why := "; ".join(self._list_obstacles(memory)):
             raise SnapshotError(f"{self._name}: {why}")
@@ -166,11 +166,13 @@ class Copier:
         seeds: Any,
         show: Callable[[], Mapping[str, Any]],
     ) -> tuple[ContinueRequest, int]:
-        """Wait for a request to continue. The process ends if the crate ends before that.
+        """In a copy, wait for the request to continue. Requests for attributes are answered.
+
+        The process exits if the crate ends before that.
 
         Args:
             crate: Pipe to the crate.
-            offsets: Positions of the files that are open for reading, by descriptor.
+            offsets: A dictionary from descriptor to position, for the files open for reading.
             seeds: State of Python's random number generator.
             show: Returns the attributes of the level.
 
@@ -220,7 +222,7 @@ class Copier:
 
 
 def _list_open_files() -> dict[int, str]:
-    """Return the names of the open files of this process by descriptor."""
+    """Return a dictionary from descriptor to file name, for the open files of this process."""
     name_by_descriptor = {}
     for entry in [*_DESCRIPTORS.iterdir()]:
         # The descriptor of the listing itself is closed by now.

@@ -1,6 +1,6 @@
 """The mailboxes of one step of the cycle, as a table for compiled code.
 
-A step is the reading of the plan, the reading of commands and statuses, or the writing. Compiled
+The steps are reading the plan, reading commands and statuses, and writing outputs. Compiled
 code accesses the mailboxes of a step in one call. Python then handles only the ports whose result
 has changed, and accesses the mailboxes whose protocol compiled code does not support.
 """

@@ -31,7 +31,7 @@ class InputPorts:
 
     Attributes:
         task: State of the reading task.
-        readers: Reader of each mailbox, by the name of the mailbox.
+        readers: Readers of the mailboxes, keyed by the name of the mailbox.
         taken: Last reading and reader of each mailbox, in the order of the ports.
         reads_plan: True if the task reads the plan of its level.
     """
@@ -52,7 +52,7 @@ class InputPorts:
         Args:
             segment: Memory of the rack.
             level: The level that reads. It decides how many messages to take from a queue.
-            sources: Mailboxes by port.
+            sources: Mailboxes of each port.
             alarms: Alarm ring of the task.
             plan: Mailbox with the plan of the task's level.
             exchange: Rules for ports that are read at a different rate or asynchronously.
@@ -116,7 +116,7 @@ class InputPorts:
         )
 
         def read_and_note(tick: int) -> Reading[AnyMessage]:
-            """Read the position, and store it in the writer of the queue."""
+            """Read the position of the queue's reader, and store it in the queue's writer."""
             reading = position_reader.read(tick)
             queue.taken = reading.message.taken
             return reading
@@ -132,7 +132,7 @@ class InputPorts:
         self.read_command_and_status(tick)
 
     def exchange_plan(self, tick: int) -> None:
-        """Read the plan as of `tick`, which transfers it over the bus from the planner's core."""
+        """Read the plan as of `tick`. This transfers it over the bus from the planner's core."""
         self._plan_table.read(tick)
 
     def read_command_and_status(self, tick: int) -> None:
@@ -197,7 +197,7 @@ class OutputPort:
         self._held_up = self._refused = 0
 
     def _mark_sent(self, basis: int | None = None) -> bool:
-        """Have the message of a port on demand written in this cycle.
+        """Request that the message is written in this cycle. Used for mailboxes written on demand.
 
         Args:
             basis: Tick of the oldest information on which the message depends. None to derive it
@@ -211,7 +211,7 @@ class OutputPort:
         return True
 
     def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
-        """Replace the active faults of this mailbox by those of `faults` that concern it.
+        """Set the active faults of this mailbox: those of `faults` that concern it.
 
         Args:
             faults: Message faults that are active in the task.
@@ -304,7 +304,7 @@ class OutputPorts:
         Args:
             segment: Memory of the rack.
             level: The level that writes.
-            mailboxes: Mailboxes by port.
+            mailboxes: Mailbox of each port.
             alarms: Alarm ring of the task.
             inputs: Input ports of the task.
             sent: Ports whose queues the level fills itself, by calling `send`.
@@ -329,7 +329,7 @@ class OutputPorts:
         self._is_faulty = False
 
     def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
-        """Replace the active faults of all mailboxes by these."""
+        """Set the active faults of all mailboxes. Each port applies those that concern it."""
         for port in self._ports:
             port.apply_faults(faults)
         self._is_faulty = any(port.is_faulty for port in self._ports)

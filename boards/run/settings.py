@@ -68,10 +68,13 @@ class _SettingsChange:
                     object.__setattr__(live, name, changed)
 
     def _merge_values(self, now: Any, old: Any, new: Any) -> Any:
-        """Return the value that an attribute gets. Objects and collections are changed in place.
+        """Return the new value of an attribute of the live object.
+
+        It is `new` if the settings change the attribute and the live object has not changed it,
+        otherwise `now`. Objects and collections are changed in place.
 
         Args:
-            now: Present value in the live object.
+            now: Current value in the live object.
             old: Value with the old settings.
             new: Value with the new settings.
         """

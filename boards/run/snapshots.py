@@ -30,7 +30,7 @@ COPY_REFUSED = -1
 
 
 def has_snapshots_enabled(segment: Segment) -> bool:
-    """Check whether snapshots of this rack are to be taken."""
+    """Return True if snapshots are enabled for the rack."""
     words = segment.words
     return any(
         words[word] for word in (System.SNAPSHOT_PART, System.SNAPSHOT_EVERY, System.SNAPSHOT_AT)
@@ -93,7 +93,8 @@ class ClockCopies:
         """Take a snapshot before `tick`, if one is due and no task is lost or stopped.
 
         Returns:
-            The next tick before which a snapshot is due, as far as it is known in ticks.
+            The next tick before which a snapshot is due. Snapshots that are due at a time, not at a
+                tick, are disregarded.
         """
         words = self._segment.words
         requested_tick = words[System.SNAPSHOT_AT] - 1

@@ -73,7 +73,7 @@ class Stopwatch:
         self.start_ns = self.plan_ns = self.read_ns = self.process_ns = self.end_ns = 0
 
     def start_counting(self) -> None:
-        """Start to count processor time, which the trace record of the next cycle includes."""
+        """Start to measure the processor time that the next trace record contains."""
         self._processor_ns = thread_time_ns()
 
     def start_cycle(self, tick: int, skipped: int) -> None:
@@ -170,7 +170,7 @@ class Stopwatch:
             self._lockstep_done.release()
 
     def _count_troubles(self) -> int:
-        """Count accesses that have failed since the last call.
+        """Add accesses that have failed since the last call to the counts in the control block.
 
         Returns:
             Flags for the trace record: `Flag.BUS_ERROR` and `Flag.CORRUPT` as they apply.

@@ -83,7 +83,7 @@ class SystemController:
         self._faults.act_within_tick(tick)
 
     def find_next_work_tick(self, tick: int) -> int:
-        """Return the first tick after `tick` that needs `begin_tick` or may end the run."""
+        """Return the first tick after `tick` at which `begin_tick` has work or the run may end."""
         if self._settled is None:
             return tick + 1
         return min(self._faults.next_tick, self._desk.next_tick, self._end_of_run.next_tick)
@@ -119,12 +119,17 @@ class SystemController:
             words[System.DEMAND] = demand
             self._driver.alarms.raise_alarm(tick, Alarm.DEMAND, subject, demand)
         # Call this again at the next tick while a board is lost, a switch is set for a later tick,
-        # or the crate is just recording a loss.
+        # or the crate is in the middle of recording a loss.
         is_settled = not lost and peer >> 1 <= tick and seen[0] % 2 == 0
         self._settled = (*seen, emergency, peer) if is_settled else None
 
     def _handle_loss(self, task: ReleasedTask, tick: int) -> None:
-        """Let a restarted board rejoin, or react to a board that will not be restarted."""
+        """Let a restarted board rejoin, or handle a board that will not be restarted.
+
+        In lockstep, a board rejoins a fixed number of ticks after its loss. A board that will not
+        be restarted causes the emergency stop and then the end of the run. If it is a host board,
+        it counts as rejoined instead, and its bus adapter reports the loss.
+        """
         lockstep = self._wiring.lockstep
         if lockstep and tick < task.lost_tick + self._wiring.restart_ticks:
             return
@@ -185,7 +190,7 @@ class OperatorCommandIssuer:
         self._silent = OPERATOR_TIMEOUT_NS // segment.layout.clock_ns if in_time else sys.maxsize
 
     def issue_due_commands(self, tick: int) -> None:
-        """Issue all commands due at `tick`."""
+        """Check all leases, then issue all commands due at `tick`."""
         if self._words[System.REQUESTED] != self.requested:
             self.requested = self._words[System.REQUESTED]
             self._waiting = self._table.list_waiting()
@@ -251,7 +256,7 @@ class OperatorCommandIssuer:
         self._leased.remove(entry)
 
     def _is_superseded(self, entry: RequestEntry) -> bool:
-        """Check whether a level has refused a leased command or has accepted a newer one."""
+        """Check whether a level has refused a leased command, or accepted one that replaces it."""
         mailbox = entry.mailbox
         serial = entry.serial
         newest = self._newest.get(mailbox, 0)

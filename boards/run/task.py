@@ -32,7 +32,8 @@ class Task(ABC):
     Attributes:
         spec: Description of the task from the layout.
         block: Control block of the task.
-        serve: Serves the interrupts of the board in each cycle, None if this task does not.
+        serve: Function that serves the board's interrupts in each cycle. None if nothing
+            interrupts the board, or another of its tasks serves the interrupts.
     """
 
     def __init__(
@@ -100,8 +101,8 @@ class Task(ABC):
 class ClockGuard:
     """Reports ticks that the clock has skipped or begun late, for one of the fastest tasks.
 
-    Even the fastest task need not cycle in every tick. It then loses no release by most skipped
-    ticks, and none of its cycles is late, so skipped ticks are found by the clock's count.
+    Even the fastest task need not cycle in every tick. Most skipped ticks then neither cost it a
+    release nor delay its cycles, so it finds skipped ticks from the clock's count.
 
     Attributes:
         reported: Number of skipped ticks that this task has reported, including earlier
@@ -135,7 +136,7 @@ class ClockGuard:
             self.reported = self._block[Block.CLOCK_SKIPPED] = counted
 
     def check_release(self, tick: int) -> None:
-        """Check, in a cycle that begins late, whether this is because the clock was late.
+        """Raise an alarm, once per episode, if the cycle began late because the clock was late.
 
         Args:
             tick: Release tick of the cycle.
@@ -158,7 +159,7 @@ class InterruptHandler:
     It takes processor time for each interrupt, counts interrupts, and reports lost ones. On the
     original boards the handler ran whenever a message arrived. Here the first task of the board
     does its work just before it reads, and takes as much processor time as the handler would have
-    used since the last cycle. Reading, t_comm of eq. 3.5, takes longer by this time, and tasks of
+    used since the last cycle. This adds to the time of reading (t_comm of eq. 3.5), and tasks of
     lower priority on the same core have to wait. In lockstep, where no task waits for a processor,
     the handler takes no time.
     """
@@ -206,8 +207,8 @@ def chain_accesses(*accesses: Callable[[int], None] | None) -> Callable[[int], N
     """Return a function that makes several accesses one after the other.
 
     Args:
-        accesses: Functions to call with the release tick, or None for those to leave out. If there
-            is only one, it is returned unchanged.
+        accesses: Functions to call with the release tick. None is ignored. A single function is
+            returned unchanged.
     """
     present = [access for access in accesses if access is not None]
 
