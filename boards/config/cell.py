@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 def compute_cell_sizes(config: RackConfig) -> dict[str, int]:
     """Return the sizes to which message types refer by name, such as the number of joints.
 
-    The result is empty for a rack without an arm. Raises `RobotError` if arm and scene do not fit
-    the model.
+    The result is empty for a rack without an arm. Raises `RobotError` if the arm or the scene does
+    not match the MuJoCo model.
     """
     if config.robot is None:
         return {}
@@ -40,7 +40,10 @@ def find_geom_name(config: RackConfig, geom: int) -> str:
 
 
 def build_rack_cell(config: RackConfig) -> Cell:
-    """Build the cell of a rack that has an arm. Raises `RobotError` if arm and scene do not fit."""
+    """Build the cell of a rack that has an arm.
+
+    Raises `RobotError` if the arm or the scene does not match the MuJoCo model.
+    """
     from rack.levels.robot.cell import build_cell
 
     assert config.robot is not None, "the rack has an arm"

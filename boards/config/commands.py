@@ -36,7 +36,7 @@ DOWN = (0.0, 0.0, -1.0)
 
 
 def describe_commands(level: PublishedLevel) -> str:
-    """Return the commands of a level as text with valid names, as in "hold, table saw|slow"."""
+    """Return a level's commands, with valid names and goals, as in "hold, table saw|slow"."""
     words = []
     for what, goals in level.commands.items():
         names = "|".join(level.wording.get(what, ()))
@@ -82,7 +82,7 @@ def build_requests(config: RackConfig, layout: Layout) -> tuple[Request, ...]:
 
 
 def _encode_request(command: CommandConfig, layout: Layout) -> Request:
-    """Return the request that enters a checked command into the operator table."""
+    """Convert a checked command to a request, as the operator table stores it."""
     name = f"{command.level}.operator"
     spec = layout.find_mailbox(name)
     message = OperatorCommand(build_message_dtype(spec.fields, spec.size))
@@ -113,7 +113,8 @@ def find_command_mistakes(
     """Return every mistake in operator commands.
 
     Args:
-        commands: The commands with their places in a config. The place of a live command is empty.
+        commands: Pairs of a command's place in the config, as in "command[0]", and the command. The
+            place of a live command is "".
         config: The config of the rack.
         levels: Its levels.
         broken: Boards with known mistakes. Commands for them are not checked.
@@ -139,7 +140,7 @@ def find_command_mistakes(
 def _check_command(
     place: str, command: CommandConfig, config: RackConfig, published: Levels
 ) -> Mistakes:
-    """Yield every mistake in one operator command. `place` is empty for a live command."""
+    """Yield every mistake in one operator command, whose place is "" if it is live."""
     at = partial(format_place, place)
     if command.tick is not None and command.at is not None:
         yield Mistake(at("at"), command.at, "tick is also given; give only one of tick, at")
@@ -172,7 +173,7 @@ def _check_goal(at: Callable[[str], str], command: CommandConfig, known: Command
     """Check that a command has exactly one goal of an accepted form, or none if it takes none.
 
     Args:
-        at: Function that returns the place of a key of the command.
+        at: Function that returns the place in the config of a key of the command.
         command: The command.
         known: Commands that the level takes, with the accepted forms of their goals.
     """
@@ -207,7 +208,7 @@ def _find_goal_key(goal: Goal) -> str:
 
 
 def _check_name(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
-    """Check that the name in a command is known to its level, or absent if it takes none."""
+    """Check that a command has a name that its level knows, or none if it takes no name."""
     if command.operation not in NAMED_OPERATIONS:
         if command.name is not None:
             yield Mistake(place, command.name, f"{command.what} takes no name; remove it")

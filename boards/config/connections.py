@@ -45,12 +45,14 @@ class TaskPorts:
     """Class of a task or host board, and the mailboxes of its ports.
 
     Attributes:
-        place: Place of the task in the config.
+        place: Entry of the task in the config.
         kind: Its class.
-        inputs: Declarations of its inputs, by port.
-        outputs: Declarations of its outputs, by port.
-        reads: Mailbox of each input. For a port that reads several, a dict of mailboxes by board.
-        exchange: Entries of the executor's `exchange` table, by port. They say when a port is read.
+        inputs: Declarations of its inputs, keyed by port.
+        outputs: Declarations of its outputs, keyed by port.
+        reads: Mailbox of each input. For a port that reads several mailboxes, a dictionary from
+            board to mailbox.
+        exchange: The executor's `exchange` table, which determines the cycles in which ports are
+            read, keyed by port.
         mistakes: Mistakes that prevent inputs from being connected.
         is_whole: False if some of the ports that the config adds are unknown because of mistakes.
     """
@@ -71,12 +73,12 @@ class TaskPorts:
 
     @property
     def joins_sides(self) -> bool:
-        """Whether the task is the bus adapter between boards and host boards."""
+        """Whether the task is a bus adapter, which connects boards with host boards."""
         return issubclass(self.kind, Adapter) and self.kind.joins_sides
 
     @cached_property
     def sources(self) -> list[tuple[str, str]]:
-        """Pairs of port and mailbox for every mailbox that the task reads."""
+        """Pairs of an input port and a mailbox that it reads."""
         return [
             (port, mailbox)
             for port, source in self.reads.items()
@@ -89,7 +91,10 @@ class TaskPorts:
         return {port: f"{self.place.board}.{port}" for port in self.outputs}
 
     def find_origin_mailboxes(self, output: str) -> tuple[str, ...]:
-        """Return the mailboxes with the information on which an output is based."""
+        """Return the mailboxes that carry the information on which an output is based.
+
+        The result is empty if the output does not declare an input in `rests_on`.
+        """
         source = self.outputs[output].rests_on
         return () if source is None else list_mailboxes(self.reads.get(source.name, {}))
 
@@ -101,10 +106,10 @@ def _connect_ports(
 
     Args:
         config: The config of the rack.
-        place: Place of the task in the config.
+        place: Entry of the task in the config.
         kind: Class of the task.
-        types: Message classes of the mailboxes known so far. Ports that the config adds take their
-            types from other mailboxes.
+        types: Message classes of the mailboxes known so far. A port that the config adds has the
+            type of the mailbox that it reads.
     """
     mistakes: list[Mistake] = []
     reads = dict(_connect_inputs(config, place, kind.inputs, mistakes))
@@ -119,7 +124,7 @@ def _connect_ports(
         reads[port] = entry.source
     outputs = {**kind.outputs, **added_ports.outputs}
     if exchange and added_ports.is_complete:
-        # If the class has an output of this name, it stays, and a rule reports it.
+        # Do not replace an output of this name in the class: `check_exchange` reports it.
         outputs.setdefault(EXCHANGE_PORT, Output(build_exchange_message(reads)))
     inputs = {**kind.inputs, **added_ports.inputs}
     return TaskPorts(
@@ -128,7 +133,10 @@ def _connect_ports(
 
 
 def _find_class(place: TaskEntry) -> LevelClass:
-    """Return the class of a task or host board. Raises `LookupError` if it is not usable."""
+    """Return the class of a task or host board.
+
+    Raises `LookupError` if the class is missing or its ports do not fit the role.
+    """
     if place.role == "executor":
         return find_class(place.target, Executor)
     if place.role == "planner":
@@ -148,13 +156,13 @@ def _connect_inputs(
     inputs: Mapping[str, InputPort[Any]],
     mistakes: list[Mistake],
 ) -> Iterator[tuple[str, Source]]:
-    """Yield each connected input with the mailbox or mailboxes that it reads.
+    """Yield each connected input port with the mailbox or mailboxes that it reads.
 
     Args:
         config: The config of the rack.
-        place: Place of the task in the config.
-        inputs: Declared inputs of the task, by port.
-        mistakes: List to which the mistakes of inputs that cannot be connected are added.
+        place: Entry of the task in the config.
+        inputs: Declared inputs of the task, keyed by port.
+        mistakes: List to which a mistake is added for each input that cannot be connected.
     """
     table = config.get_table(place)
     wired = config.get_rewired_ports(place)
@@ -178,9 +186,9 @@ def _connect_inputs(
 
 
 def _group_by_board(mailboxes: Sources) -> Source:
-    """Return a dict of the mailboxes with the names of their boards as keys.
+    """Return a dictionary from board to the mailbox that the board writes.
 
-    If a board writes several of the mailboxes, the full names of these mailboxes are the keys.
+    If a board writes several of the mailboxes, each of them is keyed by its own name instead.
     """
     boards = [box.partition(".")[0] for box in mailboxes]
     pairs = zip(boards, mailboxes, strict=True)
@@ -193,9 +201,8 @@ class Wiring:
     Attributes:
         config: The config of the rack.
         broken: Tables that were removed from the config because of mistakes, as in "board.servo".
-        ports: Ports of every task and host board whose class exists, in order.
-        unusable_classes: For every other task and host board, the reason why its class cannot be
-            used.
+        ports: Ports of every task and host board whose class can be used, in config order.
+        unusable_classes: For every other task and host board, why its class cannot be used.
     """
 
     def __init__(self, config: RackConfig, broken: frozenset[str] = frozenset()) -> None:
@@ -231,7 +238,7 @@ class Wiring:
 
     @property
     def tasks(self) -> list[TaskPorts]:
-        """Ports of the tasks, without host boards."""
+        """Ports of all tasks except host boards."""
         return [ports for ports in self.ports.values() if ports.place.role != "host"]
 
     @property
@@ -250,7 +257,7 @@ class Wiring:
 
     @cached_property
     def reading_ports(self) -> dict[str, list[tuple[TaskPorts, str]]]:
-        """For each mailbox, the tasks that read it, each with its port."""
+        """For each mailbox, the tasks that read it and the ports through which they do so."""
         reading: dict[str, list[tuple[TaskPorts, str]]] = {}
         for ports in self.ports.values():
             for port, mailbox in ports.sources:
@@ -271,7 +278,7 @@ class Wiring:
 
     @property
     def mailbox_names(self) -> str:
-        """Names of all mailboxes, separated by commas, for messages."""
+        """Names of all mailboxes, separated by commas, for error texts."""
         return ", ".join(self.types)
 
     @cached_property
@@ -281,7 +288,7 @@ class Wiring:
 
     @cached_property
     def passed_mailboxes(self) -> dict[str, str]:
-        """Mailboxes that bus adapters write, each with the mailbox that it is copied from."""
+        """Dictionary from each mailbox that a bus adapter writes to the mailbox that it copies."""
         return {
             f"{ports.place.board}.{port}": source
             for ports in self.tasks
@@ -300,7 +307,7 @@ class Wiring:
 
     @property
     def host_side_mailboxes(self) -> set[str]:
-        """Mailboxes of the host side. Only a bus adapter connects them with the real-time side."""
+        """Mailboxes that host boards write or that bus adapters write for host boards."""
         return self.mailboxes_from_host | self.mailboxes_to_host
 
     @cached_property
@@ -314,9 +321,9 @@ class Wiring:
 
     @cached_property
     def unknown_boards(self) -> set[str]:
-        """Boards whose mailboxes are not all known because of mistakes.
+        """Boards with mistakes that leave some of their mailboxes unknown.
 
-        Reading a mailbox of such a board is not reported as a further mistake.
+        A port that reads an unknown mailbox of such a board is not reported as a further mistake.
         """
         boards = {place.board for place in self.unusable_classes}
         boards |= {ports.place.board for ports in self.ports.values() if not ports.is_whole}
@@ -326,7 +333,7 @@ class Wiring:
 
     @property
     def params(self) -> Iterable[tuple[str, type[BaseModel]]]:
-        """Pairs of a table such as "board.servo" and a model of its parameters, without repeats."""
+        """Distinct pairs of a table such as "board.servo" and the model of its parameters."""
         return dict.fromkeys(
             (place.table, ports.kind.params)
             for place, ports in self.ports.items()
@@ -335,7 +342,7 @@ class Wiring:
 
     @property
     def programs(self) -> Iterable[type[Program]]:
-        """Models of the programs that levels read from `[task]`, without repeats."""
+        """Distinct models of the programs that levels read from `[task]`."""
         return dict.fromkeys(
             p.kind.program for p in self.ports.values() if p.kind.program is not None
         )
@@ -357,7 +364,11 @@ class Wiring:
         return self.config.adapter.lan is not None and name.partition(".")[0] == LAN
 
     def find_protocol(self, mailbox: str) -> Protocol:
-        """Return the protocol of a mailbox, which its writer and the config determine."""
+        """Return the protocol of a mailbox.
+
+        It is the protocol in the config, except for queues, for mailboxes of the host side, and for
+        writers that cannot use it.
+        """
         if mailbox in self.mailboxes_to_host:
             # Host boards always read the newest message at once.
             return "time-slice"
@@ -380,7 +391,7 @@ class Wiring:
 
 
 def find_executors(config: RackConfig) -> dict[str, type[Executor]]:
-    """Return the executor class of each board. Classes that are missing are left out."""
+    """Return the executor class of each board. Boards whose class is missing are left out."""
     classes: dict[str, type[Executor]] = {}
     for name, board in config.board.items():
         with suppress(LookupError):
@@ -389,13 +400,13 @@ def find_executors(config: RackConfig) -> dict[str, type[Executor]]:
 
 
 def has_operator_port(executor: type[Executor]) -> bool:
-    """Return True if a level reads commands of an operator."""
+    """Return True if a level has a port for operator commands."""
     return any(port.source == OWN_OPERATOR for port in executor.inputs.values())
 
 
 def is_adapter_name_taken(config: RackConfig) -> bool:
     """Return True if another board has the name of the network adapter's board."""
-    # If tables of boards are broken, the adapter's board may be missing too.
+    # Broken tables of boards are removed, so the adapter's board may be missing.
     return (
         config.adapter.lan is not None
         and LAN in config.board

@@ -77,7 +77,7 @@ def assemble(
             tables = append_faults(tables, faults, folder)
     invalid: list[Mistake] = []
     overridden = apply_settings(tables, overrides, invalid)
-    # Without all files, settings cannot be judged: they may refer to tables of a missing file.
+    # If a file is missing, settings cannot be checked, because they may refer to its tables.
     anchored = resolve_paths(overridden if is_whole else tables, Path.cwd())
     broken = frozenset(find_table_name(setting.value) for setting in invalid)
     return Assembled(anchored, [*mistakes, *invalid], broken, is_whole)
@@ -85,9 +85,9 @@ def assemble(
 
 @contextmanager
 def collect_mistakes(mistakes: list[Mistake]) -> Iterator[None]:
-    """Return a context that collects the mistakes of a `ConfigError` in a list.
+    """Return a context manager that catches a `ConfigError` and adds its mistakes to a list.
 
-    The error ends the block of the context and is not raised further.
+    The rest of the `with` block is skipped.
     """
     try:
         yield
@@ -96,7 +96,7 @@ def collect_mistakes(mistakes: list[Mistake]) -> Iterator[None]:
 
 
 def list_level_classes(tables: Tables) -> tuple[str, ...]:
-    """Return the level classes that unvalidated tables name, as "package.module:Class"."""
+    """Return the level classes named in unvalidated tables, as "package.module:Class"."""
     boards = [board for board in _get_table(tables, "board").values() if isinstance(board, dict)]
     names = [board.get(role) for board in boards for role in ("executor", "planner")]
     names += [LAN_ADAPTER] if "lan" in _get_table(tables, "adapter") else []
@@ -151,10 +151,10 @@ def list_names(folder: Path = CONFIGS) -> list[str]:
 
 
 def find_file(path: Path) -> Path | None:
-    """Return the absolute path of an existing file, regular or not.
+    """Return the absolute path of a file, which may also be a device or a pipe.
 
     Returns:
-        None if the file does not exist or the path is invalid, for instance with an unknown ~user.
+        None if the file does not exist or the path is invalid, as with an unknown ~user.
     """
     try:
         path = path.expanduser()
@@ -167,9 +167,9 @@ def find_file(path: Path) -> Path | None:
 
 
 def resolve_paths(tables: Tables, folder: Path) -> Tables:
-    """Return tables in which every path is absolute. Relative paths start from `folder`.
+    """Return a copy of tables in which all paths are absolute.
 
-    A file that does not exist there is looked up among the bundled files, in configs/.
+    A relative path is looked up in `folder`, then among the bundled files in configs/.
     """
 
     def find(text: str) -> str:
@@ -188,13 +188,13 @@ def resolve_paths(tables: Tables, folder: Path) -> Tables:
 
 
 def change_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) -> Any:
-    """Return a copy of tables in which the texts at one path of keys are changed.
+    """Return a copy of nested tables in which the texts under a sequence of keys are changed.
 
     Args:
         value: The tables.
-        keys: Path of the text, or of a list of texts. `ANY` matches every key. Values of other
-            types at this path stay as they are.
-        change: Function that returns the new text.
+        keys: Keys that lead to a text or a list of texts. `ANY` matches every key. Values of other
+            types are not changed.
+        change: Function from the old to the new text.
     """
     if keys and isinstance(value, dict):
         key, *rest = keys
@@ -208,13 +208,13 @@ def change_texts(value: Any, keys: Sequence[str], change: Callable[[str], str]) 
 
 
 def _get_table(tables: Tables, key: str) -> Tables:
-    """Return the table of a key. Empty if the key is missing or is not a table."""
+    """Return the table under a key. Empty if the key is missing or its value is not a table."""
     table = tables.get(key)
     return table if isinstance(table, dict) else {}
 
 
 def shorten_path(model: Path) -> str:
-    """Return a path as configs store it. The path of a bundled file is relative to configs/."""
+    """Return a path as text, relative to configs/ if the file is bundled."""
     return model.relative_to(CONFIGS).as_posix() if model.is_relative_to(CONFIGS) else str(model)
 
 
@@ -242,13 +242,13 @@ def _locate_config(name_or_path: str | Path, place: str, *folders: Path) -> Path
 def _read_config(
     path: Path, chain: tuple[Path, ...], known: dict[Path, Tables], mistakes: list[Mistake]
 ) -> Tables:
-    """Return the merged tables of a file and of the files that it extends. Read each file once.
+    """Return the merged tables of a file and all files that it extends, reading each file once.
 
     Args:
         path: The file.
-        chain: The files that extend it, directly or indirectly.
-        known: Tables of the files read so far. A file may be extended more than once.
-        mistakes: List to which every mistake is added.
+        chain: The files through which it was reached, each of which extends the next.
+        known: Tables of the files read so far, because several files may extend the same one.
+        mistakes: List to which mistakes are added.
     """
     if path not in known:
         with collect_mistakes(mistakes):
@@ -259,9 +259,9 @@ def _read_config(
 def _read_merged(
     path: Path, chain: tuple[Path, ...], known: dict[Path, Tables], mistakes: list[Mistake]
 ) -> Tables:
-    """Read a file and all files that it extends. Raises `ConfigError` if it extends itself.
+    """Read a file, merge it into the files that it extends, and return the tables.
 
-    The arguments are those of `_read_config`.
+    Takes the same arguments as `_read_config`. Raises `ConfigError` if the file extends itself.
     """
     if path in chain:
         loop = " -> ".join(p.name for p in (*chain[chain.index(path) :], path))
@@ -278,7 +278,7 @@ def _read_merged(
 
 
 def _merge_extension(base: Tables, top: Tables) -> Tables:
-    """Return `base` updated with `top`. A `[robot]` that names a model replaces the whole arm."""
+    """Return `base` updated with `top`. If `top` names a robot model, drop `[robot]` of `base`."""
     if "model" in _get_table(top, "robot"):
         base = {key: value for key, value in base.items() if key != "robot"}
     return merge_tables(base, top)
@@ -316,7 +316,7 @@ def _list_bases(extends: Any, path: Path, mistakes: list[Mistake]) -> list[Path]
 
 
 def _find_named_config(name: str, folder: Path = CONFIGS) -> Path | None:
-    """Return the file of a config by its name in a folder. None if it does not exist."""
+    """Return the file of the config `name` in a folder. None if there is no such file."""
     return find_file(folder / f"{name}.toml") or find_file(folder / name / f"{name}.toml")
 
 
@@ -324,7 +324,7 @@ def _find_referenced_file(reference: str, folder: Path) -> Path | None:
     """Return the file to which a path in a config refers. None if it does not exist.
 
     Args:
-        reference: The path, relative to `folder` or else to configs/.
+        reference: The path, absolute or relative to `folder` or to configs/, tried in this order.
         folder: Folder of the config.
     """
     return find_file(folder / reference) or find_file(CONFIGS / reference)

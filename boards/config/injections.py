@@ -35,7 +35,8 @@ def find_fault_mistakes(
     """Return every mistake in faults.
 
     Args:
-        faults: The faults with their places in a config. The place of a live fault is empty.
+        faults: Pairs of a fault's place in the config, as in "fault[0]", and the fault. The place
+            of a live fault is "".
         config: The config of the rack.
         levels: Its levels.
         layout: Its layout. None skips the checks that need one.
@@ -74,7 +75,7 @@ class FaultCheck:
 
     def find_mistakes(self) -> Mistakes:
         """Yield every mistake in the fault."""
-        # The beginning and the end must each be given in only one way.
+        # At most one key may give the start of the fault, and at most one its duration.
         for keys in (("tick", "at", "when"), ("for", "cycles")):
             given_keys = [key for key in keys if self._get_value(key) is not None]
             for key in given_keys[1:]:
@@ -103,7 +104,7 @@ class FaultCheck:
                 yield self._build_mistake("when", str(error.args[0]))
 
     def _check_kind(self, kind: Kind) -> Mistakes:
-        """Yield a mistake for each key that does not fit the kind of fault."""
+        """Yield a mistake for each key that this kind of fault does not accept."""
         if kind.realtime and self.config.is_lockstep:
             why = (
                 f"{kind.name} needs real time: in lockstep time waits for every task; run without"
@@ -147,14 +148,14 @@ class FaultCheck:
                 )
 
     def _check_target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
-        """Yield a mistake if this kind of fault cannot affect the given task or mailbox."""
+        """Yield a mistake if this kind of fault cannot affect the task or mailbox that it names."""
         if why := self._explain_unsuitable_task(kind, tasks):
             yield self._build_mistake("board", why)
         elif why := self._explain_unsuitable_mailbox(kind):
             yield self._build_mistake("mailbox", why)
 
     def _explain_unsuitable_task(self, kind: Kind, tasks: Mapping[str, Role]) -> str:
-        """Return the reason why this kind of fault cannot affect its task. Empty if it can.
+        """Return the reason why this kind of fault cannot affect the fault's task. Empty if it can.
 
         Args:
             kind: The kind of fault.
@@ -177,7 +178,7 @@ class FaultCheck:
             able = [
                 name
                 for name in self.config.board
-                # A level whose class is missing is not checked.
+                # Assume that a level whose class is missing can be affected.
                 if name not in self.levels or kind.name in self.levels[name].struck_by
             ]
             if board not in able:
@@ -188,7 +189,7 @@ class FaultCheck:
         return ""
 
     def _find_layout(self, place: str) -> Layout | None:
-        """Return the layout. None without a layout, or if it lacks the board of `place`.
+        """Return the layout, or None if there is none or it lacks the board of `place`.
 
         Args:
             place: Name of a task or mailbox, or a condition that begins with one.
@@ -197,13 +198,16 @@ class FaultCheck:
         return self.layout if is_known else None
 
     def _explain_unsuitable_mailbox(self, kind: Kind) -> str:
-        """Return why this kind of fault cannot affect the task's mailboxes. Empty if it can."""
+        """Return the reason why this kind of fault cannot affect the mailbox. Empty if it can.
+
+        A fault without a mailbox affects all mailboxes that its task writes.
+        """
         board = self.fault.board
         mailbox = self.fault.mailbox
         layout = self._find_layout(board)
         if layout is None or board == CLOCK or not kind.takes_mailbox:
             return ""
-        # The reader of a queue writes its position without a port, so only bus faults reach it.
+        # A queue's position mailbox has no port, so only bus faults can affect it.
         written = {
             m.name: m
             for m in layout.mailboxes
@@ -215,7 +219,7 @@ class FaultCheck:
         if kind.not_queued and struck and all(m.protocol == "queue" for m in struck):
             why = f"'{struck[0].name}' is a queue, which {kind.name} does not strike"
             return f"{why}: {kind.not_queued}"
-        # If boards are missing from the layout, they may be the readers.
+        # Boards that are missing from the layout may read the mailbox.
         if kind.where == "bus" and mailbox is None and not self.broken_boards:
             has_reader = any(m.readers for m in struck)
             return "" if has_reader else f"missing; no mailbox of '{board}' has a reader"
@@ -226,7 +230,7 @@ class FaultCheck:
         return ""
 
     def _forbid_keys(self, keys: Iterable[str], why: str) -> Mistakes:
-        """Yield a mistake with the reason `why` for each of the keys that the fault has."""
+        """Yield a mistake, with `why` as its reason, for each of these keys that the fault has."""
         for key in keys:
             if self._get_value(key) is not None:
                 yield self._build_mistake(key, why)
@@ -241,7 +245,7 @@ class FaultCheck:
 
 
 def _explain_invalid_value(parameter: Parameter, value: float, robot: RobotConfig | None) -> str:
-    """Return why a value of the parameter is invalid. Empty if it is valid."""
+    """Return the reason why a value of the parameter is invalid. Empty if it is valid."""
     most = parameter.most
     if parameter.name == "joint" and robot is not None:
         most = len(robot.joints) - 1
@@ -299,7 +303,7 @@ def _build_injection(
         # Two faults of one config must draw different random numbers.
         seed = crc32(f"{config.seed} {place}".encode()) % SEEDS
     when = None if fault.when is None else parse_condition(fault.when, layout)
-    # With zero ticks the fault lasts until the end of the run, or strikes only once.
+    # Zero ticks mean that the fault lasts until the end of the run, or that it occurs only once.
     ticks = 0
     if fault.cycles is not None:
         ticks = fault.cycles * cycle_ticks(layout, fault.board)
@@ -321,10 +325,10 @@ def _build_injection(
 
 
 def _find_mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
-    """Return the index of the mailbox that a fault affects.
+    """Return the index of the one mailbox that a fault affects.
 
     Returns:
-        -1 if the fault affects every mailbox that its task writes, or no mailbox.
+        The index, or -1 if the fault affects all mailboxes of its task or none.
     """
     if fault.mailbox is not None:
         return layout.find_mailbox_index(fault.mailbox)

@@ -43,16 +43,16 @@ NS_PER_MS = 1e6
 
 
 def find_core(core: int) -> int:
-    """Return the core on which a task runs that requests `core`.
+    """Return the core for a task that requests `core`.
 
-    A core that is not available is replaced by one that is, depending on its number.
+    If that core is not available, its number determines which available core replaces it.
     """
     available = sorted(os.sched_getaffinity(0))
     return core if core in available else available[core % len(available)]
 
 
 def list_replaced_cores(config: RackConfig) -> list[str]:
-    """Return a note for every requested core that is not available and is replaced."""
+    """Return a line for each requested core that is not available, naming its replacement."""
     requested: dict[int, list[str]] = {config.clock.core: [CLOCK]}
     for place in config.list_tasks():
         requested.setdefault(place.core, []).append(place.name)
@@ -66,7 +66,7 @@ def list_replaced_cores(config: RackConfig) -> list[str]:
 
 
 def build_exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]:
-    """Return the ticks at which an executor reads the ports of its `exchange` table, by port."""
+    """Return, for each port in an executor's `exchange` table, the ticks at which it is read."""
     board = ports.place.board
     every = wiring.periods[board]
     phase = wiring.config.board[board].phase
@@ -95,7 +95,7 @@ class LayoutBuilder:
         self._hosts = {ports.task: self._build_host(ports.place) for ports in wiring.hosts}
 
     def build_layout(self) -> Layout:
-        """Return the layout: all tasks, host boards and mailboxes of the segment."""
+        """Return the layout with all tasks, host boards and mailboxes of the segment."""
         mailboxes = [box for name in self._wiring.writers for box in self._build_written(name)]
         # The clock writes the operator's commands to the levels.
         mailboxes += [
@@ -107,11 +107,11 @@ class LayoutBuilder:
         return Layout(self._config.name, self._config.clock_ns, tasks, tuple(mailboxes), hosts)
 
     def _build_written(self, name: str) -> Iterator[MailboxSpec]:
-        """Yield a mailbox and, for a queue, the mailbox with the position of its reader."""
+        """Yield the mailbox `name` and, if it is a queue, the mailbox for its reader's position."""
         ports, output = self._wiring.writers[name]
         capacity = self._config.protocol.depth.get(name, UNREAD)
         if name in self._wiring.mailboxes_from_host:
-            # The ring of a host board is a queue that does not depend on ticks.
+            # Host boards write queues whose messages become visible at once.
             depth = compute_depth(capacity + SPARE_SLOTS, 1)
             yield self._build_mailbox(
                 name, writer=ports.task, every=1, delay=0, depth=depth, capacity=capacity
@@ -120,7 +120,8 @@ class LayoutBuilder:
         writer = self._tasks[ports.task]
         every = writer.every * output.cycles
         delay = writer.slice
-        # A message that is visible at the start of a reader's slice must last until the slice ends.
+        # A message that is visible at the start of a reader's slice must not be overwritten before
+        # the slice ends.
         tasks_and_hosts = self._tasks | self._hosts
         readers = [tasks_and_hosts[reader] for reader in self._wiring.list_readers(name)]
         slowest = max((reader.slice for reader in readers), default=0)
@@ -140,7 +141,7 @@ class LayoutBuilder:
         )
         if box.protocol == "interrupt":
             yield self._add_interrupts(box, writer, readers)
-        # A queue has no reader here if its reader's board has mistakes.
+        # The reader of a queue is missing if its board has mistakes.
         elif box.protocol == "queue" and readers:
             yield from self._build_queue(box, capacity, readers[0], writer)
         else:
@@ -149,7 +150,7 @@ class LayoutBuilder:
     def _build_queue(
         self, box: MailboxSpec, capacity: int, reader: TaskSpec, writer: TaskSpec
     ) -> Iterator[MailboxSpec]:
-        """Yield a queue and the mailbox in which its reader reports its position to the writer.
+        """Yield a queue and the mailbox in which the reader reports which messages it has taken.
 
         Args:
             box: Record of the queue, whose capacity and depth are not set yet.
@@ -159,8 +160,8 @@ class LayoutBuilder:
         """
         delay = reader.slice
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
-        # The writer learns the reader's position after both delays. Until then it can send at most
-        # as many messages as the capacity.
+        # The writer learns after both delays which messages the reader has taken. During that time
+        # it can send at most `capacity` messages.
         most = capacity * (1 + self._retained_ticks // (box.delay + delay))
         # A deep queue retains fewer messages, to limit its memory.
         slots = compute_depth(
@@ -182,13 +183,13 @@ class LayoutBuilder:
     def _add_interrupts(
         self, box: MailboxSpec, writer: TaskSpec, readers: Sequence[TaskSpec]
     ) -> MailboxSpec:
-        """Add the costs and times of interrupts to the record of a mailbox and return it.
+        """Return a copy of a mailbox's record with the costs and times of its interrupts.
 
-        Messages do not interrupt tasks of the writer's slot, host boards or the network adapter,
-        which read shared memory.
+        Tasks in the writer's slot, host boards and the network adapter read shared memory and are
+        not interrupted.
 
         Args:
-            box: The mailbox, as for protocol time-slice.
+            box: The mailbox, with the delay and depth of protocol time-slice.
             writer: The task that writes it.
             readers: The tasks that read it.
         """
@@ -234,7 +235,7 @@ class LayoutBuilder:
             every=every,
             within_cycles=board.within_cycles if is_planner else 1,
             depth=compute_depth(self._retained_ticks, every),
-            # The planner of a polling executor must not poll too.
+            # Only the executor of a board may poll.
             wake="timer" if is_planner and wake == "poll" else wake,
             phase=board.phase,
         )
@@ -287,7 +288,7 @@ class LayoutBuilder:
 def build_field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[FieldSpec, ...]:
     """Return the fields of a message type as plain data, with offsets, shapes and numpy types.
 
-    Tools that attach to a rack read messages by these records, without the message classes.
+    With these records, tools can read the messages of a rack without the message classes.
     """
     offsets: Mapping[str, Any] = kind.build_dtype(sizes).fields or {}
     specs = []
@@ -295,7 +296,7 @@ def build_field_specs(kind: MessageType, sizes: Mapping[str, int]) -> tuple[Fiel
         dtype, offset = offsets[field.name][:2]
         scalar = dtype.base
         group = field.kind if isinstance(field.kind, MessageType) else None
-        # The values of an enum have names.
+        # The unit of an enum field is its class, which names its values.
         names = () if isinstance(field.unit, str) else field.unit
         specs.append(
             FieldSpec(

@@ -32,7 +32,7 @@ def load(
 ) -> RackConfig:
     """Load a config and add the folders of its levels to the import path.
 
-    This checks each table alone. `resolve` checks the tables against each other.
+    Each table is checked separately. `resolve` checks whether the tables fit together.
 
     Args:
         name_or_path: Name of a bundled config, or path of a TOML file.
@@ -47,17 +47,17 @@ def load(
 
 
 def load_text(text: str) -> RackConfig:
-    """Load a config from TOML text, as `RackConfig.to_toml_text` writes it.
+    """Load a config from TOML text that `RackConfig.to_toml_text` wrote.
 
-    Like `load`, this extends the import path and raises `ConfigError` with every mistake.
+    Like `load`, this extends the import path. Raises `ConfigError` with all mistakes.
     """
     return validate(Assembled(resolve_paths(parse_tables(text), CONFIGS)))
 
 
 def read_stored(text: str) -> RackConfig:
-    """Read the stored config of a rack or a run, whose text need not be trusted.
+    """Read the stored config of a rack or a run. The text may come from an untrusted source.
 
-    Nothing that the config names is imported, and the import path stays as it is.
+    This imports no module that the config names and does not change the import path.
 
     Raises:
         ConfigError: A table is wrong. All mistakes are listed.
@@ -86,7 +86,7 @@ def validate(assembly: Assembled) -> RackConfig:
         mistakes += [
             mistake
             for mistake in convert_errors(error, RackConfig, tables)
-            # A missing key may be in a file or setting that could not be read.
+            # Do not report a missing key that an unreadable file or setting may contain.
             if not mistake.why.startswith("missing")
             or (assembly.is_whole and find_table_name(mistake.place) not in assembly.broken)
         ]
@@ -109,9 +109,9 @@ def validate(assembly: Assembled) -> RackConfig:
 
 
 def _iterate_valid_tables(tables: Tables, key: str, kind: type[T]) -> Iterator[tuple[str, T]]:
-    """Yield the place and the record of each valid table in a list of tables.
+    """Yield each valid entry of the list `key`, preceded by its place, as in "fault[0]".
 
-    Invalid tables are left out, because their mistakes are already reported.
+    Invalid entries are left out, because their mistakes are already reported.
     """
     entries = tables.get(key)
     if not isinstance(entries, list):
@@ -122,7 +122,7 @@ def _iterate_valid_tables(tables: Tables, key: str, kind: type[T]) -> Iterator[t
 
 
 def _find_broken_tables(error: ValidationError) -> frozenset[str]:
-    """Return the tables with mistakes, as "robot", "board.servo" or "host.program"."""
+    """Return the names of tables with mistakes, as in "robot", "board.servo" or "host.program"."""
     places = [[str(key) for key in entry["loc"]] for entry in error.errors()]
     return frozenset(
         ".".join(keys[:2] if keys[0] in ("board", "host") else keys[:1]) for keys in places
@@ -142,10 +142,10 @@ def _build_valid_part(tables: Tables, broken: frozenset[str]) -> RackConfig:
 
 
 def _complete_robot(config: RackConfig) -> RackConfig:
-    """Return the config with missing joints, tool and home of the arm taken from its model.
+    """Return the config, with the arm's joints, tool and home taken from its model if not given.
 
     Raises:
-        ConfigError: The model does not provide them.
+        ConfigError: The model does not define them.
     """
     robot = config.robot
     if robot is None or (robot.joints and robot.tool and robot.home):

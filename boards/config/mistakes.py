@@ -32,7 +32,7 @@ def convert_errors(
 
     Args:
         error: The error.
-        model: The model that was to validate the tables.
+        model: The model against which the tables were validated.
         tables: The tables.
         place: Place of the tables in the config. Empty for the whole config.
     """
@@ -40,7 +40,7 @@ def convert_errors(
         _convert_error(entry, model, tables, place) for entry in error.errors(include_url=False)
     ]
     # pydantic reports a value of a union once for each member type. Keep the first report for each
-    # place, and drop a report about a container if there is one about a value inside it.
+    # place, and drop a report about a container if another report is about a value inside it.
     first = {mistake.place: mistake for mistake in reversed(reports)}
     within = {
         place
@@ -51,12 +51,12 @@ def convert_errors(
 
 
 def _convert_error(entry: ErrorDetails, model: type[BaseModel], tables: Any, place: str) -> Mistake:
-    """Convert one error of pydantic into a mistake. The arguments are those of `convert_errors`."""
+    """Convert one error of pydantic into a mistake. See `convert_errors` for the arguments."""
     keys = _drop_variant_names(entry["loc"], tables, entry["type"] == "missing")
     where = (
         place + "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
     ).lstrip(".")
-    # The table can be of several kinds, and the value of one key selects the kind.
+    # The value of one key, the discriminator, should select the model of the table.
     if entry["type"].startswith("union_tag"):
         context = entry["ctx"]
         valid = context.get("expected_tags", "").replace("'", "")
@@ -85,7 +85,13 @@ def _convert_error(entry: ErrorDetails, model: type[BaseModel], tables: Any, pla
 def _drop_variant_names(
     loc: tuple[int | str, ...], table: Any, is_missing: bool
 ) -> list[int | str]:
-    """Return the keys of a location, without the names of union members that pydantic inserts."""
+    """Return the keys in an error's location, without the names of union members in it.
+
+    Args:
+        loc: The location, into which pydantic inserts these names.
+        table: The validated table, which shows which entries of `loc` are keys.
+        is_missing: Whether the last key is missing from the table.
+    """
     keys: list[int | str] = []
     for key in loc:
         in_list = isinstance(table, list) and isinstance(key, int) and key < len(table)
@@ -98,7 +104,16 @@ def _drop_variant_names(
 def _find_declaration(
     model: type[BaseModel], keys: list[int | str], table: Any
 ) -> tuple[list[str], FieldInfo | None]:
-    """Return the valid keys of the table that contains the last of `keys`, and that key's field."""
+    """Look up the declaration of a key in a model.
+
+    Args:
+        model: The model of the whole table.
+        keys: Keys that lead to the key.
+        table: The table.
+
+    Returns:
+        All valid keys of the innermost table, and the field of the key. None if it is unknown.
+    """
     models = [model]
     known = dict[str, FieldInfo]()
     field = None
@@ -113,7 +128,7 @@ def _find_declaration(
         if isinstance(key, int):
             continue
         if is_name:
-            # The user's name of a table, as "servo" in [board.servo].
+            # This key is a name that the user chose, as "servo" in [board.servo].
             is_name = False
             continue
         known = {name: f for kind in models for name, f in describe_keys(kind).items()}
@@ -124,7 +139,7 @@ def _find_declaration(
 
 
 def _matches_fixed_values(kind: type[BaseModel], table: Any) -> bool:
-    """Return True if a table has the fixed values of a model, such as do = "goto"."""
+    """Return True if a table has the literal values that a model requires, as in do = "goto"."""
     fixed = {
         key: get_args(f.annotation)
         for key, f in kind.model_fields.items()
@@ -136,7 +151,7 @@ def _matches_fixed_values(kind: type[BaseModel], table: Any) -> bool:
 
 
 def _list_models(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the models that occur in a type such as `tuple[Transfer | Goto, ...]`."""
+    """Yield the models within a type annotation such as `tuple[Transfer | Goto, ...]`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):
@@ -150,10 +165,15 @@ def report_repeated_names(place: str, names: Iterable[str]) -> Iterator[Mistake]
 
 
 def count_repeated_names(names: Iterable[str]) -> Iterator[tuple[str, int]]:
-    """Yield each name that occurs more than once, with the number of its occurrences."""
+    """Yield each repeated name and the number of its occurrences."""
     return ((name, count) for name, count in Counter(names).items() if count > 1)
 
 
 def format_place(place: str, key: str) -> str:
-    """Return the place of a key in the table at `place`, which is empty outside a config."""
+    """Return the place of a key in a table, as in "fault[0].tick".
+
+    Args:
+        place: Place of the table. "" for a live command or fault.
+        key: The key.
+    """
     return f"{place}.{key}" if place else key

@@ -61,16 +61,16 @@ class PublishedFinding:
 
 @dataclass(frozen=True)
 class PublishedLevel:
-    """Facts about a level that its operator and fault injection need.
+    """Facts about a level that operator commands and fault injection need.
 
     Attributes:
-        commands: Operator commands that it takes, with the valid forms of their goals.
-        wording: Valid names for each command that takes a name. A command is left out if its names
-            are not known.
-        names: Names for the level's alarms by number. See `Executor.list_names`.
+        commands: Operator commands that it takes, each with the valid forms of its goal.
+        wording: Valid names for each command that takes a name. Commands whose names are not known
+            are left out.
+        names: Names to which the level's alarms refer by index. See `Executor.list_names`.
         keys: Keys of all its parameters.
         live: Its live parameters by key.
-        struck_by: Fault kinds that can strike the hardware that it drives.
+        struck_by: Fault kinds that can affect the hardware that it drives.
         findings: Events that it declares, in the order of their numbers.
     """
 
@@ -84,7 +84,7 @@ class PublishedLevel:
 
     @property
     def params_model(self) -> type[Table]:
-        """Model that checks values of the live parameters and accepts any other parameter."""
+        """Model that validates the live parameters and accepts any value of the others."""
         fields: dict[str, Any] = dict.fromkeys(self.keys, (Any, None))
         for key, param in self.live.items():
             constraints: Any = param.constraints
@@ -94,18 +94,18 @@ class PublishedLevel:
 
 
 Levels = Mapping[str, PublishedLevel]
-"""Levels by board. Levels whose classes are missing are left out."""
+"""Levels, keyed by board. Levels whose classes are missing are left out."""
 
 
 @dataclass(frozen=True)
 class PublishedRack:
-    """Levels of a rack, and the fault kinds that their modules add."""
+    """Published levels of a rack, and the fault kinds that the levels' modules define."""
 
     levels: Levels = field(default_factory=dict)
     kinds: tuple[Kind, ...] = ()
 
     def to_json(self) -> str:
-        """Return the record as JSON, without the parts of fault kinds that are code."""
+        """Return the record as JSON, without the functions and classes in fault kinds."""
         return encode_json(ADAPTER.dump_python(self, exclude=CODE))
 
     @classmethod
@@ -113,7 +113,7 @@ class PublishedRack:
         """Read a record from JSON and register its fault kinds in this process.
 
         Raises:
-            ValueError: The text is not such a record.
+            ValueError: The text is not a valid record.
         """
         published = ADAPTER.validate_json(text)
         KINDS.add_missing(published.kinds)
@@ -144,7 +144,7 @@ CODE: Any = {
 
 
 def gather_facts(config: RackConfig) -> PublishedRack:
-    """Gather the facts about the levels of a rack. This imports their classes."""
+    """Import the levels of a rack and return the facts to be published about them."""
     levels = {
         name: _describe_level(config, name, kind) for name, kind in find_executors(config).items()
     }
@@ -152,14 +152,14 @@ def gather_facts(config: RackConfig) -> PublishedRack:
 
 
 def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> PublishedLevel:
-    """Gather the facts about the level of one board."""
+    """Return the facts to be published about the level of one board."""
     commands = kind.commands if has_operator_port(kind) else {}
     params = config.board[board].params
     live: dict[str, PublishedParam] = {}
     if kind.params is not None and (keys := list_live_keys(kind.params)):
         declared = describe_keys(kind.params)
         launched = None
-        # Parameters with mistakes have no values. The mistakes are reported by the rules.
+        # Parameters with mistakes have no values here. The rules report the mistakes.
         with suppress(LevelError):
             launched = read_params(kind.params, params)
         live = {key: _describe_param(declared[key], getattr(launched, key, "")) for key in keys}
@@ -183,7 +183,7 @@ def _describe_level(config: RackConfig, board: str, kind: type[Executor]) -> Pub
 
 
 def _describe_param(declared: FieldInfo, launched: object) -> PublishedParam:
-    """Return the facts about a live parameter that had the value `launched` at the launch."""
+    """Return the facts about a live parameter, including `launched`, its value at the launch."""
     constraints: dict[Constraint, float | bool] = {}
     for bound in declared.metadata:
         for key in get_args(Constraint):

@@ -30,7 +30,10 @@ class RecordConfig(Table):
 
     @model_validator(mode="after")
     def _check_windows(self) -> Self:
-        """Check that `keep` covers `before` and `after`, because faults can be detected late."""
+        """Check that `keep` is at least `before` plus `after`.
+
+        A fault may be detected late, and the time before it must not yet be discarded.
+        """
         if self.keep is not None and self.keep < self.before + self.after:
             raise ValueError(
                 f"keep = {self.keep:g} s is shorter than before + after ="

@@ -82,10 +82,10 @@ class DescribedSchema(GenerateJsonSchema):
 
 
 def list_key_tables(config: RackConfig) -> list[KeyTable]:
-    """Return every table that a config with these boards may contain.
+    """Return every table that a config with the boards of this config may contain.
 
     Raises:
-        ConfigError: A class that the config names does not exist.
+        ConfigError: A class that the config names cannot be used, or its ports do not fit.
     """
     wiring = Wiring(config)
     if mistakes := [*check_ports(wiring), *check_exchange(wiring)]:
@@ -109,10 +109,10 @@ def list_key_tables(config: RackConfig) -> list[KeyTable]:
 
 
 def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
-    """Return the table with the given name, or else all tables whose names begin with it.
+    """Return the table called `name`, or else those inside it, as "adapter.lan" for "adapter".
 
     Raises:
-        LookupError: No table has such a name. The message lists the tables.
+        LookupError: There is no such table. The message lists the top-level tables.
     """
     known = {table.name: table for table in list_key_tables(config)}
     parts = name.strip("[]").split(".")
@@ -122,7 +122,7 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
         and len(parts) > 1
         and parts[1] in (*getattr(config, parts[0]), "<name>")
     ):
-        # The keys that all boards have in common are described once, without a name.
+        # The keys that all boards have in common are listed under "board", without a board's name.
         tables.append(".".join(parts[:1] + parts[2:]))
     for table in tables:
         if table in known:
@@ -136,7 +136,7 @@ def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
 
 
 def _list_model_tables(model: type[BaseModel], path: str) -> Iterator[KeyTable]:
-    """Yield the tables that a model declares. `path` is the place of its own table."""
+    """Yield the table that a model declares, at `path` in a config, and the tables inside it."""
     schema = model.model_json_schema(schema_generator=DescribedSchema)
     return _walk_schema(schema, schema.get("$defs", {}), path, path, f"[{path}]")
 
@@ -148,7 +148,7 @@ def _walk_schema(
 
     Args:
         schema: JSON schema of the table.
-        known: Schemas to which other schemas refer, by name.
+        known: Schemas to which `$ref` entries refer, keyed by name.
         name: Name of the table for look-ups.
         path: Place of the table in the config.
         heading: Heading of the table in TOML.
@@ -173,9 +173,10 @@ def _walk_schema(
 def _list_inner_tables(
     entry: Schema, known: Schema, name: str, path: str, heading: str
 ) -> Iterator[KeyTable]:
-    """Yield the tables that a value of this schema can be or contain.
+    """Yield the tables that a key with this schema declares.
 
-    The arguments are those of `_walk_schema`.
+    The key's value may be a table, or a list or table of tables. `entry` is the schema of the key.
+    See `_walk_schema` for the other arguments.
     """
     if "$ref" in entry:
         yield from _walk_schema(known[entry["$ref"].rpartition("/")[2]], known, name, path, heading)
@@ -192,13 +193,13 @@ def _list_inner_tables(
 
 
 def _list_value_schemas(entry: Schema) -> Iterator[Schema]:
-    """Yield the schemas of the values in a table whose keys are chosen by the user."""
+    """Yield the schemas of the values in a table whose keys the user chooses."""
     values = (entry.get("additionalProperties"), *entry.get("patternProperties", {}).values())
     yield from (value for value in values if isinstance(value, dict))
 
 
 def _describe_key(name: str, entry: Schema, is_required: bool) -> Key:
-    """Return the record of one key from its JSON schema."""
+    """Convert the JSON schema of a key to a `Key`."""
     # A description declares the unit in brackets, as in "tick period [ms]; a whole number of ns".
     before, _, rest = entry.get("description", "").partition(" [")
     unit, _, after = rest.partition("]")
@@ -216,9 +217,9 @@ def _describe_key(name: str, entry: Schema, is_required: bool) -> Key:
 
 
 def _describe_values(entry: Schema) -> tuple[str, list[str]]:
-    """Return the type of a value and, for each alternative type with limits, its valid values.
+    """Return the type of a value, and the valid values of each alternative type that has limits.
 
-    For a list or table of equal items, the limits are those on each item.
+    For a list or table, the limits apply to each item.
     """
     kinds = []
     limits = []
@@ -245,7 +246,7 @@ def _describe_values(entry: Schema) -> tuple[str, list[str]]:
 
 
 def _format_limits(entry: Schema) -> str:
-    """Return the valid values of a number, text or truth value as text. Empty without limits."""
+    """Return the valid values of a number, string or boolean as text. Empty without limits."""
     if values := entry.get("enum", [entry["const"]] if "const" in entry else []):
         return ", ".join(map(format_value, values))
     if {"minimum", "maximum"} <= entry.keys():
@@ -261,20 +262,20 @@ def _format_limits(entry: Schema) -> str:
 
 
 def _format_number(value: float) -> str:
-    """Return a number as text without loss, in at most six digits if possible."""
+    """Return a number as text, with at most six significant digits if that is exact."""
     text = f"{value:g}"
     return text if float(text) == value else str(value)
 
 
 def _summarise_docstring(docstring: str) -> str:
-    """Return the first sentence of a table's docstring, without its heading."""
+    """Return the first sentence of a table's docstring, without the heading in TOML before it."""
     text = " ".join(docstring.partition("\n\n")[0].split())
     text = text.rpartition("]`: ")[2].partition(". ")[0].rstrip(".")
     return text[:1].lower() + text[1:]
 
 
 def _build_findings_table(board: str, kinds: Mapping[str, FindingKind]) -> KeyTable:
-    """Return the events that a level declares, in the form of a table of keys."""
+    """Return the events that a level declares, as a table with a key for each event."""
     keys = tuple(
         Key(kind.name, "number", kind.unit.removeprefix("1"), "", "", kind.doc)
         for kind in kinds.values()
@@ -285,7 +286,7 @@ def _build_findings_table(board: str, kinds: Mapping[str, FindingKind]) -> KeyTa
 
 
 def _list_fault_tables() -> Iterator[KeyTable]:
-    """Yield a table with the parameters of each fault kind that has any."""
+    """Yield a table of parameters for each fault kind that has parameters."""
     for kind in KINDS:
         keys = [
             Key(

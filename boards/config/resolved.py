@@ -53,7 +53,7 @@ LAYOUT_NEEDS = {"clock", "protocol", "robot", "scene", "task"}
 
 
 def resolve(config: RackConfig) -> Resolved:
-    """Check a config completely and wire it for a run on this machine.
+    """Check a config completely and derive the records for a run on this machine.
 
     Raises:
         ConfigError: The config has mistakes. All of them are listed, including mistakes in the
@@ -65,7 +65,9 @@ def resolve(config: RackConfig) -> Resolved:
 
 
 def resolve_layout(config: RackConfig) -> Layout:
-    """Check a config and return its layout. Files that only its own machine has are not checked.
+    """Check a config, except for its certificate files, and return its layout.
+
+    The config may thus come from another machine.
 
     Raises:
         ConfigError: The config has mistakes. All of them are listed.
@@ -74,13 +76,13 @@ def resolve_layout(config: RackConfig) -> Layout:
 
 
 def list_class_names(config: RackConfig) -> tuple[str, ...]:
-    """Return the class names of all levels, which the crate preloads during the config check."""
+    """Return the classes of all executors and planners, as "package.module:Class"."""
     return tuple(dict.fromkeys(place.target for place in config.list_tasks()))
 
 
 @dataclass(frozen=True)
 class Resolved:
-    """A checked config with everything that a launch derives from it.
+    """A checked config and the records that a launch derives from it.
 
     Attributes:
         config: The config.
@@ -90,7 +92,7 @@ class Resolved:
         faults: Entries of the fault table for the config's own faults.
         commands: Requests for the config's own operator commands.
         published: Facts about the levels, for tools.
-        goals: Final places of objects, by the row of each object in the scene.
+        goals: Goals of objects, keyed by the index of the object in the scene.
     """
 
     config: RackConfig
@@ -103,13 +105,14 @@ class Resolved:
     goals: Mapping[int, GoalConfig]
 
     def for_run(self, repeats: str, entries: Mapping[str, RecordedEntries] | None) -> Resolved:
-        """Return a copy for one run.
+        """Return a copy with the settings of one run.
 
         Args:
-            repeats: Name of the recorded rack whose run is repeated. Levels see this name as that
-                of their rack, because messages may contain it. Empty for the rack's own name.
-            entries: For a replay, what each adapter wrote in the recorded run. A replay starts no
-                host boards and contacts no other racks. None for an ordinary run.
+            repeats: Name of the recorded rack whose run is repeated. Levels see it as the name of
+                their rack, because messages may contain it. Empty for the rack's own name.
+            entries: For a replay, the messages that each adapter wrote in the recorded run, keyed
+                by task. A replay starts no host boards and contacts no other racks. None for an
+                ordinary run.
         """
         tasks = tuple(
             replace(
@@ -145,7 +148,7 @@ class Resolved:
         # faster than waking up another core. A polling board never yields its core.
         if config.is_lockstep and (yielding := [t for t in executors if t.wake != "poll"]):
             core = min(yielding, key=lambda task: (task.every, task.slot)).core
-        # Reaction of the arm to the loss of a board. None if the level below the board holds.
+        # The clock demands nothing from the arm if the level below a lost board holds by itself.
         demands = {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}
         return ClockWiring(
             lockstep=config.is_lockstep,
@@ -169,7 +172,7 @@ class Resolved:
 
     @property
     def ends_run(self) -> str | None:
-        """Name of the status mailbox whose state ends the run. None if no level ends it."""
+        """Name of the status mailbox whose state can end the run. None if no level ends the run."""
         return next(
             (f"{name}.status" for name, board in self.config.board.items() if board.ends_run), None
         )
@@ -182,7 +185,7 @@ class Resolved:
 
 
 def _examine(config: RackConfig, further: Iterable[Mistake] = ()) -> Examination:
-    """Check a config. Raises `ConfigError` with its mistakes and the `further` ones, if any."""
+    """Check a config. Raises `ConfigError` if it has mistakes or `further` is not empty."""
     commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
     examination = Examination(config, list_faults(config), commands)
     if mistakes := [*examination.mistakes, *further]:
@@ -195,8 +198,8 @@ class Examination:
 
     Args:
         config: The config, without broken tables.
-        faults: Faults to check, with their places in the config.
-        commands: Operator commands to check, with their places in the config.
+        faults: Faults to check, each preceded by its place, as in "fault[0]".
+        commands: Operator commands to check, each preceded by its place, as in "command[0]".
         broken: Tables that were removed because of known mistakes, as in "board.servo". Nothing
             that depends on them is checked.
 
@@ -216,7 +219,7 @@ class Examination:
         self._sizes: dict[str, int] = {}
         self._layout: Layout | None = None
         self.mistakes = apply_rules(self._wiring)
-        # The checks that need a layout use only the boards without mistakes.
+        # The layout, and the checks that need it, include only the boards without mistakes.
         wrong = broken.union(find_table_name(mistake.place) for mistake in self.mistakes)
         wiring = self._wiring if not wrong else Wiring(_remove_broken_boards(config, wrong), wrong)
         if wiring.tasks and not wrong & LAYOUT_NEEDS:
@@ -238,7 +241,7 @@ class Examination:
             self.mistakes = [network.move_to_adapter(mistake, config) for mistake in self.mistakes]
 
     def build_resolved_rack(self) -> Resolved:
-        """Return everything derived from the config. Call this only if there are no mistakes."""
+        """Derive all records that a launch needs. Call this only if there are no mistakes."""
         config = self._config
         layout = self._layout
         assert layout is not None, "no mistakes"
@@ -278,11 +281,11 @@ class Examination:
     def _build_task_wiring(
         self, layout: Layout, ports: TaskPorts, fails_self_test: bool
     ) -> TaskWiring:
-        """Return the wiring of a task. `fails_self_test` makes its self-test fail."""
+        """Return the wiring of a task, whose self-test fails if `fails_self_test` is set."""
         board = self._config.board[ports.place.board]
         spec = layout.find_task(ports.task)
         is_executor = spec.role == "executor"
-        # A bus adapter exchanges the mailboxes of the host side itself.
+        # A bus adapter reads and writes the mailboxes of the host side without ports.
         of_host = self._wiring.host_side_mailboxes
         from_host = self._wiring.mailboxes_from_host
         is_locked = not is_executor and is_critical(self._config, layout, spec.board)
@@ -302,7 +305,7 @@ class Examination:
             fails_self_test=fails_self_test,
             entries=None,
             exchange=build_exchanges(self._wiring, ports),
-            # Planners run below all reservations.
+            # Only executors reserve processor time.
             reservation=compute_reservation(
                 self._config, board.busy_ms if is_executor else 0.0, spec.every
             ),
@@ -312,7 +315,7 @@ class Examination:
         )
 
     def _build_board_contexts(self, wiring: Wiring) -> dict[str, LevelContext]:
-        """Return the contexts of the levels by board."""
+        """Return a dictionary from board to the context of its level."""
         every = wiring.periods
         boards = wiring.config.board
         paces = {name: Pace(every[name], board.within_cycles) for name, board in boards.items()}
@@ -332,13 +335,13 @@ class Examination:
         }
 
     def _build_context(self, name: str, params: Mapping[str, Any], **times: Any) -> LevelContext:
-        """Return the context of a level or host program. `times` are its remaining fields."""
+        """Return the context of a level or host program. `times` are its timing fields."""
         config = self._config
         return LevelContext(
             board=name,
             clock_ns=config.clock_ns,
             seed=config.seed,
-            # This is None without an arm, and then no level uses it.
+            # The robot is None only in a rack without an arm, whose levels do not use it.
             robot=cast(RobotConfig, config.robot),
             scene=config.scene,
             task=config.task,

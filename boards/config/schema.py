@@ -48,7 +48,7 @@ OnLoss = Literal["hold", "stop", "brake"]
 
 
 def _to_tuple(value: Any) -> Any:
-    """Return a single name or a list of names as a tuple."""
+    """Convert a single name or a list of names to a tuple. Return other values unchanged."""
     if isinstance(value, str):
         return (value,)
     return tuple(value) if isinstance(value, list) else value
@@ -191,7 +191,7 @@ class SupervisionConfig(Table):
     limit"""
 
     def find_restart_time(self, lockstep: bool) -> float:
-        """Return the longest simulated time in s that a restart may take."""
+        """Return the longest simulated time in s allowed for a restart."""
         return self.lockstep_restart_s if lockstep else max(RESTART_S, self.lockstep_restart_s)
 
 
@@ -259,7 +259,7 @@ class BoardConfig(PlacedConfig):
 
     @property
     def busy_ms(self) -> float:
-        """Processor time of one executor cycle in ms, as budgeted. 0 without a budget."""
+        """Budgeted processor time of one executor cycle in ms. 0 without a budget."""
         cost = self.budget
         if cost is None:
             return 0.0
@@ -280,12 +280,12 @@ class LanConfig(PlacedConfig, LanTable):
     """rate of the board [Hz]; must divide the clock rate"""
 
     def build_board(self) -> BoardConfig:
-        """Return the table of the board that this table adds to the rack."""
+        """Return this table as the table of a board, `[board.lan]`."""
         placement = {key: value for key, value in self if key not in LanTable.model_fields}
         params = self.model_dump(
             exclude_none=True, by_alias=True, include=set(LanTable.model_fields)
         )
-        # Without its adapter a rack does not know which peers are present.
+        # Without its adapter, the rack cannot know which peers are present.
         on_loss: OnLoss = "stop" if self.on_peer_loss == "stop" else "hold"
         return BoardConfig(executor=LAN_ADAPTER, params=params, on_loss=on_loss, **placement)
 
@@ -367,12 +367,12 @@ class CommandConfig(Table):
 
     @property
     def operation(self) -> Operation:
-        """Operation that the command requests."""
+        """The `Operation` that `what` names."""
         return Operation[self.what.upper()]
 
     @property
     def goals(self) -> list[Goal]:
-        """Forms of the given goals. A valid command has one goal, or none if it takes none."""
+        """Forms of the goals that the command gives. A valid command gives at most one."""
         goals = [Goal.JOINTS] if self.joints is not None else []
         if self.position is not None or self.quaternion is not None or self.direction is not None:
             goals.append(Goal.DIRECTION if self.quaternion is None else Goal.POSE)
@@ -413,7 +413,7 @@ class TaskEntry(NamedTuple):
 
     @property
     def reads_key(self) -> str:
-        """Key of the task's table that connects its ports to other mailboxes."""
+        """Key of the task's table that connects its inputs to mailboxes of the user's choice."""
         return "planner_reads" if self.role == "planner" else "reads"
 
 
@@ -460,14 +460,14 @@ class RackConfig(Table):
 
     @model_validator(mode="after")
     def _add_adapter_boards(self) -> Self:
-        """Add the board of the network adapter."""
+        """Add the board of the network adapter, if `[adapter.lan]` exists."""
         if self.adapter.lan is not None and LAN not in self.board:
             self.board[LAN] = self.adapter.lan.build_board()
         return self
 
     @property
     def format_notes(self) -> list[str]:
-        """Notes on changes made after this config's format. Empty for the newest format."""
+        """Notes on changes since this config's format. Empty if the format is the newest."""
         return [FORMAT_NOTE] if self.format < FORMAT else []
 
     @property
@@ -502,9 +502,9 @@ class RackConfig(Table):
         return compute_period_ticks(config.rate_hz or 0.0, self.clock_ns, f"level '{board}'")
 
     def list_links(self) -> Iterator[tuple[str, str]]:
-        """Yield each pair of neighbouring boards, first the upper and then the lower board.
+        """Yield each pair of neighbouring boards, as (upper, lower).
 
-        Two boards are neighbours if at least one of them names the other.
+        Two boards are neighbours if at least one of them names the other in `above` or `below`.
         """
         listed = [(name, lower) for name, board in self.board.items() for lower in board.below]
         listed += [(upper, name) for name, board in self.board.items() for upper in board.above]
@@ -544,19 +544,19 @@ class RackConfig(Table):
             yield TaskEntry(name, name, "host", host.program, OUTSIDE, ANY_CORE, 0)
 
     def get_table(self, entry: TaskEntry | TaskSpec) -> BoardConfig | HostConfig:
-        """Return the table of a task's board, or of a host board."""
+        """Return the table of the board or host board to which a task belongs."""
         return self.host[entry.board] if entry.role == "host" else self.board[entry.board]
 
     def get_rewired_ports(self, place: TaskEntry) -> Mapping[str, Sources]:
-        """Return the mailboxes to which the config connects ports of a task, by port."""
+        """Return the inputs of a task that the config rewires, with their new mailboxes."""
         sources: Mapping[str, Sources] = getattr(self.get_table(place), place.reads_key)
         return sources
 
     @property
     def outside_state(self) -> str:
-        """State outside the rack that snapshots cannot contain, as text. Empty if there is none.
+        """Description of state outside the rack, which snapshots cannot contain. Empty without any.
 
-        Such a rack repeats a run only if the recorded messages from outside enter it again.
+        A rack with such state repeats a run only if it replays the recorded outside messages.
         """
         hosts = ", ".join(map(repr, self.host))
         states = [f"{hosts}: a host program's state"] if hosts else []
@@ -564,7 +564,7 @@ class RackConfig(Table):
         return "; ".join(states)
 
     def to_toml_text(self) -> str:
-        """Return the config as TOML text that loads to the same config without further files."""
+        """Return the config as complete TOML text, which extends no other file."""
         # JSON mode cannot represent infinity and NaN, which parameters of levels may contain.
         tables = self.model_dump(exclude_none=True, by_alias=True)
         tables["python_path"] = [str(folder) for folder in self.python_path]

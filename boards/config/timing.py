@@ -43,7 +43,7 @@ def build_rack_timing(
     Args:
         config: The config of the rack.
         layout: Its layout.
-        measured: Budgets by board. None for the budgets in the config.
+        measured: Budgets, keyed by board. None to use the budgets in the config.
     """
     measured = read_budgets(config) if measured is None else measured
     goal_ms = config.timing.response_ms
@@ -71,12 +71,12 @@ def build_rack_timing(
 
 
 def compute_frames(table: ScheduleConfig, clock_ns: int) -> CyclicSchedule:
-    """Return the lengths of the frames of a static schedule, rounded to ticks."""
+    """Return the minor and major frame of a static schedule, rounded to ticks."""
     return CyclicSchedule(*(round(ms * 1e6 / clock_ns) for ms in (table.minor_ms, table.major_ms)))
 
 
 def build_inboxes(layout: Layout) -> dict[str, InboxTiming]:
-    """Return the inbox of each board that messages interrupt, by the task that serves it."""
+    """Return the inboxes of boards that messages interrupt, keyed by the task that serves them."""
     timings = {}
     for slot in dict.fromkeys(task.slot for task in layout.tasks):
         if boxes := layout.list_interrupting_mailboxes(slot):
@@ -91,9 +91,9 @@ def build_inboxes(layout: Layout) -> dict[str, InboxTiming]:
 
 
 def subtract_interrupts(timing: RackTiming, measured: Mapping[str, Budget]) -> dict[str, Budget]:
-    """Return budgets measured in a run without the time that interrupts took.
+    """Subtract the time that interrupts took from budgets measured in a run.
 
-    In lockstep interrupts take no time.
+    In lockstep interrupts take no time, so the budgets are unchanged.
     """
     if timing.is_lockstep:
         return dict(measured)
@@ -137,10 +137,10 @@ def _build_board_timing(
 
 
 def _find_read_ticks(layout: Layout, board: str) -> dict[str, TickGrid]:
-    """Return the ticks at which an executor reads messages, by their writer.
+    """Return a dictionary from writer to the ticks at which an executor reads its messages.
 
-    Writers whose messages it reads in every cycle are left out. If it reads a writer's messages at
-    several ports, the port that is read most rarely counts.
+    It contains only writers that the executor's `exchange` table concerns. If several ports read
+    messages of one writer, the least frequently read port determines the ticks.
     """
     grids: dict[str, TickGrid] = {}
     for box in layout.mailboxes:
@@ -151,7 +151,7 @@ def _find_read_ticks(layout: Layout, board: str) -> dict[str, TickGrid]:
 
 
 def compute_reservation(config: RackConfig, busy_ms: float, every: int) -> Reservation | None:
-    """Return the processor time that a task reserves under earliest deadline first.
+    """Return the processor time per period that a task reserves under earliest deadline first.
 
     Args:
         config: The config of the rack.
@@ -159,7 +159,7 @@ def compute_reservation(config: RackConfig, busy_ms: float, every: int) -> Reser
         every: Period of the task in ticks.
 
     Returns:
-        None if the task runs by its priority instead.
+        The reservation. None if the task has a fixed priority or no budget, or in lockstep.
     """
     if config.clock.scheduler == "fixed-priority" or config.is_lockstep or not busy_ms:
         return None
@@ -168,7 +168,7 @@ def compute_reservation(config: RackConfig, busy_ms: float, every: int) -> Reser
 
 
 def compute_first_tick(entry: CommandConfig | FaultConfig, clock_ns: int) -> int:
-    """Return the tick from which a command or a fault is due. -1 means at once."""
+    """Return the first tick at which a command or fault is due. -1 if it is due at once."""
     if entry.at is not None:
         return round(entry.at * 1e9 / clock_ns)
     return -1 if entry.tick is None else entry.tick
@@ -191,7 +191,7 @@ def is_critical(config: RackConfig, layout: Layout, board: str) -> bool:
 
 
 def read_budgets(config: RackConfig) -> dict[str, Budget]:
-    """Return the budgets in a config, by board. Boards without one are left out."""
+    """Return a dictionary from board to its budget in the config, for boards that have one."""
     return {
         name: Budget(
             **{part: round(getattr(board.budget, key) * NS_PER_MS) for part, key in KEYS.items()}
@@ -202,9 +202,9 @@ def read_budgets(config: RackConfig) -> dict[str, Budget]:
 
 
 def replace_budgets(config: RackConfig, measured: Mapping[str, Budget]) -> RackConfig:
-    """Return a config whose budgets are replaced by the measured ones, given by board.
+    """Return a config with the measured budgets, keyed by board, instead of its own.
 
-    A board without a measured budget has none in the result. The others keep `plan_within_ms`.
+    Boards without a measured budget have none in the result. `plan_within_ms` is kept.
     """
     boards = {}
     for name, board in config.board.items():

@@ -25,8 +25,8 @@ def parse_tables(text: str, place: str = "config") -> Tables:
     """Parse TOML text.
 
     Raises:
-        ConfigError: The text is not TOML, or contains values that no config may have, such as
-            dates, very long integers and very deep nesting. All such values are listed.
+        ConfigError: The text is not TOML, or contains values that configs must not contain, such
+            as dates, very long integers and very deep nesting. All such values are listed.
     """
     try:
         tables = load_toml(text)
@@ -43,7 +43,7 @@ def parse_tables(text: str, place: str = "config") -> Tables:
 
 
 def _find_values_out_of_bounds(where: str, value: Any, depth: int) -> Iterator[Mistake]:
-    """Yield mistakes for values that TOML permits and configs do not, such as dates and NUL."""
+    """Yield a mistake for each value that TOML permits but configs do not, such as a date."""
     if isinstance(value, dict | list) and depth >= MAX_DEPTH:
         yield Mistake(where, None, TOO_DEEP)
     elif isinstance(value, dict):
@@ -67,7 +67,7 @@ def to_toml(tables: Mapping[str, Any]) -> str:
 
 
 def _drop_empty_values(table: Mapping[str, Any]) -> Tables:
-    """Return a table without empty values, but with all values in tables that levels declare."""
+    """Return a copy of a table without empty values. Tables in `FREE_FORM` are kept unchanged."""
     filled = {key: value for key, value in table.items() if value not in ({}, [], ())}
     return {
         key: value if key in FREE_FORM else _drop_empty_items(value)
@@ -76,14 +76,14 @@ def _drop_empty_values(table: Mapping[str, Any]) -> Tables:
 
 
 def _drop_empty_items(value: Any) -> Any:
-    """Drop the empty values from `value` if it is a table, or from the tables in it."""
+    """Return a copy of a value in which tables, also inside lists, have no empty values."""
     if isinstance(value, list | tuple):
         return [_drop_empty_items(item) for item in value]
     return _drop_empty_values(value) if isinstance(value, Mapping) else value
 
 
 def merge_tables(base: Tables, top: Tables) -> Tables:
-    """Return `base` updated with `top`. Tables within them are merged key by key."""
+    """Return `base` updated with `top`. Tables that both contain are merged recursively."""
     merged = dict(base)
     for key, value in top.items():
         is_table = isinstance(value, dict) and isinstance(base.get(key), dict)
@@ -92,15 +92,15 @@ def merge_tables(base: Tables, top: Tables) -> Tables:
 
 
 def apply_settings(tables: Tables, settings: Sequence[str], mistakes: list[Mistake]) -> Tables:
-    """Return tables with settings `key.sub=value` applied in order.
+    """Return a copy of tables with settings `key.sub=value` applied in order.
 
-    Values are TOML. Text that is not TOML is taken as a string. A number in a key is an index into
+    A value is parsed as TOML. If it is not TOML, it is a string. A number in a key is an index into
     a list, as in `task.action.0.by=30`.
 
     Args:
-        tables: Tables of a config, which are not changed.
+        tables: Tables of a config.
         settings: The settings.
-        mistakes: List to which the mistakes are added. Settings without a mistake are applied.
+        mistakes: List to which mistakes are added. Settings with a mistake are not applied.
     """
     for setting in settings:
         try:
@@ -114,7 +114,10 @@ def apply_settings(tables: Tables, settings: Sequence[str], mistakes: list[Mista
 
 
 def _split_setting(setting: str) -> tuple[list[str], str]:
-    """Split a setting into keys and value text. Raises `LookupError` if it is not one."""
+    """Split `key.sub=value` into its keys and the text of its value.
+
+    Raises `LookupError` if the setting does not have this form.
+    """
     match = SETTING.fullmatch(setting)
     keys: list[str] = []
     try:
@@ -132,22 +135,25 @@ def _split_setting(setting: str) -> tuple[list[str], str]:
 
 
 def _parse_value(text: str) -> Any:
-    """Return the value of a TOML text, or the text itself if it is not TOML.
+    """Parse a TOML value. Return the stripped text itself if it is not TOML.
 
-    Raises `ConfigError` if the value is out of bounds.
+    Raises `ConfigError` if configs must not contain the value.
     """
     try:
         load_toml(f"value = {text}")
     except tomllib.TOMLDecodeError:
         return text.strip()
     except ValueError:
-        # The text is TOML, but its value is out of bounds: `parse_tables` reports why.
+        # `parse_tables` raises `ConfigError` with the reason why the value is refused.
         pass
     return parse_tables(f"value = {text}")["value"]
 
 
 def _set_value(node: Any, keys: list[str], value: Any) -> Any:
-    """Return a copy of `node` with `value` set at `keys`. Raises `LookupError` for a wrong path."""
+    """Return a copy of `node` with `value` set at `keys`.
+
+    Raises `LookupError` for a wrong list index, or for a key in a value that is not a table.
+    """
     if not keys:
         return (
             merge_tables(node, value)
@@ -170,13 +176,13 @@ def _set_value(node: Any, keys: list[str], value: Any) -> Any:
 
 
 def find_table_name(place: str) -> str:
-    """Return the table that contains a place: "board.servo" for "board.servo.rate_hz = 3"."""
+    """Return the table that contains a place, as "board.servo" for "board.servo.rate_hz"."""
     kind, *name = re.split(r"[.\[=]", place.replace("mailbox ", "board."))[:2]
     return f"{kind}.{name[0]}" if name and kind in ("board", "host") else kind
 
 
 def remove_tables(tables: Tables, broken: frozenset[str]) -> Tables:
-    """Return tables without the `broken` ones, which are named as in "robot" or "board.servo"."""
+    """Return tables without those that `broken` names, as in "robot" or "board.servo"."""
     remaining = {key: value for key, value in tables.items() if key not in broken}
     for key in ("board", "host"):
         named = remaining.get(key, {})

@@ -181,7 +181,7 @@ class AlarmReader:
         self.lost = 0
 
     def read_alarms(self) -> list[ReadAlarm]:
-        """Return the alarms since the last call, in the order of ticks and times."""
+        """Return all alarms raised since the last call, sorted by tick and then by time."""
         alarms: list[ReadAlarm] = []
         for owner, ring in self._rings.items():
             if not ring.waiting_count:
@@ -225,15 +225,16 @@ class AlarmConverter:
     def build_event(self, row: np.void, owner: str) -> Event:
         """Convert an alarm to an event.
 
-        The board of the event is the one that raised the alarm. For a fault, restart or command it
-        is the affected board.
+        `Event.board` is the board that raised the alarm, or for a fault, restart or command, the
+        board that it affects.
 
         Args:
             row: A record of type `rack.backplane.watch.alarms.RECORD`.
             owner: The task from whose ring the record was read.
 
         Raises:
-            DamageError: The record refers to something that does not exist.
+            DamageError: The record refers to a fault, command, task or other item that does not
+                exist.
         """
         alarm = to_enum(Alarm, row["code"])
         about, text = next((kind, texts[alarm]) for kind, texts in TEXTS.items() if alarm in texts)
@@ -300,7 +301,7 @@ class AlarmConverter:
         )
         tick = found_at = int(row["tick"])
         if alarm == Alarm.BRAKES_CLOSED and since < found_at:
-            # Brakes that engage while no board drives the arm are reported once a board drives it.
+            # If no board drove the arm when the brakes engaged, the alarm is raised later.
             tick = since
             text += f", known at tick {found_at}"
         return Event(
@@ -317,7 +318,13 @@ class AlarmConverter:
         )
 
     def _name_subject(self, about: About, number: int, owner: str) -> str:
-        """Return the name of the subject of an alarm. Raises `DamageError` if it does not exist."""
+        """Return the name of an alarm's subject. Raises `DamageError` if there is no such subject.
+
+        Args:
+            about: What kind of subject the alarm has.
+            number: Number of the subject.
+            owner: Task that raised the alarm.
+        """
         match about:
             case "task":
                 return self._name_task(number, CLOCK)
@@ -338,14 +345,14 @@ class AlarmConverter:
                 return ""
 
     def _format_previous_value(self, board: str, command: OperatorCommand) -> str:
-        """Return the value of a parameter before a command that sets it, as a clause.
+        """Return a clause with the value that a parameter had before a command set it.
 
-        The new value is stored as the previous value for the next such command.
+        The new value is stored, as the previous value for the next command.
         """
         try:
             key, value = read_setting(command.name)
         except LevelError:
-            # The command was not checked against the config, and the level refuses it.
+            # Another program issued the command without checking it, and the level refuses it.
             return ""
         param = self._levels[board].live.get(key)
         before = self._live.get((board, key), param and param.launched)
@@ -357,5 +364,5 @@ class AlarmConverter:
         return select_item(self._layout.processes, number, "task").name if number >= 0 else other
 
     def _format_span(self, ticks: float) -> str:
-        """Return a number of ticks as text, followed by its simulated time in ms."""
+        """Return a number of ticks as text, with the simulated time in ms in parentheses."""
         return f"{format_count(ticks, 'tick')} ({ticks * self._layout.clock_ns * 1e-6:g} ms)"

@@ -20,7 +20,7 @@ from rack.backplane.words import Head
 
 
 def remove_dead_rack(rack: str) -> bool:
-    """Remove the segment of a rack that is not running.
+    """Remove the segment of a rack if the rack is not running.
 
     Returns:
         True if this call removed a segment.
@@ -32,8 +32,8 @@ def remove_dead_rack(rack: str) -> bool:
     if rack not in list_racks():
         return False
     with suppress(FileNotFoundError):
-        # A file too short for a head is not in use: a launch gives a segment its name only when it
-        # is complete.
+        # A file that is too short for a head is not in use, because a launch names its segment only
+        # when the segment is complete.
         if find_foreign_kind(rack) is None and get_shm_path(rack).stat().st_size < HEAD_SIZE:
             unlink_segment(rack)
             return True
@@ -60,11 +60,11 @@ def remove_dead_rack(rack: str) -> bool:
 
 
 def remove_own_racks(rack: str | None = None, killed: Collection[int] = ()) -> None:
-    """Remove racks that this process has launched, whatever their state.
+    """Remove the segments of racks that this process launched, even if they are running.
 
     Args:
         rack: Name of a rack. None for all of them.
-        killed: Processes that this process has killed. Racks launched by them are removed too.
+        killed: Ids of processes that this process has killed. Their racks are removed too.
     """
     for name in list_racks() if rack is None else [rack]:
         with suppress(SegmentError):
@@ -80,7 +80,8 @@ def remove_dead_racks() -> tuple[list[str], list[str], list[str]]:
     """Remove every rack that is not running.
 
     Returns:
-        Names of the removed racks, names of racks in use, and an error for each other segment.
+        The names of the removed racks, the names of the racks in use, and an error text for each
+        segment that could not be removed.
     """
     removed = []
     in_use = []

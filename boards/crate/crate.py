@@ -81,7 +81,7 @@ LEAVE_S = 0.5
 
 
 class Crate:
-    """Parent process of all boards. It lives until the Rack closes the line or ends.
+    """Parent process of all boards. It ends when the Rack closes the line or ends.
 
     Args:
         line: Connection to the Rack.
@@ -107,7 +107,7 @@ class Crate:
 
     @property
     def _segment(self) -> Segment:
-        """Segment of the present rack. It exists only while a rack is open."""
+        """Segment of the present rack. Use it only while a rack is open."""
         assert self._opened is not None, "a rack is open"
         return self._opened
 
@@ -166,7 +166,7 @@ class Crate:
                 self._kill_boards(name)
             case Leave():
                 self._leave_rack()
-                # If the Rack is gone, `run` notices it next.
+                # If the Rack is gone, `run` detects that on its next pass.
                 with suppress(OSError):
                     self._line.send(Left())
             case Show(tick, name):
@@ -177,7 +177,7 @@ class Crate:
                 self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
 
     def _open_rack(self, opening: Open) -> None:
-        """Attach to a segment, and restore its content if the rack continues from a snapshot."""
+        """Attach to the segment of a rack. If the rack continues a run, restore its snapshot."""
         self._opened = segment = Segment.attach(opening.rack)
         note_used_files()
         set_priority(opening.priority)
@@ -189,7 +189,7 @@ class Crate:
         self._line.send(Opened(-1 if snapshot is None else snapshot.tick))
 
     def _power_on(self, name: str, wiring: TaskWiring | ClockWiring) -> None:
-        """Fork a task or the clock, or let its copy in the snapshot continue instead."""
+        """Start a task or the clock: continue its copy in the snapshot, or fork a process."""
         self._wirings[name] = wiring
         copy = self._copies_to_continue.pop(name, None)
         if copy is not None and copy.can_continue_as(wiring):
@@ -208,20 +208,20 @@ class Crate:
         self._fork_board(name, lambda segment: run_clock_board(segment, wiring, *lines))
 
     def _receive_copy_note(self) -> None:
-        """Receive the note of a board that has forked a copy, and publish the new snapshots."""
+        """Receive a board's message about its copy, and publish the number of snapshots."""
         self._shelf.receive_note(self._wirings)
         self._publish_snapshots()
 
     def _publish_snapshots(self) -> None:
-        """Write the number and size of the snapshots to the backplane."""
+        """Write the number of snapshots and their size in bytes to the backplane."""
         words = self._segment.words
         words[System.SNAPSHOTS] = len(self._shelf)
         words[System.SNAPSHOT_BYTES] = self._shelf.private_bytes
 
     def _preload_levels(self, request: Preload) -> None:
-        """Import and preload the levels that the boards share.
+        """Import and preload levels and compile the cell, so that all boards share the results.
 
-        The crate ignores mistakes of the config, which the Rack reports.
+        Mistakes in the config are ignored here, because the Rack reports them.
         """
         sys.path[:] = request.path
         compiled.on_compile = lambda function: self._line.send(Compiling(function))
@@ -231,8 +231,8 @@ class Crate:
                 continue
             self._line.send(Preloading(reference))
             with suppress(LookupError):
-                # The launcher tries the import first, because it survives a module that ends its
-                # process.
+                # The launcher tries the import in a child first, which detects a module that ends
+                # its process.
                 kind = find_class(reference, object, in_child_first=False)
                 try:
                     if issubclass(kind, Executor | Planner):
@@ -273,23 +273,23 @@ class Crate:
         self._watch_process(name, pid)
 
     def _report_fork_failure(self, name: str, why: str) -> None:
-        """Report that a board could not be forked. It counts as lost."""
+        """Mark a board that could not be forked as lost, and report it to the Rack."""
         end = Ended(name, 0, os.EX_OSERR, time.monotonic_ns(), self._mark_lost(name))
         with suppress(OSError):
             self._line.send(ForkFailed(end, f"board '{name}' cannot be forked: {why}"))
 
     def _watch_process(self, name: str, pid: int) -> None:
-        """Watch a new process of a board and report it to the Rack."""
+        """Report a new process of a board to the Rack, and watch for its end."""
         pidfd = os.pidfd_open(pid)
         self._boards[pidfd] = name, pid
-        # The Rack may have closed the line. The crate must survive that to end its boards.
+        # If the Rack has closed the line, the crate must continue, in order to end its boards.
         with suppress(OSError):
             self._line.send(Forked(name, pid))
 
     def _kill_orphans(self) -> None:
-        """Kill the processes that an ended host board has left behind, whatever their session.
+        """Kill the descendants that a host board left behind, in any session.
 
-        When it ended, they became children of the crate.
+        They became children of the crate when the host board ended.
         """
         deadline = time.monotonic() + ORPHANS_S
         while time.monotonic() < deadline:
@@ -302,10 +302,12 @@ class Crate:
                 os.waitpid(pid, os.WNOHANG)
 
     def _mark_lost(self, name: str) -> int:
-        """Mark a board as lost on the backplane, for the clock and the other boards.
+        """Mark a board as lost on the backplane, where the clock and the other boards see it.
+
+        A host board whose program is finished is not lost.
 
         Returns:
-            The tick of the loss.
+            The tick at which the board ended.
         """
         words = self._segment.words
         tick = words[System.TICK]
@@ -314,7 +316,7 @@ class Crate:
             # In lockstep the board may have finished part of a batch of cycles.
             tick = max(tick, min(block[Block.DONE] + 1, block[Block.RELEASED]))
             if self._is_host(name) and block[Block.STATE] == TaskState.ENDED:
-                # The host program is finished. Tasks, in contrast, end only with the run.
+                # Its program is finished. Only host boards can end before the run does.
                 block[Block.PID] = 0
                 return tick
             # An odd number tells the clock that a loss is being recorded.
@@ -327,7 +329,7 @@ class Crate:
                     self._segment.layout.find_task(name).slot
                 )
             words[System.LOSSES] += 1
-            # In lockstep the clock waits for the task's semaphore.
+            # In lockstep the clock may be waiting for this semaphore.
             get_done_semaphore(self._segment, name).release()
         return tick
 
@@ -342,18 +344,18 @@ class Crate:
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
 
     def _leave_rack(self) -> None:
-        """Leave the present rack: let its boards end, and kill boards that take too long."""
+        """Wait for the boards of the present rack to end, kill those that do not, and detach."""
         deadline = time.monotonic() + LEAVE_S
         for pidfd, (name, _) in self._boards.items():
             if self._is_host(name):
-                # A host program may block without a time limit, which only a signal interrupts.
+                # A host program may block without a time limit, and only a signal can interrupt it.
                 signal.pidfd_send_signal(pidfd, signal.SIGTERM)
         while self._boards and (left := deadline - time.monotonic()) > 0:
             self._reap_ended(left)
         self._kill_boards()
         while self._boards:
             self._reap_ended(None)
-        # Receive the notes that boards wrote about their copies before they ended.
+        # Receive the messages about copies that boards sent before they ended.
         while wait_readable(self._shelf.line.fileno(), 0):
             self._receive_copy_note()
         self._reap_copies()
@@ -368,20 +370,20 @@ class Crate:
             self._opened = None
 
     def _reap_copies(self, are_all: bool = False) -> None:
-        """Reap copies that have ended. If `are_all` is set, wait until all of them have."""
+        """Reap copies that have ended. If `are_all` is set, wait until all copies have ended."""
         with suppress(ChildProcessError):
             while os.waitpid(-1, 0 if are_all else os.WNOHANG)[0]:
                 continue
 
     def _reap_ended(self, timeout_s: float | None, *others: Source) -> Collection[object]:
-        """Wait until something is ready, reap boards that have ended, and receive notes on copies.
+        """Wait for an event, reap boards that have ended, and receive messages about copies.
 
         Args:
             timeout_s: Longest time to wait in s. None to wait without a limit.
-            others: Further objects to wait for.
+            others: Objects to wait for in addition to boards and messages about copies.
 
         Returns:
-            The objects that are ready.
+            All objects that are ready. Empty after the time-out.
         """
         ready = wait([self._shelf.line, *self._boards, *others], timeout_s)
         for pidfd in [pidfd for pidfd in self._boards if pidfd in ready]:
@@ -401,7 +403,7 @@ class Crate:
 
 
 def main() -> None:
-    """Serve the Rack at the other end of the inherited socket."""
+    """Run a crate that serves the Rack at the other end of the inherited socket."""
     # Ctrl-C reaches every process of the group, but only the Rack decides how the run ends.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)

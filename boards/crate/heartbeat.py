@@ -41,15 +41,15 @@ class Heartbeat:
         self._waited_at = -1
 
     def find_hanging(self) -> list[str]:
-        """Return the tasks that were newly found to hang. The system clock is called "clock"."""
+        """Return the tasks found to hang since the last call. The clock is called "clock"."""
         if self._words[System.STATE] != Run.RUNNING:
             return []
         now = time.monotonic()
         progress = {}
         for name, block in self._blocks.items():
             done = block[Block.DONE]
-            # A task is excused if it is idle because its newest release is done, if its loss is
-            # already known, or if it waits for another rack, which may take any time.
+            # A task need not make progress if its newest release is done, if it is known to be
+            # lost, or if it waits for another rack, which may take any time.
             is_idle = done == block[Block.RELEASED] or block[Block.LOST] or block[Block.AWAITS]
             progress[name] = done, is_idle
         blocks = self._blocks.values()
@@ -73,13 +73,14 @@ class Heartbeat:
         return hanging
 
     def _clock_is_stuck(self) -> bool:
-        """Return True if a clock without progress is stopped, dead or waiting.
+        """Return True if the clock makes no progress because it is stopped, dead or waiting.
 
-        A clock that is merely starved of processor time is not stuck.
+        If its process is runnable, it only lacks processor time and is not stuck.
         """
         state = read_state(self._words[System.CLOCK_PID])
         tick = self._seen[CLOCK][0]
-        # A waiting clock must be seen twice: after a pause of the whole machine it is woken soon.
+        # The clock must be found waiting twice at the same tick, because after a pause of the whole
+        # machine it wakes up soon.
         waits = state in WAITING_STATES
         is_stuck = state in STOPPED_STATES + ENDED_STATES or (waits and self._waited_at == tick)
         self._waited_at = tick if waits else -1

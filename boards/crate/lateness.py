@@ -22,18 +22,19 @@ def judge_lost_cycles(
 ) -> tuple[list[str], list[str]]:
     """Find the tasks that missed or skipped more cycles than the config permits.
 
-    Without a trace it is not known which cycles an injected fault cost. Every task may therefore
-    lose as many cycles as were due between the first effect of a fault and the end of its recovery,
-    which the fault's kind bounds. The other lost cycles are compared with the other cycles.
+    Only totals are known, not which cycles an injected fault cost. Every task may therefore lose
+    as many cycles as were due between the first effect of a fault and the latest end of recovery
+    that the fault's kind permits. Any further lost cycles must not exceed `max_missed_fraction` of
+    the cycles that were due at other times.
 
     Args:
         segment: Segment of the rack. Its boards must have finished their last cycles.
-        config: Config of the rack. Its `[supervision]` says how many cycles may be lost.
+        config: Config of the rack.
         end: Length of the run in ticks.
 
     Returns:
-        A line for each task that lost too many cycles, and a line for each task that lost too many
-        only if cycles during faults and recoveries count as well.
+        A line for each task that lost too many cycles, and a line for each task that would have
+        lost too many if cycles during faults and recoveries counted as well.
     """
     late = []
     excused = []
@@ -49,7 +50,7 @@ def judge_lost_cycles(
             recovery = find_kind(fault).compute_recovery_ticks(
                 find_board(fault, layout), layout, restart_s
             )
-            # The cycle in progress when the fault strikes may also be lost.
+            # The cycle in progress at the first effect of the fault may also be lost.
             first = max(0, fault.struck_tick - task.slice + 1)
             disturbed.append((first, min(end, fault.until + recovery)))
         excusable = min(counts.due, _count_releases(task, disturbed))
@@ -68,7 +69,7 @@ def judge_lost_cycles(
 
 
 def _count_releases(task: TaskSpec, spans: Iterable[tuple[int, int]]) -> int:
-    """Return the number of releases of a task within spans of ticks, which may overlap."""
+    """Return the number of releases of a task in the union of spans of ticks [first, end)."""
     count = 0
     reached = 0
     for first, end in sorted(spans):
@@ -82,13 +83,13 @@ def _count_releases(task: TaskSpec, spans: Iterable[tuple[int, int]]) -> int:
 def _count_permitted(due: int, fraction: float, plan: int) -> int:
     """Return how many of the due cycles may be lost.
 
-    The fraction is rounded up, so that one late cycle or plan does not fail a short run. A run in
-    which all cycles are lost fails nevertheless, unless the fraction is 1.
+    The number is rounded up to whole plans, so that one late cycle or plan does not fail a short
+    run. It is always less than `due`, unless the fraction is 1.
 
     Args:
         due: Number of cycles that were due.
         fraction: Fraction of them that may be lost.
-        plan: Number of cycles that one late plan costs.
+        plan: Number of cycles that count as lost for one late plan.
     """
     most = plan * math.ceil(fraction * due / plan)
     return most if fraction == 1 else max(0, min(most, due - 1))

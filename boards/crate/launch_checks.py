@@ -41,7 +41,7 @@ def check_realtime(plan: Resolved, segment: Segment) -> None:
 
 
 def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
-    """Yield the notes of a launch on replaced cores, refused priorities and other limits."""
+    """Yield notes on replaced cores, refused priorities and other limits of this machine."""
     config = plan.config
     yield from (*config.format_notes, *list_replaced_cores(config))
     if (network := load_network_rules(config)) is not None:
@@ -77,7 +77,7 @@ def list_launch_notes(plan: Resolved, segment: Segment) -> Iterator[str]:
 def _find_refusal(plan: Resolved, segment: Segment) -> str:
     """Return a clause that names the tasks whose real-time priority was refused.
 
-    It is empty if there are none, or in lockstep.
+    The clause is empty in lockstep, or if no priority was refused.
     """
     refused = [
         task.name
@@ -90,7 +90,7 @@ def _find_refusal(plan: Resolved, segment: Segment) -> str:
 
 
 def _list_reservations(plan: Resolved, segment: Segment) -> Iterator[str]:
-    """Yield clauses on which tasks have reserved processor time and which were refused it."""
+    """Yield clauses that name the tasks with reserved processor time and the refused ones."""
     blocks = {
         task.task: segment.get_block(task.task)
         for task in plan.tasks

@@ -46,8 +46,8 @@ NO_WINDOWS = {"MUJOCO_GL": "disable"}
 class CrateLine:
     """A running crate: connection, notifications and output of its boards.
 
-    A `Rack` closes the line that it is given. Use the line as a context to close it also if no Rack
-    is created.
+    A `Rack` closes the line that it is given. Use the line as a context manager if there may be no
+    Rack to close it.
 
     Attributes:
         line: Connection to the crate.
@@ -99,22 +99,22 @@ class CrateLine:
         return [text for line in lines for text in line.decode(errors="replace").splitlines()]
 
     def send_request(self, request: object) -> None:
-        """Send a request to the crate. Raise `LaunchError` with its output if it has ended."""
+        """Send a request. If the crate has ended, raise `LaunchError` with its last output."""
         try:
             self.line.send(request)
         except OSError:
             raise LaunchError("\n".join(self.read_output()) or "the crate has ended") from None
 
     def try_request(self, request: object) -> None:
-        """Send a request to the crate. Do nothing if the crate is gone.
+        """Send a request to the crate. Do nothing if the crate has ended.
 
-        In that case `receive_message` returns None.
+        The caller learns of the end from `receive_message`, which then returns None.
         """
         with suppress(LaunchError):
             self.send_request(request)
 
     def receive_message(self) -> object:
-        """Wait for the crate's next message and return it. None if the crate is gone."""
+        """Wait for the crate's next message and return it. None if the crate has ended."""
         return receive_or_none(self.line)
 
     def close(self, timeout_s: float) -> None:
@@ -137,13 +137,13 @@ class CrateLine:
 
 
 class WarmCrate(CrateLine):
-    """Crate for several racks in succession, which keeps what it has imported and compiled.
+    """Crate for several racks in succession, which keeps imported and compiled code.
 
-    When a Rack closes it, it only leaves that rack. Its owner ends it by `end_crate` or by using it
-    as a context.
+    When a Rack closes it, it only leaves that rack. Its owner must end it by `end_crate`, or use it
+    as a context manager.
 
     Attributes:
-        is_last: Whether it ends together with its present rack.
+        is_last: Whether the crate ends when its present rack is closed.
     """
 
     def __init__(self) -> None:
@@ -155,16 +155,17 @@ class WarmCrate(CrateLine):
 
     @property
     def is_over(self) -> bool:
-        """Whether the crate has ended, for instance because it did not leave a rack in time."""
+        """Whether the crate has ended, by request or because it did not leave a rack in time."""
         return self._is_closed
 
     def close(self, timeout_s: float) -> None:
         """Make the crate end the boards of its rack, and wait until it has done so.
 
-        If `is_last` is set, the crate itself ends as well.
+        If `is_last` is set, end the crate itself as well.
 
         Args:
-            timeout_s: Time in s after which a crate that ends is killed.
+            timeout_s: Time in s after which the crate is killed if it does not end. Used only if
+                `is_last` is set.
         """
         if self._is_closed:
             return
@@ -187,11 +188,12 @@ class WarmCrate(CrateLine):
         """Read the attributes of a level from a snapshot.
 
         Args:
-            tick: The last snapshot at or before this tick is used.
-            task: Task of the level. Empty to find only the tick of the snapshot.
+            tick: Tick. The last snapshot at or before it is read.
+            task: Task of the level. Empty to get only the tick of the snapshot.
 
         Returns:
-            The tick of the snapshot, or -1 without one, and the attributes as JSON.
+            The tick of the snapshot and the attributes as JSON. The tick is -1 if there is no such
+            snapshot.
         """
         self.try_request(Show(tick, task))
         answer: object = self
@@ -200,12 +202,15 @@ class WarmCrate(CrateLine):
         return answer or Shown(-1, "")
 
     def end_crate(self) -> None:
-        """End the crate and its snapshots."""
+        """End the crate, which drops its snapshots."""
         super().close(END_S)
 
 
 def build_environment() -> dict[str, str]:
-    """Return the environment of the crate: this process's, with settings for repeatable runs."""
+    """Return the environment of the crate.
+
+    It is the environment of this process, changed so that runs repeat exactly.
+    """
     tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
     return {
         **os.environ,

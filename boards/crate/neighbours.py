@@ -37,7 +37,7 @@ class Holder:
     tasks: tuple[str, ...]
 
     def __str__(self) -> str:
-        """Return the holder as a clause for messages."""
+        """Return the holder as a clause for error texts."""
         return (
             f"rack '{self.rack}' ({self.process}) runs {', '.join(self.tasks)} on it at"
             " real-time priority"
@@ -45,7 +45,11 @@ class Holder:
 
 
 def find_holders(ignored: str) -> dict[int, Holder]:
-    """Return the rack that occupies each core. The rack called `ignored` is left out."""
+    """Return a dictionary from each occupied core to the rack that occupies it.
+
+    Args:
+        ignored: Name of a rack that is left out.
+    """
     occupied: dict[int, Holder] = {}
     for name in list_racks():
         if name == ignored:
@@ -53,7 +57,7 @@ def find_holders(ignored: str) -> dict[int, Holder]:
         try:
             segment = Segment.attach(name)
         except SegmentError:
-            # A rack of another user or version cannot be read, but its processes show its cores.
+            # The segment of another user or version cannot be read, but the processes can be found.
             occupied = {**_find_cores_of_processes(name), **occupied}
             continue
         if segment.launcher_is_alive and not segment.words[System.LOCKSTEP]:
@@ -64,13 +68,13 @@ def find_holders(ignored: str) -> dict[int, Holder]:
 
 
 def _find_cores_of_processes(rack: str) -> dict[int, Holder]:
-    """Find the cores that a rack occupies from the names and priorities of processes."""
+    """Find the cores of a rack by its real-time processes, which are named after the rack."""
     occupied: dict[int, Holder] = {}
     for folder in Path("/proc").glob("[0-9]*"):
         pid = int(folder.name)
         # The process may have ended.
         with suppress(OSError):
-            # The kernel keeps 15 characters of a name: see `process.name_process`.
+            # The kernel truncates names to 15 characters: see `process.name_process`.
             name = (folder / "comm").read_text().strip()
             policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
             if name.startswith(f"{rack}:"[:15]) and policy in (os.SCHED_FIFO, SCHED_DEADLINE):
@@ -83,7 +87,7 @@ def _find_cores_of_processes(rack: str) -> dict[int, Holder]:
 
 
 def _find_cores_of_rack(segment: Segment) -> dict[int, list[str]]:
-    """Return the real-time tasks of a running rack by core, from its segment."""
+    """Return a dictionary from core to the real-time tasks that a running rack has on it."""
     if segment.words[System.STATE] == Run.STOPPED:
         return {}
     occupied: dict[int, list[str]] = {}
@@ -92,21 +96,21 @@ def _find_cores_of_rack(segment: Segment) -> dict[int, list[str]]:
             occupied.setdefault(task.core, []).append(task.name)
     # The config is not validated: another version of this program may have created the segment.
     clock = load_toml(segment.config).get("clock", {})
-    # If the boards were refused their priority, so was the clock.
+    # If the boards have their priorities, the clock has its priority too.
     if occupied and clock.get("priority"):
         occupied.setdefault(find_core(clock["core"]), []).append(CLOCK)
     return occupied
 
 
 def move_boards(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
-    """Move boards from occupied cores to a free one, unless the config gives their core.
+    """Move boards from occupied cores to a free core, unless the config states their core.
 
     Args:
         config: The config.
-        held: The rack that occupies each core.
+        held: Dictionary from each occupied core to the rack that occupies it.
 
     Returns:
-        The changed config and a note on each move.
+        The changed config and a line for each moved board.
     """
     free = [core for core in sorted(os.sched_getaffinity(0)) if core not in held]
     if not free or config.clock.mode == "lockstep":

@@ -33,7 +33,7 @@ from rack.levels.level import Executor, Planner, Reading, Verdict
 
 
 class OneProcess:
-    """Levels of a rack in one process. Leaving the context closes them.
+    """Levels of a rack in one process, as a context manager that closes them.
 
     Attributes:
         tick: The next tick.
@@ -64,7 +64,7 @@ class OneProcess:
 
     @classmethod
     def from_file(cls, config: str | Path, overrides: Sequence[str] = ()) -> Self:
-        """Return the levels of a config, given by name or path, with settings as in `load`."""
+        """Create the levels of a config. The arguments are those of `load`."""
         return cls(load(config, overrides))
 
     def __enter__(self) -> Self:
@@ -85,12 +85,12 @@ class OneProcess:
             task.level.close()
 
     def run(self, seconds: float) -> None:
-        """Run for `seconds` of simulated time. Exceptions of levels are passed on."""
+        """Run for `seconds` of simulated time. Exceptions raised by levels propagate."""
         self.run_ticks(round(seconds * 1e9 / self._clock_ns))
 
     def run_ticks(self, ticks: int) -> None:
-        """Run for a number of ticks. Exceptions of levels are passed on."""
-        # As in a board, garbage is not collected during cycles.
+        """Run for a number of ticks. Exceptions raised by levels propagate."""
+        # As in a board, the garbage collector must not run during cycles.
         gc.collect()
         gc.freeze()
         gc.disable()
@@ -105,7 +105,7 @@ class OneProcess:
             gc.unfreeze()
 
     def newest(self, mailbox: str) -> AnyMessage:
-        """Return a copy of the newest message that was visible in the last tick.
+        """Return a copy of the newest message that was visible in the last tick of the run.
 
         Raises:
             LookupError: The mailbox does not exist, or no message was visible.
@@ -122,7 +122,7 @@ class OneProcess:
 
     @property
     def serials(self) -> Mapping[str, int]:
-        """Serial of the newest visible message of each mailbox that has one."""
+        """Serials of the newest visible messages, keyed by mailbox, without empty mailboxes."""
         newest = {name: post.find_newest(self.tick - 1) for name, post in self._mailboxes.items()}
         return {name: entry[0] for name, entry in newest.items() if entry is not None}
 
@@ -135,8 +135,8 @@ class PrivateMailbox:
         dtype: numpy type of its messages.
         message: Message that the writer fills.
         serial: Serial of the last written message.
-        stored: Written messages that are not visible yet, and the newest visible one. Each has the
-            tick at which it becomes visible, its serial and its bytes.
+        stored: The newest visible message and those that are not visible yet, oldest first. Each is
+            a tuple of the tick at which it becomes visible, its serial and its bytes.
     """
 
     def __init__(self, spec: MailboxSpec) -> None:
@@ -147,7 +147,7 @@ class PrivateMailbox:
         self.stored: deque[tuple[int, int, bytes]] = deque(maxlen=spec.delay // spec.every + 2)
 
     def write(self, tick: int, cycle: int) -> None:
-        """Store the message if the mailbox is due at the end of the present cycle.
+        """Store the message if the mailbox is to be written at the end of this cycle.
 
         Args:
             tick: Tick at which the cycle was released.
@@ -158,7 +158,7 @@ class PrivateMailbox:
             self.stored.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
 
     def find_newest(self, tick: int) -> tuple[int, bytes] | None:
-        """Return serial and bytes of the newest message visible at `tick`. None without one."""
+        """Return the serial and bytes of the newest message visible at `tick`. None if empty."""
         for visible_at, serial, data in reversed(self.stored):
             if visible_at <= tick:
                 return serial, data
@@ -166,7 +166,7 @@ class PrivateMailbox:
 
 
 class PrivateReader:
-    """Reader of a `PrivateMailbox`. It returns messages with verdicts as a board's reader does."""
+    """Reader of a `PrivateMailbox`, with the same verdicts as the readers of a board."""
 
     def __init__(self, post: PrivateMailbox, kind: type[Message]) -> None:
         self._post = post
@@ -193,7 +193,7 @@ class PrivateTask:
     Args:
         layout: Layout of the rack.
         wiring: Wiring of the task.
-        posts: All mailboxes by name.
+        posts: All mailboxes, keyed by name.
     """
 
     def __init__(
@@ -226,12 +226,12 @@ class PrivateTask:
         self.cycle = self._run_executor if isinstance(level, Executor) else self._run_planner
 
     def _add_reader(self, values: dict[str, Any], key: str, reader: PrivateReader) -> None:
-        """Add a reader whose newest reading is stored as `values[key]`."""
+        """Add a reader. Each cycle stores its reading in `values[key]`."""
         values[key] = reader.read(-1)
         self._readers.append((values, key, reader.read))
 
     def _run_executor(self, tick: int) -> None:
-        """Run the cycle of an executor that is released at `tick`."""
+        """Run the executor's cycle that is released at `tick`."""
         self._read_inputs(tick)
         assert isinstance(self.level, Executor), "a planner plans"
         self.level.process(tick)
@@ -239,7 +239,7 @@ class PrivateTask:
         self._write_outputs(tick)
 
     def _run_planner(self, tick: int) -> None:
-        """Make a plan if the time slice of the last plan is over and the planner wants to plan."""
+        """Make a plan if the time slice of the last plan is over and `wanted` returns True."""
         if tick < self._busy_until:
             return
         self._read_inputs(tick)
@@ -250,7 +250,7 @@ class PrivateTask:
             self._write_outputs(tick)
 
     def _read_inputs(self, tick: int) -> None:
-        """Store the reading of every input in the table of its port."""
+        """Read every input and store the reading for the level."""
         for values, key, read in self._readers:
             values[key] = read(tick)
 

@@ -15,9 +15,9 @@ _LINE = re.compile(rb"[^\n]{%d}\n?|[^\n]*\n" % LONGEST_LINE)
 
 
 def split_lines(data: bytes) -> list[bytes]:
-    """Split output into complete lines with their line ends. Long lines are cut.
+    """Return the complete lines of output, each with its line end.
 
-    An incomplete line at the end is left out.
+    Long lines are split. An incomplete last line is left out.
     """
     return _LINE.findall(data)
 
@@ -42,10 +42,12 @@ class HostOutput:
         os.close(self.writer)
 
     def copy_output(self, is_over: bool = False) -> None:
-        """Copy new output, and report the number of dropped lines each time it has doubled.
+        """Copy new output to the crate's own, up to `MOST_LINES` lines in a run.
+
+        Each time the number of lines has doubled, report how many were dropped.
 
         Args:
-            is_over: Whether the board has ended, so that an incomplete last line is complete.
+            is_over: Whether the board has ended, so that an incomplete last line is copied too.
         """
         with suppress(BlockingIOError):
             self._rest += os.read(self.reader, MOST_READ)

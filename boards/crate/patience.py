@@ -19,7 +19,7 @@ PATIENCE_S = 2.0
 
 
 class ReportedWait:
-    """A wait with a time limit. If it takes long, it is reported.
+    """A wait with a time limit, which is reported as an event if it takes long.
 
     Args:
         journal: Journal to which a long wait is reported.
@@ -43,12 +43,12 @@ class ReportedWait:
         return max(0.0, min(self._report_s, self._limit_s) - self._waited_s)
 
     def restart_limit(self, limit_s: float) -> None:
-        """Start another time limit now. The times of reports do not change."""
+        """Replace the time limit by `limit_s` from now. The times of reports do not change."""
         self.limit_s = limit_s
         self._limit_s = self._waited_s + limit_s
 
     def report_if_due(self, doing: str) -> None:
-        """Report the wait if a report is due. `doing` is a clause that says what is in progress."""
+        """Report the wait if a report is due, with a clause such as "the crate is starting"."""
         if self._waited_s >= self._report_s:
             self._journal.add_event("waiting", "", f"{doing}, {self._waited_s:.0f} s so far")
             self._report_s *= 2.0
@@ -60,7 +60,7 @@ class ReportedWait:
 
 
 class PeerWaitReporter:
-    """Reports adapters that wait for another rack in lockstep. Such waits have no time limit."""
+    """Reporter of adapters that wait for another rack in lockstep, without a time limit."""
 
     def __init__(self, segment: Segment, journal: Journal) -> None:
         self._segment = segment
@@ -68,7 +68,7 @@ class PeerWaitReporter:
         self._patience: ReportedWait | None = None
 
     def report_if_due(self) -> None:
-        """Report the racks that adapters wait for, if a report is due."""
+        """Report the racks for which adapters wait, if a report is due."""
         waits = list(find_waits(self._segment))
         if not waits:
             self._patience = None
@@ -84,10 +84,10 @@ def await_open_segment(crate: CrateLine, journal: Journal, limit_s: float) -> in
     Args:
         crate: The crate.
         journal: Journal to which a long wait is reported.
-        limit_s: Time limit in s for each class.
+        limit_s: Time limit in s for each class that is preloaded.
 
     Returns:
-        Tick of the snapshot from which the rack continues. -1 without one.
+        Tick of the snapshot from which the rack continues. -1 if there is none.
 
     Raises:
         LaunchError: A class cannot be preloaded, or the time limit is exceeded.

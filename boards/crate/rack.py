@@ -43,21 +43,21 @@ WATCH_S = 0.5
 class Rack:
     """Rack of boards: launches, supervises and ends them.
 
-    Use it as a context: `with Rack.from_file("nasrem") as rack: rack.run(seconds=10)`.
+    Use it as a context manager: `with Rack.from_file("nasrem") as rack: rack.run(seconds=10)`.
 
     Args:
         config: Config of the rack.
         on_event: Function called with every `Event` in this process. During a run in the background
-            it is called in the thread of that run.
+            it is called in the background thread.
         share: Whether this rack may use cores that real-time boards of other racks occupy. If
-            False, such a launch is refused.
-        crate: A crate that was started earlier, which saves time. None to start one.
-        entries: For a replay, what each adapter wrote in the recorded run. These messages enter
-            again; host boards are not started and other racks are not contacted.
-        snapshots: When to take snapshots, which needs lockstep. None for no snapshots.
+            False, a launch on such cores is refused.
+        crate: A running crate, which makes the launch faster. None to start one.
+        entries: For a replay, the messages that each adapter wrote in the recorded run. Adapters
+            write them again. No host boards are started and no other racks are contacted.
+        snapshots: When to take snapshots, which requires lockstep. None for no snapshots.
         continues: Snapshot of `crate` from which the run continues. None to start a new run.
-        requests: Operator commands in addition to those of the config, in the order of their ticks.
-        repeats: Name of the rack whose run is repeated under another name. Levels see this name.
+        requests: Further operator commands, sorted by tick.
+        repeats: Name of the rack whose run is repeated. Levels see it as the name of their rack.
 
     Attributes:
         begins_at: Tick of the snapshot from which the run continues. -1 without one.
@@ -96,7 +96,7 @@ class Rack:
 
     @property
     def segment(self) -> Segment:
-        """Segment of the rack. It exists from the launch on."""
+        """Segment of the rack. Use it only after the launch."""
         return self._supervisor.segment
 
     @property
@@ -106,7 +106,7 @@ class Rack:
 
     @classmethod
     def from_file(cls, name_or_path: str | Path, overrides: Sequence[str] = ()) -> Self:
-        """Return the rack of a config, given by name or path, with settings `key.sub=value`.
+        """Create a rack from the name or path of a config, with settings `key.sub=value`.
 
         Raises:
             ConfigError: The config has mistakes. All of them are listed.
@@ -127,12 +127,12 @@ class Rack:
     def launch(self) -> None:
         """Power on every board except the clock, and wait until all have passed their self-tests.
 
-        If the launch fails, no process and no segment is left behind.
+        If this fails, it leaves no process and no segment behind.
 
         Raises:
             ConfigError: The config has mistakes, or the cores are occupied.
             SegmentError: The name of the rack is in use.
-            LaunchError: A board failed.
+            LaunchError: A board failed, or this machine does not permit the launch.
         """
         try:
             self._power_on()
@@ -141,13 +141,13 @@ class Rack:
             raise
 
     def _power_on(self) -> None:
-        """Carry out the steps of a launch. After an error the caller must close the rack."""
+        """Carry out the launch. If this raises an error, the caller must close the rack."""
         occupied = find_holders(self.config.name)
         self.config, moved = move_boards(self.config, occupied)
         shared = find_conflicts(self.config, occupied)
         if shared and not self._share:
             raise ConfigError([Mistake(line, None, TO_SHARE) for line in shared])
-        # Report shared cores first, because the next steps take long on them.
+        # Report shared cores first, because they slow down the next steps.
         for note in shared:
             self._journal.add_event("waiting", "", note)
         self._crate = crate = self._crate or CrateLine()
@@ -158,7 +158,7 @@ class Rack:
         )
         plan = resolve(self.config).for_run(self._repeats, self._entries)
         if self._snapshots is not None:
-            # In a replay the wiring contains the recorded messages from outside.
+            # In a replay there is no outside state: the wiring contains the recorded messages.
             why = "" if plan.is_replay else self.config.outside_state
             if self.config.clock.mode != "lockstep":
                 why = "they are taken in lockstep; add --lockstep"
@@ -196,7 +196,7 @@ class Rack:
             self._journal.add_event("ready", "", note)
 
     def _fill_tables(self, plan: Resolved, crate: CrateLine) -> None:
-        """Enter the config's faults and commands into their tables, and start hog processes."""
+        """Enter faults and commands into their tables, and start the processes of hog faults."""
         table = FaultTable(self.segment)
         before = self._continues or Continuation(0)
         for injection in plan.faults[before.faults :]:
@@ -214,9 +214,9 @@ class Rack:
             desk.add_request(request_entry)
 
     def take_over_events(self, events: Iterable[Event]) -> None:
-        """Add the events of the continued run from before its snapshot to those of this run.
+        """Add events of the continued run, from before the snapshot, to those of this run.
 
-        The outcome of this run counts them.
+        The outcome of this run includes them.
         """
         self._journal.events.extend(events)
 
@@ -238,7 +238,8 @@ class Rack:
         if self._continues is None:
             supervisor.reset_latch()
         else:
-            # The latch is in the snapshot, and earlier alarms are events of the continued run.
+            # The snapshot contains the state of the latch. Discard alarms from before it, which are
+            # events of the continued run.
             supervisor.is_armed = True
             supervisor.alarms.read_alarms()
             tick = self.begins_at
@@ -261,7 +262,7 @@ class Rack:
     def run_in_background(self, seconds: float | None = None) -> None:
         """Begin a run as `run` does and return at once, while a thread supervises the boards.
 
-        Code that holds the interpreter's lock for long delays restarts of boards, not the boards.
+        While other code holds the interpreter lock, the boards run but are not restarted.
         """
         self.start(seconds)
         # In a notebook a rack may never be closed, and the interpreter does not wait for a daemon
@@ -271,7 +272,7 @@ class Rack:
         self._thread.start()
 
     def _supervise(self) -> None:
-        """Supervise the boards until the run ends. This runs in the background thread."""
+        """Supervise the boards until the run ends, in the background thread."""
         try:
             while self.watch(WATCH_S):
                 continue
@@ -303,7 +304,7 @@ class Rack:
         return self._supervisor.watch(timeout_s)
 
     def stop(self, why: str = "stopped by its program") -> None:
-        """End the run at the next tick. May be called at any time, even by a signal handler."""
+        """End the run at the next tick. Safe to call at any time, even in a signal handler."""
         self._supervisor.stop(why)
 
     def command(
@@ -313,7 +314,7 @@ class Rack:
 
         Args:
             level: Board of the level.
-            what: The command, as in a `[[command]]` table.
+            what: The command, as under the key `what` of a `[[command]]` table.
             tick: Tick at which it is issued. None for at once.
             goal: Further keys of a `[[command]]` table, such as `joints=(...)`.
 
@@ -330,7 +331,7 @@ class Rack:
         return OperatorTable(self.segment).add_request(entry)
 
     def close(self) -> None:
-        """End the rack. No process and no segment is left behind."""
+        """End the rack, its processes and its segment."""
         atexit.unregister(self.close)
         if (crate := self._crate) is None:
             return
@@ -346,22 +347,22 @@ class Rack:
                 is_any_lost = any(self.segment.get_block(task.name)[Block.LOST] for task in tasks)
                 if is_any_lost or launched.recovery.given_up:
                     crate.try_request(PowerOff())
-                # Do not wait for a crate without boards, which may still be importing.
+                # A crate without boards may still be importing, so do not wait for it.
                 leave_s = BOARDS_END_S if launched.pids else 0.0
             crate.close(leave_s)
         finally:
-            # Remove the segment by name: the launch may have been interrupted before it was stored.
+            # Remove the segment by its name, because an interrupted launch may not have stored it.
             remove_own_racks(self.config.name)
             if self._launched is not None:
                 self.segment.close()
 
     @property
     def _supervisor(self) -> Supervisor:
-        """Supervisor of the rack. It exists from the launch on."""
+        """Supervisor of the rack. Use it only after the launch."""
         assert self._launched is not None, "the rack is launched"
         return self._launched
 
 
 def build_cell_config(config: RackConfig) -> CellConfig | None:
-    """Return the tables that the crate needs to compile the cell. None without an arm."""
+    """Return the tables from which the crate compiles the cell. None without an arm."""
     return None if config.robot is None else CellConfig(config.robot, config.scene, config.clock_ns)

@@ -28,16 +28,16 @@ UP_STATES = (TaskState.READY, TaskState.RUNNING)
 
 
 class RestartPolicy:
-    """Restart policy of a rack.
+    """Limits and order of restarts in a rack.
 
-    It counts in ticks, so that equal losses in lockstep have equal outcomes.
+    Times are ticks, so that equal losses in lockstep have equal outcomes.
     """
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
         self._config = config
         self._layout = layout
         self._restarts: dict[str, list[int]] = defaultdict(list)
-        # Names that each task depends on. The clock and host boards depend on nothing.
+        # Tasks on which each task depends. The clock and host boards depend on no task.
         self._needs: dict[str, set[str]] = defaultdict(set)
         for task in layout.tasks:
             below = config.find_boards_below(task.board)
@@ -47,10 +47,10 @@ class RestartPolicy:
             )
 
     def admit_restart(self, task: str, tick: int) -> str:
-        """Request a restart of a task that was lost at `tick`, and count it if it is permitted.
+        """Decide whether a task that was lost at `tick` may be restarted. Count the restart if so.
 
         Returns:
-            The number of the restart, as text. Empty if no more restarts are permitted.
+            Text such as "restart 1 of at most 3 in 60 s". Empty if no restart is permitted.
         """
         common = self._config.supervision
         most, within_s = common.restarts, common.within_s
@@ -69,7 +69,7 @@ class RestartPolicy:
     def sort_by_dependency(self, tasks: list[str]) -> list[str]:
         """Return the tasks in the order in which they must be restarted.
 
-        The clock comes first, lower levels come before higher ones, and executors before planners.
+        The clock precedes all others, a lower level those above it, and an executor its planner.
         """
         # A task has more dependencies than any task it depends on, so sorting by count is enough.
         return sorted(tasks, key=lambda task: len(self._needs[task]))
@@ -77,7 +77,7 @@ class RestartPolicy:
     def must_wait(self, task: str, absent: list[str]) -> bool:
         """Return True if a task on which this one depends is still absent.
 
-        A task depends on all tasks below it, and a planner also on its executor.
+        A task depends on the clock and on all tasks below it, and a planner also on its executor.
 
         Args:
             task: The task.
@@ -89,14 +89,13 @@ class RestartPolicy:
 class Recovery:
     """Recovery of lost boards.
 
-    A board is powered on again once everything that it depends on is present. It rejoins on the
-    clock's grid.
+    A lost board is powered on again when all boards on which it depends are present.
 
     Attributes:
-        wirings: Wiring of all boards and of the host boards that are not external, by name. Empty
-            before the run; until then no board is restarted.
-        faults: A line for each board that was given up.
-        given_up: Whether a board, or the crate with all boards, was given up.
+        wirings: Wirings of all boards and of the host boards that are not external, keyed by name.
+            Empty before the run, when no board is restarted.
+        faults: The reason for each board that was given up.
+        given_up: Whether the crate or a board that is not a host board was given up.
         is_beyond_help: Whether the run cannot continue.
     """
 
@@ -116,7 +115,7 @@ class Recovery:
         self._stopped: set[str] = set()
 
     def start(self, clock: ClockWiring, plan: Resolved) -> None:
-        """Power on the clock and the host boards. From now on, lost boards are restarted."""
+        """Power on the clock and the host boards, and enable restarts of lost boards."""
         self.wirings = {
             CLOCK: clock,
             **{host.board: host for host in plan.hosts if not host.is_external},
@@ -127,12 +126,12 @@ class Recovery:
                 self._crate.try_request(PowerOn(name, wiring))
 
     def record_loss(self, end: Ended, is_over: bool, record_printed: Callable[[], None]) -> None:
-        """Record the end of a board, and restart it or give it up.
+        """Record the end of a board, and schedule a restart or give the board up.
 
         Args:
             end: The crate's report on the end.
             is_over: Whether the run is over.
-            record_printed: Function that records the lines that boards have printed.
+            record_printed: Function that records all printed lines as events.
         """
         name = end.name
         is_host = isinstance(self.wirings.get(name), HostWiring)
@@ -165,31 +164,31 @@ class Recovery:
         self._record_giving_up(name, text, is_host)
 
     def record_crate_loss(self) -> None:
-        """Record that the crate, and with it every board, has ended."""
+        """Record that the crate, and therefore every board, has ended."""
         self.is_beyond_help = True
         text = "the crate ended, and all boards with it"
         self._journal.add_event("died", "crate", text, "died")
         self._record_giving_up("crate", text)
 
     def report_hanging(self, board: str, why: str = "") -> None:
-        """Record that a board hangs.
+        """Record as an event that a board hangs.
 
         Args:
             board: Name of the board.
-            why: Text appended to the event, with its separator, as in ": stopped by a signal".
+            why: Text to append to the event, as in ": stopped by a signal". May be empty.
         """
         text = f"'{board}' is not responding{why}"
         self._journal.add_event("detection", "rack", text, "hang", subject=board)
 
     def kill_hanging(self, board: str) -> None:
-        """Kill a hanging board, unless it is already being restarted. It then counts as lost."""
+        """Kill a hanging board, which then counts as lost, unless it is already being restarted."""
         if board not in (*self._waiting, *self._starting):
             self._crate.try_request(PowerOff(board))
 
     def restart_due_boards(self) -> None:
-        """Power on boards whose dependencies are present, and kill stopped host boards.
+        """Power on lost boards that need not wait for others, and kill stopped host boards.
 
-        A host board that a signal has stopped is not detected in any other way.
+        No other check detects that a signal has stopped a host board.
         """
         self._starting = [
             name
@@ -210,17 +209,17 @@ class Recovery:
                 self._crate.try_request(PowerOff(name))
 
     def _find_printed_reason(self, board: str) -> str:
-        """Return the reason that a board printed last. Empty if it has printed none."""
+        """Return the last line that a board printed about itself. Empty without any."""
         printed = (event.text for event in reversed(self._journal.events))
         return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
 
     def _record_giving_up(self, board: str, text: str, is_host: bool = False) -> None:
-        """Record that a board, or the crate, was given up.
+        """Record that a board or the crate was given up.
 
         Args:
             board: Name of the board, or "crate".
             text: The reason, which becomes a fault of the run.
-            is_host: Whether it is a host board, whose loss the run survives.
+            is_host: Whether it is a host board, which does not end the run.
         """
         self.faults.append(text)
         self.given_up |= not is_host

@@ -30,12 +30,13 @@ Wiring = TaskWiring | ClockWiring
 
 @dataclass
 class WaitingCopy:
-    """Copy of one process that waits to continue from a snapshot.
+    """Forked copy of a process, which waits in a snapshot until a run continues from there.
 
     Attributes:
         wiring: Wiring of the process.
         line: Connection to the copy.
-        pid: Process of the copy. 0 if it has continued and its successor is not known yet.
+        pid: Process id of the copy. 0 after it has continued, until the copy that replaces it is
+            known.
     """
 
     wiring: Wiring
@@ -45,7 +46,7 @@ class WaitingCopy:
     def can_continue_as(self, wiring: Wiring) -> bool:
         """Return True if the copy can continue with a wiring.
 
-        Only the context of its level may differ from its present wiring.
+        The wiring may differ from the copy's own only in the context of the level.
         """
         before = self.wiring
         if isinstance(before, TaskWiring) and isinstance(wiring, TaskWiring):
@@ -55,14 +56,14 @@ class WaitingCopy:
     def continue_as(self, wiring: Wiring, rack: str) -> int:
         """Let the copy continue as a board of a rack.
 
-        The waiting copy that replaces it reports later by a note.
+        Before it continues, it forks a waiting copy in its place, whose id arrives as a message.
 
         Args:
-            wiring: Wiring with the context that its level gets.
-            rack: Name of the rack, whose segment it attaches to.
+            wiring: Wiring that contains the new context of its level.
+            rack: Name of the rack to whose segment it attaches.
 
         Returns:
-            The process of the copy, which becomes a child of this process.
+            The process id of the copy, which becomes a child of this process.
 
         Raises:
             OSError: The copy has ended.
@@ -76,7 +77,7 @@ class WaitingCopy:
         return pid
 
     def read_attributes(self) -> str:
-        """Return the attributes of the copy's level as JSON. Empty if the copy has ended."""
+        """Return the attributes of the copy's level as JSON. Empty if the copy does not answer."""
         with suppress(EOFError, OSError):
             self.line.send(None)
             if self.line.poll(SHOW_S):
@@ -86,14 +87,15 @@ class WaitingCopy:
 
 @dataclass
 class HeldSnapshot:
-    """Snapshot of a rack before a tick.
+    """Snapshot of a rack, taken before a tick.
 
     Attributes:
         tick: The tick.
-        copies: Copies of all processes, by name.
+        copies: Copies of the rack's processes, keyed by name.
         memory: Descriptor of a file with a copy of the segment. -1 until it is received.
-        private_bytes: Memory that it does not share with other processes, as last measured.
-        is_complete: Whether all copies are present.
+        private_bytes: Memory in bytes, as last measured, that it does not share with other
+            processes.
+        is_complete: Whether the copy of the segment and all copies of processes are present.
     """
 
     tick: int
@@ -103,7 +105,7 @@ class HeldSnapshot:
     is_complete: bool = False
 
     def measure_memory(self) -> None:
-        """Measure the memory that the snapshot does not share with other processes."""
+        """Update `private_bytes`."""
         self.private_bytes = os.fstat(self.memory).st_size
         for copy in self.copies.values():
             with suppress(OSError):
@@ -120,30 +122,32 @@ class HeldSnapshot:
 
 
 class SnapshotShelf:
-    """Snapshots of a crate's racks.
+    """Snapshots of a crate's racks, limited in number and memory.
 
     Attributes:
-        line: Socket from which the crate receives notes about copies.
-        boards_line: Socket to which boards send these notes.
+        line: Socket from which the crate receives messages about copies.
+        boards_line: Socket to which boards send these messages.
     """
 
     def __init__(self) -> None:
         self.line, self.boards_line = socketpair(AF_UNIX, SOCK_SEQPACKET)
-        # In the order in which they were taken. The last one may not be whole yet.
+        # In the order in which they were taken. The last one may be incomplete.
         self._snapshots: list[HeldSnapshot] = []
         sizes = re.findall(r"MemTotal: +(\d+)", Path("/proc/meminfo").read_text())
         self._most_bytes = sum(int(kib) << 10 for kib in sizes) // MEMORY_PART
 
     @property
     def _whole_snapshots(self) -> list[HeldSnapshot]:
-        """Snapshots with copies of all processes, in the order in which they were taken."""
+        """Complete snapshots, in the order in which they were taken."""
         return [snapshot for snapshot in self._snapshots if snapshot.is_complete]
 
     def receive_note(self, wirings: Mapping[str, Wiring]) -> None:
-        """Receive the next note of a board about its copy.
+        """Receive a board's message about its copy, and add the copy to its snapshot.
+
+        A copy that replaces one that has continued only reports its process id.
 
         Args:
-            wirings: Wirings of all processes that a whole snapshot contains.
+            wirings: Wirings of all processes that a complete snapshot contains, keyed by name.
         """
         note, files = receive_note(self.line)
         if not files:
@@ -167,7 +171,10 @@ class SnapshotShelf:
             self._add_whole_snapshot(unfinished)
 
     def _add_whole_snapshot(self, snapshot: HeldSnapshot) -> None:
-        """Add a whole snapshot, replace one of the same tick, and drop others to stay in bounds."""
+        """Add a complete snapshot, which replaces one of the same tick.
+
+        Drop other snapshots if there are more than the limits of number and memory permit.
+        """
         for before in self._whole_snapshots:
             if before.tick == snapshot.tick:
                 self.drop_snapshot(before)
@@ -183,9 +190,9 @@ class SnapshotShelf:
             self.drop_snapshot(self._choose_snapshot_to_drop())
 
     def _choose_snapshot_to_drop(self) -> HeldSnapshot:
-        """Return the snapshot of the older half whose removal leaves the smallest gap.
+        """Return the snapshot in the older half whose removal leaves the smallest gap in ticks.
 
-        The newest snapshot and the one with the first tick are never chosen.
+        Neither the newest snapshot nor the one with the first tick is chosen.
         """
         held = self._whole_snapshots
         ticks = sorted(snapshot.tick for snapshot in held)
@@ -193,7 +200,7 @@ class SnapshotShelf:
         candidates = [old for old in older if old.tick != ticks[0] and old is not held[-1]]
 
         def gap(snapshot: HeldSnapshot) -> int:
-            """Return the ticks between the snapshots before and after this one."""
+            """Return the ticks from the snapshot before this one to the snapshot after it."""
             at = ticks.index(snapshot.tick)
             return ticks[min(at + 1, len(ticks) - 1)] - ticks[at - 1]
 
@@ -204,26 +211,29 @@ class SnapshotShelf:
 
     @property
     def private_bytes(self) -> int:
-        """Memory in bytes that the snapshots do not share with other processes, in total."""
+        """Total memory in bytes that the snapshots do not share with other processes."""
         return sum(snapshot.private_bytes for snapshot in self._whole_snapshots)
 
     @property
     def pids(self) -> set[int]:
-        """Processes of all copies, as far as they are known."""
+        """Known process ids of all copies."""
         return {copy.pid for held in self._snapshots for copy in held.copies.values()} - {0}
 
     def find_nearest(self, tick: int) -> HeldSnapshot | None:
-        """Return the last whole snapshot at or before `tick`. None if there is none."""
+        """Return the last usable snapshot at or before `tick`. None if there is none.
+
+        Snapshots in which a copy has ended are dropped.
+        """
         earlier = [held for held in self._whole_snapshots if held.tick <= tick]
         for snapshot in sorted(earlier, key=lambda held: held.tick, reverse=True):
-            # A line that is readable has lost its other end: that copy has ended.
+            # A readable line means that the copy at its other end has ended.
             if all(copy.pid and not copy.line.poll() for copy in snapshot.copies.values()):
                 return snapshot
             self.drop_snapshot(snapshot)
         return None
 
     def drop_snapshot(self, snapshot: HeldSnapshot) -> None:
-        """Remove a snapshot and kill its processes."""
+        """Remove a snapshot and kill its copies."""
         for copy in snapshot.copies.values():
             if copy.pid:
                 with suppress(ProcessLookupError):
@@ -237,7 +247,7 @@ class SnapshotShelf:
             self.drop_snapshot(snapshot)
 
     def close_inherited(self) -> None:
-        """Close all descriptors in a process that was forked from the crate."""
+        """Close the descriptors that a process forked from the crate does not need."""
         self.line.close()
         for snapshot in self._snapshots:
             snapshot.close()

@@ -43,8 +43,8 @@ class Supervisor:
         policy: Restart policy.
         recovery: Recovery of lost boards.
         alarms: Reader of the boards' alarms.
-        pids: Processes of the boards, by name.
-        is_armed: Whether the emergency stop, which is set at the launch, has been reset.
+        pids: Process ids of the boards, keyed by name.
+        is_armed: Whether the emergency-stop latch, which is set at the launch, has been reset.
         outcome: Outcome of the run. None while it lasts.
     """
 
@@ -104,7 +104,7 @@ class Supervisor:
                     task = select_item(self.plan.layout.tasks, rung.subject, "task")
                     self.recovery.kill_hanging(task.name)
                 elif rung.alarm == Alarm.CLOCK_STOPPED and rung.subject == self.pids.get(CLOCK):
-                    # Kill only the clock that was reported. Its successor may already be running.
+                    # Kill the clock only if it is still the reported process and not its successor.
                     self.recovery.kill_hanging(CLOCK)
             for board in self._heartbeat.find_hanging():
                 self.recovery.report_hanging(board)
@@ -121,13 +121,13 @@ class Supervisor:
         return self.outcome is None
 
     def stop(self, why: str) -> None:
-        """End the run at the next tick. May be called at any time, even from a signal handler."""
+        """End the run at the next tick. Safe to call at any time, even in a signal handler."""
         self._why_stopped = self._why_stopped or why
         self.segment.words[System.STOP_REQUEST] = 1
         os.eventfd_write(self._crate.attention, 1)
 
     def reset_latch(self) -> None:
-        """Reset the emergency-stop latch if all its inputs permit that."""
+        """Reset the emergency-stop latch, unless an input still demands a stop."""
         with suppress(EmergencyStopError):
             UtilityLines(self.segment).reset_emergency_stop()
             self.is_armed = True
@@ -138,14 +138,14 @@ class Supervisor:
         self.segment.words[System.STATE] = Run.STOPPED
 
     def _record_printed(self) -> None:
-        """Record each line that boards have printed as an event."""
+        """Record each line that boards have printed since the last call as an event."""
         for line in self._crate.read_output():
             self._journal.add_event(
                 "ready" if line.startswith(NO_SNAPSHOTS_PREFIX) else "printed", "", line
             )
 
     def _wait_for_messages(self, timeout_s: float) -> None:
-        """Wait up to `timeout_s` for an alarm or a message of the crate, and handle the message."""
+        """Wait up to `timeout_s` for an alarm or a message from the crate. Handle the message."""
         attention = self._crate.attention
         for ready in wait([self._crate.line, attention], timeout_s):
             if ready == attention:
@@ -154,7 +154,7 @@ class Supervisor:
                 self._handle_message()
 
     def _handle_message(self) -> None:
-        """Receive a message of the crate and act on it."""
+        """Receive a message from the crate and act on it."""
         message = self._crate.receive_message()
         if isinstance(message, ForkFailed):
             if self.segment.words[System.STATE] == Run.STARTING:
@@ -169,8 +169,8 @@ class Supervisor:
                 is_board = name == CLOCK or name in self.segment.map.blocks
                 is_over = self._is_stopped or self.outcome is not None
                 if is_board and not (is_over and status == 0):
-                    # If a board died before the run stopped, the restart policy decides, even if
-                    # its end is reported later.
+                    # The restart policy applies to a board that died before the run stopped, even
+                    # if its end is reported later.
                     died_before = name != CLOCK and self.segment.get_block(name)[Block.LOST]
                     is_late = self._is_stopped and not died_before
                     self.recovery.record_loss(end, is_late, self._record_printed)
@@ -178,13 +178,13 @@ class Supervisor:
                 self.recovery.record_crate_loss()
 
     def _end_run(self) -> None:
-        """Determine the outcome of the run, record it, and let the boards end."""
+        """Tell the boards that the run is over, and determine and record its outcome."""
         for rung in self.alarms.read_alarms():
             self._journal.record_event(rung.event)
         words = self.segment.words
         stop = words[System.TICK] + 1
         if planned := words[System.STOP_TICK]:
-            # A clock that did not react to a request to stop has not reached the planned end.
+            # If the clock did not react to a stop request, the run ended before its planned end.
             stop = min(stop, planned)
         if not 0 <= stop < MOST_TICKS:
             raise DamageError(f"a run of {stop} ticks")
@@ -207,7 +207,7 @@ class Supervisor:
             faults += ending.find_long_holds(events, braking_periods, stop * tick_ms)
         objects = ending.find_object_ends(self.plan.goals)
         if cause == "task done":
-            # The comparison is written so that NaN counts as too far.
+            # With this form of the comparison, NaN counts as too far.
             faults += [str(end) for end in objects if not end.off_mm <= end.tolerance_mm]
         self.end_boards()
         # Let boards finish the cycles that they have begun.

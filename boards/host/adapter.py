@@ -18,8 +18,8 @@ class Adapter(Executor):
     """Board that passes messages between the backplane and the outside.
 
     Attributes:
-        readings: Readings of its inputs, by port. They are not attributes of the level, because an
-            output may have the same name as an input.
+        readings: Readings of its inputs, keyed by port. They are not attributes of the level,
+            because an input and an output may have the same name.
     """
 
     wired_by: ClassVar[str]
@@ -37,29 +37,30 @@ class Adapter(Executor):
 
     @classmethod
     def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return the outputs that a replay writes from the recording.
+        """Return the output ports whose recorded messages a replay writes again.
 
         Args:
             params: Parameters of the adapter's board.
             layout: Layout of the rack.
 
         Returns:
-            For each such port, whether its messages are sent one by one. Empty if the adapter runs
-            normally in a replay.
+            A dictionary from each such port to whether its messages are sent one by one. Empty if
+            the adapter runs in a replay as in any other run.
         """
         return {}
 
     def attach_segment(self, segment: Segment, entries: RecordedEntries | None) -> None:
-        """Open what the adapter needs in the segment. The board calls this before the self-test.
+        """Open the mailboxes that the adapter accesses without ports.
+
+        The board calls this before the self-test.
 
         Args:
             segment: Segment of the rack.
-            entries: In a replay, the recorded messages that replace those from outside. Otherwise
-                None.
+            entries: In a replay, the recorded messages from outside, keyed by port. Otherwise None.
         """
 
     def open_connections(self) -> None:
         """Open connections to the outside.
 
-        The board has its core and priority when this is called, and threads inherit both.
+        The board has already set its core and priority, which new threads inherit.
         """

@@ -33,8 +33,8 @@ FAILED_STATUS = 1
 def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output: int) -> int:
     """Run the program of a host board in this process, which becomes the leader of a session.
 
-    It adopts the orphans of its children. When it ends, they become children of the crate, which
-    kills them.
+    Its orphaned descendants become its children. When it ends, they become children of the crate,
+    which kills them.
 
     Args:
         segment: Segment of the rack.
@@ -49,8 +49,8 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
     adopt_orphans()
     os.dup2(output, 1)
     os.dup2(output, 2)
-    # The crate ignores this signal. Here it ends the program like `sys.exit`, so that the program
-    # leaves its `with` and `finally` blocks.
+    # The crate ignores this signal, and its children inherit that. Raise `SystemExit` instead, so
+    # that the program leaves its `with` and `finally` blocks.
     signal.signal(signal.SIGTERM, _exit_on_signal)
     bus = _open_bus(segment, wiring)
     os.eventfd_write(attention, 1)
@@ -71,10 +71,10 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
 
 
 def _open_bus(segment: Segment, wiring: HostWiring) -> HostBus:
-    """Open the bus, and try again for a while if it is still claimed.
+    """Open the bus. If it is still claimed, try again for `CLAIM_S`.
 
-    Processes that the previous process of this board has forked may hold the claim until the crate
-    has killed them.
+    After a restart, processes that the program forked may keep the claim until the crate has killed
+    them.
     """
     deadline = time.monotonic() + CLAIM_S
     while True:
@@ -87,7 +87,7 @@ def _open_bus(segment: Segment, wiring: HostWiring) -> HostBus:
 
 
 def _exit_on_signal(number: int, frame: FrameType | None) -> None:
-    """Raise `SystemExit` in the program that a signal interrupts."""
+    """Raise `SystemExit`, as the handler of a signal."""
     raise SystemExit(f"ended by {signal.Signals(number).name}")
 
 

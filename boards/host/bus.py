@@ -25,20 +25,20 @@ LONGEST_S = 1e9
 
 
 class BusReceiver:
-    """Input of a program: see `HostReceiver`. The first read returns only the newest message."""
+    """Input of a host program. See `HostReceiver`."""
 
     def __init__(self, reader: DoubleBufferReader) -> None:
         self._reader = reader
 
     def read(self) -> Reading[AnyMessage]:
-        """Return the newest message, together with the unread messages before it."""
+        """Return the newest message and, except in the first read, the unread ones before it."""
         before = self._reader.serial
         reading = self._reader.peek()
         return self._reader.add_earlier(reading, before) if before else reading
 
 
 class BusSender:
-    """Output of a program: see `HostSender`.
+    """Output of a host program. See `HostSender`.
 
     Attributes:
         message: The message that the program fills and sends.
@@ -52,13 +52,17 @@ class BusSender:
         self._clear_message()
 
     def _clear_message(self) -> None:
-        """Clear the message. If messages have an id, set that of the next message."""
+        """Clear the message. If it has a field for an id, set it to the id of the next message."""
         self.message.clear()
         if COMMAND_ID in (self.message.record.dtype.names or ()):
             self.message.id = self.sent + 1
 
     def send(self) -> bool:
-        """Send a copy of the message and clear it. Return False if too many messages wait."""
+        """Send a copy of the message and clear it.
+
+        Returns:
+            False if the queue is full. The message is then neither sent nor cleared.
+        """
         is_sent = self._writer.send_message(self._bus.tick)
         if is_sent:
             self._clear_message()
@@ -73,7 +77,7 @@ class BusSender:
 class HostBus:
     """Ports and clock of one host board. Creating it claims the board for this process.
 
-    In lockstep a program is paced: it runs in turns while its adapter waits. See
+    In lockstep a program is paced: it runs only in turns, during which its adapter waits. See
     `rack.boards.host.bus_adapter`.
 
     Args:
@@ -105,14 +109,14 @@ class HostBus:
             self.close()
             raise
         self._semaphore = get_wake_semaphore(segment, wiring.board)
-        # Faults send signals to this process id. If the program runs in another PID namespace, they
-        # would strike another process, so no id is published.
+        # Faults send signals to this process id. If the program runs in another PID namespace, the
+        # id could belong to another process, so it is not published.
         self.block[Block.PID] = os.getpid() if segment.launcher else 0
         self.block[Block.WAITS_UNTIL] = 0
         self.block[Block.STATE] = TaskState.RUNNING
 
     def connect_ports(self, program: HostProgram) -> None:
-        """Give a program the objects through which its ports receive and send messages."""
+        """Set the ports of a program to objects that receive and send messages."""
         ports = vars(program)
         for port, mailbox in self._wiring.inputs.items():
             self._segment.message_classes[mailbox] = program.inputs[port].message
@@ -127,7 +131,7 @@ class HostBus:
 
     @property
     def time_s(self) -> float:
-        """Time in s since an arbitrary moment. For a paced program it is simulated time."""
+        """Monotonic time in s, with an arbitrary origin. Simulated time for a paced program."""
         return self.tick * self._wiring.context.tick_s if self._is_paced else time.monotonic()
 
     @property
@@ -139,7 +143,7 @@ class HostBus:
         """Wait until a message arrives.
 
         Args:
-            timeout_s: Longest time to wait in s. For a paced program it is simulated time.
+            timeout_s: Longest time to wait in s. Simulated time for a paced program.
 
         Returns:
             False after the time-out or at the end of the run.
@@ -160,10 +164,13 @@ class HostBus:
         return False
 
     def await_turn(self) -> None:
-        """Wait until the program may run or the run ends. In real time this returns at once."""
+        """Wait for the turn of a paced program or the end of the run.
+
+        Return at once if the program is not paced.
+        """
         block = self.block
-        # The clock must first admit the successor of a lost process. It clears LOST last, so LOST
-        # must be read first.
+        # After a restart, the clock must first readmit the board. It clears LOST as its last step,
+        # so LOST must be read first.
         while (
             self._is_paced
             and (block[Block.LOST] or block[Block.DONE] == block[Block.RELEASED])
@@ -215,7 +222,7 @@ class HostBus:
         return list(self._words[address // WORD : last // WORD])
 
     def finish(self) -> None:
-        """Record that the program is finished, as happens when its `run` returns."""
+        """Record that the program is finished. The board calls this when `run` returns."""
         self.block[Block.STATE] = TaskState.ENDED
         if self._is_paced:
             self._end_turn()

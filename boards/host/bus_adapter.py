@@ -59,9 +59,9 @@ LONGEST_S = 30.0
 
 
 class BusAdapter(Adapter):
-    """Passes mailboxes between the real-time side and host boards.
+    """Copies mailboxes between the real-time side and host boards.
 
-    Its status is done when the programs of all its host boards are finished.
+    The state in its status is DONE when the programs of all its host boards are finished.
     """
 
     params = AdapterParams
@@ -82,7 +82,7 @@ class BusAdapter(Adapter):
     def build_ports(
         cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
     ) -> ConfiguredPorts:
-        """Return an input and an output port for each entry, and the output port of the status.
+        """Return an input and an output port for each `pass` entry, and an output for the status.
 
         Args:
             params: Parameters of the adapter's board.
@@ -94,8 +94,8 @@ class BusAdapter(Adapter):
             port: Input(types.get(entry.source, AdapterEntry), entry.source)
             for port, entry in entries.items()
         }
-        # Messages that are passed exactly once need a queue. The bridge itself writes the messages
-        # to host boards.
+        # An entry that passes each message once needs a queue. The adapter writes mailboxes for
+        # host boards without these ports.
         outputs = {
             port: (QueuedOutput if entry.asynchronous else Output)(
                 types[entry.source], rests_on=inputs[port]
@@ -109,9 +109,9 @@ class BusAdapter(Adapter):
 
     @classmethod
     def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return the ports with messages of host boards, and the status.
+        """Return the ports that pass messages of host boards, and the status.
 
-        The arguments and the result are those of `Adapter.list_replayed_ports`.
+        See `Adapter.list_replayed_ports` for the arguments and the result.
         """
         hosts = {host.name for host in layout.hosts}
         sent = {
@@ -122,16 +122,16 @@ class BusAdapter(Adapter):
         return {**sent, STATUS: False}
 
     def attach_segment(self, segment: Segment, entries: RecordedEntries | None) -> None:
-        """Open the mailboxes of the host side, or in a replay the recorded messages.
+        """Open the mailboxes of the host side. In a replay, open the recorded messages instead.
 
         Args:
             segment: Segment of the rack.
-            entries: In a replay, the recorded messages by port. Otherwise None.
+            entries: In a replay, the recorded messages, keyed by port. Otherwise None.
         """
         layout = segment.layout
         hosts = {host.name for host in layout.hosts}
         board = self.context.board
-        # If the bridge was restarted, continue with what its previous process has written.
+        # After a restart, continue with the messages and counters of the previous process.
         status, tick = read_last_written(segment, f"{board}.{STATUS}")
         for port, table in self._tables.items():
             count = self._counts[port]
@@ -162,7 +162,7 @@ class BusAdapter(Adapter):
             self._statuses = ReplayedEntry(entries[STATUS], STATUS, is_sent=False)
 
     def process(self, tick: int) -> None:
-        """Exchange messages of all due entries. In lockstep, then run the programs that are due."""
+        """Exchange the messages of all due entries. In lockstep, then run the due programs."""
         for port, message in self._before.items():
             out = self.ports[port]
             (out.message if isinstance(out, Sender) else out).raw[:] = message
@@ -179,7 +179,7 @@ class BusAdapter(Adapter):
             self._write_status(self.ports[STATUS], tick)
 
     def _write_status(self, status: Status, tick: int) -> None:
-        """Write the counters and the state of the host boards to the status."""
+        """Write the counters of all entries and the state of the host boards to the status."""
         for port, count in self._counts.items():
             count.write_counts(getattr(status, port), tick)
         states = {name: block[Block.STATE] for name, block in self._hosts.items()}
@@ -189,8 +189,8 @@ class BusAdapter(Adapter):
         status.error = 0
         status.reason = ""
         if lost:
-            # Report the loss first: in lockstep the Rack may give a board up at any moment, and
-            # only the clock's confirmation comes at a determined tick.
+            # Report the loss first, because the clock records it at a tick that repeats. In
+            # lockstep the Rack may give a board up at any moment.
             status.state = State.HOLDING
             status.reason = f"host board '{lost[0]}' is lost: it is being restarted"
         elif gone:
@@ -201,9 +201,9 @@ class BusAdapter(Adapter):
 
 
 class HostTurn(ReleasedTask):
-    """Adapter's side of the turns of a host program in lockstep.
+    """Turns that an adapter gives to a host program in lockstep.
 
-    The program's side is `rack.boards.host.bus.HostBus`.
+    `rack.boards.host.bus.HostBus` is their implementation in the program's process.
     """
 
     def __init__(self, segment: Segment, host: TaskSpec) -> None:
@@ -214,10 +214,10 @@ class HostTurn(ReleasedTask):
         """If the program is due in the cycle released at `tick`, let it run until it waits.
 
         Raises:
-            CannotGoOn: The program runs too long.
+            CannotGoOn: The program has not waited within `LONGEST_S` of real time.
         """
         block = self.block
-        # A program with a later state is finished, or was given up.
+        # In a state after RUNNING, the program is finished or was given up.
         if (
             block[Block.STATE] > TaskState.RUNNING
             or block[Block.WAITS_UNTIL] > tick
@@ -238,11 +238,11 @@ class HostTurn(ReleasedTask):
                     " s of real time, and lockstep cannot continue without it"
                 )
         if block[Block.LOST]:
-            # The crate has recorded the tick of the clock, which may be later than this cycle.
+            # The crate has recorded the clock's tick, which may be later than this cycle.
             block[Block.LOST] = tick + 1
 
 
 def build_status_class(entries: Mapping[str, EntryConfig]) -> type[Status]:
-    """Return the class of a bridge's status, with a group of counters for each entry."""
+    """Return the class of an adapter's status, with a group of counters for each entry."""
     groups = {port: field(AdapterEntry, doc=f"entry {port}") for port in entries}
     return make_message("adapter_status", 1, Status, groups)

@@ -28,7 +28,7 @@ RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clea
 
 
 def declare_counter(doc: str) -> Any:
-    """Return the declaration of a counter in an adapter's status. `doc` is its meaning."""
+    """Declare a counter, whose meaning is `doc`, in the status of an adapter."""
     return field("u4", unit="1", doc=doc)
 
 
@@ -69,7 +69,7 @@ class EntryConfig(Table):
 
     @model_validator(mode="after")
     def _check_phase_and_every(self) -> Self:
-        """Check that `phase` is below `every`, and that asynchronous entries have `every` = 1."""
+        """Check that `phase` is less than `every`, which must be 1 for asynchronous entries."""
         if self.phase >= self.every:
             raise ValueError(f"phase = {self.phase}: must be less than every, {self.every}")
         if self.asynchronous and self.every > 1:
@@ -79,7 +79,7 @@ class EntryConfig(Table):
         return self
 
     def is_due(self, cycle: int) -> bool:
-        """Return True if the adapter passes messages of this entry in that cycle."""
+        """Return True if the adapter passes messages of this entry in cycle number `cycle`."""
         return cycle % self.every == self.phase
 
 
@@ -91,7 +91,7 @@ class AdapterParams(Table):
 
     @model_validator(mode="after")
     def _check_port_names(self) -> Self:
-        """Check that all names of ports are valid and differ from the fields of a status."""
+        """Check that names of ports are valid and are not reserved for fields of the status."""
         for port in self.entries:
             if not PORT.fullmatch(port) or port in RESERVED:
                 why = f"valid: a-z, 0-9 and _, except {', '.join(RESERVED)}"
@@ -100,7 +100,7 @@ class AdapterParams(Table):
 
     @classmethod
     def read_entries(cls, params: Mapping[str, Any]) -> dict[str, EntryConfig]:
-        """Return the entries in a table of parameters. Empty if the table has mistakes."""
+        """Return the entries in a table of parameters, keyed by port. Empty if it has mistakes."""
         try:
             return cls.model_validate(params).entries
         except ValidationError:
@@ -124,7 +124,7 @@ class EntryCounters:
     written: int = NEVER
 
     def restore_counts(self, record: Any, tick: int) -> None:
-        """Restore the counters from the status of an earlier cycle.
+        """Restore the counters from the last status before a restart.
 
         Args:
             record: The entry's group of fields in that status.
@@ -136,7 +136,7 @@ class EntryCounters:
         self.written = NEVER if age == NEVER else tick - age
 
     def count_passed(self, tick: int, written: int) -> None:
-        """Count a message that reaches the other side at `tick` and was written at `written`."""
+        """Count a message, written at tick `written`, that reaches the other side at `tick`."""
         self.passed += 1
         self.arrived = tick
         self.written = written
@@ -153,9 +153,7 @@ class EntryCounters:
 
 
 class InwardEntry:
-    """Entry that passes messages from the ring of a host board to a mailbox of the adapter.
-
-    Levels read that mailbox at ticks.
+    """Entry that passes messages from the ring of a host board to a mailbox that levels read.
 
     Args:
         segment: Segment of the rack.
@@ -178,9 +176,9 @@ class InwardEntry:
     def exchange_messages(
         self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> None:
-        """Take waiting messages from the ring, check them, and pass them on.
+        """Take waiting messages from the ring and pass the valid ones on.
 
-        In lockstep the messages of a program can be taken once its computing time has passed.
+        In lockstep, messages of a program wait until its computing time has passed.
 
         Args:
             read: Readings of the adapter's inputs, by port. Not used.
@@ -209,8 +207,6 @@ class InwardEntry:
 class OutwardEntry:
     """Entry that passes messages of a level to a mailbox that host boards read.
 
-    Each exchange wakes these host boards.
-
     Args:
         segment: Segment of the rack.
         mailbox: Mailbox that the adapter writes.
@@ -237,6 +233,8 @@ class OutwardEntry:
     ) -> None:
         """Copy the messages that the adapter has read, and wake the host boards that read them.
 
+        An asynchronous entry copies only new messages. Other entries repeat the newest one.
+
         Args:
             read: Readings of the adapter's inputs, by port.
             write: Output messages of the adapter, by port. Not used.
@@ -248,13 +246,15 @@ class OutwardEntry:
         for message in (*reading.earlier, reading.message):
             self._writer.message.copy_from(message)
             self._writer.write(tick)
-        # A reading does not contain the tick at which its message was written.
+        # The reading does not contain the tick at which its message was written, so get it from the
+        # mailbox.
         self._source.read(tick)
         self._count.count_passed(tick, self._source.newest)
         for block, semaphore in self._readers:
-            # In lockstep the program of the host board is now due.
+            # In lockstep this makes the program due for a turn.
             block[Block.WAITS_UNTIL] = 0
-            # Do not count further: the semaphore of a host board that never waits would overflow.
+            # Do not count above 1, or the semaphore of a host board that never waits would
+            # overflow.
             if not semaphore.value:
                 semaphore.release()
 
@@ -271,13 +271,14 @@ def read_last_written(segment: Segment, mailbox: str) -> tuple[AnyMessage | None
 
 
 class ReplayedEntry:
-    """Entry in a replay: writes the messages of the recorded run again, at the same ticks.
+    """Entry in a replay, which writes the messages of the recorded run at the same ticks.
 
     Args:
         rows: Recorded messages. See `rack.boards.wiring.MessageRows`.
         port: Port of the adapter.
-        is_sent: Whether messages are sent one by one, in order, and none may be repeated.
-        since: Tick up to which messages were already sent, before a restart of the adapter.
+        is_sent: Whether each message must be sent exactly once and in order.
+        since: Tick up to which messages were sent before the adapter was restarted. `NEVER` if it
+            was not.
     """
 
     def __init__(self, rows: MessageRows, port: str, is_sent: bool, since: int = NEVER) -> None:
@@ -289,7 +290,7 @@ class ReplayedEntry:
     def exchange_messages(
         self, read: Mapping[str, Reading[AnyMessage]], write: Mapping[str, Any], tick: int
     ) -> bool:
-        """Write the recorded messages up to this cycle.
+        """Write the recorded messages that are due in this cycle.
 
         Args:
             read: Readings of the adapter's inputs, by port. Not used.
@@ -297,7 +298,7 @@ class ReplayedEntry:
             tick: Tick at which the cycle was released.
 
         Returns:
-            True if a message was written.
+            True if at least one message was written.
         """
         out = write[self._port]
         message = out.message if self._is_sent else out

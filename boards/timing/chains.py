@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 
 def format_names(names: Sequence[str]) -> str:
-    """Return names as text. Consecutive numbers are shortened, as in "joint1 ... joint6"."""
+    """Return names as text, with consecutive numbers shortened to "joint1 ... joint6"."""
     rows: list[list[str]] = []
     for name in names:
         if rows and name == _increment_number(rows[-1][-1]):
@@ -19,20 +19,20 @@ def format_names(names: Sequence[str]) -> str:
 
 
 def _increment_number(name: str) -> str:
-    """Return the name with a number higher by one. Empty if the name has no number."""
+    """Return the name with its last number increased by 1. Empty if the name has no number."""
     match = re.fullmatch(r"(.*?)(\d+)(\D*)", name)
     return f"{match[1]}{int(match[2]) + 1}{match[3]}" if match else ""
 
 
 @dataclass(frozen=True)
 class ParallelChains:
-    """Chains of boards with equal cycles, which have a common timing.
+    """Chains of boards whose cycles are equal at each level, so that they share one result.
 
-    A rack with one board per joint has a chain for each joint, and one result for all of them.
+    An example is a rack with one board per joint, which has a chain for each joint.
 
     Attributes:
-        chains: Boards of each chain, the highest first. If there are several chains, they are all
-            combinations of the boards of each level.
+        chains: Boards of each chain, the highest first. If there are several chains, they contain
+            every combination of one board per level.
         cycles: Cycle of each level in ticks.
     """
 
@@ -41,14 +41,14 @@ class ParallelChains:
 
     @property
     def levels(self) -> tuple[str, ...]:
-        """Boards of each level, as text."""
+        """Boards of each level as text, the highest level first."""
         return tuple(
             format_names(tuple(dict.fromkeys(boards))) for boards in zip(*self.chains, strict=True)
         )
 
     @property
     def bound(self) -> int:
-        """Bound on the system response in ticks: n R_max for n levels (eq. 3.2)."""
+        """Bound on the system response in ticks (eq. 3.2): n R_max for n levels."""
         return len(self.cycles) * max(self.cycles, default=0)
 
     @property

@@ -11,16 +11,16 @@ from rack.boards.timing.system_response import find_path_mailboxes
 
 @dataclass(frozen=True)
 class CommandPath:
-    """Levels that an operator's command passes.
+    """Path of an operator's command through the levels.
 
     Attributes:
         levels: Levels from the commanded one to the lowest.
         releases: Ticks at which each level begins its cycles.
-        reads: Ticks at which each level reads the command from the level above it, the first level
-            from the operator.
-        delay: Ticks from issuing a command until it can be read.
-        is_exact: Whether all messages on the path have protocol time-slice. Then the computed
-            releases are exact if all deadlines are met, and otherwise they are bounds.
+        reads: Ticks at which each level reads the command: the first level from the operator, the
+            others from the level above.
+        delay: Ticks from issuing a command until the first level can read it.
+        is_exact: Whether all mailboxes on the path have protocol time-slice. If so, and if all
+            deadlines are met, computed releases are exact. Otherwise they are bounds.
     """
 
     levels: tuple[str, ...]
@@ -35,7 +35,7 @@ class CommandPath:
         return tuple(releases.every for releases in self.releases)
 
     def find_reading_release(self, visible_at: int) -> int:
-        """Return the first release at which the first level can read a command.
+        """Return the release at which the first level reads a command.
 
         Args:
             visible_at: Tick at which the command becomes visible to that level.
@@ -43,7 +43,7 @@ class CommandPath:
         return self.reads[0].find_tick(visible_at)
 
     def find_acting_release(self, visible_at: int) -> int:
-        """Return the release at which the lowest level acts on a command.
+        """Return the release of the cycle in which the lowest level acts on a command.
 
         Args:
             visible_at: Tick at which the command becomes visible to the first level.
@@ -56,11 +56,11 @@ class CommandPath:
         return release
 
     def compute_response(self, given: int, acts: int) -> int:
-        """Return the time in ticks from a command to the end of the cycle that acts on it.
+        """Return the time in ticks from a command to the end of the cycle that acts on the command.
 
         Args:
             given: Tick at which the command is issued.
-            acts: Release of the lowest level's cycle that acts on it.
+            acts: Release of the lowest level's cycle that acts on the command.
         """
         return acts + self.cycles[-1] - given
 
@@ -68,7 +68,7 @@ class CommandPath:
     def bound_eq_3_2(self) -> int:
         """Bound of eq. 3.2 in ticks: the number of levels times the longest cycle.
 
-        The response is measured from the release that reads the command.
+        It limits the response from the release at which the first level reads the command.
         """
         return len(self.cycles) * max(self.cycles)
 
@@ -76,14 +76,14 @@ class CommandPath:
     def sum_eq_3_3(self) -> int:
         """Bound of eq. 3.3 in ticks: the sum of the cycles.
 
-        It is valid if each cycle divides the cycle of the level above. The response is measured
-        from the release that reads the command.
+        It is valid if each cycle divides the cycle of the level above. It limits the response from
+        the release at which the first level reads the command.
         """
         return sum(self.cycles)
 
     @property
     def longest(self) -> int:
-        """Longest response in ticks: the command just misses a release and waits at every level."""
+        """Longest response in ticks, of a command that just misses a release and always waits."""
         waits = [
             compute_grid_wait(written, read)
             for written, read in zip(self.releases, self.reads[1:], strict=False)
@@ -92,7 +92,7 @@ class CommandPath:
 
 
 def find_command_paths(rack: RackTiming, layout: Layout) -> dict[str, CommandPath]:
-    """Return the longest path to the lowest level for each level that an operator can command."""
+    """Return, for each level that an operator can command, its longest path to a lowest level."""
     boxes = {box.name: box for box in layout.mailboxes}
     paths: dict[str, CommandPath] = {}
     for chain in rack.chains:

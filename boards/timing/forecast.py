@@ -22,10 +22,10 @@ class Forecast:
         rack: Data of the rack.
         system: Predicted system response.
         verdicts: Verdicts of all equations.
-        inboxes: Cost of interrupts for each board, as plain data.
+        inboxes: Worst-case cost of interrupts for each inbox, as plain data.
         frames: Distinct frames of each core in a static schedule.
         notes: Limits of the prediction, one sentence each.
-        uncounted: Boards, planners and host boards that are not included, with the reasons.
+        uncounted: Dictionary from each task or host board that is not included to the reason.
     """
 
     rack: RackTiming
@@ -62,11 +62,11 @@ class Forecast:
 
     @property
     def holds(self) -> bool:
-        """Whether the rack satisfies every equation and criterion."""
+        """Whether all verdicts hold."""
         return all(verdict.holds for verdict in self.verdicts)
 
     def to_document(self) -> dict[str, Any]:
-        """Return the forecast as plain data, for JSON. Times named `_ns` are wall-clock times."""
+        """Return the forecast as plain data for JSON. Keys ending in `_ns` are wall-clock times."""
         rack = self.rack
         schedule = None
         if rack.schedule is not None:
@@ -88,9 +88,9 @@ class Forecast:
 
 
 def _list_uncounted(rack: RackTiming) -> dict[str, str]:
-    """Return the tasks that the forecast does not include, each with the reason."""
+    """Return a dictionary from each task that the forecast does not include to the reason."""
     counted = {task.name for task in rack.tasks if task.cost_ns}
-    # A budget with an update but no planning time does not include a plan.
+    # A planner whose budget has no planning time is not counted, even if it has an update.
     counted -= {f"{b.name}.planner" for b in rack.boards.values() if not b.is_plan_budgeted}
     reasons = {name: NO_BUDGET for name in rack.cores if name not in counted}
     if rack.clock.name in reasons:
@@ -99,7 +99,7 @@ def _list_uncounted(rack: RackTiming) -> dict[str, str]:
 
 
 def _list_notes(rack: RackTiming, has_cores: bool) -> Iterator[str]:
-    """Yield the limits of the prediction, one sentence each."""
+    """Yield a sentence for each limit of the prediction."""
     if queues := [
         queue for rank in rack.ranks for name in rank for queue in rack.boards[name].queues
     ]:

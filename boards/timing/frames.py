@@ -1,9 +1,9 @@
-"""Static cyclic schedules: places of the boards in the minor frames of a major frame.
+"""Static cyclic schedules: positions of the boards in the minor frames of a major frame.
 
 The terms are from T. P. Baker and A. Shaw, *The Cyclic Executive Model and Ada*, Real-Time
 Systems 1 (1989). A board's cycle is a whole number of minor frames and divides the major frame. Its
-phase is its place in them. Boards with places in the same tick run in the order of their
-priorities. Planners have no place and run in the slack.
+phase is its position in them. Boards with the same position run in the order of their priorities.
+Planners have no position and run in the slack.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from rack.boards.timing.schedule import Span, simulate_schedule
 from rack.boards.timing.tasks import TimedTask
 
 Work = dict[tuple[str, int], list[Span]]
-"""Spans of every job in order of time. The key is the job's task and its release time in ns."""
+"""Spans of every job, sorted by time, keyed by the job's task and its release time in ns."""
 
 
 @dataclass(frozen=True)
 class FramePlace:
-    """Place of a board in a frame. Times are in ns from the start of the frame.
+    """Position of a board in a frame. Times are in ns from the start of the frame.
 
     Attributes:
         board: The board.
         offset_ns: Time at which it begins.
         job_ns: Its budget with two context switches.
         limit_ns: Time at which it must be done.
-        slack_ns: Time from its end to the limit. If negative, the processor time that it still
-            needs at the limit.
+        slack_ns: Time from its end to the limit. If it is not done by the limit, minus the
+            processor time that it still needs.
         until: Board that begins at the limit. Empty if the frame ends at the limit.
     """
 
@@ -46,12 +46,12 @@ class FramePlace:
 
 @dataclass(frozen=True)
 class CoreFrames:
-    """Frames of one core in which the same boards have the same places.
+    """Frames of one core that are equal: the same boards have the same positions.
 
     Attributes:
         core: The core.
         frames: Numbers of these minor frames within the major frame.
-        places: The places of the boards.
+        places: The positions of the boards.
     """
 
     core: int
@@ -59,7 +59,7 @@ class CoreFrames:
     places: tuple[FramePlace, ...]
 
     def to_document(self) -> dict[str, Any]:
-        """Return the frames as plain data, for JSON. Times are in ms."""
+        """Return the frames as plain data for JSON. Times are in ms."""
         names = ("offset", "job", "limit", "slack")
         places = [
             {
@@ -75,8 +75,8 @@ class CoreFrames:
 def compute_core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
     """Return the distinct frames of each core. Empty without a static schedule.
 
-    The frames are taken from the second major frame, so that they include the effect of boards that
-    are late in the first one.
+    The frames are those of the second major frame, so that they show the effect of boards that are
+    late in the first one.
     """
     if rack.schedule is None:
         return ()
@@ -101,7 +101,7 @@ def compute_core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
 def _list_places(
     tasks: Sequence[TimedTask], work: Work, start: int, minor: int
 ) -> Iterator[FramePlace]:
-    """Yield the places of one core's tasks in one frame.
+    """Yield the positions of one core's tasks in one frame, sorted by time.
 
     Args:
         tasks: Tasks of the core.
@@ -122,7 +122,7 @@ def _list_places(
         is_last = not later or later[0][0] > release
         spans = work[board, release]
         done = sum(min(s.end_ns, limit) - s.start_ns for s in spans if s.start_ns < limit)
-        # A job that is not done by the limit counts as ending at the limit.
+        # Treat a job that is not done by the limit as ending at the limit.
         end = spans[-1].end_ns if done == cost_ns else limit
         begins = max(begins, release)
         yield FramePlace(

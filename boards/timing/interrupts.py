@@ -15,8 +15,8 @@ class InboxTiming:
     Attributes:
         task: Task that serves the inbox.
         mailboxes: Mailboxes whose messages interrupt the board.
-        sources: Their periods and service times in ns of simulated time, in the same order. A
-            mailbox that is not written in every cycle counts as if it were.
+        sources: Their periods and service times in ns of simulated time, in the same order. The
+            model assumes that each mailbox is written in every cycle of its writer.
         depth: Largest number of pending interrupts.
     """
 
@@ -26,16 +26,16 @@ class InboxTiming:
     depth: int
 
     def compute_cost_ns(self, span_ns: int) -> int:
-        """Return the processor time in ns of all interrupts that can arrive within `span_ns`."""
+        """Return the longest processor time in ns of interrupts that arrive within `span_ns`."""
         return sum(source.service_ns * -(-span_ns // source.every_ns) for source in self.sources)
 
     @property
     def burst(self) -> Burst:
-        """Worst case, in which all sources send at once."""
+        """Worst case, in which all sources send at the same time."""
         return compute_burst(self.sources)
 
     def to_document(self, cycle_ns: int) -> dict[str, Any]:
-        """Return the worst case as plain data, for JSON. `cycle_ns` is the cycle of the board."""
+        """Return the worst case as plain data for JSON. `cycle_ns` is the slice of the task."""
         burst = self.burst
         return {
             "task": self.task,

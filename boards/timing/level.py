@@ -34,7 +34,7 @@ class BoardTiming:
         plan_within_ns: Longest time for a new plan that the config accepts. None without a limit.
         queues: Queues that it reads.
         phase: Tick of the first release.
-        reads: Ticks at which it reads the messages of another board, by that board. Boards whose
+        reads: Ticks at which it reads messages, keyed by the board that writes them. Boards whose
             messages it reads in every cycle are left out.
     """
 
@@ -63,7 +63,7 @@ class BoardTiming:
 
     @property
     def is_plan_budgeted(self) -> bool:
-        """Whether the budget contains planning time. It does not if a measured run had no plan."""
+        """Whether the budget contains planning time. A run without plans measures none."""
         return self.has_planner and self.budget is not None and self.budget.plan_ns > 0
 
     @property
@@ -116,7 +116,7 @@ class LevelTiming:
 
     @property
     def executor_planner_ns(self) -> int:
-        """t_executor-planner of eqs 3.9 and 3.10: C + U. Both fall into the worst cycle."""
+        """t_executor-planner of eqs 3.9 and 3.10: C + U. The worst cycle contains both."""
         return self.exchange_ns + self.update_ns
 
     @property
@@ -134,7 +134,7 @@ class LevelTiming:
 
     @property
     def slice_ns(self) -> int | None:
-        """Time from a planner's release until its plan is available, d R_i. None without a plan."""
+        """Time d R_i from a planner's release until its plan is available. None without a plan."""
         return None if self.within_cycles is None else self.within_cycles * self.cycle_ns
 
     def to_document(self) -> dict[str, Any]:

@@ -34,12 +34,12 @@ class RackTiming:
             processor times.
         clock_ns: Length of a tick in ns of simulated time.
         clock: Task of the system clock, released every tick. Its cost is 0 if it is not known.
-        boards: Boards by name.
+        boards: Boards, keyed by name.
         context_switch_ns: t_cs, the time of one context switch.
         small_share: Largest fraction of a cycle that eq. 3.10 accepts as small.
         response_goal_ns: Goal for the system response in ns of simulated time. None without a goal.
-        inboxes: Inboxes of boards that messages interrupt, by task. Budgets do not include the time
-            of interrupts.
+        inboxes: Inboxes of boards that messages interrupt, keyed by task. Budgets do not include
+            the time of interrupts.
         schedule: Static cyclic schedule. None if the rack has none.
     """
 
@@ -60,7 +60,7 @@ class RackTiming:
         return self.clock.every_ns
 
     def replace_board(self, board: str, **changes: Any) -> RackTiming:
-        """Return a copy of the rack in which fields of one board have other values."""
+        """Return a copy of the rack in which `changes` replace fields of one board."""
         return replace(self, boards={**self.boards, board: replace(self.boards[board], **changes)})
 
     @cached_property
@@ -73,7 +73,7 @@ class RackTiming:
         return tuple(chain for name in lowest for chain in self._list_chains((name,)))
 
     def _list_chains(self, lower_end: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-        """Yield every chain that ends with these boards."""
+        """Yield every chain from a highest level down to and including `lower_end`."""
         above = self.boards[lower_end[0]].above
         if not above:
             yield lower_end
@@ -82,10 +82,10 @@ class RackTiming:
 
     @cached_property
     def chain_groups(self) -> tuple[ParallelChains, ...]:
-        """All chains in groups with equal timing.
+        """All chains, grouped by timing.
 
-        Chains with equal cycles form one group if they are all combinations of their boards.
-        Otherwise each of them is a group.
+        Chains with equal cycles form one group if they contain every combination of one board per
+        level. Otherwise each of them is a group.
         """
         by_cycles: dict[tuple[int, ...], list[tuple[str, ...]]] = {}
         for chain in self.chains:
@@ -99,7 +99,7 @@ class RackTiming:
 
     @property
     def hierarchy(self) -> ParallelChains:
-        """Chains with the longest response to a command. Empty if no board is above another."""
+        """Group of chains with the longest response to a command. Empty if there are no chains."""
         return max(
             self.chain_groups, key=self.compute_command_ticks, default=ParallelChains((), ())
         )
@@ -113,11 +113,10 @@ class RackTiming:
         return max((self.compute_response_ticks(chain[::-1]) for chain in chains.chains), default=0)
 
     def compute_response_ticks(self, boards: Sequence[str]) -> int:
-        """Return the longest response along a sequence of boards in ticks.
+        """Return the longest response, in ticks, along a sequence of boards.
 
         It lasts from the release of the first board to the end of the cycle in which the last board
-        acts. Each level takes one cycle (eq. 3.3), and each message waits until its reader reads
-        it.
+        acts: one cycle of each level (eq. 3.3), and the time that each message waits to be read.
 
         Args:
             boards: Names of the boards, in the order in which the information flows.
@@ -131,9 +130,9 @@ class RackTiming:
 
     @cached_property
     def ranks(self) -> tuple[tuple[str, ...], ...]:
-        """Boards of all chains by rank, the highest rank first.
+        """Boards of all chains, grouped by rank, from the top down.
 
-        The rank of a board is its position in the longest chain that leads down to it.
+        The rank of a board is the length of the longest chain of boards above it.
         """
         depth: dict[str, int] = {}
         for chain in self.chains:
@@ -145,11 +144,11 @@ class RackTiming:
 
     @cached_property
     def longest_cycles(self) -> dict[str, float]:
-        """R_max by board: the longest cycle in ticks that a level may have.
+        """R_max of each board: the longest cycle, in ticks, that its level may have.
 
-        With a goal for the response it is R_s / n (eq. 3.2), where n is the number of levels in the
-        longest chain through the board. Otherwise it is the longest cycle in the hierarchy of the
-        board. For a board without neighbours it is its own cycle.
+        If there is a goal R_s for the response, R_max is R_s / n (eq. 3.2), where n is the number
+        of levels in the longest chain through the board. Otherwise R_max is the longest cycle in
+        the board's hierarchy. For a board without neighbours it is the board's own cycle.
         """
         longest = {name: float(board.every) for name, board in self.boards.items()}
         if self.response_goal_ns is None:
@@ -163,7 +162,7 @@ class RackTiming:
         return longest
 
     def build_level(self, board: str) -> LevelTiming:
-        """Return the timing of a level. Raises `KeyError` for a board without a budget."""
+        """Return the timing of a board's level. Raises `KeyError` if the board has no budget."""
         table = self.boards[board]
         budget = table.budget
         if budget is None:
@@ -186,9 +185,9 @@ class RackTiming:
         )
 
     def compute_interrupted_ns(self, task: str) -> int:
-        """Return the processor time in ns that interrupts take from one cycle or plan of a task.
+        """Return the processor time in ns that interrupts take during one cycle or plan of a task.
 
-        0 if the task does not serve an inbox.
+        It is 0 if the task does not serve an inbox.
         """
         inbox = self.inboxes.get(task)
         return (
@@ -206,7 +205,7 @@ class RackTiming:
 
     @cached_property
     def levels(self) -> dict[str, LevelTiming]:
-        """Timing of every level that has a budget, by board."""
+        """Timing of every level that has a budget, keyed by board."""
         return {
             name: self.build_level(name)
             for name, board in self.boards.items()
@@ -215,7 +214,7 @@ class RackTiming:
 
     @cached_property
     def tasks(self) -> tuple[TimedTask, ...]:
-        """Tasks of the clock, if its cost is known, and of every board that has a budget."""
+        """The clock, if its cost is known, and the tasks of every board that has a budget."""
         clock = (self.clock,) if self.clock.cost_ns else ()
         return (
             *clock,
@@ -223,7 +222,7 @@ class RackTiming:
         )
 
     def _build_tasks(self, board: BoardTiming) -> list[TimedTask]:
-        """Return a board's executor and, if it has one, its planner. Empty without a budget."""
+        """Return the executor and any planner of a board. Empty without a budget."""
         budget = board.budget
         if budget is None:
             return []
@@ -288,12 +287,12 @@ class RackTiming:
 
 
 def _drop_empty_parts(*parts: Part) -> tuple[Part, ...]:
-    """Return the parts that take any time."""
+    """Return the parts whose time is not 0."""
     return tuple(part for part in parts if part.time_ns)
 
 
 def compute_grid_wait(written: TickGrid, read: TickGrid) -> int:
-    """Return the longest time in ticks from writing a message until its reader reads it.
+    """Return the longest time in ticks for which a visible message waits to be read.
 
     Args:
         written: Ticks at which messages become visible.

@@ -50,7 +50,7 @@ def compute_response_time(
     sharing: Sequence[Load],
     horizon: int,
 ) -> int | None:
-    """Compute the longest time from the release of a job to its end.
+    """Compute the longest time in ns from the release of a job to its end.
 
     Releases do not queue: a late task takes the newest release and skips the others. A job
     therefore never waits for an earlier job of its task, and a response longer than the period is a
@@ -58,26 +58,26 @@ def compute_response_time(
 
     Args:
         cost: Processor time of the job.
-        above: Tasks of higher or equal priority on the core. Each delays the job by whole jobs.
-        blocking: Longest part of a task of lower priority that cannot be preempted.
-        sharing: Tasks under ordinary scheduling that take turns with this one. While the job waits,
-            each of them runs at most as long as the job plus one turn. This assumes fair turns,
-            which Linux does not guarantee.
+        above: Tasks of higher or equal priority on the core, whose jobs precede this one.
+        blocking: Longest time for which a task of lower priority cannot be preempted.
+        sharing: Tasks under ordinary scheduling that take turns with this one. Each of them is
+            assumed to delay the job by at most the job's own cost and one turn. Linux does not
+            guarantee such fair turns.
         horizon: Time after which the search ends.
 
     Returns:
-        The time, or None if there is no bound or none within the horizon.
+        The time. None if there is no bound, or if it exceeds the horizon.
     """
-    # A bound exists below full load, but near full load the search for it may take too long.
+    # At full load there is no bound. Just below it, the search for the bound may take too long.
     if cost and sum(Fraction(*load) for load in above) >= 1:
         return None
 
     def work(until: int) -> int:
-        """Return the work that must be done before the job ends if it ends at `until`."""
+        """Return the processor time that is needed before the job can end at `until`."""
         turns = sum(min(_sum_released_work(until, load), cost + TURN_NS) for load in sharing)
         return blocking + cost + turns + sum(_sum_released_work(until, load) for load in above)
 
-    # The job ends at the smallest time at which all work released before that time is done.
+    # The job ends at the earliest time at which all work released before that time is done.
     end = blocking + cost
     for _ in range(MAX_STEPS):
         if end > horizon:
@@ -103,9 +103,9 @@ def _compute_scheduled_responses(
     never delays another.
 
     Returns:
-        The times by task. Empty if the schedule is not exact: if there are planners, which may plan
-        at any release; if tasks of equal priority wait at the same time, so that their order is not
-        fixed; if a deadline is missed; or if the schedule is too long.
+        The times in ns, keyed by task. Empty if the schedule is too long or not exact. It is not
+        exact if there are planners, which may plan at any release, if tasks of equal priority wait
+        at the same time, so that their order is not fixed, or if a deadline is missed.
     """
     period = lcm(*(task.period_ns for task in tasks))
     first = max(task.phase_ns for task in tasks)
@@ -175,8 +175,8 @@ def compute_task_responses(
     (priority 0) take turns.
 
     The bound is exact for tasks of different priorities without blocking. It ignores that a job's
-    own parts may not be preemptible. On a core with phases the repeating schedule gives exact
-    times.
+    own parts may not be preemptible. On a core whose tasks have phases, the times come from the
+    simulated schedule if it is exact.
     """
     busy = [task for task in tasks if task.cost_ns]
     exact: dict[str, int] = {}
@@ -220,15 +220,15 @@ def compute_job_ns(task: TimedTask, context_switch_ns: int) -> int:
 
 
 def merge_parts(task: TimedTask, context_switch_ns: int) -> TimedTask:
-    """Return a copy of a task whose job, with its context switches, is one single part."""
+    """Return a copy of a task whose job is a single part that includes the context switches."""
     return replace(task, parts=(Part(Unit.PROCESS, compute_job_ns(task, context_switch_ns)),))
 
 
 def compute_blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
-    """Return the longest wait in ns of a task for a task of lower priority on its core.
+    """Return the longest time in ns for which a task waits for lower priorities on its core.
 
-    It waits for one plan update that began before its release, if the ceiling of the update is at
-    least the priority of this task (eq. 3.10).
+    It is the time of one plan update that began before the task's release and whose ceiling is at
+    least the task's priority (eq. 3.10).
     """
     below = (t for t in tasks if t.core == task.core and t.priority < task.priority <= t.ceiling)
     locked = (part.time_ns for t in below for part in t.parts if not part.preemptible)
@@ -247,5 +247,5 @@ def compute_loads(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[in
 
 
 def _compute_demand(task: TimedTask, context_switch_ns: int) -> Load:
-    """Return the demand of a task on its core, including context switches."""
+    """Return the cost of a task's job, including context switches, and the task's period."""
     return compute_job_ns(task, context_switch_ns), task.period_ns

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 Variants = Mapping[str, Sequence[Sequence[Part]]]
-"""Parts of tasks whose cycles differ, by task: one sequence for each cycle, used in rotation."""
+"""Parts of tasks whose cycles differ, keyed by task: sequences that cycles use in rotation."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Job:
-    """Work of one release. The job of a release that a late executor skipped never ends.
+    """Work of one release. If a late executor skips the release, its job never ends.
 
     Attributes:
         task: Name of the task.
@@ -56,7 +56,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Chart:
-    """Schedule between two times. Spans and jobs are in order of time."""
+    """Schedule between two times, with spans and jobs sorted by time."""
 
     start_ns: int
     end_ns: int
@@ -64,8 +64,8 @@ class Chart:
     jobs: tuple[Job, ...]
 
     def list_late_jobs(self, task: str) -> list[Job]:
-        """Return the jobs of a task that missed their deadlines, including unfinished jobs."""
-        # An unfinished job also misses a deadline at the very end of the chart.
+        """Return the jobs of a task, finished or not, that missed their deadlines."""
+        # An unfinished job has also missed a deadline that coincides with the end of the chart.
         unfinished = self.end_ns + 1
         return [
             job
@@ -75,10 +75,10 @@ class Chart:
         ]
 
     def cut_window(self, start_ns: int, end_ns: int) -> Chart:
-        """Return the part of the chart between two times. Spans are cut at them, jobs are not.
+        """Return the part of the chart between two times.
 
-        A job belongs to the window if it is released in it, or if it is unfinished or not yet due
-        at its start.
+        Spans are cut at both times. Jobs are kept whole: those released in the window, and earlier
+        ones that are unfinished or not yet due at its start.
         """
         spans = tuple(
             replace(span, start_ns=max(span.start_ns, start_ns), end_ns=min(span.end_ns, end_ns))
@@ -108,7 +108,7 @@ def simulate_schedule(
         tasks: The tasks, on any cores. Each is first released at its phase.
         until_ns: End of the schedule.
         context_switch_ns: Time of one context switch.
-        variants: Parts of tasks whose cycles differ. Other tasks use `TimedTask.parts`.
+        variants: Parts of tasks whose cycles differ. None if every task uses `TimedTask.parts`.
     """
     runners = [
         _TaskSimulation(task, context_switch_ns, (variants or {}).get(task.name, (task.parts,)))
@@ -127,7 +127,7 @@ def simulate_schedule(
 
 
 def _simulate_core(runners: list[_TaskSimulation], until_ns: int) -> None:
-    """Simulate the tasks of one core, from one possible preemption to the next."""
+    """Simulate the tasks of one core, choosing the task to run at each release or end of a part."""
     now = 0
     while now < until_ns:
         ready = [runner for runner in runners if runner.ready_at <= now]
@@ -160,19 +160,19 @@ class _TaskSimulation:
         self._steps: list[Part] = []
         self._spent_ns = 0
         self._release = -1
-        # Largest age of the release of the next job. A planner is never late for its first plan.
+        # Largest age in ns of a release that the next job may take. The first job takes the newest.
         self._slack_ns = 0
         self._ends: dict[int, int | None] = {}
 
     def get_sort_key(self) -> tuple[int, bool, int, str]:
-        """Return a sort key for ready tasks. The task with the smallest key runs."""
+        """Return the key by which ready tasks are sorted. The task with the smallest key runs."""
         is_locked = self._spent_ns > 0 and not self._steps[0].preemptible
         priority = max(self.task.priority, self.task.ceiling) if is_locked else self.task.priority
-        # A protected part that has begun precedes tasks of the same priority released since.
+        # Once begun, a part that is not preemptible precedes other tasks of equal priority.
         return -priority, not is_locked, self.ready_at, self.task.name
 
     def run_step(self, now_ns: int, until_ns: int) -> int:
-        """Run the task from `now_ns` until a part ends or `until_ns`, and return that time."""
+        """Run the task from `now_ns` to the end of a part or `until_ns`, and return that time."""
         if not self._steps:
             self._begin_job(now_ns)
         if not self._steps:
@@ -203,7 +203,7 @@ class _TaskSimulation:
         return end
 
     def _begin_job(self, now_ns: int) -> None:
-        """Begin the job of the oldest release that has not expired. Executors skip older ones."""
+        """Begin a job for the oldest release that is not too old. Executors skip older releases."""
         every = self.task.every_ns
         first = self.task.phase_ns
         newest = first + (now_ns - first) // every * every

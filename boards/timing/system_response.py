@@ -12,7 +12,7 @@ from rack.boards.timing.rack import RackTiming
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted response of the hierarchy in simulated time. Without a hierarchy it is 0.
+    """Predicted response of the hierarchy in simulated time. Without one, it is 0.
 
     Attributes:
         levels: Boards of each level, as text.
@@ -21,7 +21,7 @@ class Prediction:
         command_ms: Longest response of a command, down to the lowest level, including waits for
             releases.
         status_ms: Longest response of a status, up to the highest level, including these waits.
-        plan_ms: Time from a planner's release until its plan can be used, by board.
+        plan_ms: Time from a planner's release until its plan can be used, keyed by board.
     """
 
     levels: tuple[str, ...]
@@ -50,9 +50,9 @@ def predict_response(rack: RackTiming) -> Prediction:
 def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
     """Return the mailboxes that carry information along a sequence of boards.
 
-    Each mailbox depends on the one before it. If the path is interrupted, only the longest part
-    that reaches the last board is returned. Queues interrupt it, because the writer determines how
-    long messages wait in them.
+    Each mailbox is based on the one before it. If this sequence does not begin at the first board,
+    its longest part that ends at the last board is returned. It does not contain queues, because
+    their writers determine how long messages wait in them.
 
     Args:
         layout: Layout of the rack.
@@ -71,9 +71,9 @@ def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxS
 def _find_longest_row(
     layout: Layout, boards: Sequence[str], taken: Collection[str]
 ) -> tuple[MailboxSpec, ...]:
-    """Return the longest sequence of dependent mailboxes that ends in one of those in `taken`.
+    """Return the longest sequence of mailboxes, each based on the previous, that ends in `taken`.
 
-    It has one mailbox for each board, or fewer if it does not reach back to the first board.
+    It has one mailbox of each board, or fewer if it does not begin at the first board.
     """
     if not boards:
         return ()

@@ -77,7 +77,7 @@ class TimedTask:
             order of their releases, then of their names. 0 is ordinary scheduling, below all.
         every_ns: Time between two releases.
         parts: Parts of a job, in order.
-        within_cycles: Number of releases that a job may last. The next job is released after them.
+        within_cycles: Number of releases that a job may span. The next job is released after them.
         ceiling: Priority of the parts that are not preemptible. A plan update blocks its executor
             and every task that has no higher priority than the executor (eq. 3.10).
         phase_ns: Time of the first release.
@@ -96,10 +96,10 @@ class TimedTask:
 
     @property
     def period_ns(self) -> int:
-        """Shortest time between the releases of two jobs. It is also the deadline of a job."""
+        """Shortest time in ns between the releases of two jobs, which is also a job's deadline."""
         return self.every_ns * self.within_cycles
 
     @property
     def cost_ns(self) -> int:
-        """Processor time of one job without context switches."""
+        """Processor time of one job in ns, without context switches."""
         return sum(part.time_ns for part in self.parts)

@@ -61,12 +61,12 @@ def compute_duration_ns(rows: TraceRows) -> Values:
 
 
 def compute_execution_ns(rows: TraceRows) -> Values:
-    """Return t_exec of eq. 3.5 or, for a planner, the planning time. Both include preemption."""
+    """Return t_exec of eq. 3.5, or the planning time of a planner, in ns with preemption."""
     return np.asarray(rows["process_ns"] - rows["read_ns"])
 
 
 def compute_communication_ns(rows: TraceRows) -> Values:
-    """Return t_comm of eq. 3.5: the time in ns of each cycle that is not execution."""
+    """Return t_comm of eq. 3.5: the duration in ns of each cycle without its execution."""
     return np.asarray(rows["read_ns"] - rows["start_ns"] + rows["end_ns"] - rows["process_ns"])
 
 
@@ -96,7 +96,7 @@ def find_missed_cycles(rows: TraceRows) -> Values:
 
 
 def count_skipped_releases(rows: TraceRows) -> Values:
-    """Return the number of releases that were skipped just before each cycle."""
+    """Return for each cycle the number of releases skipped between it and the previous cycle."""
     return np.asarray(rows["flags"] >> SKIPPED_SHIFT)
 
 
@@ -106,19 +106,19 @@ def count_misses_and_skips(rows: TraceRows) -> tuple[int, int]:
 
 
 def select_plans(rows: TraceRows) -> Values:
-    """Return the records of a planner that belong to a plan.
+    """Return the records of cycles in which a planner made a plan.
 
-    A release at which the planner did not plan may also leave a record.
+    The other records are of cycles in which the planner decided not to plan.
     """
     return rows[(rows["flags"] & Flag.PLANNED) > 0]
 
 
 def find_newest_visible(ticks: Values, visible_at: Values) -> Values:
-    """Return the index of the newest message that is visible at each tick. -1 before the first.
+    """Return the index of the newest message visible at each tick. -1 if none is visible.
 
     Args:
         ticks: The ticks.
-        visible_at: Ticks at which messages become visible, in the order of writing.
+        visible_at: Ticks at which messages become visible, in the order in which they were written.
     """
     # A message that becomes visible late delays the messages after it.
     return np.asarray(np.searchsorted(np.maximum.accumulate(visible_at), ticks, side="right") - 1)
@@ -143,7 +143,7 @@ def compute_distribution(values: Values) -> Distribution | None:
     """Return minimum, percentiles and maximum of values of any unit, shape (n,).
 
     Returns:
-        The statistics by name: min, p50, p99, p99_9 and max. None without values.
+        The statistics, keyed by name: min, p50, p99, p99_9 and max. None if there are no values.
     """
     if not len(values):
         return None
@@ -213,7 +213,7 @@ def compute_waking_ns(rows: TraceRows) -> Values:
 def compute_overhead_ns(rows: TraceRows) -> int:
     """Return the median processor time in ns for waking up and for closing a cycle.
 
-    0 if every cycle was disturbed.
+    It is 0 if every cycle was preempted.
     """
     beyond = _compute_unstamped_ns(rows)
     undisturbed = beyond[beyond >= 0]
@@ -221,7 +221,7 @@ def compute_overhead_ns(rows: TraceRows) -> int:
 
 
 def _compute_unstamped_ns(rows: TraceRows) -> Values:
-    """Return the processor time in ns of each cycle outside its time stamps.
+    """Return the processor time in ns that each cycle used before its start and after its end.
 
     It is negative if the cycle was preempted.
     """
@@ -231,17 +231,17 @@ def _compute_unstamped_ns(rows: TraceRows) -> Values:
 def compute_unit_times(rows: TraceRows, above: Occupation) -> Values:
     """Return the processor time in ns of each part of a cycle, shape (n, 4).
 
-    The parts of an executor are C, R, X and W. Those of a planner are an unused one, reading, P
+    The parts of an executor are C, R, X and W. Those of a planner are an unused part, reading, P
     without reading, and U.
 
-    If the parts exceed the processor time of the cycle, because ordinary scheduling or the machine
-    interfered, the excess is subtracted from what the parts took beyond their undisturbed times,
-    and the rest from all parts in proportion.
+    If ordinary scheduling or the machine has interfered, the parts add up to more than the
+    processor time of the cycle. The excess is subtracted first from parts that took longer than
+    undisturbed ones, then from all parts in proportion to their times.
 
     Args:
         rows: Trace records of the task.
-        above: Times in which tasks of higher priority occupied the core. They are subtracted from
-            the parts in which they fell.
+        above: Times in which tasks of higher priority occupied the core. They do not count as
+            times of the parts.
     """
     stamps = np.stack([rows[name] for name in STAMPS], axis=1)
     starts = stamps[:, :-1]
@@ -259,7 +259,7 @@ def _estimate_undisturbed(parts: Values, processor_ns: Values) -> Values:
     """Return the undisturbed time in ns of each part, shape (4,).
 
     Short parts are undisturbed in many cycles. The longest part may be disturbed in all of them, so
-    it gets at most the processor time that the others leave.
+    its time is limited to the processor time that the other parts leave.
     """
     usual = np.asarray(np.percentile(parts, UNDISTURBED, axis=0))
     longest = int(np.argmax(usual))
@@ -272,7 +272,7 @@ def _estimate_undisturbed(parts: Values, processor_ns: Values) -> Values:
 def _distribute(total: Values, weights: Values) -> Values:
     """Distribute `total`, shape (n,), in proportion to `weights`, shape (n, 4).
 
-    No share exceeds its weight.
+    A share never exceeds its weight, even if the shares then do not add up to the total.
     """
     sums = weights.sum(axis=1)
     factor = np.divide(np.minimum(total, sums), sums, out=np.zeros(len(sums)), where=sums > 0)

@@ -1,6 +1,6 @@
 """Verdicts: the equations of the timing model for every level, core and task of a rack.
 
-Equations 3.1 to 3.10 (NISTIR 90-4251, section 3) are judged as in the paper, where each level has
+Equations 3.1 to 3.10 (NISTIR 90-4251, section 3) are applied as in the paper, where each level has
 its own processor. Response times and core loads account for levels that share a core.
 
 Symbols of the paper: R_i is the response time of a level, which is its cycle. R_max is the longest
@@ -47,7 +47,7 @@ ORDER = (*EQUATIONS, *BEYOND)
 
 @dataclass(frozen=True)
 class EquationVerdict:
-    """Verdict of one equation for one subject, predicted or measured.
+    """Verdict on one equation or criterion for one subject, predicted or measured.
 
     Attributes:
         equation: Number in the paper, as in "3.8", or one of `BEYOND`.
@@ -57,7 +57,7 @@ class EquationVerdict:
         right: Value of the right side, in `unit`.
         meaning: Both sides in the paper's terms, as in "t_plan / d < t_residual - 2 t_cs".
         unit: "ns", or "1" for pure numbers.
-        endless: Reason why the left side has no bound, as a clause. Empty if it has one.
+        endless: Reason why the left side is infinite, as a clause. Empty if it is finite.
     """
 
     equation: str
@@ -81,11 +81,11 @@ class EquationVerdict:
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """Identity of the verdict, which a change of the rack's times does not affect."""
+        """Key by which the verdict is found again after the rack's times have changed."""
         return self.equation, self.subject, self.meaning
 
     def to_document(self) -> dict[str, Any]:
-        """Return the verdict as plain data, for JSON. An infinite side becomes None."""
+        """Return the verdict as plain data for JSON. Infinite values become None."""
         sides = {"left": self.left, "right": self.right, "margin": self.margin}
         finite = {name: side if isfinite(side) else None for name, side in sides.items()}
         return {**asdict(self), "holds": self.holds, **finite}
@@ -94,7 +94,7 @@ class EquationVerdict:
 def judge_rack(rack: RackTiming) -> list[EquationVerdict]:
     """Return all verdicts on a rack, in the order of the equations.
 
-    Only levels and tasks with a budget are judged. A response time without a bound is infinite.
+    Levels and tasks without a budget have no verdicts. A response time without a bound is infinite.
     """
     levels = (judge_level(rack, level) for level in rack.levels.values())
     beyond = _judge_tasks(rack), _judge_cores(rack), _judge_frames(rack), _judge_inboxes(rack)
@@ -109,9 +109,9 @@ def judge_level(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVerdic
 
 
 def judge_system(rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on the system response along each chain of boards.
+    """Yield the verdicts on the system response along each group of chains.
 
-    If the config has a goal for the response, the cycle of each board in a chain is judged too.
+    If the config has a goal for the response, also yield a verdict on each board's cycle.
     """
     goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
     for chains in rack.chain_groups:
@@ -124,9 +124,9 @@ def judge_system(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 
 def name_response_subject(rack: RackTiming, chains: ParallelChains) -> str:
-    """Return the subject of verdicts on the system response along chains.
+    """Return the subject of verdicts on the system response along a group of chains.
 
-    It contains their names if the rack has other chains too.
+    It is "system", followed by the boards of the chains if the rack has several groups.
     """
     return SYSTEM if len(rack.chain_groups) == 1 else f"{SYSTEM}, {chains.text}"
 
@@ -159,7 +159,7 @@ def _judge_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
     yield EquationVerdict("3.1", board, used, "<=", cycle, "t_proc + t_c <= R_i")
     longest = level.longest_cycle_ns
     yield EquationVerdict("3.4", board, level.execution_ns, "<", longest, "t_exec < R_max")
-    # If a cycle is too short for its parts, the residual is 0 and the parts exceed the cycle.
+    # If the cycle is too short for its parts, t_residual counts as 0 and the left side is larger.
     meaning = "t_exec + t_comm + t_residual = R_i"
     yield EquationVerdict("3.5", board, max(used, cycle), "=", cycle, meaning)
     yield EquationVerdict("3.6", board, 0, "<", level.residual_ns, "0 < t_residual <= alpha")
@@ -168,7 +168,7 @@ def _judge_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
 
 
 def _judge_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on the planner of a level. Nothing if its planning time is unknown."""
+    """Yield the verdicts on a level's planner, or none if its planning time is unknown."""
     if level.planning_ns is None or level.within_cycles is None or level.slice_ns is None:
         return
     board = level.board
@@ -186,7 +186,7 @@ def _judge_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator
     share = level.planning_ns / level.within_cycles
     left = level.residual_ns - 2 * switch_ns
     yield EquationVerdict("3.8", board, share, "<", left, "t_plan / d < t_residual - 2 t_cs")
-    # In the worst cycle the plan is also updated.
+    # The worst cycle also contains the update of the plan.
     communication = level.interlevel_ns + level.executor_planner_ns
     used = level.execution_ns + communication + 2 * switch_ns
     meaning = "t_exec + t_comm + 2 t_cs < R_i, leaving t_(plan+residual)"
@@ -228,7 +228,7 @@ def _judge_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
 
 
 def _judge_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on the places of a static schedule, one for all equal frames."""
+    """Yield a verdict on each board in each distinct frame of a static schedule."""
     for equal_frames in compute_core_frames(rack):
         for place in equal_frames.places:
             limit = f"'{place.until}' begins" if place.until else "the frame ends"

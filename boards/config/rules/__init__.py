@@ -26,7 +26,7 @@ def load_network_rules(config: RackConfig) -> ModuleType | None:
 
 
 def _check_network(wiring: Wiring) -> Mistakes:
-    """Check the table `[adapter.lan]` of a rack that has one."""
+    """Check the table `[adapter.lan]`, if the rack has one."""
     if (rules := load_network_rules(wiring.config)) is not None:
         yield from rules.check_network(wiring, wiring.config.adapter.lan)
 
@@ -78,6 +78,6 @@ NEEDS: Mapping[Rule, set[str]] = {
 
 
 def apply_rules(wiring: Wiring) -> list[Mistake]:
-    """Return the mistakes that all applicable rules find in a wiring."""
+    """Return all mistakes that the rules find in a wiring."""
     rules = (rule for rule in RULES if not wiring.broken & NEEDS.get(rule, set()))
     return [mistake for rule in rules for mistake in rule(wiring)]

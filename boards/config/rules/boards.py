@@ -31,7 +31,7 @@ BOARD_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
 
 
 def check_boards(wiring: Wiring) -> Mistakes:
-    """Check names, neighbours and planners of the boards."""
+    """Check that boards have valid names, neighbours that exist, and consistent planner keys."""
     known = [*wiring.config.board, *wiring.broken_boards]
     for name, board in wiring.config.board.items():
         place = f"board.{name}"
@@ -46,7 +46,7 @@ def check_boards(wiring: Wiring) -> Mistakes:
 
 
 def check_hosts(wiring: Wiring) -> Mistakes:
-    """Check names and neighbours of the host boards."""
+    """Check that host boards have valid, unused names, and neighbours that exist."""
     known = [*wiring.config.board, *wiring.broken_boards]
     for name, host in wiring.config.host.items():
         place = f"host.{name}"
@@ -76,14 +76,14 @@ def _check_neighbours(
 
 
 def _check_name(place: str, name: str) -> Mistakes:
-    """Check the name of a board or host board."""
+    """Check that a board or host board has a valid name that is not reserved."""
     if not BOARD_NAME.fullmatch(name) or name in RESERVED:
         why = f"valid: at most 31 of a-z, 0-9 and _, except {', '.join(RESERVED)}"
         yield Mistake(place, None, f"invalid name for a board; {why}")
 
 
 def _check_planner(place: str, board: BoardConfig) -> Mistakes:
-    """Check that the keys for a planner fit its coupling, or are absent without a planner."""
+    """Check that the planner keys of a board fit its coupling, or are absent without a planner."""
     has_planner = board.planner is not None
     is_loose = board.coupling == "loose"
     if has_planner != (board.coupling != "none"):
@@ -105,7 +105,7 @@ def _check_planner(place: str, board: BoardConfig) -> Mistakes:
         )
         yield Mistake(f"{place}.planner_priority", board.planner_priority, why)
     if not has_planner:
-        # These times would be ignored silently.
+        # Without a planner, these times would be ignored silently.
         for table, keys in (("budget", PLANNER_BUDGET), ("transfer", PLANNER_TRANSFER)):
             for key in keys:
                 if value := getattr(getattr(board, table), key, None):
@@ -117,10 +117,7 @@ def _check_planner(place: str, board: BoardConfig) -> Mistakes:
 
 
 def check_circles(wiring: Wiring) -> Mistakes:
-    """Check that no level is above itself, directly or through other levels.
-
-    A circle of levels would have no highest or lowest level.
-    """
+    """Check that no level is above itself, directly or through other levels."""
     config = wiring.config
     links = list(config.list_links())
     try:
@@ -130,7 +127,7 @@ def check_circles(wiring: Wiring) -> Mistakes:
     except CycleError as error:
         circle = error.args[1][:-1]
         pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
-        # The likely mistake is a link that only one of its two boards names.
+        # Blame a link that only one of its two boards names, if there is one.
         upper, lower = min(reversed(pairs), key=lambda link: len(_find_declarations(config, *link)))
         board, key, end = _find_declarations(config, upper, lower)[0]
         at = circle.index(lower)
@@ -141,11 +138,11 @@ def check_circles(wiring: Wiring) -> Mistakes:
 
 
 def _find_declarations(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
-    """Return where the config puts board `upper` above board `lower`.
+    """Return the keys by which the config puts board `upper` above board `lower`.
 
     Returns:
-        For each such place: the board, its key, and the level ("lowest" or "highest") that has no
-        such key.
+        For each of them: the board that has it, the key ("above" or "below"), and the level
+        ("highest" or "lowest") that must not have such a key.
     """
     tables = ((upper, "below", "lowest", lower), (lower, "above", "highest", upper))
     return [
@@ -179,7 +176,7 @@ def check_run_end(wiring: Wiring) -> Mistakes:
 
 
 def check_record_windows(wiring: Wiring) -> Mistakes:
-    """Check that `before` and `after` are given only for a flight recorder."""
+    """Check that `before` and `after` are given only together with `keep`."""
     table = wiring.config.record
     if table.keep is None:
         for key in ("before", "after"):
@@ -194,7 +191,7 @@ LONGEST_MAJOR = 10_000
 
 
 def check_clock(wiring: Wiring) -> Mistakes:
-    """Check the length of a tick in simulated time and in real time."""
+    """Check that a tick is whole ns and not too short, and that lockstep has no `speed`."""
     config = wiring.config
     clock = wiring.config.clock
     if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
@@ -215,7 +212,7 @@ def check_clock(wiring: Wiring) -> Mistakes:
 
 
 def check_rates(wiring: Wiring) -> Mistakes:
-    """Check that each board has one period, in whole ticks and not too long, and a valid phase."""
+    """Check that each board has one period of whole ticks, not too long, and a smaller phase."""
     for name, board in wiring.config.board.items():
         place = f"board.{name}.rate_hz"
         if (board.rate_hz is None) == (board.every is None):
@@ -243,7 +240,7 @@ def check_rates(wiring: Wiring) -> Mistakes:
 def check_polling(wiring: Wiring) -> Mistakes:
     """Check that a board that busy-waits has a core to itself.
 
-    At a real-time priority it would starve all other processes on its core.
+    Otherwise it would starve the other tasks on its core.
     """
     config = wiring.config
     cores = {CLOCK: config.clock.core} | {place.name: place.core for place in config.list_tasks()}
@@ -255,7 +252,7 @@ def check_polling(wiring: Wiring) -> Mistakes:
 
 
 def check_reservations(wiring: Wiring) -> Mistakes:
-    """Check that each board can reserve processor time under earliest deadline first."""
+    """If the scheduler is earliest deadline first, check that each board can reserve its time."""
     config = wiring.config
     if config.clock.scheduler == "fixed-priority":
         return
@@ -276,7 +273,7 @@ def check_reservations(wiring: Wiring) -> Mistakes:
 
 
 def check_schedule(wiring: Wiring) -> Mistakes:
-    """Check the frames of a static schedule and, if they are valid, the cycles of the boards."""
+    """If the rack has a static schedule, check its frames and the boards' cycles in them."""
     table = wiring.config.schedule
     if table is not None:
         mistakes = list(_check_frames(table, wiring.config.clock_ns))
@@ -284,7 +281,10 @@ def check_schedule(wiring: Wiring) -> Mistakes:
 
 
 def _check_frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
-    """Check that the frames are not too long and that the minor frame divides the major frame."""
+    """Check that the minor frame is whole ticks and that the major frame is a multiple of it.
+
+    The major frame must also not exceed `LONGEST_MAJOR`.
+    """
     tick_ms = clock_ns * 1e-6
     minor, major = compute_frames(table, clock_ns)
     if minor < 1 or abs(minor * tick_ms - table.minor_ms) > 1e-6 * tick_ms:
@@ -306,13 +306,13 @@ def _check_frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
 
 
 def _format_nearest(value: float, step: float) -> str:
-    """Return the multiples of `step` just below and above `value`, without zero, as text."""
+    """Return the positive multiples of `step` just below and above `value`, as text."""
     below = int(value / step)
     return " or ".join(f"{number * step:.12g}" for number in (below, below + 1) if number)
 
 
 def _check_cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
-    """Check that the cycle of each board fits the frames."""
+    """Check that each board's cycle is a multiple of the minor frame and divides the major."""
     clock_ns = wiring.config.clock_ns
     minor, major = compute_frames(table, clock_ns)
     tick_ms = clock_ns * 1e-6

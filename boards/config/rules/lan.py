@@ -33,7 +33,7 @@ _MAILBOX = f"mailbox {LAN}."
 
 
 def check_network(wiring: Wiring, table: LanConfig) -> Mistakes:
-    """Check the table `[adapter.lan]` and everything that it names."""
+    """Check the table `[adapter.lan]`, and the mailboxes and message types that it names."""
     yield from _check_endpoints(table)
     if is_adapter_name_taken(wiring.config):
         why = f"[{PLACE}] adds a board of this name; rename this board, or remove one of them"
@@ -51,7 +51,10 @@ def check_network(wiring: Wiring, table: LanConfig) -> Mistakes:
 
 
 def _check_board(wiring: Wiring, table: LanConfig) -> Mistakes:
-    """Check the rates, the priority and the names of the adapter's board."""
+    """Check names and rates of the exchanges, and in real time the adapter's priority.
+
+    In real time, `protocol.strict` must not be set.
+    """
     config = wiring.config
     yield from _check_names(table, config.name)
     if LAN in wiring.periods:
@@ -70,10 +73,10 @@ def _check_board(wiring: Wiring, table: LanConfig) -> Mistakes:
 
 
 def _check_names(table: LanTable, rack: str) -> Mistakes:
-    """Check the names of racks and ports.
+    """Check that the names of racks and ports are unambiguous.
 
-    No mailbox may be listed twice, no rack may be this one, and no port may have a name under
-    which the adapter itself writes a mailbox.
+    No mailbox may be listed twice, this rack must not be its own peer, and no port may have the
+    name of a mailbox that the adapter itself writes.
     """
     taken = {
         STATUS: "its status",
@@ -111,11 +114,13 @@ def _check_names(table: LanTable, rack: str) -> Mistakes:
 
 
 def _check_rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -> Mistakes:
-    """Check the rate of an exchange and, for an import, the longest permitted age of a message.
+    """Check that the rate of an exchange divides the adapter's rate.
+
+    For an import, also check that messages cannot get too old between two exchanges.
 
     Args:
         place: Place of the entry in the config.
-        entry: The exchange.
+        entry: The export or import.
         cycle_ns: Period of the adapter's board in ns of simulated time.
     """
     grid = ("of the adapter", "cycle")
@@ -135,9 +140,9 @@ def _check_rate(place: str, entry: ExportConfig | ImportConfig, cycle_ns: int) -
 
 
 def _check_priority(config: RackConfig, table: LanConfig) -> Mistakes:
-    """Check that the adapter has a higher priority than real-time boards on its core.
+    """Check that the adapter has a higher priority than the real-time boards on its core.
 
-    They could delay its heartbeats, and other racks would then consider this rack lost.
+    If they delayed its heartbeats, other racks would consider this rack lost.
     """
     others = [
         place for place in config.list_tasks() if place.core == table.core and place.board != LAN
@@ -156,9 +161,9 @@ def _check_priority(config: RackConfig, table: LanConfig) -> Mistakes:
 
 
 def _explain_invalid_export(wiring: Wiring, source: str) -> Iterator[str]:
-    """Yield the reason why a mailbox cannot be exported. Nothing if it can.
+    """Yield the reason why a mailbox cannot be exported, or nothing if it can.
 
-    Exported queues are reported by the rule for queues instead.
+    Exported queues are reported by `check_queues`.
     """
     board = source.partition(".")[0]
     if board == LAN:
@@ -176,7 +181,7 @@ def _explain_invalid_export(wiring: Wiring, source: str) -> Iterator[str]:
 
 
 def move_to_adapter(mistake: Mistake, config: RackConfig) -> Mistake:
-    """Return a mistake with places on the adapter's board changed to places in `[adapter.lan]`."""
+    """Return a mistake in which `board.lan` is replaced by `adapter.lan`, which the user wrote."""
     table = config.adapter.lan
     if table is None or mistake.place == BOARD_PLACE:
         return mistake
@@ -198,7 +203,7 @@ EXPIRY_WARNING = timedelta(days=30)
 
 
 def _check_endpoints(table: LanTable) -> Mistakes:
-    """Check endpoints and their protection as far as the config alone determines them."""
+    """Check that endpoints are valid and protected, without reading certificate files."""
     for key in ("listen", "connect"):
         for at, text in enumerate(getattr(table, key)):
             try:
@@ -236,7 +241,7 @@ def _list_open_endpoints(table: LanTable) -> list[str]:
 
 
 def _explain_unsafe_endpoint(endpoint: Endpoint, table: LanTable, connects: bool) -> str:
-    """Return why an endpoint is not protected well enough. Empty if it is.
+    """Return the reason why an endpoint is not protected well enough. Empty if it is.
 
     Args:
         endpoint: The endpoint.
@@ -269,7 +274,7 @@ def _explain_unsafe_endpoint(endpoint: Endpoint, table: LanTable, connects: bool
 
 
 def check_credentials(config: RackConfig) -> Mistakes:
-    """Check the certificate files of this machine at the present time."""
+    """Check that the certificate files on this machine exist and are valid now."""
     table = config.adapter.lan
     if table is None or table.certificates is None:
         return

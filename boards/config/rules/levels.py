@@ -23,7 +23,7 @@ MAX_MODEL_BYTES = 2**30
 
 
 def check_params(wiring: Wiring) -> Mistakes:
-    """Check the parameters of each board against the declarations of its level's classes."""
+    """Check that each board's parameters are valid for the classes of its level."""
     for table, kind in wiring.params:
         tables, _, board = table.partition(".")
         values = getattr(wiring.config, tables)[board].params
@@ -34,7 +34,7 @@ def check_params(wiring: Wiring) -> Mistakes:
 
 
 def check_programs(wiring: Wiring) -> Mistakes:
-    """Check `[task]` against the program that each level's class declares."""
+    """Check that `[task]` is valid for each level that declares a program."""
     config = wiring.config
     for kind in wiring.programs:
         try:
@@ -47,11 +47,11 @@ def check_programs(wiring: Wiring) -> Mistakes:
 
 
 def check_sizes(wiring: Wiring, sizes: Mapping[str, int]) -> Mistakes:
-    """Check that the rack defines every size that the fields of a message need.
+    """Check that the rack defines every size to which fields of messages refer.
 
     Args:
         wiring: The wiring.
-        sizes: The defined sizes by name, such as the number of joints.
+        sizes: The defined sizes, such as the number of joints, keyed by name.
     """
     for mailbox, (ports, output) in wiring.writers.items():
         try:
@@ -78,8 +78,8 @@ def check_neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mi
 
     Args:
         wiring: The wiring.
-        contexts: Contexts of the levels, by board. Boards with mistakes have none, and neither they
-            nor their neighbours are checked.
+        contexts: Contexts of the levels, keyed by board. Boards without a context, because of
+            mistakes, are not checked, and neither are their neighbours.
     """
     for ports in wiring.tasks:
         board = wiring.config.board[ports.place.board]
@@ -93,7 +93,7 @@ def check_neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mi
 
 
 def check_scene(wiring: Wiring) -> Mistakes:
-    """Check that entries of the scene name existing bodies, and that names are unique."""
+    """Check that motions, pushes and goals name existing bodies, and that names are unique."""
     scene = wiring.config.scene
     for kind, key, bodies in (
         ("motion", "body", "obstacles"),
@@ -110,7 +110,10 @@ def check_scene(wiring: Wiring) -> Mistakes:
 
 
 def check_robot(wiring: Wiring) -> Mistakes:
-    """Check that the model file can be read and that each list has one value per joint."""
+    """Check that the model file can be read and that `[robot]` is consistent.
+
+    Lists must have one value per joint, joints unique names, and a hand torque control.
+    """
     robot = wiring.config.robot
     if robot is None:
         return
@@ -127,9 +130,9 @@ def check_robot(wiring: Wiring) -> Mistakes:
 
 
 def check_cell(wiring: Wiring) -> Mistakes:
-    """Check that arm and scene fit the model.
+    """Check that arm and scene match the MuJoCo model.
 
-    If `[robot]` or `[scene]` has other mistakes, only names in the model are checked.
+    If `[robot]` or `[scene]` has other mistakes, check only that the model has their names.
     """
     robot_table, scene_table = wiring.config.robot, wiring.config.scene
     reasons: list[str] = []
@@ -143,7 +146,7 @@ def check_cell(wiring: Wiring) -> Mistakes:
             reasons = [str(error)]
     from rack.levels.robot.lookup import find_unknown_names
 
-    # Report all names that the model lacks instead, if the model can be read.
+    # If the model can be read and lacks names, report these instead.
     with suppress(RobotError):
         reasons = [*find_unknown_names(robot_table, scene_table)] or reasons
     for reason in reasons:

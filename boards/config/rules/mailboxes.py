@@ -16,7 +16,7 @@ PASS_IT = "pass it through a bus adapter: [board.<bridge>.params.pass]"
 
 
 def check_ports(wiring: Wiring) -> Mistakes:
-    """Check that the levels' classes exist and that their inputs are connected as declared."""
+    """Check that the classes of tasks can be used and that their ports can be connected."""
     for place, why in wiring.unusable_classes.items():
         yield Mistake(f"{place.table}.{place.class_key}", place.target, why)
     for place, ports in wiring.ports.items():
@@ -44,7 +44,7 @@ def check_writers(wiring: Wiring) -> Mistakes:
 
 
 def check_read_mailboxes(wiring: Wiring) -> Mistakes:
-    """Check that every mailbox that is read exists and carries the port's type of message."""
+    """Check that each input port reads an existing mailbox with the port's message type."""
     for ports in wiring.ports.values():
         for port, mailbox in ports.sources:
             place = _find_place(ports, port)
@@ -66,14 +66,14 @@ def check_read_mailboxes(wiring: Wiring) -> Mistakes:
 
 
 def _find_place(ports: TaskPorts, port: str) -> str:
-    """Return the place in the config where an input is wired: "board.servo.reads.command"."""
+    """Return the place of an input in the config, as in "board.servo.reads.command"."""
     place = ports.place
     key = ports.kind.wired_by if issubclass(ports.kind, Adapter) else place.reads_key
     return f"{place.table}.{key}.{port}"
 
 
 def check_ending_status(wiring: Wiring) -> Mistakes:
-    """Check that the board that ends the run writes a status with a state."""
+    """Check that a board with `ends_run` writes a status with a field `state`."""
     for name, board in wiring.config.board.items():
         if not board.ends_run:
             continue
@@ -88,7 +88,10 @@ def check_ending_status(wiring: Wiring) -> Mistakes:
 
 
 def check_sides(wiring: Wiring) -> Mistakes:
-    """Check that only bus adapters read mailboxes of both the real-time and the host side."""
+    """Check that boards and host boards read only mailboxes on their own side.
+
+    Only a bus adapter may read mailboxes on both sides.
+    """
     for task in wiring.ports.values():
         for port, mailbox in task.sources:
             if mailbox.partition(".")[0] not in wiring.unknown_boards and (
@@ -98,7 +101,7 @@ def check_sides(wiring: Wiring) -> Mistakes:
 
 
 def _explain_wrong_side(wiring: Wiring, task: TaskPorts, mailbox: str) -> str:
-    """Return why a task or host board must not read a mailbox. Empty if it may."""
+    """Return the reason why a task or host board must not read a mailbox. Empty if it may."""
     is_host = task.place.role == "host"
     is_of_host = mailbox in wiring.host_side_mailboxes
     if task.joins_sides:
@@ -125,7 +128,7 @@ WHY_NOT_FOR_OPERATORS = {
 
 
 def check_strict(wiring: Wiring) -> Mistakes:
-    """If `protocol.strict` is set, report everything that makes a run depend on timing."""
+    """If `protocol.strict` is set, report all settings that make a run depend on timing."""
     config = wiring.config
     if not config.protocol.strict:
         return
@@ -146,7 +149,10 @@ def check_strict(wiring: Wiring) -> Mistakes:
 
 
 def check_exchange(wiring: Wiring) -> Mistakes:
-    """Check the times at which executors read their ports, and the mailbox that records them."""
+    """Check that `exchange` tables name existing ports and have valid cycles and phases.
+
+    Also check that no output of the executor has the name of the exchange record.
+    """
     for ports in wiring.tasks:
         if not ports.exchange or not ports.is_whole:
             continue
@@ -174,7 +180,7 @@ def check_exchange(wiring: Wiring) -> Mistakes:
 
 
 def check_operator_mailboxes(wiring: Wiring) -> Mistakes:
-    """Check that only the clock writes operators' mailboxes, with a protocol that never waits."""
+    """Check that only the clock writes operator mailboxes, and that their protocol is valid."""
     for mailbox in wiring.operator_mailboxes:
         if mailbox in wiring.writers:
             first = wiring.writers[mailbox][0].task
@@ -202,8 +208,8 @@ def check_protocols(wiring: Wiring) -> Mistakes:
 
 
 def check_queues(wiring: Wiring) -> Mistakes:
-    """Check which mailboxes are queues, how many readers they have, and their depths."""
-    # A task that reads from the wrong side is reported by `check_sides` alone.
+    """Check that queues have protocol queue and one reader, and that only queues have a depth."""
+    # If a task reads from the wrong side, only `check_sides` reports it.
     if any(check_sides(wiring)):
         return
     table = wiring.config.protocol
@@ -228,7 +234,7 @@ def check_queues(wiring: Wiring) -> Mistakes:
 
 
 def _check_queue(wiring: Wiring, mailbox: str) -> Mistakes:
-    """Check that exactly one port reads a queue, and that its position mailbox has a free name."""
+    """Check that one port in this rack reads a queue and that its position mailbox is unique."""
     if get_position_mailbox(mailbox) in wiring.writers:
         why = (
             f"the reader of the queue '{mailbox}' writes its position under this name; rename the"
@@ -260,7 +266,7 @@ def _check_queue(wiring: Wiring, mailbox: str) -> Mistakes:
 
 
 def check_asynchronous(wiring: Wiring) -> Mistakes:
-    """Check that the messages of asynchronous ports can be read as soon as they are written."""
+    """Check that no asynchronous port reads a mailbox with protocol queue or interrupt."""
     for ports in wiring.tasks:
         for port, mailbox in ports.sources:
             why = {
@@ -276,7 +282,7 @@ def check_asynchronous(wiring: Wiring) -> Mistakes:
 
 
 def check_interrupts(wiring: Wiring) -> Mistakes:
-    """Check that the messages of mailboxes with protocol interrupt can interrupt a board."""
+    """Check that protocol interrupt is not used on the host side or by the network adapter."""
     for mailbox, protocol in wiring.config.protocol.mailbox.items():
         if protocol != "interrupt":
             continue
