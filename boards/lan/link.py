@@ -234,7 +234,7 @@ def _build_reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
 def _build_settings(
     rack: str, table: LanTable, credentials: Credentials | None, is_operator: bool
 ) -> zenoh.Config:
-    """Return the configuration of zenoh for a session."""
+    """Return zenoh's configuration for the session of a rack or operator."""
     timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if has_tls(table) else ""
     shortest, longest = RETRY_MS
     protocols = {
