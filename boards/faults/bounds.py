@@ -31,16 +31,16 @@ Up to 0.5 ms per megabyte were seen on a busy machine, and a planner with its li
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
-    """Return a task's cycle in ticks. For a planner, its time slice. For the clock, one tick."""
+    """Return the cycle of a task in ticks: a planner's time slice, or 1 for the clock."""
     if board == CLOCK:
         return 1
     return layout.find_task(board).slice
 
 
 def compute_last_read_ticks(mailboxes: tuple[str, ...], layout: Layout) -> int:
-    """Return the longest time from the release of a writer until all its readers have read.
+    """Return the longest time in ticks from a writer's release until all readers have the message.
 
-    The time is in ticks and is the maximum over these mailboxes. 0 if nobody reads them.
+    It is the maximum over these mailboxes. 0 if nobody reads them.
     """
     boxes = [layout.find_mailbox(name) for name in mailboxes]
     return max(

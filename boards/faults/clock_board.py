@@ -263,7 +263,7 @@ class FaultStage:
         self.next_tick = min(changes, default=NEVER)
 
     def act_within_tick(self, tick: int) -> None:
-        """Carry out the faults that have a phase in `tick`. Called after the releases."""
+        """After the releases of `tick`, carry out its faults with a phase, each at its time."""
         if not self._phased:
             return
         clock = self.clock

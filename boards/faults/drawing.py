@@ -82,7 +82,7 @@ def uniform_messages(least: int, most: int) -> DrawTicks:
 
 
 def longest_of(*lengths: DrawTicks) -> DrawTicks:
-    """Return a draw that takes the longest of several drawn durations."""
+    """Return a draw of a duration that is the longest of several draws."""
     return lambda d: max(draw(d) for draw in lengths)
 
 

@@ -161,7 +161,7 @@ class Kind:
 
     @property
     def recoverable(self) -> bool:
-        """Whether the task continues after the fault."""
+        """Whether the task can continue after the fault."""
         return self.where != "start"
 
     @cached_property
@@ -284,7 +284,7 @@ class Kinds:
 
     @property
     def names(self) -> Mapping[str, Kind]:
-        """The kinds by name."""
+        """Dictionary from names to kinds."""
         return self._by_name
 
 

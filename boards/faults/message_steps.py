@@ -172,7 +172,7 @@ class HoldLock(MessageStep):
     def send_message(self, message: Outgoing) -> None:
         """Acquire the lock and stop or kill this process, unless the fault has already acted.
 
-        When a stopped process continues, it releases the lock. Then it passes the message on.
+        When a stopped process continues, it releases the lock and passes the message on.
         """
         writer = self.writer
         is_killed = bool(self.entry.parameters[0])

@@ -209,7 +209,7 @@ class Clocks:
         self._now_ns = 0
 
     def open(self, link: LanLink, sealer: Sealer) -> None:
-        """Start to answer and prepare to send pings. Do nothing in lockstep."""
+        """Start to answer pings, and prepare to send pings. Do nothing in lockstep."""
         if self._grid.is_lockstep:
             return
         self._link = link

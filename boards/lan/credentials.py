@@ -124,7 +124,7 @@ class Credentials:
         return KeyPair(content, key)
 
     def identify_sender(self, chain: bytes) -> Identity | None:
-        """Return the sender's identity according to the certificates that came with a seal.
+        """Verify the certificates that came with a seal and return the sender's identity.
 
         Args:
             chain: Certificates in DER form, the sender's first.

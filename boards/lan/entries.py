@@ -287,7 +287,8 @@ class Import:
         """Return True if a message comes from the present launch and its age is known.
 
         In lockstep that is always true: see `Barrier`. A message that may become acceptable is
-        stored for a later cycle, in place of the one stored before. Others are counted as unknown.
+        stored for a later cycle, in place of the one stored before. Any other is counted as
+        coming from an unknown launch.
 
         Args:
             head: Head of the message.

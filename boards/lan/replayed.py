@@ -64,7 +64,7 @@ class ReplayedNetwork:
         """Write the messages that were recorded in this cycle.
 
         Args:
-            write: Output ports of the adapter, by name.
+            write: Dictionary from names to output ports of the adapter.
             tick: Release of the cycle.
         """
         for entry, sent in self._imports.values():

@@ -200,7 +200,7 @@ def find_aftermath(
 
 
 def _can_react(strike: Strike, reaction: Event) -> bool:
-    """Return True if a reaction may be caused by a fault.
+    """Return True if a reaction may have been caused by a fault.
 
     Only faults that take cycles make the brakes close because of missed cycles. Only kinds that may
     latch cause a latch.

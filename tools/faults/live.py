@@ -132,7 +132,7 @@ class LiveRack:
         return format_fitted_table(list(columns), rows)
 
     def _parse_fault(self, settings: Document) -> FaultConfig:
-        """Parse the keys of a fault. If they contain no seed, choose one that no other fault has.
+        """Parse the keys of a fault. If they contain no seed, choose a new one.
 
         Raises:
             ConfigError: A key or a value is invalid.
@@ -176,7 +176,7 @@ class LiveRack:
         set_priority(0)
 
     def _wait_until(self, holds: Callable[[], bool], timeout_s: float | None) -> bool:
-        """Wait until a condition holds or the run is over. Return False if it takes too long."""
+        """Wait until a condition holds or the run is over. Return False after a time-out."""
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while not holds() and not self._segment.run_is_over:
             if time.monotonic() > deadline:

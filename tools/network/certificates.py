@@ -109,7 +109,7 @@ def sign_certificate(
     expires: datetime,
     addresses: Sequence[str] = (),
 ) -> x509.Certificate:
-    """Return a signed certificate.
+    """Create a certificate and sign it.
 
     Args:
         name: Common name of the certificate.

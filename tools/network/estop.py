@@ -109,7 +109,7 @@ class EstopSession:
         )
 
     def set_stop(self, launch: int, flags: int = 0) -> int:
-        """Set the emergency stop of the rack, or check whether it could be set.
+        """Set the emergency stop of the rack, or only check that this is permitted.
 
         Args:
             launch: Number of the rack's launch. A restarted rack has another number.

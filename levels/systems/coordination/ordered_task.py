@@ -281,7 +281,7 @@ class OrderedTaskExecutor(TaskExecutor):
         return self._absent or self._held or waits or self._waits
 
     def _check_progress(self, plan: TaskPlan, waits: str, tick: int) -> None:
-        """End with an error if nothing has happened for too long."""
+        """End with an error if there has been no progress for too long."""
         # While the coordinator holds the arm, the coordinator decides for how long.
         if self._held:
             self._moved_at = tick

@@ -77,7 +77,7 @@ class RackUnderTest:
     def compute_window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
         """Return the minimum time from the beginning of a fault to the next fault.
 
-        It is long enough for the fault to be detected, to end and to be recovered from.
+        It is long enough for the fault to be detected and to end, and for the rack to recover.
 
         Args:
             target: Target of the fault.
@@ -366,7 +366,7 @@ def _choose_order(room_ticks: int, cards: Sequence[FaultCard], rng: Random) -> l
 
 
 def _draw_starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
-    """Return the start ticks of consecutive windows, of which the first has a random start.
+    """Return the start ticks of consecutive windows. The first start is random.
 
     A later start makes the trial shorter, because it continues from the last snapshot before its
     first fault.

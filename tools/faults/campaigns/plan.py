@@ -59,7 +59,7 @@ class Plan:
 
     @property
     def name(self) -> str:
-        """Name with the number of the trial. Without a number, with the purpose of the run."""
+        """Name of the run, made of its number or, without a number, of its purpose."""
         return f"trial {self.number}" if self.number else f"{self.purpose} run"
 
     @property
@@ -101,7 +101,7 @@ class Plan:
 def needs_real_time(kind: str) -> bool:
     """Return True if faults of a kind are not useful in lockstep.
 
-    Either the kind does not exist in lockstep, or its delay has no meaning because no simulated
+    Either the kind is impossible in lockstep, or its delay has no meaning because no simulated
     time passes while a process dies.
     """
     return kind == EXTERNAL or KINDS[kind].realtime
@@ -127,7 +127,7 @@ class Target:
 
     @property
     def record(self) -> Kind:
-        """The kind itself, from its name."""
+        """Record that describes the kind."""
         return find_record(self.kind)
 
 

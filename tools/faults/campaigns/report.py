@@ -174,7 +174,7 @@ class CampaignReport:
         return list(dict.fromkeys(note for run in runs for note in run.notes))
 
     def _count_trials(self, kind: str) -> dict[str, int]:
-        """Return the number of trials in which a kind acted, and of those with the task done."""
+        """Count the trials in which a kind acted, and those among them whose task was done."""
         ends = [
             run.ended
             for run in self.results.trials

@@ -193,7 +193,7 @@ class Results:
 
     @property
     def faults(self) -> list[Judgement]:
-        """Judgements of all trials, without the trials for curves of size."""
+        """Judgements of the faults of all trials, except the trials for curves of size."""
         return [fault for run in self.trials for fault in run.faults]
 
 

@@ -178,7 +178,7 @@ def list_size_points(faults: Iterable[Judgement], kind: str, clock_ns: int) -> l
 
 
 def compute_spread(values: Iterable[float | None]) -> Spread | None:
-    """Return median and maximum of the values, without None. None if no values remain."""
+    """Return median and maximum of the values, ignoring None. None if no value remains."""
     numbers = [value for value in values if value is not None]
     return Spread(round(median(numbers), 3), round(max(numbers), 3)) if numbers else None
 

@@ -91,7 +91,7 @@ class Killer:
             self._retry_at = time.monotonic() + RETRY_S
 
     def _compute_instant_ns(self) -> int:
-        """Return the CLOCK_MONOTONIC in ns at which the next kill is due."""
+        """Return the CLOCK_MONOTONIC time in ns at which the next kill is due."""
         kill = self._waiting[0]
         words = self._words
         return words[System.EPOCH_NS] + round((kill.tick + kill.phase) * words[System.PERIOD_NS])
