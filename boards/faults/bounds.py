@@ -4,7 +4,7 @@ A bound is counted from the tick at which the fault first shows. Most faults sho
 act. A fault of the arm may at first have a smaller effect than friction, a contact or a slow joint.
 No detector could tell such an arm from a working one, so the bound starts later.
 
-A bound is a sum of terms. Each term has a text and computes its ticks; help, judgement and tests
+A bound is a sum of terms. Each term has a text and computes its ticks; help, reports and tests
 all use the same terms. A cycle is a cycle of the affected task; for a planner it is the time slice.
 A message is delivered at its reader's first read after it becomes visible.
 """
@@ -31,17 +31,16 @@ Up to 0.5 ms per megabyte were seen on a busy machine, and a planner with its li
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
-    """Return the cycle of a task in ticks: for a planner its time slice, for the clock one tick."""
+    """Return the cycle of a task in ticks: a planner's time slice, or 1 for the clock."""
     if board == CLOCK:
         return 1
     return layout.find_task(board).slice
 
 
 def compute_last_read_ticks(mailboxes: tuple[str, ...], layout: Layout) -> int:
-    """Return the longest time in ticks until every reader of a mailbox has read a message.
+    """Return the longest time in ticks from a writer's release until all readers have the message.
 
-    It is counted from the release of the cycle that writes the message, and is the longest among
-    these mailboxes. 0 if nobody reads them.
+    It is the maximum over these mailboxes. 0 if nobody reads them.
     """
     boxes = [layout.find_mailbox(name) for name in mailboxes]
     return max(
@@ -103,7 +102,7 @@ class BoundCase:
 
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
-        """Affected mailboxes that the reader reads or, if no reader is given, any task reads."""
+        """Affected mailboxes that the reader reads. Without a reader, those that any task reads."""
         struck = list_affected_mailboxes(self.layout, self.injection.mailbox, self.board)
         if self.reader:
             return tuple(mailbox for mailbox in struck if self.reader in mailbox.readers)
@@ -121,14 +120,14 @@ class BoundCase:
 
     @property
     def write_ticks(self) -> int:
-        """Interval in ticks between messages in the slowest affected mailbox."""
+        """Longest writing period in ticks among the affected mailboxes."""
         return max(mailbox.every for mailbox in self.mailboxes)
 
     @property
     def read_ticks(self) -> int:
         """Longest interval in ticks between reads of an affected mailbox.
 
-        It applies to the reader or, if no reader is given, to the fastest reader of each mailbox.
+        Only reads of the reader count or, without a reader, of the fastest reader of each mailbox.
         """
         read_interval = partial(compute_read_interval, self.layout)
         if self.reader:

@@ -1,4 +1,4 @@
-"""Faults as directed by the clock's board: each one waits, becomes active and ends at ticks.
+"""Life cycle of faults, directed by the clock's board: waiting, active, over.
 
 The board itself carries out the faults that no task can: signals to processes, forged messages, and
 faults of the clock's ticks.
@@ -30,17 +30,17 @@ from rack.boards.faults.message_steps import Babble, forge_message
 
 OPEN_STAGES = (Stage.WAITING, Stage.ACTIVE)
 PHASES = 1000
-"""Number of steps into which a phase divides a tick."""
+"""Number of phases in a tick: a phase of 500 is the middle of the tick."""
 MIN_LATENESS_TICKS = 0.6
 """Smallest delay of a late tick, in ticks. Boards report a tick that is at least 0.5 late."""
 
 
 Strike = Callable[["FaultStage", FaultEntry, int], None]
-"""Carries out one step of a fault: takes the stage, the entry of the fault table, and the tick."""
+"""Function that carries out one step of a fault at a tick."""
 
 
 def _do_nothing(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Do nothing."""
+    """Do nothing. This is the default for each step of a fault."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,10 @@ class ClockStep:
 
 
 def _kill_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Kill a task's process, or the clock itself. Wait until the crate has recorded the loss."""
+    """Kill a task's process and, in lockstep, wait until the crate has recorded the loss.
+
+    If the fault affects the clock, kill this process.
+    """
     task = stage.find_target(entry)
     if task is None:
         # The clock kills itself. Mark the entry first, so that the restarted clock does not do it
@@ -78,7 +81,7 @@ def _kill_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
 
 
 def _stop_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Stop a task's process by SIGSTOP."""
+    """Stop a task's process with SIGSTOP."""
     task = stage.find_target(entry)
     if task is not None and stage.send_signal(entry, tick, task, signal.SIGSTOP):
         task.is_stopped = True
@@ -88,7 +91,7 @@ def _stop_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
 
 
 def _continue_process(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Let a stopped process continue, unless the Rack has killed it."""
+    """Let a stopped process continue, unless it has been killed in the meantime."""
     task = stage.find_target(entry)
     if task is not None and task.is_stopped and not task.is_lost:
         with suppress(ProcessLookupError):
@@ -110,20 +113,20 @@ def _forge_message(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
 
 
 def _stop_clock(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Stop this process, which runs the clock, by SIGSTOP."""
+    """Stop this process, and with it the clock, with SIGSTOP."""
     entry.record_action(tick)
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
 def _skip_ticks(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Let the clock skip the number of ticks that the fault states."""
+    """Make the clock skip as many ticks as the fault's parameter specifies."""
     entry.record_action(tick)
     stage.driver.skip = int(entry.parameters[0])
     stage.driver.count_skipped(tick, stage.driver.skip)
 
 
 def _delay_tick(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Delay a tick by a random part of its period."""
+    """Delay a tick by a random fraction of its period, at most the fault's parameter."""
     entry.record_action(tick)
     delay = random.Random(entry.seed + tick).uniform(MIN_LATENESS_TICKS, entry.parameters[0])
     until_ns = stage.clock.compute_time_ns(tick) + int(delay * stage.clock.period_ns)
@@ -142,13 +145,13 @@ ELSEWHERE = ClockStep()
 
 
 def _find_step(entry: FaultEntry) -> ClockStep:
-    """Return what the clock's board does for a fault. `ELSEWHERE` if another process acts."""
+    """Return the steps of a fault in the clock's board. `ELSEWHERE` if another process acts."""
     step = find_kind(entry).step
     return step if isinstance(step, ClockStep) else ELSEWHERE
 
 
 def _next_change(entry: FaultEntry, tick: int) -> int:
-    """Return the first tick after `tick` at which a fault may begin, act or end, or `NEVER`."""
+    """Return the first tick after `tick` at which a fault may change. `NEVER` if it is over."""
     if entry.stage == Stage.WAITING:
         return tick + 1 if entry.when_box >= 0 else max(tick + 1, entry.tick)
     if entry.stage == Stage.ACTIVE:
@@ -160,10 +163,10 @@ def _next_change(entry: FaultEntry, tick: int) -> int:
 class FaultStage:
     """Begins and ends the faults of a rack at their ticks, before any task of the tick is released.
 
-    It also reports when messages flow again after a fault. In lockstep a process is killed or
-    stopped between two cycles, after it has finished its release, and the run continues once the
-    crate has recorded its end. A run with faults is therefore repeatable. In real time a fault may
-    have a phase: it then acts at a fraction of its tick, after the releases.
+    It also reports the first new message in each affected mailbox after a fault. In lockstep a
+    process is killed or stopped between two cycles, after it has finished its release, and the run
+    continues once the crate has recorded its end. A run with faults is therefore repeatable. In
+    real time a fault may have a phase: it then acts at a fraction of its tick, after the releases.
 
     Attributes:
         injected: Number of faults injected so far.
@@ -182,7 +185,7 @@ class FaultStage:
         self.injected = 0
         self.next_tick = 0
         self._awaited: dict[int, int] = {}
-        """By index of a mailbox, the tick from which a new message is awaited."""
+        """Dictionary from a mailbox's index to the tick from which a new message is awaited."""
         if self._words[System.STATE] == Run.RUNNING:
             # A restarted clock does not know which messages have been seen before.
             for entry in self._table.list_entries((Stage.OVER,)):
@@ -220,7 +223,10 @@ class FaultStage:
         return True
 
     def advance_faults(self, tick: int) -> None:
-        """Begin the faults that are due at `tick` and end the ones that are over."""
+        """Begin the faults that are due at `tick`, end the ones that are over, and set `next_tick`.
+
+        Also report the mailboxes that have a new message after a fault.
+        """
         self.injected = self._words[System.INJECTED]
         faults = self._table.list_entries(OPEN_STAGES)
         active = [entry for entry in faults if entry.stage == Stage.ACTIVE]
@@ -257,7 +263,7 @@ class FaultStage:
         self.next_tick = min(changes, default=NEVER)
 
     def act_within_tick(self, tick: int) -> None:
-        """Carry out the faults that have a phase in `tick`. Call it after the releases."""
+        """After the releases of `tick`, carry out its faults with a phase, each at its time."""
         if not self._phased:
             return
         clock = self.clock

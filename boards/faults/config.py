@@ -70,7 +70,7 @@ class FaultConfig(Table):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Values of the parameters by name, not yet checked against the kind."""
+        """Dictionary from parameter names to values, not yet checked against the kind."""
         return dict(self.__pydantic_extra__ or {})
 
 

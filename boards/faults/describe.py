@@ -24,7 +24,7 @@ def find_board(entry: FaultEntry, layout: Layout) -> str:
 
 
 def find_subject(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
-    """Return the mailbox or the joint that a fault affects.
+    """Return the name of the mailbox or joint that a fault affects.
 
     Args:
         entry: The fault.
@@ -41,7 +41,7 @@ def find_subject(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> st
 
 
 def format_joint(index: int, joints: Sequence[str]) -> str:
-    """Return the name of a joint by its index. -1 stands for all joints."""
+    """Return the name of the joint with this index. -1 stands for all joints."""
     if index < 0:
         return ALL_JOINTS
     return joints[index] if index < len(joints) else f"joint {index}"

@@ -54,49 +54,49 @@ def log_uniform_number(least: float, most: float) -> Draw:
 
 
 def draw_joint(d: Drawing) -> int:
-    """Draw the index of a joint. In one of ten cases it is -1, which means all joints."""
+    """Draw the index of a joint, or -1 (all joints) with probability 0.1."""
     return d.rng.randrange(d.joints) if d.rng.random() < 0.9 else -1
 
 
 def draw_joint_or_all(d: Drawing) -> int:
-    """Draw the index of a joint. In half of all cases it is -1, which means all joints."""
+    """Draw the index of a joint, or -1 (all joints) with probability 0.5."""
     return d.rng.choice((-1, d.rng.randrange(d.joints)))
 
 
 def uniform_seconds(least: float, most: float) -> DrawTicks:
-    """Return a draw of a duration, uniform between two simulated times in s."""
+    """Return a draw of a duration in ticks, uniform between two simulated times in s."""
     return lambda d: max(1, round(d.rng.uniform(least, most) * d.second))
 
 
 def uniform_cycles(least: int, most: int) -> DrawTicks:
-    """Return a draw of a duration, uniform between two numbers of cycles of the task."""
+    """Return a draw of a duration in ticks, uniform between `least` and `most` task cycles."""
     return lambda d: d.rng.randint(least, most) * d.cycle
 
 
 def uniform_messages(least: int, most: int) -> DrawTicks:
-    """Return a draw of a duration in which the task writes `least` to `most` messages.
+    """Return a draw of a duration in ticks in which the task writes `least` to `most` messages.
 
-    The duration is at least two cycles of the fastest reader, so that the reader sees the fault.
+    The duration is at least two cycles of the fastest reader, so that the reader can notice it.
     """
     return lambda d: max(d.rng.randint(least, most) * d.cycle, 2 * d.reader)
 
 
 def longest_of(*lengths: DrawTicks) -> DrawTicks:
-    """Return a draw of the longest of several durations."""
+    """Return a draw of a duration that is the longest of several draws."""
     return lambda d: max(draw(d) for draw in lengths)
 
 
 def uniform_silence(least: float, most: float) -> DrawTicks:
-    """Return a draw of the time for which a mailbox is silent.
+    """Return a draw of the time in ticks for which a task writes no messages.
 
-    `least` and `most` are multiples of the time within which the fastest reader must notice the
-    silence.
+    `least` and `most` are multiples of the time within which the fastest reader must notice that
+    messages are missing.
     """
     return lambda d: round((2 * d.cycle + d.reader) * d.rng.uniform(least, most))
 
 
 def list_sweep_sizes(least: float, visible: float, count: int) -> list[float]:
-    """Return the sizes at which detection delay is measured, a geometric series.
+    """Return a geometric series of fault sizes for measuring the detection delay.
 
     Args:
         least: Smallest size.

@@ -1,6 +1,6 @@
 """The record that describes a fault kind.
 
-Help, checks, injection, judgement and campaigns use only this record. The project's own kinds are
+Help, checks, injection, reports and campaigns use only this record. The project's own kinds are
 in `rack.boards.faults.kinds`. The author of a level adds a kind next to the level:
 
     KINDS.add(Kind(name="gauge-stuck", where="writer", ...))
@@ -32,7 +32,7 @@ from rack.boards.faults.bounds import (
 from rack.boards.faults.drawing import Draw, DrawTicks
 
 Where = Literal["process", "load", "core", "writer", "bus", "lock", "clock", "arm", "start"]
-"""Place where a step acts.
+"""Process in which a step acts, and when.
 
 - `process`, `clock`, `bus`: in the clock's board, at the start of a tick.
 - `load`, `writer`, `lock`: in the task itself.
@@ -45,7 +45,7 @@ Died = Literal["died"]
 DIED: Died = "died"
 """Detection of a process's death by the Rack."""
 RECOVERY_S = 0.25
-"""Default time after a fault within which reactions must be undone, s of simulated time."""
+"""Default simulated time in s after a fault within which reactions must be undone."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Kind:
 
     @property
     def recoverable(self) -> bool:
-        """Whether the task continues after the fault."""
+        """Whether the task can continue after the fault."""
         return self.where != "start"
 
     @cached_property
@@ -173,13 +173,13 @@ class Kind:
 
     @property
     def size(self) -> Parameter | None:
-        """Parameter that determines whether the fault is detectable. None if it always is."""
+        """The parameter `size`, if faults below a certain size need not be detected, else None."""
         if self.visible_from is None:
             return None
         return next(p for p in self.parameters if p.name == "size")
 
     def read_parameters(self, fault: FaultEntry | Injection) -> dict[str, float]:
-        """Return the parameters of a fault of this kind, by name."""
+        """Return a dictionary from parameter names to the values of a fault of this kind."""
         return {p.name: value for p, value in zip(self.parameters, fault.parameters, strict=False)}
 
     def compute_bound_ticks(
@@ -204,9 +204,8 @@ class Kind:
     def compute_recovery_ticks(self, board: str, layout: Layout, restart_s: float) -> int:
         """Compute the time within which the rack must have recovered.
 
-        A restarted board continues at its next release; the executor of a restarted planner
-        continues with the planner's first plan. Messages flow again once each mailbox has a new
-        one.
+        It is the sum of the kind's recovery time, a restart and one cycle of the task if the fault
+        ends its process, and the time for a new message in every mailbox if it affects messages.
 
         Args:
             board: Name of the affected task.
@@ -285,7 +284,7 @@ class Kinds:
 
     @property
     def names(self) -> Mapping[str, Kind]:
-        """The kinds by name."""
+        """Dictionary from names to kinds."""
         return self._by_name
 
 
@@ -293,5 +292,5 @@ KINDS = Kinds()
 
 
 def find_kind(entry: FaultEntry) -> Kind:
-    """Return the kind of an entry of the fault table."""
+    """Return the kind of an entry of the fault table. `UNKNOWN` if this process lacks it."""
     return KINDS[entry.kind]

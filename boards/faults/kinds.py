@@ -68,7 +68,10 @@ def _probability_parameter(default: float, most: float) -> Parameter:
 
 
 def _size_parameter(meaning: str, visible: float, least: float, most: float) -> Parameter:
-    """Return the parameter for the size of a sensor error. Draws start at the visible size."""
+    """Return the parameter for the size of a sensor error.
+
+    Campaigns draw it from `visible` to `MAX_SIZE_RATIO` times `visible`.
+    """
     return Parameter(
         "size",
         "rad",
@@ -187,7 +190,7 @@ KINDS.add(
         step=messages.Drop,
         parameters=(_probability_parameter(0.3, 0.9),),
         detected_as=(Alarm.GAP,),
-        # The gap in serials shows with the next message.
+        # The next message makes the gap in the serials visible.
         bound=bounds.write_bound(1) + bounds.DELIVERY,
         consequence=Consequence(own=(Alarm.MUTE,)),
         lasts=draw.uniform_messages(4, 8),
@@ -208,7 +211,7 @@ KINDS.add(
                 drawn=draw.uniform_integer(1, 5),
             ),
         ),
-        # Until the first delayed message arrives, the mailbox is silent.
+        # Until the first delayed message arrives, the mailbox gets no messages.
         detected_as=(Alarm.HELD_BACK, Alarm.MUTE),
         bound=bounds.DELAY + bounds.DELIVERY,
         # Afterwards the first punctual messages overtake the last delayed ones.
@@ -220,7 +223,7 @@ KINDS.add(
         means="consecutive messages are swapped",
         step=messages.Reorder,
         parameters=(_probability_parameter(0.3, 0.9),),
-        # The last message may have no successor with which to be swapped. It is then only late.
+        # If the last message has no successor to be swapped with, it is only late.
         detected_as=(Alarm.DISORDER, Alarm.HELD_BACK),
         not_queued="the messages of one cycle have the same tick: nothing would show their order",
         bound=bounds.write_bound(1) + bounds.DELIVERY,
@@ -372,8 +375,8 @@ KINDS.add(
         name="sensor-stuck",
         means="joint position and velocity freeze",
         step=arm.SensorStep(arm.freeze_sample),
-        # A stuck sensor does not show on a joint at rest, so some draws freeze all joints for long
-        # enough.
+        # A stuck sensor cannot be noticed while its joint is at rest, so some draws freeze all
+        # joints for long enough that one of them moves.
         parameters=(_joint_parameter(draw.draw_joint_or_all),),
         # A joint that is driven but shows no velocity looks like one whose motor produces no
         # torque.

@@ -23,7 +23,7 @@ from rack.boards.faults.kind import find_kind
 
 
 class Outgoing(NamedTuple):
-    """A message on its way to the mailbox.
+    """A message that is about to be published.
 
     Attributes:
         at: Tick at which the cycle that publishes the message was released.
@@ -63,7 +63,7 @@ class MessageStep:
         self._seed = f"{entry.seed} {index}"
 
     def send_message(self, message: Outgoing) -> None:
-        """Process a message and pass on the result."""
+        """Pass the message on. Subclasses change, delay or discard it."""
         self.onward(message)
 
     def flush_due(self, tick: int, visible_at: int) -> None:
@@ -74,11 +74,11 @@ class MessageStep:
         self.entry.record_action(message.at)
 
     def create_random(self, message: Outgoing) -> random.Random:
-        """Return a random generator seeded by the fault and the message's release alone."""
+        """Return a generator seeded from the fault, the mailbox and the message's release alone."""
         return random.Random(f"{self._seed} {message.released}")
 
     def hold_message(self, message: Outgoing) -> None:
-        """Delay a message. Its content is copied, because the writer's buffer will be reused."""
+        """Store a message with a copy of its content, because the buffer will be reused."""
         content = message.content or bytes(self.writer.message.raw)
         self.held.append(message._replace(content=content))
 
@@ -107,7 +107,7 @@ class Delay(MessageStep):
     """Delays every message by a number of cycles."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Hold the message back."""
+        """Store the message until its delay is over."""
         self.count_action(message)
         self.hold_message(message)
 
@@ -124,7 +124,7 @@ class Reorder(MessageStep):
     """Swaps messages with their successors."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Swap the message with the one held back before, if there is one.
+        """Send the message ahead of the one held back earlier, if there is one.
 
         Otherwise hold it back with the fault's probability, or pass it on.
         """
@@ -140,10 +140,10 @@ class Reorder(MessageStep):
 
 
 class Corrupt(MessageStep):
-    """Flips bits of messages in their slots at random."""
+    """Flips random bits of messages in their slots."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Pass the message on. With the fault's probability, choose bits of it to flip."""
+        """With the fault's probability, mark random bits to be flipped. Pass the message on."""
         probability, bits, *_ = self.entry.parameters
         chance = self.create_random(message)
         size = 8 * self.writer.spec.size
@@ -160,7 +160,7 @@ class Babble(MessageStep):
     """Writes each message many times."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Pass the message on as many times as the fault states."""
+        """Pass the message on as many times as the parameter `writes` specifies."""
         self.count_action(message)
         for _ in range(round(self.entry.parameters[0])):
             self.onward(message)
@@ -170,7 +170,10 @@ class HoldLock(MessageStep):
     """Stops or kills the process once, while it holds the mailbox's lock."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Take the lock and stop or die. A stopped process releases the lock when it continues."""
+        """Acquire the lock and stop or kill this process, unless the fault has already acted.
+
+        When a stopped process continues, it releases the lock and passes the message on.
+        """
         writer = self.writer
         is_killed = bool(self.entry.parameters[0])
         if isinstance(writer, LockWriter) and not self.entry.count and writer.lock.acquire():
@@ -258,12 +261,15 @@ class FaultyWriter:
         self._show_messages()
 
     def _show_messages(self) -> None:
-        """Update the count of delayed messages and show published messages to readers."""
+        """Update the count of delayed messages and make published ones visible to readers."""
         self._writer.held = len(self._late) + sum(len(step.held) for step in self._steps.values())
         self._writer.show_published()
 
     def _publish_message(self, message: Outgoing) -> None:
-        """Publish a message with its stored content, if it has any, from the writer's buffer."""
+        """Publish a message through the writer's buffer.
+
+        Stored content, if any, temporarily replaces the content of the buffer.
+        """
         raw = self._writer.message.raw
         # Restore the buffer afterwards, because it contains the level's newest message.
         present = bytes(raw)

@@ -65,7 +65,7 @@ Times are CLOCK_MONOTONIC in ns.
 
 
 def extend_cycle(load: ExtraComputing, tick: int, now_ns: int) -> int:
-    """Extend an executor's cycle by `by` cycles, or by a random part of that.
+    """Compute when extra computing of `by` cycles, or a random fraction of that, ends.
 
     Args:
         load: The extra computing; its fault has the parameters `by` and `random`.
@@ -81,7 +81,7 @@ def extend_cycle(load: ExtraComputing, tick: int, now_ns: int) -> int:
 
 
 def extend_time_slice(load: ExtraComputing, tick: int, now_ns: int) -> int:
-    """Extend a planner's time slice by `by` cycles.
+    """Compute when extra computing that exceeds a planner's time slice by `by` cycles ends.
 
     Args:
         load: The extra computing; its fault has the parameter `by`.
@@ -153,12 +153,16 @@ class TaskFaults:
         return generation if len(active) == len(begun) else -1
 
     def burn_time(self, tick: int) -> None:
-        """Spend the extra computing time of all active faults."""
+        """Keep the processor busy for each active fault in turn."""
         for load in self.loads:
             load.burn_time(tick)
 
     def count_actions(self, acted: Mapping[int, bool], tick: int) -> None:
-        """Record which faults of the arm acted in a cycle: see `Executor.acted`."""
+        """Record which faults of the arm acted in the cycle released at `tick`.
+
+        `acted` maps the index of a fault among those of the arm to True if its effect must be
+        detected: see `Executor.acted`.
+        """
         for index, shows in acted.items():
             self._arm[index].record_action(tick, shows)
 
@@ -194,7 +198,7 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
 def act_on_core(segment: Segment, index: int) -> int:
     """Carry out the fault at `index` of the fault table, which takes a task's core.
 
-    Called in a process that the crate has forked. Returns the exit status.
+    Called in a process that the crate has forked, or by `rack inject`. Returns exit status 0.
     """
     entry = FaultTable(segment).entries[index]
     step = find_kind(entry).step

@@ -35,11 +35,11 @@ ANYONE = "*"
 
 
 Rule = tuple[str, Sequence[str], Sequence[str]]
-"""Direction, kinds of messages and keys that are allowed."""
+"""Direction (`IN` or `OUT`), allowed kinds of messages, and allowed keys."""
 
 
 def build_access_control(rack: str, table: LanTable, is_operator: bool) -> dict[str, Any]:
-    """Return the value of zenoh's `access_control` for a session.
+    """Return zenoh's `access_control` setting for a session.
 
     Args:
         rack: Name of the rack, or of the operator.
@@ -83,7 +83,7 @@ def build_access_control(rack: str, table: LanTable, is_operator: bool) -> dict[
 
 
 def _list_exchange_rules(rack: str, peer: str, table: LanTable) -> list[Rule]:
-    """Return the rules for a rack with which this rack exchanges mailboxes."""
+    """Return the rules for exchanging mailboxes, steps and pings with one other rack."""
     imports = [
         out_key(peer, entry.mailbox) for entry in table.imports.values() if entry.rack == peer
     ]
@@ -100,7 +100,7 @@ def _list_exchange_rules(rack: str, peer: str, table: LanTable) -> list[Rule]:
 
 
 def _list_export_rules(keys: Sequence[str]) -> list[Rule]:
-    """Return the rules for keys to which others may subscribe."""
+    """Return the rules that let others subscribe to keys under which this rack sends."""
     return [(IN, SUBSCRIBE, keys), (OUT, PUT, keys)] if keys else []
 
 
@@ -110,7 +110,7 @@ def _list_presence_rules(rack: str) -> list[Rule]:
 
 
 def _build_settings(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:
-    """Return the rules of each subject in the form that zenoh expects."""
+    """Convert the rules of each subject to zenoh's `access_control` format."""
     return {
         "enabled": True,
         "default_permission": "deny",

@@ -67,9 +67,9 @@ class LanAdapter(Adapter):
 
     @classmethod
     def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
-        """Return the names of the other racks and of those who may set the emergency stop.
+        """Return the names of the peers and of the senders that may set the emergency stop.
 
-        Alarms refer to them by their index in this sequence.
+        Alarms contain indices into this sequence. It is empty if the parameters are invalid.
         """
         table = _read_table(params)
         return () if table is None else tuple(dict.fromkeys([*table.racks, *table.estop_from]))
@@ -78,10 +78,10 @@ class LanAdapter(Adapter):
     def build_ports(
         cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
     ) -> ConfiguredPorts:
-        """Return the ports that the parameters configure.
+        """Return an input for each export, and outputs for imports, peers and the status.
 
-        These are an input for each export, an output for each import and for the presence of each
-        other rack, and the status.
+        The result is marked as incomplete if the parameters are invalid or refer to an unknown
+        mailbox or message class.
         """
         table = _read_table(params)
         if table is None:
@@ -109,7 +109,10 @@ class LanAdapter(Adapter):
 
     @classmethod
     def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return the ports that a replay writes. Only messages of imports are sent one by one."""
+        """Return a dictionary from each port that a replay writes to True if it is an import.
+
+        Only the messages of imports are sent one by one.
+        """
         imports = read_params(LanTable, params).imports
         return {port: port in imports for port in cls.build_ports(params, {}).outputs}
 
@@ -201,7 +204,10 @@ class LanAdapter(Adapter):
         link.declare_token(self._launch, 0 if barrier is None else barrier.cycle_ns)
 
     def process(self, tick: int) -> None:
-        """Exchange the messages that are due in this cycle."""
+        """Send and receive the messages that are due, and write the status.
+
+        In a replay, write the messages that were recorded in this cycle.
+        """
         if self._replayed is not None:
             self._replayed.start_cycle(tick)
             self._update_presence(tick)
@@ -226,7 +232,7 @@ class LanAdapter(Adapter):
         self._write_status(tick)
 
     def _update_presence(self, tick: int) -> None:
-        """Update which racks are present.
+        """Update which racks are present. If a rack has appeared, resend all exports.
 
         With `on_peer_loss = "stop"`, stop the arm while a rack is lost.
         """
@@ -280,7 +286,7 @@ class LanAdapter(Adapter):
 
 
 def _read_table(params: Mapping[str, Any]) -> LanTable | None:
-    """Return the table in the parameters, or None if they contain mistakes."""
+    """Parse the `[adapter.lan]` table. Return None if it is invalid."""
     try:
         return read_params(LanTable, params)
     except LevelError:

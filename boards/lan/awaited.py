@@ -35,7 +35,7 @@ _TEXTS = {
 
 
 def encode_wait(index: int, why: WaitReason) -> int:
-    """Encode the rack that an adapter waits for and the reason.
+    """Encode in one word which rack an adapter waits for and why.
 
     Args:
         index: Index of the rack in `LanTable.racks`.
@@ -48,11 +48,11 @@ def encode_wait(index: int, why: WaitReason) -> int:
 
 
 def find_waits(segment: Segment) -> Iterator[tuple[str, str]]:
-    """Yield each adapter that waits for another rack, with a text that names the rack and why.
+    """Yield the board of each waiting adapter, and a text with the awaited rack and the reason.
 
     Raises:
-        DamageError: A board that waits is not an adapter, or its word contains a rack or a reason
-            that does not exist.
+        DamageError: A waiting board is not an adapter, or its word contains an invalid rack or
+            reason.
     """
     for task in segment.layout.tasks:
         if word := segment.get_block(task.name)[Block.AWAITS]:

@@ -73,7 +73,7 @@ class RoundTrip(NamedTuple):
 
     @property
     def offset_ns(self) -> int:
-        """Other clock minus this rack's clock in ns, if both directions took equally long."""
+        """Other clock minus this rack's clock in ns, assuming both directions took equally long."""
         return (self.received - self.sent + self.answered - self.arrived) // 2
 
     def compute_uncertainty_ns(self, now_ns: int) -> int:
@@ -93,8 +93,8 @@ class ClockOffset:
     clocks has stepped, for example while its machine slept.
 
     Attributes:
-        best: Round trip with the smallest uncertainty, or None. All uncertainties grow alike, so
-            the choice does not depend on the time.
+        best: Round trip with the smallest uncertainty, or None. All uncertainties grow at
+            the same rate, so the choice does not depend on the time.
         steps: Number of steps of either clock that were detected.
     """
 
@@ -107,7 +107,7 @@ class ClockOffset:
         return len(self._recent)
 
     def add_round_trip(self, trip: RoundTrip) -> bool:
-        """Add a round trip. Return False, without adding it, if its time stamps are impossible."""
+        """Add a round trip unless its time stamps are impossible. Return True if it was added."""
         if trip.duration_ns < 0 or trip.arrived < trip.sent or trip.answered < trip.received:
             return False
         now_ns = trip.arrived
@@ -137,7 +137,7 @@ class PeerClock:
         peer: The rack.
         put: Sends a ping to the rack.
         offset: Offset of the rack's clock.
-        sent: Time in ns at which each unanswered ping was sent, by the serial of the ping.
+        sent: Dictionary from the serial of each unanswered ping to the time in ns when it was sent.
         due_ns: Time in ns at which the next ping is due.
         launch_and_losses: Launch and number of losses of the rack when the measurements began.
         epoch_ns: CLOCK_MONOTONIC of the rack's machine at the rack's tick 0, in ns. 0 if the rack
@@ -157,7 +157,7 @@ class PeerClock:
     clock_ns: int = 0
 
     def discard_if_outdated(self) -> None:
-        """Discard measurements that were made before a new launch or a loss of the rack."""
+        """Discard all measurements if the rack has been launched again or lost since they began."""
         launch_and_losses = (self.peer.launch, self.peer.losses)
         if launch_and_losses != self.launch_and_losses:
             self.launch_and_losses = launch_and_losses
@@ -171,7 +171,7 @@ class PeerClock:
         """Convert a CLOCK_MONOTONIC stamp of the other machine to the rack's simulated time.
 
         Returns:
-            The simulated time in ns. 0 before tick 0 of that rack.
+            The simulated time in ns. 0 if the stamp is before tick 0, or if the epoch is unknown.
         """
         return (
             max(0, stamp_ns - self.epoch_ns) * self.clock_ns // self.period_ns
@@ -209,7 +209,7 @@ class Clocks:
         self._now_ns = 0
 
     def open(self, link: LanLink, sealer: Sealer) -> None:
-        """Start to answer the pings of other racks, and prepare to ping them."""
+        """Start to answer pings, and prepare to send pings. Do nothing in lockstep."""
         if self._grid.is_lockstep:
             return
         self._link = link
@@ -252,7 +252,7 @@ class Clocks:
             self._put[asker](content, self._sealer.seal(key, pong, content))
 
     def exchange_pings(self) -> None:
-        """Process the answers that have arrived and send the pings that are due."""
+        """Process arrived answers, send the pings that are due, and update the peers' offsets."""
         if self._grid.is_lockstep:
             return
         for clock in self._clocks.values():
@@ -282,7 +282,11 @@ class Clocks:
         clock.put(b"", self._sealer.seal(ping_key(self._rack, rack), head, b""))
 
     def _accept_answer(self, arrived_ns: int, pong: ReceivedMessage) -> bool:
-        """Process an answer. Return False if it is malformed or belongs to no ping of this rack."""
+        """Add the round trip of an answer to the measurements of its sender.
+
+        Returns:
+            False if the answer is malformed or does not belong to a recent ping of this rack.
+        """
         head = self._sealer.open_message(*pong)
         if isinstance(head, Flaw) or head.kind != _PONG_KIND or len(pong.payload) != _PONG.size:
             return False
@@ -306,9 +310,10 @@ class Clocks:
         return True
 
     def is_unmeasured(self, peer: PeerRack, tick: int) -> bool:
-        """Return True if a rack has been present for a while but its clock is still not measured.
+        """Return True if a rack has been present for `REPORT_UNKNOWN_NS` without a clock offset.
 
-        Messages from such a rack are held back, because their age is unknown.
+        Messages from such a rack are held back, because their age is unknown. In lockstep no offset
+        is needed, so the result is always False.
         """
         is_unknown = peer.is_present and peer.offset_ns is None and not self._grid.is_lockstep
         return is_unknown and tick - peer.since > self._grid.ticks_in(REPORT_UNKNOWN_NS)
@@ -319,6 +324,8 @@ class Clocks:
 
     def write_clock(self, out: Any, rack: str, tick: int) -> None:
         """Write offset, uncertainty and speed of a rack's clock into its presence message.
+
+        Without a measurement, uncertainty and round trip are -1, or 0 in lockstep.
 
         Args:
             out: The message to fill, a `rack.levels.peer.PeerPresence`.

@@ -52,7 +52,7 @@ from rack.boards.lan.config import MAX_CHAIN_BYTES, CredentialError
 AUTHORITY = "authority.pem"
 MAX_CREDENTIAL_BYTES = 100_000
 MAX_REMEMBERED = 1024
-"""Maximum number of senders whose checked certificates are remembered."""
+"""Maximum number of senders whose checked certificates are cached."""
 OTHERS_MODE = stat.S_IRWXG | stat.S_IRWXO
 OWNER_ONLY = 0o600
 MINUTE = "%Y-%m-%d %H:%M"
@@ -105,7 +105,11 @@ class Credentials:
 
     @cached_property
     def key_pair(self) -> KeyPair:
-        """Certificates and key with which the rack seals. Raises `CredentialError`."""
+        """Certificates and private key with which the rack seals its messages.
+
+        Raises:
+            CredentialError: A file cannot be used, or the key does not match the certificate.
+        """
         chain = load_certificates(self.certificate)
         content = b"".join(certificate.public_bytes(Encoding.DER) for certificate in chain)
         if len(content) > MAX_CHAIN_BYTES:
@@ -120,7 +124,7 @@ class Credentials:
         return KeyPair(content, key)
 
     def identify_sender(self, chain: bytes) -> Identity | None:
-        """Return the sender's identity according to the certificates that came with a seal.
+        """Verify the certificates that came with a seal and return the sender's identity.
 
         Args:
             chain: Certificates in DER form, the sender's first.
@@ -256,7 +260,10 @@ def _is_p256(key: object) -> TypeGuard[EllipticCurvePublicKey]:
 
 
 def _identify_chain(chain: bytes, authorities: list[Certificate]) -> Identity | None:
-    """Return the identity in a chain of DER certificates, or None if no authority signed it."""
+    """Return the identity of the first certificate of a DER chain.
+
+    None if the chain is malformed or not signed by an authority, or if the key is not on P-256.
+    """
     certificates = []
     try:
         while chain:

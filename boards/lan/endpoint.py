@@ -78,14 +78,14 @@ class Endpoint(NamedTuple):
 
     @property
     def is_wildcard(self) -> bool:
-        """Whether it stands for all addresses of the machine."""
+        """Whether the host is the wildcard for all addresses of the machine."""
         with suppress(ValueError):
             return ip_address(self.host).is_unspecified
         return False
 
 
 def list_endpoints(table: LanTable) -> list[Endpoint]:
-    """Return the endpoints of a table, without malformed ones, which the config checks report."""
+    """Return the well-formed endpoints of a table. The config checks report the others."""
     endpoints = []
     for text in (*table.listen, *table.connect):
         with suppress(ValueError):
@@ -94,5 +94,5 @@ def list_endpoints(table: LanTable) -> list[Endpoint]:
 
 
 def has_tls(table: LanTable) -> bool:
-    """Return True if an endpoint uses TLS, so that certificates identify the other racks."""
+    """Return True if any endpoint uses TLS, so that certificates identify the other racks."""
     return any(endpoint.has_tls for endpoint in list_endpoints(table))

@@ -50,11 +50,11 @@ class SequenceTracker:
         self._arrived = _WHOLE
 
     def accept_message(self, head: Envelope) -> bool:
-        """Record a message and decide whether it should be delivered.
+        """Record a message and check whether it should be delivered.
 
         Returns:
-            True if the message is newer than every earlier one. Gaps before it are counted as
-            missing. Any other message is counted as repeated or disordered.
+            True if the message is newer than every earlier one. Messages missing before it are
+            counted. Any other message is counted as repeated or disordered.
         """
         count = self.count
         if head.launch != self.launch:
@@ -134,7 +134,10 @@ class Export:
             self.send_newest(tick)
 
     def send_newest(self, tick: int) -> None:
-        """Send the newest message if it is new or if a rack that joined needs it."""
+        """Send the newest message if it was not sent before.
+
+        In real time, send it again if a rack has joined since.
+        """
         # Read the mailbox directly, because a port gives neither the serial nor the written tick.
         source = self._source
         grid = self._grid
@@ -162,7 +165,7 @@ class Export:
 class Import:
     """Receives the messages of one mailbox of another rack.
 
-    Each exchange writes the newest good message to the mailbox `lan.<port>`. From the loss of the
+    Each exchange writes the newest valid message to the mailbox `lan.<port>`. From the loss of the
     other rack until its first message after its return, the mailbox is marked as away: readers see
     its writer as lost or, with `on_peer_loss = "go on"`, keep the last message, however old.
 
@@ -209,7 +212,7 @@ class Import:
         self._sealer = sealer
 
     def is_old(self, tick: int) -> bool:
-        """Return True if the newest message is older than the import permits."""
+        """Return True if the newest message is too old for the import. False if there is none."""
         return self._basis is not None and tick - self._basis > self._max_age
 
     def update_presence(self, tick: int) -> None:
@@ -220,7 +223,7 @@ class Import:
                 self._set_away(True, tick + self._delay if self._grid.is_lockstep else tick)
 
     def mark_present(self, tick: int) -> None:
-        """Mark the mailbox as present again, from the message of this cycle on."""
+        """End the absence of the mailbox when the message of this cycle becomes visible."""
         if self._is_away:
             self._set_away(False, tick + self._delay)
 
@@ -230,7 +233,7 @@ class Import:
         self._box[self._word] = encode_switch(tick, is_away)
 
     def deliver_newest(self, out: Sender[AnyMessage], tick: int) -> None:
-        """Process the messages that have arrived and write the newest good one.
+        """Process the messages that have arrived. Write the newest valid one unless it is too old.
 
         Args:
             out: Output port of the import.
@@ -262,9 +265,10 @@ class Import:
         self.mark_present(tick)
 
     def _open_message(self, arrived: ReceivedMessage) -> Envelope | None:
-        """Return the head of a received message, or count the message as refused and return None.
+        """Check a received message and return its head.
 
-        The seal, the type, the length and the range of the numbers are checked.
+        If the seal, the type, the length or a number is invalid, count the message as refused and
+        return None.
         """
         head = self._sealer.open_message(*arrived)
         if (
@@ -283,7 +287,8 @@ class Import:
         """Return True if a message comes from the present launch and its age is known.
 
         In lockstep that is always true: see `Barrier`. A message that may become acceptable is
-        stored for a later cycle and replaces a message that was stored before.
+        stored for a later cycle, in place of the one stored before. Any other is counted as
+        coming from an unknown launch.
 
         Args:
             head: Head of the message.
@@ -310,11 +315,11 @@ class Import:
         return False
 
     def _is_present_launch(self, head: Envelope) -> bool:
-        """Return True if a message comes from the launch that is present."""
+        """Return True if a message comes from the present launch of its rack."""
         return self._peer.is_present and head.launch == self._peer.launch
 
     def _keep_if_newest(self, head: Envelope, payload: bytes) -> bool:
-        """Store a message and return True if it is well formed and newer than all earlier ones."""
+        """Store a message and return True if it is well formed and newer than all stored before."""
         message = AnyMessage(self._buffer.record.dtype, memoryview(bytearray(payload)))
         if not is_proper(message.record, self._fields):
             self.count.refused += 1

@@ -112,7 +112,7 @@ class Sealer:
         self.flaws |= zip(Flaw, flaws, strict=False)
 
     def seal(self, key: str, head: Envelope, payload: bytes | memoryview) -> bytes:
-        """Return the envelope of a message.
+        """Seal a message and return its envelope.
 
         Args:
             key: Key expression under which the message will be sent.
@@ -125,7 +125,7 @@ class Sealer:
         return packed + (self._pair.sign_digest(digest) if self._pair else digest)
 
     def open_message(self, key: str, envelope: bytes | None, payload: bytes) -> Envelope | Flaw:
-        """Check a received message and return its head. A flaw is counted.
+        """Check length, format and seal of a received message. If one is wrong, count the flaw.
 
         Args:
             key: Key expression under which the message arrived.
@@ -151,7 +151,10 @@ class Sealer:
         return Envelope._make((*fields, flags))
 
     def _has_valid_seal(self, key: str, digest: bytes, chain: bytes, seal: bytes) -> bool:
-        """Return True if the seal was made by the sender that the key expression names."""
+        """Return True if the seal was made by the sender that the key expression names.
+
+        Without credentials, the seal must be the digest itself.
+        """
         if self._credentials is None:
             return compare_digest(seal, digest)
         identity = self._credentials.identify_sender(chain)

@@ -48,7 +48,7 @@ class OwnGrid:
         return tick * self._clock_ns
 
     def stamp_ns(self, tick: int) -> int:
-        """Return the CLOCK_MONOTONIC of a tick in ns, or its simulated time in lockstep."""
+        """Return the CLOCK_MONOTONIC time of a tick in ns. In lockstep, its simulated time."""
         return self.time_ns(tick) if self.is_lockstep else self._clock.compute_time_ns(tick)
 
     def to_local_tick(self, head: Envelope, peer: PeerRack, tick: int) -> int:

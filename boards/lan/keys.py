@@ -21,7 +21,7 @@ _SENDER = re.compile(r"rack/([^/]+)/")
 
 
 def sender_of(key: str) -> str:
-    """Return the sender's name in a key expression, or an empty string if it has none."""
+    """Return the sender's name in a key expression. Empty if the expression contains none."""
     match = _SENDER.match(key)
     return match[1] if match else ""
 

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
     from rack.boards.lan.credentials import Credentials
 
 MAX_UNREAD = 32
-"""Maximum number of messages of one import that wait for a cycle."""
+"""Maximum number of messages of one import that wait for the adapter's next cycle."""
 MAX_TOKENS = 1024
-"""Maximum number of liveliness changes between two cycles of an adapter."""
+"""Maximum number of liveliness changes that wait for the adapter's next cycle."""
 RETRY_MS = (50, 200)
 """Shortest and longest interval between two attempts to connect."""
 KEEP_ALIVES = 4
@@ -59,7 +59,7 @@ class ReceivedMessage(NamedTuple):
 
     @classmethod
     def from_sample(cls, sample: zenoh.Sample) -> Self:
-        """Copy a message out of a sample of zenoh."""
+        """Copy key expression, envelope and payload from a zenoh sample."""
         return cls(str(sample.key_expr), _to_bytes(sample.attachment), sample.payload.to_bytes())
 
 
@@ -112,8 +112,8 @@ class LanLink:
     def publish(self, key: str, reliable: bool = False) -> Callable[[bytes, bytes], None]:
         """Return a function that sends a payload and its envelope under a key expression.
 
-        It drops the message if the send queue is full. With `reliable`, which only lockstep uses,
-        it waits for room in the queue instead.
+        If the send queue is full, the returned function drops the message. With `reliable`, which
+        only lockstep uses, it waits for room in the queue.
         """
         control = zenoh.CongestionControl.BLOCK if reliable else zenoh.CongestionControl.DROP
         publisher = self.session.declare_publisher(
@@ -129,10 +129,10 @@ class LanLink:
         """Open a subscription or a query channel with a bounded buffer.
 
         Args:
-            declare: Method of the session that declares it.
+            declare: Session method that declares the channel.
             key: Key expression.
-            unread: Length of the buffer.
-            options: Passed on to `declare`.
+            unread: Length of the buffer. If it is full, the oldest sample is overwritten.
+            options: Further arguments of `declare`.
 
         Returns:
             A function that yields the samples since its last call, oldest first.
@@ -141,7 +141,7 @@ class LanLink:
         self._kept.append(channel)
 
         def take_samples() -> Iterator[Any]:
-            """Yield the samples in the buffer, oldest first."""
+            """Remove and yield the samples in the buffer, oldest first."""
             # Take at most one buffer's worth, so that a flood cannot prolong the cycle.
             for _ in range(unread):
                 if (sample := channel.try_recv()) is None:
@@ -159,7 +159,7 @@ class LanLink:
         """Call a function for each message under a key expression, in a thread of zenoh."""
 
         def pass_sample(sample: zenoh.Sample) -> None:
-            """Pass a sample on as a message."""
+            """Convert a sample to a message and pass it to the callback."""
             callback(ReceivedMessage.from_sample(sample))
 
         # Indirect callbacks would add the wake-up of another thread and an unbounded queue.
@@ -176,7 +176,7 @@ class LanLink:
         waiting = self._open_channel(self.session.declare_queryable, key, unread)
 
         def take_questions() -> Iterator[Question]:
-            """Yield the questions in the buffer, oldest first."""
+            """Remove and yield the questions in the buffer that have no wildcard, oldest first."""
             for query in waiting():
                 with query:
                     content = _to_bytes(query.payload) or b""
@@ -191,8 +191,8 @@ class LanLink:
     def declare_token(self, launch: int, cycle_ns: int = 0) -> None:
         """Declare the liveliness token of this launch.
 
-        Call it last: a rack that sees the token may send at once. In lockstep, `cycle_ns` is the
-        length of the adapter's cycle: see `alive_key`.
+        Call this after all subscriptions, because a rack that sees the token may send at once. In
+        lockstep, `cycle_ns` is the length of the adapter's cycle: see `alive_key`.
         """
         self._kept.append(
             self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns))
@@ -201,13 +201,14 @@ class LanLink:
     def watch_tokens(self) -> Callable[[], Iterator[tuple[str, int, bool]]]:
         """Return a function that yields the changes of other racks' tokens since its last call.
 
-        It yields the rack, its launch, and True if the token has appeared or False if it has gone.
+        Each change has the rack, its launch, and True if the token has appeared or False if it has
+        expired.
         """
         declare = self.session.liveliness().declare_subscriber
         waiting = self._open_channel(declare, ALL_ALIVE, MAX_TOKENS, history=True)
 
         def take_changes() -> Iterator[tuple[str, int, bool]]:
-            """Yield the changes in the buffer, oldest first."""
+            """Remove and yield the changes in the buffer, oldest first."""
             for sample in waiting():
                 key = str(sample.key_expr)
                 if (parsed := parse_alive_key(key)) is not None:
@@ -221,7 +222,7 @@ class LanLink:
 
 
 def _to_bytes(content: zenoh.ZBytes | None) -> bytes | None:
-    """Return the bytes of a payload or an attachment, if there is one."""
+    """Convert a payload or an attachment to bytes. None, for no content, remains None."""
     return None if content is None else content.to_bytes()
 
 
@@ -233,7 +234,7 @@ def _build_reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
 def _build_settings(
     rack: str, table: LanTable, credentials: Credentials | None, is_operator: bool
 ) -> zenoh.Config:
-    """Return the configuration of zenoh for a session."""
+    """Return zenoh's configuration for the session of a rack or operator."""
     timed = f"#tls_handshake_timeout_ms={HANDSHAKE_MS}" if has_tls(table) else ""
     shortest, longest = RETRY_MS
     protocols = {
@@ -296,7 +297,7 @@ def _build_settings(
 
 
 def _to_locator(text: str) -> str:
-    """Return an endpoint in zenoh's notation, and create the folder for this user's sockets.
+    """Convert an endpoint to zenoh's notation. For a Unix socket, create its folder.
 
     Raises:
         LevelError: The folder cannot be made, or users other than this one can access it.

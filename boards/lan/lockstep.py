@@ -110,7 +110,7 @@ class Partner:
         steps: Steps whose exports are not yet delivered.
         is_out: Whether the rack no longer takes part, so that nobody waits for it.
         is_present: Whether the rack was present in the last cycle.
-        gone_s: CLOCK_MONOTONIC in s at which its adapter was noticed to have ended. None if the
+        gone_s: CLOCK_MONOTONIC time in s at which the end of its adapter was noticed. None if the
             adapter is present or was never seen.
     """
 
@@ -138,11 +138,11 @@ class Partner:
         return self.gone_s is not None and time.monotonic() - self.gone_s > time_s
 
     def has_reached(self, now_ns: int) -> bool:
-        """Return True if the step of this simulated time has arrived or the rack takes no part."""
+        """Return True if the step of time `now_ns` has arrived or the rack no longer takes part."""
         return self.time_ns >= now_ns or self.is_out
 
     def add_step(self, step: Step) -> None:
-        """Record a received step. Only a step that is newer than all earlier ones is stored."""
+        """Store a step if it is newer than all earlier ones. Update `is_out` from its flags."""
         self.gone_s = None
         if step.head.time_ns > self.time_ns:
             self.time_ns = step.head.time_ns
@@ -150,7 +150,7 @@ class Partner:
         self.is_out = bool(step.head.flags & StepFlag.OVER)
 
     def take_steps(self, now_ns: int) -> Iterator[Step]:
-        """Remove and yield the steps up to this simulated time."""
+        """Remove and yield the steps up to simulated time `now_ns`."""
         while self.steps and self.steps[0].head.time_ns <= now_ns:
             yield self.steps.popleft()
 
@@ -176,7 +176,7 @@ class Barrier:
             segment: Segment of the rack.
             board: Board of the adapter.
             racks: Racks with which to run in lockstep.
-            lost: Those that the previous adapter has already lost. They take no part.
+            lost: Racks that the previous adapter has already lost. They take no part.
         """
         self._segment = segment
         self._block = segment.get_block(board)
@@ -196,7 +196,7 @@ class Barrier:
         self._exports: list[ReceivedMessage] = []
         self._imports: dict[str, deque[ReceivedMessage]] = {}
         self._changes: list[tuple[str, int, bool]] = []
-        # Another rack can lack the newest two steps at most.
+        # Another rack lacks at most the newest two steps.
         self._steps: deque[tuple[int, bytes]] = deque(maxlen=2)
         self._now_ns = NEVER
         self._sent = 0
@@ -210,12 +210,12 @@ class Barrier:
         self._sealer = link.sealer.with_limit(MAX_STEP_BYTES)
         self._key = step_key(link.rack)
         self._put = link.publish(self._key, reliable=True)
-        # Called in a thread of zenoh: it only wakes the waiting cycle.
+        # Called in a thread of zenoh, so the handler only wakes the waiting cycle.
         handler = zenoh.handlers.Callback(self._events.put, indirect=False)
         for partner in self._partners.values():
             self._kept.append(link.session.declare_subscriber(step_key(partner.rack), handler))
             if self._is_restarted:
-                # It may have ended while this adapter was restarted.
+                # The other adapter may have ended while this one was restarted.
                 partner.gone_s = time.monotonic()
         self._kept.append(
             link.session.liveliness().declare_subscriber(ALL_ALIVE, handler, history=True)
@@ -228,12 +228,12 @@ class Barrier:
         )
 
     def subscribe(self, key: str) -> Callable[[], Iterator[ReceivedMessage]]:
-        """Return a function that yields the messages under a key up to this cycle, each once."""
+        """Return a function that yields the messages delivered under a key since its last call."""
         waiting = self._imports.setdefault(key, deque())
         return lambda: (waiting.popleft() for _ in range(len(waiting)))
 
     def take_changes(self) -> Iterator[tuple[str, int, bool]]:
-        """Yield rack, launch and presence for each change of presence since the last call."""
+        """Yield rack, launch and whether it is present, for each change since the last call."""
         changes = self._changes
         self._changes = []
         yield from changes
@@ -297,7 +297,7 @@ class Barrier:
             self._send_step(*self._steps[-1], StepFlag.OVER | self._first_flag)
 
     def _send_step(self, time_ns: int, content: bytes, flags: StepFlag) -> None:
-        """Send a step with these flags."""
+        """Seal and send the packed step of simulated time `time_ns`."""
         self._sent += 1
         tick = time_ns // self._tick_ns
         head = Envelope(
@@ -306,13 +306,13 @@ class Barrier:
         self._put(content, self._sealer.seal(self._key, head, content))
 
     def _resend_steps(self, flags: StepFlag) -> None:
-        """Repeat the newest steps for a rack that may have missed them. Others ignore them."""
+        """Send the newest steps again for a rack that may have missed them. Others ignore them."""
         for time_ns, content in self._steps:
             self._send_step(time_ns, content, flags)
 
     @property
     def _first_flag(self) -> StepFlag:
-        """`FIRST` until the first exchange is over, else no flag."""
+        """`FIRST` until the first exchange is complete, afterwards no flag."""
         return StepFlag.FIRST if self._is_first else StepFlag(0)
 
     @property
@@ -339,7 +339,11 @@ class Barrier:
     def _process_token(
         self, partner: Partner, launch: int, cycle_ns: int, is_present: bool
     ) -> None:
-        """Process a change of another rack's liveliness token."""
+        """Process a change of another rack's liveliness token.
+
+        If the token has appeared, resend this rack's newest steps. If it has expired, start the
+        time-out after which the rack counts as lost.
+        """
         if is_present and partner.launch in (NO_LAUNCH, launch):
             self._check_cycle(partner, cycle_ns)
             partner.gone_s = None
@@ -353,7 +357,11 @@ class Barrier:
                 partner.reset_state()
 
     def _process_step(self, partner: Partner, step: Step) -> None:
-        """Process a step of another rack. Refuse lockstep if the racks are incompatible."""
+        """Store a step of another rack. Resend this rack's steps if the other one has just started.
+
+        Raises:
+            CannotGoOn: The racks cannot run in lockstep.
+        """
         self._check_cycle(partner, step.cycle_ns)
         flags = step.head.flags
         if not flags & StepFlag.OVER and self._rack not in step.racks:
@@ -377,10 +385,10 @@ class Barrier:
             self._resend_steps(StepFlag(0))
 
     def _is_partner_launch(self, partner: Partner, launch: int) -> bool:
-        """Return True if a launch of another rack may take part. Remember it if it is new.
+        """Return True if a launch of another rack may take part. A new one replaces the last one.
 
-        Once the run has begun, a second launch of a rack cannot join, and the first one counts as
-        ended.
+        Once the run has begun, a second launch of a rack cannot join, and the rack no longer takes
+        part.
         """
         if partner.launch != launch:
             if self._has_begun and partner.launch != NO_LAUNCH:
@@ -391,7 +399,7 @@ class Barrier:
         return True
 
     def _check_cycle(self, partner: Partner, cycle_ns: int) -> None:
-        """Refuse lockstep if the other rack runs in real time or has a different cycle length."""
+        """Raise `CannotGoOn` if the other rack is in real time or has another cycle length."""
         if not cycle_ns:
             self._refuse_lockstep(f"rack '{partner.rack}' runs in real time, this one in lockstep")
         if cycle_ns != self.cycle_ns:
@@ -406,7 +414,7 @@ class Barrier:
         raise CannotGoOn(why)
 
     def _deliver_exports(self, partner: Partner) -> None:
-        """Deliver the exports of a rack up to this cycle, and record a change of its presence."""
+        """Deliver what a rack exported up to this cycle, and record a change of its presence."""
         for step in partner.take_steps(self._now_ns):
             # After a restart of this adapter, steps that it had delivered arrive again. Skip them.
             for export in step.exports if step.head.time_ns > self._passed_ns else ():

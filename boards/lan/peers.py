@@ -75,11 +75,11 @@ class PeerRack:
         return self.presence is Presence.THERE
 
     def is_superseded(self, launch: int) -> bool:
-        """Return True if another launch has replaced this one and its token has expired."""
+        """Return True if `launch` was replaced by another launch and its token has expired."""
         return launch in self._over
 
     def add_token(self, launch: int, tick: int) -> None:
-        """Record that the liveliness token of a launch has appeared."""
+        """Process a new token. Its launch becomes the present one unless it is superseded."""
         if launch in self._over or (launch not in self.tokens and len(self.tokens) == MAX_LAUNCHES):
             return
         if launch not in self.tokens:
@@ -92,7 +92,11 @@ class PeerRack:
             self._mark_present(launch, tick)
 
     def remove_token(self, launch: int, tick: int) -> None:
-        """Record that the liveliness token of a launch has expired."""
+        """Process the expiry of a token.
+
+        If it belonged to the present launch, the launch of another token becomes the present one.
+        Without another token the rack is lost.
+        """
         if launch in self.tokens:
             self.tokens.remove(launch)
         elif launch != self.launch:
@@ -165,7 +169,7 @@ class PeerRack:
     def write_presence(self, message: PeerPresence, is_lockstep: bool) -> None:
         """Write the presence of the rack into its message.
 
-        The launch is left out in lockstep, because launch numbers differ from run to run.
+        The launch is written as 0 in lockstep, because launch numbers differ from run to run.
         """
         message.presence = self.presence
         message.launch = NO_LAUNCH if is_lockstep else self.launch
@@ -175,7 +179,7 @@ class PeerRack:
 
 
 class Peers:
-    """The racks with which this rack works, by name. Other racks on the network are ignored.
+    """The racks with which this rack works, indexed by name. Other racks are ignored.
 
     Attributes:
         arrivals: How often a rack has appeared, including racks that are not peers.

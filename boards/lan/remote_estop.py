@@ -27,7 +27,7 @@ ESTOP_KIND = xxh3(b"rack estop 1")
 CHECK_FLAG = 1
 """Flag of a request that is answered like a stop but sets none."""
 REQUESTS_A_CYCLE = 16
-"""Maximum number of requests that wait for a cycle and are processed in it."""
+"""Maximum number of requests that are buffered for a cycle and processed in it."""
 
 
 class EstopResponder:
@@ -45,7 +45,7 @@ class EstopResponder:
         Args:
             segment: Segment of the rack.
             grid: Grid of the rack.
-            askers: Senders that may set the stop, with the number by which alarms refer to each.
+            askers: Dictionary from the name of each permitted sender to its index in alarms.
             findings: List to which a finding is added for each stop.
         """
         self._rack = segment.rack
@@ -64,7 +64,7 @@ class EstopResponder:
             self._requests = link.open_questions(estop_key("*", self._rack), REQUESTS_A_CYCLE)
 
     def answer_requests(self, tick: int) -> None:
-        """Answer the requests that have arrived, and latch the emergency stop if asked to."""
+        """Answer the requests of permitted senders. Latch the stop unless they only check."""
         for request, reply in self._requests():
             head = self._sealer.open_message(*request)
             asker = request.key.split("/")[1]
@@ -79,7 +79,7 @@ class EstopResponder:
                 if not self._lines.emergency_stop:
                     self._findings.append(Finding(Alarm.REMOTE_STOP, self._askers[asker]))
                 self._lines.latch_emergency_stop()
-            # Echo session and number of the request, so that no other request is answered by this.
+            # Echo session and number of the request, so that the answer fits no other request.
             answer = Envelope(ESTOP_KIND, self._launch, head.serial, head.launch, tick, 0, 0)
             reply(b"", self._sealer.seal(estop_answer_key(self._rack, asker), answer, b""))
 

@@ -1,7 +1,7 @@
 """The network in a replay: recorded messages are repeated at the recorded ticks.
 
 The adapter's mailboxes are written as they were recorded; the other racks do not run. The recorded
-mailboxes of the racks also tell when a rack appeared and when it was lost. Alarms and void messages
+mailboxes of the racks also show when a rack appeared and when it was lost. Alarms and void messages
 follow from that as in the recorded run.
 """
 
@@ -64,7 +64,7 @@ class ReplayedNetwork:
         """Write the messages that were recorded in this cycle.
 
         Args:
-            write: Output ports of the adapter, by name.
+            write: Dictionary from names to output ports of the adapter.
             tick: Release of the cycle.
         """
         for entry, sent in self._imports.values():
@@ -76,7 +76,7 @@ class ReplayedNetwork:
 
 
 def _list_presence_changes(rack: str, rows: MessageRows) -> Iterator[tuple[int, str, bool]]:
-    """Yield each change of presence: tick, rack, and True if it appeared or False if lost."""
+    """Yield tick, rack, and True (appeared) or False (lost) for each change of presence."""
     message = PeerPresence.zeros({})
     last_presence = int(Presence.AWAITED)
     for tick, _, content in rows:

@@ -25,7 +25,7 @@ REST_VELOCITY = 0.02
 
 
 def find_record(kind: str) -> Kind:
-    """Return the record of a kind in a report. External kills have the record of `kill`.
+    """Return the fault kind with this name in a report. `EXTERNAL` stands for `kill`.
 
     Raises:
         Failure: The kind is unknown.
@@ -73,17 +73,17 @@ class Strike:
 
     @property
     def first_tick(self) -> int:
-        """Tick at which it first acted or, if it never did, at which it began."""
+        """Tick at which the fault first acted or, if it never did, at which it began."""
         return self.tick if self.tick >= 0 else self.began
 
     @property
     def affected_mailboxes(self) -> tuple[str, ...]:
-        """Mailboxes whose messages it affects."""
+        """Mailboxes whose messages the fault affects. Empty if its kind affects no messages."""
         return self.mailboxes if self.record.takes_mailbox else ()
 
     @property
     def record(self) -> Kind:
-        """Record of its kind."""
+        """Kind of the fault."""
         return find_record(self.kind)
 
 

@@ -17,7 +17,7 @@ from rack.tools.faults.ending import Strike
 
 
 def _to_codes(alarms: Iterable[Alarm]) -> set[str]:
-    """Return the codes of events that correspond to alarms."""
+    """Return the event codes of alarms."""
     return {alarm.name.lower() for alarm in alarms}
 
 
@@ -36,7 +36,7 @@ COLLISION = Alarm.COLLISION.name.lower()
 UNDONE_BY: Mapping[str, str] = {BRAKES: "brakes_opened", "demand": "demand", "restart": "rejoined"}
 """Code of the recovery that undoes each reaction."""
 TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
-"""Places of faults that may keep boards from running their cycles."""
+"""Values of `Kind.where` for faults that may keep boards from running their cycles."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +66,11 @@ class Detection:
 
     @property
     def sort_key(self) -> tuple[bool, int, float, float, str]:
-        """Sort key by which the best of several detections comes first.
+        """Key for sorting detections so that the best one comes first.
 
-        Detections within their bounds come first, then early ones, then ones with a tight bound.
-        The name of the board decides last: in lockstep, boards may detect a fault in the same tick
-        and report it in any order.
+        Detections within their bounds come first, then those with a shorter delay, then those with
+        a tighter bound. The name of the board breaks ties, because in lockstep boards may detect a
+        fault in the same tick and report it in any order.
         """
         bound = math.inf if self.bound is None else self.bound
         return not self.is_within, self.delay, self.delay_ms or 0.0, bound, self.event.board
@@ -92,7 +92,7 @@ def can_be_detection(event: Event, strike: Strike) -> bool:
 
 
 def can_explain(strike: Strike, event: Event) -> bool:
-    """Return True if an event during a fault may be its detection or a consequence of its kind."""
+    """Return True if an event during a fault may be its detection or one of its consequences."""
     consequence = strike.record.consequence
     if event.kind == "miss":
         # A fault that takes one task's cycles may take cycles of any task on the same core.
@@ -128,7 +128,7 @@ class SkippedTicks:
         self._skips = [event for event in events if event.kind == "miss" and event.code == name]
 
     def count_between(self, first: int, last: int) -> int:
-        """Return how many ticks after `first`, up to `last`, were skipped.
+        """Return the number of ticks after `first`, up to `last`, that the clock skipped.
 
         Every task reports the skips that it has noticed, so the largest count of one task is taken.
         """
@@ -200,10 +200,10 @@ def find_aftermath(
 
 
 def _can_react(strike: Strike, reaction: Event) -> bool:
-    """Return True if a reaction may be caused by a fault.
+    """Return True if a reaction may have been caused by a fault.
 
-    Brakes that close because of missed cycles need a fault that takes cycles. A latch needs a kind
-    that may latch.
+    Only faults that take cycles make the brakes close because of missed cycles. Only kinds that may
+    latch cause a latch.
     """
     if reaction.code == LATCHED:
         return strike.record.consequence.latches

@@ -91,7 +91,7 @@ class Judgement:
 
     @property
     def fraction_of_bound(self) -> float | None:
-        """Delay divided by its bound, in time if time is bounded. None without a bound."""
+        """Delay divided by its bound, both in ms if possible. None without a bound."""
         if self.bound_ms is not None and self.delay_ms is not None:
             return self.delay_ms / self.bound_ms
         return self.delay / self.bound if self.bound and self.delay is not None else None
@@ -130,10 +130,10 @@ class Circumstances:
 def judge_faults(
     strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
 ) -> FaultVerdict:
-    """Judge the faults of a run by its events.
+    """Evaluate the faults of a run from its events.
 
-    An event detects one fault only. If it matches two, it counts for the fault that acted first and
-    is not yet detected. A fault of the arm that ended before its bound without being detected
+    An event is the detection of one fault only. If it fits two faults, it counts for the one that
+    acted first and has no detection yet. A fault of the arm that ended undetected before its bound
     counts as not having acted, and so does a fault whose run ended before the bound of its
     recovery.
 
@@ -146,7 +146,7 @@ def judge_faults(
 
 
 class Judge:
-    """Judges the faults of one run."""
+    """Evaluates the faults of one run."""
 
     def __init__(
         self, strikes: Sequence[Strike], events: Sequence[Event], run: Circumstances
@@ -201,7 +201,7 @@ class Judge:
         """Return the ticks from the first action of a fault within which it must be detected.
 
         None if there is no bound, or if the fault never had a detectable effect. Without a
-        `reader`, the bound is for the first process to detect it.
+        `reader`, the bound applies to whichever process detects the fault first.
         """
         task = self._tasks.index(strike.board) if strike.board in self._tasks else -1
         injection = strike.injection or Injection(strike.record.number, task)
@@ -209,7 +209,7 @@ class Judge:
         return bound + strike.hidden if bound is not None and strike.count else None
 
     def _compute_recovery(self, strike: Strike) -> int:
-        """Return the ticks within which a fault must have been recovered from."""
+        """Return the time in ticks within which the rack must have recovered from a fault."""
         return strike.record.compute_recovery_ticks(strike.board, self._layout, self._run.restart_s)
 
     def _compute_window(self, strike: Strike) -> tuple[int, int]:
@@ -228,7 +228,7 @@ class Judge:
         return over + self._compute_recovery(strike) + read + self._settle
 
     def _list_detections(self, strike: Strike, last_tick: int, used: set[int]) -> list[Detection]:
-        """Return the unused events up to `last_tick` that may be the detection of a fault."""
+        """Return the possible detections of a fault up to `last_tick`, without events in `used`."""
         if not strike.count:
             # It need not be detected, so any later detection belongs to something else.
             last_tick = min(last_tick, strike.ends)
@@ -240,7 +240,7 @@ class Judge:
         return [self._build_detection(event, strike) for event in fitting]
 
     def _is_periodic(self, mailbox: str) -> bool:
-        """Return True if a mailbox has a message in every period of its writer.
+        """Return True if a mailbox gets a message in every period of its writer.
 
         Mailboxes of planners and host boards, queues, and mailboxes with a maximum age do not.
         """
@@ -267,7 +267,7 @@ class Judge:
         return not strike.count or active_ticks < (self._compute_bound(strike) or 0)
 
     def _build_detection(self, event: Event, strike: Strike) -> Detection:
-        """Return an event as the detection of a fault, with its delay and its bound."""
+        """Build the detection of a fault from an event. Compute its delay and its bound."""
         delay = max(0, event.tick - strike.tick)
         if event.code != "clock_skipped":
             delay -= self._skipped.count_between(strike.tick, event.tick)
@@ -286,7 +286,10 @@ class Judge:
         return Detection(event, delay, bound, delay_ms, bound_ms)
 
     def _build_judgement(self, strike: Strike, best: Detection | None, horizon: int) -> Judgement:
-        """Judge a fault by its best detection and by the reactions before tick `horizon`."""
+        """Build the judgement of a fault from its best detection and the reactions to it.
+
+        Reactions from tick `horizon` on do not belong to the fault.
+        """
         visible_from = strike.record.visible_from
         owed = (
             tuple(filter(self._is_periodic, strike.affected_mailboxes)) or strike.affected_mailboxes
@@ -361,13 +364,13 @@ class Judge:
 
 
 def find_end(strike: Strike) -> int:
-    """Return the tick at which a fault ended or would have ended."""
+    """Return the planned end of a fault, or its first action if it ends the task's process."""
     # A hanging task is killed as soon as the hang is detected, before the fault's planned end.
     return strike.tick if strike.record.consequence.ends_process else strike.ends
 
 
 def report_faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Report:
-    """Judge the recorded events of a run and return the results for its report."""
+    """Evaluate the faults in the recorded events of a run and return the results for its report."""
     events = [Event(**event) for event in recorded if "tick" in event]
     outcome: Mapping[str, Any] = next(
         (event for event in recorded if event["kind"] == "outcome"), {}
@@ -400,7 +403,7 @@ def report_faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Repo
 
 
 def _build_row(judgement: Judgement, layout: Layout) -> Report:
-    """Return a judgement as a row of the report."""
+    """Convert a judgement to a row of the report."""
     tick_ms = layout.clock_ns * 1e-6
     recovery_ms = None if judgement.recovery is None else round(judgement.recovery * tick_ms, 6)
     return {

@@ -28,7 +28,7 @@ from rack.tools.console.held import describe_wait
 from rack.tools.console.tables import format_fitted_table
 
 BEGIN_S = 5.0
-"""Maximum wait for a fault to begin at the next tick."""
+"""Maximum wait in s for a fault to begin at the next tick."""
 LOOK_S = 0.001
 NEXT_TICK = "the next tick"
 SEEDS = 2**31
@@ -132,7 +132,7 @@ class LiveRack:
         return format_fitted_table(list(columns), rows)
 
     def _parse_fault(self, settings: Document) -> FaultConfig:
-        """Return a fault from its keys. A fault without a seed gets an unused one.
+        """Parse the keys of a fault. If they contain no seed, choose a new one.
 
         Raises:
             ConfigError: A key or a value is invalid.
@@ -176,7 +176,7 @@ class LiveRack:
         set_priority(0)
 
     def _wait_until(self, holds: Callable[[], bool], timeout_s: float | None) -> bool:
-        """Wait until a condition holds or the run is over. Return False after `timeout_s` s."""
+        """Wait until a condition holds or the run is over. Return False after a time-out."""
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while not holds() and not self._segment.run_is_over:
             if time.monotonic() > deadline:
@@ -196,7 +196,7 @@ class LiveRack:
         self._check_begun(entry)
 
     def _print_waiting(self, entry: FaultEntry) -> None:
-        """If a fault is waiting to begin, print for what it waits."""
+        """If a fault has not begun, print the tick or condition for which it waits."""
         if entry.stage == Stage.WAITING:
             print(self._describe_state(entry), file=sys.stderr, flush=True)
 
@@ -242,5 +242,5 @@ class LiveRack:
 
 
 def _format_cell(value: str | int | None) -> str:
-    """Return a value as a cell of the table of faults. An unknown tick is shown as "-"."""
+    """Format a value for the table of faults. An unknown tick (None or -1) becomes "-"."""
     return "-" if value is None or value == -1 else str(value)

@@ -36,12 +36,12 @@ from rack.tools.console.answer import Failure
 AUTHORITY_KEY = "authority-key.pem"
 AUTHORITY_NAME = "rack test authority"
 CLOCK_MARGIN = timedelta(hours=1)
-"""Certificates are valid from this long ago, because the clocks of machines differ."""
+"""Certificates are valid from this long before now, because clocks of machines differ."""
 
 
 @dataclass(frozen=True)
 class CredentialFiles:
-    """Content of the files that were made, by name, and the time when the certificates expire."""
+    """Contents of the created files, keyed by file name, and expiry time of the certificates."""
 
     files: Mapping[str, bytes]
     expires: datetime
@@ -61,8 +61,8 @@ def make_credentials(
 
     Args:
         folder: Folder for the files.
-        names: Host names and addresses of each rack, by its name. Empty for a rack or an operator
-            that only connects.
+        names: Dictionary from the name of each rack or operator to its host names and addresses.
+            The sequence is empty for one that only connects.
         days: Validity of the certificates in days, at most until the authority's certificate
             expires.
 
@@ -109,7 +109,7 @@ def sign_certificate(
     expires: datetime,
     addresses: Sequence[str] = (),
 ) -> x509.Certificate:
-    """Return a signed certificate.
+    """Create a certificate and sign it.
 
     Args:
         name: Common name of the certificate.
@@ -155,7 +155,7 @@ def sign_certificate(
 
 
 def _to_general_name(text: str) -> x509.GeneralName:
-    """Return an address or a host name in the form of a certificate's alternative name."""
+    """Convert an address or a host name to a subject alternative name."""
     try:
         return x509.IPAddress(ip_address(text))
     except ValueError:
@@ -173,7 +173,11 @@ def key_to_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def write_credentials(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write each file into a folder. Create the folder if it does not exist."""
+    """Write new files, which only the owner can read, and create the folder if necessary.
+
+    Raises:
+        FileExistsError: A file exists already.
+    """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, content in files.items():
         # Create the file with its final mode, and never follow a link that somebody has left.
@@ -188,7 +192,7 @@ def parse_named_addresses(entries: Iterable[str]) -> dict[str, list[str]]:
     """Parse the values of `--for`, such as "cell=10.0.0.1,cell.local" or "operator".
 
     Returns:
-        The addresses of each name.
+        A dictionary from each name to its addresses, which may be empty.
 
     Raises:
         Failure: A name or an address is malformed, or a name is repeated.

@@ -47,7 +47,7 @@ PRESENCE_CHECK_S = 0.2
 
 
 class EstopSession:
-    """Session of an operator at one host, used as a context manager.
+    """Context manager for an operator's session with the racks at one host.
 
     Raises:
         Failure: Nothing listens at the host, or it refuses this operator.
@@ -76,7 +76,7 @@ class EstopSession:
         self._link.close()
 
     def _wait_until(self, condition: Callable[[], object], bound_s: float) -> None:
-        """Track which racks are present until a condition holds or `bound_s` seconds are over."""
+        """Track which racks are present until a condition holds or `bound_s` s have passed."""
         end_s = time.monotonic() + bound_s
         while True:
             for rack, launch, has_appeared in self._changes():
@@ -89,10 +89,10 @@ class EstopSession:
             time.sleep(PAUSE_S)
 
     def find_launch(self) -> int:
-        """Return the number of the rack's launch.
+        """Wait until the rack is present and return the number of its launch.
 
         Raises:
-            Failure: The rack is not present. The message names the racks that are.
+            Failure: The rack does not appear in time. The message names the racks that are present.
         """
         rack = self._address.rack
         self._wait_until(lambda: self._launches, CONNECT_S)
@@ -109,7 +109,7 @@ class EstopSession:
         )
 
     def set_stop(self, launch: int, flags: int = 0) -> int:
-        """Set the emergency stop of the rack, or check whether it could be set.
+        """Set the emergency stop of the rack, or only check that this is permitted.
 
         Args:
             launch: Number of the rack's launch. A restarted rack has another number.
@@ -188,7 +188,7 @@ def stop_when(
 ) -> int:
     """Stay connected to a rack and set its emergency stop when the operator asks for it.
 
-    If the rack is out of reach then, the request is repeated until the stop is set.
+    If the rack is out of reach at that time, the request is repeated until the stop is set.
 
     Args:
         pressed: Waits for at most the given time in s. Returns True if the operator asks for the

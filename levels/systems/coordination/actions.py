@@ -17,7 +17,7 @@ _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
 
 
 def write_action(action: AnyAction, message: CellAction) -> None:
-    """Write an action into the `CellAction` of a message. Fields that it lacks are set to zero."""
+    """Write an action into the `CellAction` of a message. Set other fields to 0."""
     for field in CellAction.message_type.fields:
         message.record[field.name] = np.zeros((), message.record.dtype[field.name])
     message.by = action.by or 0.0
@@ -74,7 +74,7 @@ def read_action(message: CellAction, context: LevelContext) -> AnyAction:
 
 
 def _to_table(message: CellAction) -> dict[str, Any]:
-    """Return the action of a message as a table of a program, without the key `by`.
+    """Convert the action of a message to a table as in a program, without the key `by`.
 
     Raises:
         ProgramError: The action or the form of its goal is unknown.

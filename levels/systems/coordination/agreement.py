@@ -144,7 +144,7 @@ class Agreement:
                 self.phase = Phase.OVER
 
     def _read_responses(self, arms: Collection[str]) -> dict[str, Response]:
-        """Return the responses of these arms to the present order."""
+        """Return the response of each arm to the present order. NONE if it has not answered."""
         responses = dict.fromkeys(arms, Response.NONE)
         for arm in arms:
             answer = self._answers[arm].message
@@ -158,7 +158,7 @@ class Agreement:
         return all(answer.has_message and not answer.is_lost for answer in answers)
 
     def _await_reports(self) -> None:
-        """Wait until every arm reports, then begin with the step that the reports show.
+        """Once every arm reports, begin with the step that the reports show.
 
         If a report shows that the program has already ended, end it at the coordinator as well.
         """
@@ -187,7 +187,7 @@ class Agreement:
             self.end_program(Error.NONE, "")
 
     def _evaluate_answers(self) -> None:
-        """Evaluate the answers to a question: do the step, cancel it, or end the program."""
+        """Decide whether to do the step, cancel it, end the program or wait for more answers."""
         responses = self._read_responses(self.partners)
         if self._end_if_any(responses, NEGATIVE):
             return
@@ -205,7 +205,7 @@ class Agreement:
             self.phase = Phase.DOING if in_time else Phase.CANCELLING
 
     def _await_done(self) -> None:
-        """Wait until all arms have done the step."""
+        """Start the next step once all arms have done this one. End the program if an arm fails."""
         responses = self._read_responses(self.partners)
         if self._end_if_any(responses, (*NEGATIVE, *INTERRUPTED)):
             return
@@ -215,7 +215,10 @@ class Agreement:
             self._start_next_step()
 
     def _await_cancelled(self) -> None:
-        """Wait until all arms have cancelled the step, then ask again or end the program."""
+        """Once all arms have cancelled the step, ask again.
+
+        End the program instead if an arm had begun or failed, or after `MAX_ATTEMPTS` attempts.
+        """
         responses = self._read_responses(self.partners)
         if self._end_if_any(responses, NEGATIVE):
             return
@@ -305,7 +308,7 @@ class TakenOrder:
         return self.response is Response.DOING
 
     def process_order(self, program: int, order: int, verb: int, reason: str = "") -> None:
-        """Process the order in the newest message.
+        """Update the response according to the order in the newest message.
 
         Args:
             program: Checksum of the program.

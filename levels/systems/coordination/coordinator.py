@@ -75,7 +75,7 @@ class CellStep(Table):
 
     @property
     def actions(self) -> dict[str, ArmTransfer | ArmGoto | ArmHome]:
-        """The actions by arm."""
+        """Dictionary from the name of each arm to its action."""
         return {action.arm: action for action in self.do}
 
 
@@ -147,11 +147,11 @@ class CoordinatorParams(Table):
 
 
 class Coordinator(Executor):
-    """Lets each step of its program be carried out by all its arms or by none.
+    """Task level whose program is carried out by the arms of other racks.
 
-    While an arm is lost, or an operator holds this level, the arms rest on their paths. The time
-    `by` of an action counts from the moment when every arm has reported, and starts again with each
-    launch of this rack.
+    A step is begun by all its arms or by none. While an arm is lost, or an operator holds this
+    level, the arms rest on their paths. The time `by` of an action counts from the moment when
+    every arm has reported, and starts again with each launch of this rack.
     """
 
     last_progress = Input(CellProgress, "own.progress")
@@ -185,7 +185,7 @@ class Coordinator(Executor):
     def build_ports(
         cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
     ) -> ConfiguredPorts:
-        """Return the ports for the orders to each arm and for its reports."""
+        """Return an output for the orders to each arm and an input for its reports."""
         try:
             arms = CoordinatorParams.model_validate(params).arms
         except ValidationError:
@@ -275,7 +275,7 @@ class Coordinator(Executor):
         return ""
 
     def _check_progress(self, wait_reason: str, tick: int) -> None:
-        """End the program if nothing has happened for too long.
+        """End the program if neither orders nor reports have changed for `stalled_s`.
 
         Time during which an operator holds a level does not count.
         """
@@ -299,7 +299,7 @@ class Coordinator(Executor):
             agreement.end_program(Error.STALLED, reason)
 
     def _write_order(self, arm: str, hold_reason: str, order: CellOrder) -> None:
-        """Write the order for one arm."""
+        """Write the order for one arm. The arm must hold if `hold_reason` is not empty."""
         agreement = self._agreement
         verb = agreement.choose_verb(arm)
         if verb in (OrderVerb.ASK, OrderVerb.DO, OrderVerb.CANCEL):
@@ -314,7 +314,7 @@ class Coordinator(Executor):
         order.reason = agreement.reason if verb is OrderVerb.END else hold_reason
 
     def _write_status(self, wait_reason: str, status: TaskStatus) -> None:
-        """Write the status of this level."""
+        """Write the status of this level. `wait_reason` is empty if the program advances."""
         agreement = self._agreement
         status.state = State.IDLE
         status.error = Error.NONE

@@ -36,7 +36,7 @@ RackName = Annotated[str, StringConstraints(pattern=f"^({RACK_NAME})?$")]
 PLANNED = (Response.POSSIBLE, Response.DOING, Response.REFUSED)
 """Responses to an order that are based on its plan."""
 MAX_STRAY_RAD = 0.005
-"""Largest motion of a joint since the request of a plan with which the plan is still valid."""
+"""Largest joint motion since the request of a plan for which the plan is still valid."""
 
 
 class OrderedTaskParams(TaskParams):
@@ -96,7 +96,7 @@ class OrderedTaskExecutor(TaskExecutor):
     def build_ports(
         cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
     ) -> ConfiguredPorts:
-        """Return the port for orders and, over a network, a port for the other rack's clock."""
+        """Return an input for orders and, over a network, one for the other rack's clock."""
         try:
             table = OrderedTaskParams.model_validate(params)
         except ValidationError:
@@ -130,7 +130,10 @@ class OrderedTaskExecutor(TaskExecutor):
             self._take_action(self.request)
 
     def _find_plan(self, tick: int) -> TaskPlan:
-        """Process the orders and return the plan of the one that is being carried out."""
+        """Process the newest order and return the plan to follow.
+
+        The plan is empty if no order is being carried out.
+        """
         self._read_order(self.ports["order"])
         self._waits = ""
         taken = self._taken
@@ -155,7 +158,7 @@ class OrderedTaskExecutor(TaskExecutor):
         return plan if self._begun and self._begun == plan.id else self._nothing
 
     def _read_order(self, reading: Reading[CellOrder]) -> None:
-        """Process the newest order, or note why there is none."""
+        """Process the newest order, or store the reason why there is none."""
         order = reading.message
         self._held = self._absent = ""
         if not reading.has_message:
@@ -225,7 +228,7 @@ class OrderedTaskExecutor(TaskExecutor):
         return ""
 
     def _begin_plan(self, request: CellRequest) -> None:
-        """Begin the promised plan. Request a new one if the arm or an object has moved since."""
+        """Begin the promised plan, or request a new one if the arm or an object has moved."""
         if not self._actions:
             self._take_action(request)
         has_strayed = float(np.abs(self.below.message.start - request.start).max()) > MAX_STRAY_RAD
@@ -246,7 +249,7 @@ class OrderedTaskExecutor(TaskExecutor):
         self._ahead_s = request.ahead
 
     def _interrupt_program(self, plan: TaskPlan, below: MoveStatus) -> int:
-        """Interrupt the order for an operator or because the coordinator stops it.
+        """Interrupt the order if an operator or the coordinator demands it.
 
         Returns:
             How many moves of the plan are done.
@@ -271,14 +274,14 @@ class OrderedTaskExecutor(TaskExecutor):
         return until if self._breaking_off is None else min(until, self._breaking_off)
 
     def _find_reason_to_wait(self, below: Reading[MoveStatus]) -> str:
-        """Return why the arm waits: for an operator, for orders or for a plan."""
+        """Return why the arm waits for an operator, orders or a plan. Empty if it does not."""
         waits = super()._find_reason_to_wait(below)
         if self._orders.is_in_force:
             return waits
         return self._absent or self._held or waits or self._waits
 
     def _check_progress(self, plan: TaskPlan, waits: str, tick: int) -> None:
-        """End with an error if nothing has happened for too long."""
+        """End with an error if there has been no progress for too long."""
         # While the coordinator holds the arm, the coordinator decides for how long.
         if self._held:
             self._moved_at = tick
@@ -286,11 +289,11 @@ class OrderedTaskExecutor(TaskExecutor):
             super()._check_progress(plan, waits, tick)
 
     def _list_progress_values(self) -> tuple[int, ...]:
-        """Return further values whose change counts as progress."""
+        """Return values of the order whose change counts as progress."""
         return self._taken.order, self._taken.response, self._begun, not self._absent
 
     def _write_status(self, plan: TaskPlan, waits: str) -> None:
-        """Write status and report, after ending an order that is done or has failed."""
+        """End an order that is done or has failed, then write status and report."""
         report = self.report
         status = self.status
         echo = self.status.echo
@@ -325,8 +328,7 @@ class OrderedTaskExecutor(TaskExecutor):
     def _end_order(self, plan: TaskPlan) -> None:
         """End an order that is done or has failed.
 
-        An error that ends the whole run stays in place. Any other error becomes the answer to the
-        order.
+        An error that ends the whole run is kept. Any other error becomes the answer to the order.
         """
         taken = self._taken
         if self._error and (taken.needs_answer or taken.is_under_way):
@@ -348,7 +350,7 @@ class OrderedTaskExecutor(TaskExecutor):
             self.command.hold = True
 
     def _compute_state(self, plan: TaskPlan) -> State:
-        """Return the state that the status shows."""
+        """Return the state of this level for its status."""
         if self._error:
             return State.ERROR
         if self._taken.response is Response.ENDED:
@@ -396,7 +398,7 @@ class OrderedTaskPlanner(TaskPlanner):
         return max(super()._compute_visible_s(tick), self._begin_s + self.context.period_s)
 
     def _check_times(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
-        """Add the earliest end of the order to the plan, in the coordinator's time."""
+        """Check the times, and write the earliest end of the order in the coordinator's time."""
         super()._check_times(moves, visible_s)
         unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
         self.output.earliest = (

@@ -90,19 +90,19 @@ class SharedBody:
         return self.claim.owner not in (b"", self.rack)
 
     def update_touch(self, touches: bool) -> None:
-        """Note whether this rack's gripper touches the body. The first touch claims the body."""
+        """Update whether this rack's gripper touches the body. A new touch claims the body."""
         if touches and not self.is_touched and self.claim.owner != self.rack:
             self.claim = Claim(min(self.claim.number + 1, MAX_CLAIM), self.rack)
         self.is_touched = touches
 
     def process_message(self, message: SharedBodies) -> Array | None:
-        """Process a message of another rack.
+        """Update the claim from another rack's message, and return the pose for the copy.
 
-        A greater claim is accepted from any rack. Otherwise only the owner's message counts.
+        A greater claim is accepted from any rack, an equal claim only from its owner.
 
         Returns:
-            The new pose of the body, (7,): position in m and quaternion. None if the message is
-            to be ignored.
+            The new pose of the body, (7,): position in m and quaternion. None if the message does
+            not move it.
         """
         for entry in message.bodies[message.bodies["name"] == self.name]:
             claim = Claim(int(entry["claim"]), bytes(entry["owner"]))

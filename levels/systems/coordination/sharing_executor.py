@@ -19,7 +19,7 @@ from rack.levels.systems.coordination.shared_bodies import (
 from rack.levels.systems.coordination.sharing_arm import SharingArm
 
 SHARED = Output(SharedBodies, cycles=8)
-"""Exchanged at 50 Hz if the clock runs at 400 Hz, the fastest exchange between racks."""
+"""With a clock of 400 Hz this is 50 Hz, the fastest exchange between racks."""
 
 
 class SharingServoParams(ServoParams):
@@ -33,7 +33,7 @@ class SharingServoParams(ServoParams):
     @field_validator("arm")
     @classmethod
     def _check_arm(cls, reference: str) -> str:
-        """Check that the arm can share objects."""
+        """Check that the class of the arm is `SharingArm` or a subclass."""
         if not issubclass(find_arm(reference), SharingArm):
             raise ValueError(
                 "this arm cannot share objects; it must be"
@@ -67,7 +67,7 @@ class SharingServoExecutor(ServoExecutor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield mistakes in the list of shared objects, and those of any servo level.
+        """Yield the mistakes in the list of shared objects and in the rest of the servo level.
 
         Args:
             context: Context of this level.
@@ -108,7 +108,7 @@ class SharingServoExecutor(ServoExecutor):
         self._fix_copies()
 
     def take_messages(self) -> None:
-        """Read new messages, also from other racks, and update claims and copies."""
+        """Read new messages, including those of other racks, and update claims and copies."""
         super().take_messages()
         for row, body in self._shared.items():
             for other in self.others.values():

@@ -1,8 +1,8 @@
 """Faultless lockstep run, from whose snapshots trials continue.
 
 Until its first fault, a trial equals this run bit for bit. The trial therefore continues from the
-last snapshot before the fault, with the events up to it, and its verdict is the verdict on a whole
-trial.
+last snapshot before the fault and takes over the earlier events of this run. Its verdict is the
+same as if it had begun at tick 0.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rack.tools.faults.campaigns.plan import Plan
 EVERY_S = 2.0
 """Simulated time between two snapshots. On average a trial repeats half of it."""
 OF_LAUNCH = ("launch", "ready", "start")
-"""Kinds of events that each launch reports itself, so a trial does not take them over."""
+"""Kinds of events that each launch reports. A trial does not take them over from this run."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Start:
     events: tuple[Event, ...] = ()
 
     def resolve_snapshot(self, tick: int) -> Start:
-        """Return this start with the tick of the snapshot that was used and the events before it.
+        """Return a copy with the tick of the snapshot that was used and only the events before it.
 
         Args:
             tick: Tick at which the trial actually began.
@@ -69,7 +69,7 @@ class BaseRack:
         self._why_none = config.outside_state
 
     def find_start(self, plan: Plan, crate: WarmCrate | None, seconds: float | None) -> Start:
-        """Return where the trial of a plan starts. Run the faultless rack first if necessary.
+        """Return the starting point of a trial. Run the faultless rack first if necessary.
 
         Args:
             plan: Plan of the trial.

@@ -28,7 +28,7 @@ from rack.tools.faults.campaigns.workers import TrialJob, Workers
 from rack.tools.faults.ending import EXTERNAL, find_record
 
 LAUNCH_S = 2.0
-"""Approximate duration of a launch and an end, for the progress bar."""
+"""Approximate time in s to launch and end a rack, for the progress bar."""
 SHORTEST_S = 1.0
 """Shortest run of faultless time."""
 ROUNDS = 8
@@ -97,7 +97,7 @@ class Campaign:
         self.order = order
         self.folder = folder
         self._progress = progress
-        # Drop the config's faults, which would act in every trial. Misses are counted, not judged.
+        # Drop the config's faults, which would act in every trial. Permit any number of misses.
         unjudged = order.config.supervision.model_copy(update={"max_missed_fraction": 1.0})
         self._config = order.config.model_copy(update={"fault": (), "supervision": unjudged})
         self.layout: Layout = resolve_layout(self._config)
@@ -109,7 +109,7 @@ class Campaign:
         self._whole = whole
 
     def run(self) -> Results:
-        """Run everything that has no result yet, until all is done or Ctrl-C is pressed.
+        """Run every trial that has no result yet, until all are done or Ctrl-C is pressed.
 
         Raises:
             Failure: The task is not done even without faults, or another campaign uses the folder.
@@ -162,18 +162,18 @@ class Campaign:
         write_json(path, wanted)
 
     def _describe_rack(self, lockstep: bool) -> RackUnderTest:
-        """Return what the draws of plans need to know about the rack."""
+        """Return the facts about the rack that are needed to draw plans."""
         restart = self._config.supervision.find_restart_time(lockstep)
         return RackUnderTest(self._targets, self._ticks, self._second, restart)
 
     def _run_fault_trials(self, results: Results, lockstep: bool) -> None:
-        """Run trials until every kind has acted as often as specified."""
+        """Run trials until every kind has acted as often as specified, or for `ROUNDS` rounds."""
         order = self.order
         kinds = self.kinds
         if lockstep or len(order.modes) > 1:
             # In real time, run only kinds that are impossible in lockstep.
             kinds = [kind for kind in kinds if needs_real_time(kind) != lockstep]
-        # Unary plus removes the kinds of which no fault is missing.
+        # Unary plus removes kinds with a count of 0.
         lacking = +Counter(dict.fromkeys(kinds, order.injections))
         rack = self._describe_rack(lockstep)
         tried = set[str]()
@@ -202,7 +202,7 @@ class Campaign:
         ]
 
     def _run_plans(self, plans: Sequence[Plan]) -> list[TrialResult]:
-        """Return the results of these plans in their order, from new runs or from files."""
+        """Run the plans that have no saved result. Return the results of all, in their order."""
         self._number = max([self._number, *(plan.number for plan in plans)])
         if plans:
             self._progress.set_total(self._estimate_s(plans))
@@ -227,7 +227,7 @@ class Campaign:
         return TrialJob(plan, path, self._ticks, self.order.seconds)
 
     def _show_result(self, job: TrialJob) -> None:
-        """Show how a trial ended. If it has shortfalls, write a plan that repeats it."""
+        """Show how a trial ended. If it has shortfalls, write a file for repeating its faults."""
         plan = job.plan
         if (result := _load_matching_result(job)) is None:
             return
@@ -251,7 +251,7 @@ class Campaign:
             results.faultless.append(FaultlessTime(load_text, seconds, runs))
 
     def _run_faultless_stretch(self, stretch: int, load_text: str) -> Iterator[TrialResult]:
-        """Yield the results of faultless runs in real time.
+        """Yield results of faultless real-time runs until their total time is as specified.
 
         Args:
             stretch: Index of the stretch of faultless time.
@@ -298,7 +298,7 @@ def _load_matching_result(job: TrialJob) -> TrialResult | None:
 
 
 def _describe_plan(plan: Plan) -> str:
-    """Describe a plan briefly: its name and the number of its faults of each kind."""
+    """Return the name of a plan and the number of its faults of each kind."""
     if not plan.number:
         return plan.purpose
     kinds = Counter([*(table["kind"] for table in plan.faults), *[EXTERNAL] * len(plan.kills)])

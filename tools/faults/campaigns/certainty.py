@@ -15,10 +15,10 @@ from rack.tools.faults.judge import Circumstances, Judge, Judgement, find_end
 class EarlyEnd:
     """Ends a lockstep trial as soon as no later event can change the verdict on any fault.
 
-    It holds the rack before the ticks at which that may be the case.
+    It holds the rack before the ticks at which all verdicts may have become final.
 
     Attributes:
-        is_reached: Whether it has ended the trial.
+        is_reached: Whether the trial was ended.
     """
 
     def __init__(self, rack: Rack, joints: Sequence[str], run: Circumstances) -> None:
@@ -30,7 +30,7 @@ class EarlyEnd:
         self._hold_before(max(0, rack.begins_at))
 
     def judge_if_held(self) -> None:
-        """If the rack is held, judge its faults, then let it continue or end it."""
+        """If the rack is held, end it if all verdicts are final. Otherwise let it continue."""
         tick = self._words[System.HELD] - 1
         if tick < 0 or self.is_reached:
             return
@@ -63,7 +63,7 @@ def find_certain_tick(
         tick: Tick before which the rack is held.
 
     Returns:
-        A tick up to `tick` if the judgement is certain, a later tick at which to ask again, or None
+        A tick up to `tick` if the judgement is final, a later tick at which to check again, or None
         if the judgement needs the whole run.
     """
     end_event = Event(0, tick, "end", "", "")
@@ -71,7 +71,7 @@ def find_certain_tick(
 
 
 class _ForesightedJudge(Judge):
-    """Judge that also computes when its judgements become final."""
+    """Evaluates faults and also computes when the judgements become final."""
 
     def find_certain_tick(self, tick: int) -> int | None:
         """Return the tick from which all judgements are final: see `find_certain_tick` above."""
@@ -86,7 +86,10 @@ class _ForesightedJudge(Judge):
     def _find_fault_certain_tick(
         self, strike: Strike, judgement: Judgement, tick: int
     ) -> int | None:
-        """Return the tick from which one judgement is final: see `find_certain_tick`."""
+        """Return the tick from which one judgement is final.
+
+        The result has the same meaning as that of `find_certain_tick`.
+        """
         retry_tick = tick + self._settle
         if strike.began < 0:
             return retry_tick

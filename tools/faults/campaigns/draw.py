@@ -71,18 +71,19 @@ class RackUnderTest:
 
     @property
     def room_ticks(self) -> int:
-        """Number of ticks in which faults may begin and have their consequences."""
+        """Number of ticks of a faultless run that are available for faults and their effects."""
         return max(1, self.ticks - round(TAIL_S * self.second) - self.first_tick)
 
     def compute_window(self, target: Target, ticks: int, parameters: Mapping[str, float]) -> int:
         """Return the minimum time from the beginning of a fault to the next fault.
 
-        It is long enough for the fault to be detected, to end and to be recovered from.
+        It is long enough for the fault to be detected and to end, and for the rack to recover.
 
         Args:
             target: Target of the fault.
             ticks: Duration of the fault in ticks.
-            parameters: Values of its parameters. Parameters that are missing have their defaults.
+            parameters: Dictionary from names to values of its parameters. Missing ones have their
+                defaults.
 
         Returns:
             The time in ticks.
@@ -200,10 +201,9 @@ class FaultCard:
 def fault_plans(
     rack: RackUnderTest, counts: Mapping[str, int], seed: str, lockstep: bool, first: int
 ) -> list[Plan]:
-    """Draw plans that contain a number of faults of each kind.
+    """Draw plans with the given number of faults of each kind, in random order.
 
-    The order of the faults is random. Each trial has as many as fit into the task one after the
-    other.
+    Each trial has as many faults as fit into the task one after the other.
 
     Args:
         rack: The rack.
@@ -266,7 +266,7 @@ def size_plans(
 
 
 def list_swept_sizes(kind: str, count: int) -> list[float]:
-    """Return the sizes for a kind's curve. Empty for a kind that is detectable at any size."""
+    """Return the fault sizes for a kind's curve. Empty if the kind is detectable at any size."""
     record = find_record(kind)
     if record.visible_from is None or record.size is None:
         return []
@@ -284,7 +284,7 @@ class TrialShare:
     def __init__(self, room_ticks: int) -> None:
         self.cards: list[FaultCard] = []
         self.room = room_ticks
-        # By affected mailbox, whether another fault of it may follow.
+        # Dictionary from each affected mailbox to True if another fault may affect it too.
         self._struck: dict[str, bool] = {}
 
     def has_room_for(self, card: FaultCard) -> bool:
@@ -311,7 +311,7 @@ def _pack_plans(
     cards: Sequence[FaultCard],
     rng: Random,
 ) -> list[Plan]:
-    """Return plans with all of these faults, in as few trials as possible."""
+    """Assign faults to as few trials as possible and return the plans of the trials."""
     shared = [card for card in cards if card.target.record.recoverable]
     trials = [
         share.cards
@@ -349,15 +349,15 @@ def _distribute_cards(room_ticks: int, cards: Sequence[FaultCard]) -> list[Trial
 
 
 def _choose_order(room_ticks: int, cards: Sequence[FaultCard], rng: Random) -> list[FaultCard]:
-    """Return faults in the best of several random orders.
+    """Return the faults of a trial in the best of several random orders.
 
-    If possible, each fault begins before the end of the task, which earlier faults may have
-    prolonged. Faults of the arm come late, because the arm is at rest at first.
+    In the best order, each fault begins before the end of the task, which earlier faults may have
+    prolonged, and faults of the arm come late, because the arm is at rest at first.
     """
     orders = [rng.sample(cards, len(cards)) for _ in range(SHUFFLES)]
 
     def rate_order(order: list[FaultCard]) -> tuple[bool, int]:
-        """Rate an order: whether all faults fit, and how late the first fault of the arm comes."""
+        """Return whether all faults fit, and the ticks before the first fault of the arm."""
         needed = max(accumulate(card.room for card in order))
         cards_before = takewhile(lambda card: card.target.record.where != "arm", order)
         return needed <= room_ticks, sum(card.window for card in cards_before)
@@ -366,10 +366,10 @@ def _choose_order(room_ticks: int, cards: Sequence[FaultCard], rng: Random) -> l
 
 
 def _draw_starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> list[int]:
-    """Return start ticks for windows that follow each other from a random tick on.
+    """Return the start ticks of consecutive windows. The first start is random.
 
-    The first tick is late if there is room, because a trial continues from the last snapshot before
-    its first fault.
+    A later start makes the trial shorter, because it continues from the last snapshot before its
+    first fault.
     """
     spare_ticks = max(rack.first_tick, rack.room_ticks - sum(windows))
     earliest = accumulate(windows, initial=rack.first_tick + rng.randint(0, spare_ticks))
@@ -377,5 +377,5 @@ def _draw_starts(rack: RackUnderTest, windows: Sequence[int], rng: Random) -> li
 
 
 def _draw_phase(rng: Random) -> float:
-    """Draw the fraction of a tick that passes before a fault acts."""
+    """Draw the fraction of a tick after which a fault acts."""
     return rng.randrange(PHASES) / PHASES

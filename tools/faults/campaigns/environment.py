@@ -27,21 +27,21 @@ WRITING = ("sh", "-c", "while :; do sync; done")
 
 
 def list_living_descendants() -> set[int]:
-    """Return the living descendants of this process."""
+    """Return the process ids of all living descendants of this process except snapshots."""
     living = {pid for pid in list_descendants(os.getpid()) if is_alive(pid)}
     # Snapshots end with their crate, which may serve several racks.
     return {pid for pid in living if not _read_name(pid).startswith(COPY_PREFIX)}
 
 
 def find_leftovers(rack: str, pids_before: set[int]) -> list[str]:
-    """Return everything that a rack left behind, as readable texts.
+    """Return the files and processes that a rack left behind.
 
     Args:
         rack: Name of the rack.
         pids_before: Descendants of this process that existed before the rack.
 
     Returns:
-        The paths of segments and semaphores, and the processes.
+        A text for each: the path of a segment or semaphore, or id and name of a process.
     """
     await_ends({*_find_board_processes(rack), *(list_living_descendants() - pids_before)}, BOUND_S)
     processes = _find_board_processes(rack) | (list_living_descendants() - pids_before)
@@ -50,7 +50,7 @@ def find_leftovers(rack: str, pids_before: set[int]) -> list[str]:
 
 
 def _find_board_processes(rack: str) -> set[int]:
-    """Return the processes that are named like a rack's boards, whatever their parent."""
+    """Return the ids of processes whose names begin with the name of a rack and a colon."""
     start = f"{rack}:"[:COMM_LENGTH]
     pids = (int(path.name) for path in Path("/proc").glob("[0-9]*"))
     return {pid for pid in pids if _read_name(pid).startswith(start) and is_alive(pid)}
@@ -64,9 +64,9 @@ def _read_name(pid: int) -> str:
 
 
 def check_violation_counter(config: RackConfig) -> None:
-    """Check the violation counter by moving every joint at twice its limit for one tick.
+    """Check that the violation counter counts each joint that moves at twice its limit.
 
-    A campaign that reports "no limit violated" must be able to see a violation.
+    Otherwise the result "no limit violated" of a campaign would prove nothing.
 
     Raises:
         Failure: A violation is not counted.
@@ -103,7 +103,7 @@ def check_violation_counter(config: RackConfig) -> None:
 
 @contextmanager
 def run_load() -> Iterator[str]:
-    """Keep all cores that this process may use, and the disks, busy. Yields a description.
+    """Keep the disks and all cores of this process busy. Yield a description of the load.
 
     Uses `stress-ng` if it is installed.
     """
@@ -129,6 +129,6 @@ def run_load() -> Iterator[str]:
 
 
 def _prepare_load_process(parent: int, cores: set[int]) -> None:
-    """Prepare a process of the load, which runs on these cores and ends with its parent."""
+    """Pin the calling load process to these cores, and let it end with its parent."""
     die_with_parent(parent)
     os.sched_setaffinity(0, cores)

@@ -1,4 +1,4 @@
-"""Plan of a trial, and the targets in a rack among which plans choose."""
+"""Plan of a trial, and the possible targets of its faults in a rack."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Plan:
 
     @property
     def name(self) -> str:
-        """Name of the trial by its number, or of a run without a number by its purpose."""
+        """Name of the run, made of its number or, without a number, of its purpose."""
         return f"trial {self.number}" if self.number else f"{self.purpose} run"
 
     @property
@@ -69,7 +69,7 @@ class Plan:
         return min(ticks, default=0)
 
     def to_config(self, config: RackConfig, rack: str) -> RackConfig:
-        """Return the config that carries out this plan, with another name for the rack."""
+        """Return a copy of a config with this plan's clock mode and faults and a new rack name."""
         clock: dict[str, Any] = {"mode": "realtime"}
         if self.lockstep:
             # A speed has no meaning in lockstep.
@@ -84,7 +84,7 @@ class Plan:
         )
 
     def format_faults(self, config: str) -> str:
-        """Return the faults as a file for `--faults`.
+        """Return the content of a file for `--faults` that repeats this plan.
 
         External kills cannot be expressed in such a file, so they are written as comments.
         """
@@ -101,7 +101,7 @@ class Plan:
 def needs_real_time(kind: str) -> bool:
     """Return True if faults of a kind are not useful in lockstep.
 
-    Either the kind does not exist in lockstep, or its delay has no meaning because no simulated
+    Either the kind is impossible in lockstep, or its delay has no meaning because no simulated
     time passes while a process dies.
     """
     return kind == EXTERNAL or KINDS[kind].realtime
@@ -109,7 +109,7 @@ def needs_real_time(kind: str) -> bool:
 
 @dataclass(frozen=True)
 class Target:
-    """A place at which a fault of a kind may act.
+    """A task or mailbox that a fault of a kind may affect.
 
     Attributes:
         kind: Name of the kind.
@@ -127,17 +127,17 @@ class Target:
 
     @property
     def record(self) -> Kind:
-        """Record of the kind."""
+        """Record that describes the kind."""
         return find_record(self.kind)
 
 
 class Targets:
-    """The places in one rack at which a fault of each kind can act and be detected.
+    """The tasks and mailboxes of a rack in which faults of each kind can act and be detected.
 
     Attributes:
         layout: Layout of the rack.
         joints: Number of joints of the arm.
-        by_kind: Targets of each kind.
+        by_kind: Dictionary from the name of each kind to its targets.
     """
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
@@ -150,7 +150,7 @@ class Targets:
         self.by_kind[EXTERNAL] = self._build_targets(EXTERNAL, [*self._roles, CLOCK])
 
     def _find_targets(self, kind: Kind) -> list[Target]:
-        """Return the targets of a kind."""
+        """Return the tasks or mailboxes in which a fault of a kind can be detected."""
         if not kind.takes_mailbox:
             return self._build_targets(kind.name, self._list_tasks(kind))
         targets = []
@@ -166,7 +166,7 @@ class Targets:
         return [Target(kind, task, cycle_ticks(self.layout, task)) for task in tasks]
 
     def _list_tasks(self, kind: Kind) -> list[str]:
-        """Return the tasks that a kind may affect as a whole."""
+        """Return the names of the tasks that a kind without a mailbox may affect."""
         if kind.where == "clock":
             return [CLOCK]
         if kind.where == "arm":
@@ -174,11 +174,12 @@ class Targets:
         return [task for task, role in self._roles.items() if role in kind.tasks]
 
     def _is_detectable(self, kind: Kind, box: MailboxSpec) -> bool:
-        """Return True if a fault of a mailbox can be detected.
+        """Return True if a fault of this kind in a mailbox can be detected.
 
-        The mailbox needs readers, and messages often enough: plans, for example, are not periodic.
+        The mailbox needs readers, and messages must be frequent enough: plans, for example, are not
+        periodic.
         """
-        # The clock writes only for an operator, and a host board whenever its program likes.
+        # The clock writes only for an operator, and a host board at any time.
         role = self._roles.get(box.writer)
         if role is None or not box.readers:
             return False
@@ -191,7 +192,7 @@ class Targets:
 
 
 def select_kinds(wanted: str | None, targets: Targets, realtime: bool) -> list[str]:
-    """Return the kinds of a campaign.
+    """Return the names of the kinds of a campaign.
 
     Args:
         wanted: Names of kinds, separated by commas. None for all that are possible in the rack.

@@ -25,7 +25,7 @@ MIDDLE = "#222222"
 BOUND = "#cc3311"
 """Colours that are distinguishable with any kind of colour vision (Paul Tol)."""
 MAX_FRACTION = 1.5
-"""Fraction of a bound up to which delays are drawn. Later ones are arrows at the edge."""
+"""Fraction of a bound up to which delays are drawn. Longer ones are arrows at the edge."""
 
 
 def plot_campaign(report: CampaignReport, path: Path) -> None:
@@ -96,14 +96,14 @@ def _draw_delays(axes: Axes, report: CampaignReport) -> None:
 
 
 def _draw_row(axes: Axes, row: int, values: list[float]) -> None:
-    """Draw values as dots in a row."""
+    """Draw values as dots on a horizontal line at height `row`."""
     axes.scatter(
         values, [row] * len(values), s=26, color=DOT, alpha=0.4, linewidths=0, clip_on=False
     )
 
 
 def _name_rows(axes: Axes, names: list[str]) -> None:
-    """Write names beside the rows."""
+    """Label the rows with names, from the bottom up."""
     axes.set_yticks(range(len(names)), names, fontsize=8)
     axes.set_ylim(-0.7, max(0, len(names) - 1) + 0.7)
 
@@ -111,7 +111,7 @@ def _name_rows(axes: Axes, names: list[str]) -> None:
 def _compute_fraction(fault: Judgement) -> float | None:
     """Return the delay of a fault as a fraction of its bound.
 
-    A bound of 0, the same cycle, is either met exactly or exceeded.
+    With a bound of 0 (the same cycle) the result is 0 if it is met, else beyond the chart.
     """
     if fault.bound == 0 and fault.bound_ms is None:
         return 0.0 if fault.delay == 0 else 2 * MAX_FRACTION
@@ -119,7 +119,7 @@ def _compute_fraction(fault: Judgement) -> float | None:
 
 
 def _draw_sizes(axes: Axes, report: CampaignReport) -> None:
-    """Draw the size of sensor errors against the delay of their detection."""
+    """Draw the detection delay of sensor errors as a function of their size."""
     edge = axes.get_xaxis_transform()
     longest = 10 * report.clock_ms
     for (kind, size_curve), marker in zip(report.curves.items(), "os", strict=False):
@@ -147,7 +147,7 @@ def _draw_sizes(axes: Axes, report: CampaignReport) -> None:
 
 
 def _draw_recoveries(axes: Axes, report: CampaignReport) -> None:
-    """Draw the time from each fault until every reaction was undone."""
+    """Draw the recovery time of each fault, in a row for each kind."""
     kinds: list[str] = []
     for kind in reversed(report.by_kind):
         ticks = [fault.recovery for fault in report.list_faults(kind) if fault.recovery is not None]

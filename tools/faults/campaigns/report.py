@@ -122,11 +122,11 @@ class CampaignReport:
 
     @property
     def trials_text(self) -> str:
-        """Number of trials and their modes, as text."""
+        """Text with the number of trials and their clock modes."""
         return f"{self.summary.trials} trials, {' and '.join(self.modes)}"
 
     def list_faults(self, kind: str) -> list[Judgement]:
-        """Return the judgements of a kind in all trials."""
+        """Return the judgements of all faults of a kind."""
         return [fault for fault in self.results.faults if fault.kind == kind]
 
     def to_document(self) -> Document:
@@ -168,13 +168,13 @@ class CampaignReport:
         }
 
     def _list_notes(self) -> list[str]:
-        """Return the notes of launches in real time, without repetitions."""
+        """Return the distinct notes of all real-time launches."""
         # Omit lockstep, where every launch notes that all boards share one core.
         runs = [run for run in self.results.runs if not run.plan.lockstep]
         return list(dict.fromkeys(note for run in runs for note in run.notes))
 
     def _count_trials(self, kind: str) -> dict[str, int]:
-        """Count the trials in which a kind acted, and how many of them completed their task."""
+        """Count the trials in which a kind acted, and those among them whose task was done."""
         ends = [
             run.ended
             for run in self.results.trials
@@ -219,7 +219,7 @@ class CampaignReport:
             yield from (f"- {line}" for line in self.shortfalls[:MAX_SHOWN])
 
     def _format_summary(self) -> Iterator[tuple[str, Any]]:
-        """Yield the rows of the summary."""
+        """Yield name and value of each row of the summary."""
         summary = self.summary
         redrawn = f"{summary.not_struck} more did not strike and were drawn again"
         yield "injected", f"{summary.injected}; {redrawn}"
@@ -249,7 +249,7 @@ class CampaignReport:
         yield "unexplained misses in real time", summary.stray_misses
 
     def _format_faultless(self) -> Iterator[str]:
-        """Yield the lines about faultless time."""
+        """Yield the lines of the section about faultless time."""
         rows = []
         for stretch in self.results.faultless:
             load = f"under {stretch.load}" if stretch.load else "alone"
@@ -293,7 +293,7 @@ def _build_summary(results: Results, second: float) -> CampaignSummary:
 
 
 def _list_shortfalls(results: Results) -> list[str]:
-    """Return the shortfalls of all runs."""
+    """Return the shortfalls of all runs, and kinds that acted too rarely."""
     lines = [f"{run.plan.name}: {line}" for run in results.runs for line in run.shortfalls]
     return lines + results.lacking
 
@@ -314,14 +314,14 @@ def _to_trial_entry(run: TrialResult) -> Document:
 
 
 def _format_rate(event_rate: EventRate | None) -> str:
-    """Format a rate with its confidence bound."""
+    """Format a rate with its confidence bound. None becomes "-"."""
     if event_rate is None:
         return "-"
     return f"{event_rate.an_hour:.3g} an hour, below {event_rate.below:.3g} with 95 % confidence"
 
 
 def _format_kind(kind: str, figures: KindFigures) -> list[str]:
-    """Return the row of a kind in the table of kinds."""
+    """Return the cells of a kind's row in the table of kinds."""
     counts = (figures.injected, figures.detected, figures.within_bound, figures.recovered)
     lowest = [share[0] for share in figures.wilson.values() if share is not None]
     worst = f"{min(lowest):.1%}" if lowest else "-"
@@ -339,12 +339,12 @@ def _format_kind(kind: str, figures: KindFigures) -> list[str]:
 
 
 def _format_spread(values: Spread | None) -> tuple[str, str]:
-    """Format median and maximum."""
+    """Format median and maximum. Both are "-" for None."""
     return ("-", "-") if values is None else (f"{values.median:.4g}", f"{values.max:.4g}")
 
 
 def _format_sizes(kind: str, curve_of_sizes: SizeCurve) -> Iterator[str]:
-    """Yield the lines about a curve of size against delay."""
+    """Yield the lines of the section about a kind's curve of size against delay."""
     size = KINDS[kind].size
     unit = size.unit if size is not None else ""
     yield from ("", f"## {kind}: size against delay", "")

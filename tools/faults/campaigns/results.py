@@ -1,4 +1,4 @@
-"""Results of a campaign: judged trials, each saved in a file, and faultless time."""
+"""Results of a campaign: evaluated trials, each saved in a file, and faultless time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Ended = Literal["task done", "verdicts certain", "safely stopped", "not armed", 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """The part of a trial that is saved for the report of its campaign.
+    """Result of a trial, which is saved for the report of its campaign.
 
     Attributes:
         plan: Plan of the trial.
@@ -41,7 +41,7 @@ class TrialResult:
         stray_misses: Number of misses that no fault explains.
         faults: Judgements of its faults.
         unexplained: Detections that no fault explains.
-        shortfalls: What was wrong, a line each. Empty for a good trial.
+        shortfalls: What was wrong, a line each. Empty for a successful trial.
         start: Tick of the snapshot from which the trial continued. 0 if it did not.
         whole: Why the trial did not continue from a snapshot. Empty if it did.
     """
@@ -65,7 +65,7 @@ class TrialResult:
 
 
 def judge_trial(trial: Trial) -> TrialResult:
-    """Judge a trial and return the result that its campaign saves."""
+    """Evaluate a trial and return the result that its campaign saves."""
     outcome = trial.outcome
     verdict = _judge_faults(trial)
     ended = _classify_end(trial)
@@ -91,7 +91,7 @@ def judge_trial(trial: Trial) -> TrialResult:
 
 
 def save_result(trial: Trial, path: Path) -> None:
-    """Judge a trial and save it with all its events. The file is written atomically."""
+    """Evaluate a trial and atomically write the result and all events to a file."""
     outcome = asdict(trial.outcome) if trial.outcome else None
     document = {
         "finding": asdict(judge_trial(trial)),
@@ -108,7 +108,7 @@ _KEPT = TypeAdapter(TrialResult)
 
 
 def load_result(path: Path) -> TrialResult | None:
-    """Load the result in a file, or return None if the file does not exist."""
+    """Load the result from a file. Return None if the file does not exist."""
     try:
         return _KEPT.validate_python(json.loads(path.read_text())["finding"])
     except FileNotFoundError:
@@ -131,7 +131,7 @@ class FaultlessTime:
 
     @property
     def trips(self) -> int:
-        """Number of false trips: detections, and deaths of boards without a fault."""
+        """Number of false trips, which are detections and deaths of boards without a fault."""
         return sum(len(run.unexplained) for run in self.runs)
 
     @property
@@ -141,7 +141,7 @@ class FaultlessTime:
 
     @property
     def misses(self) -> dict[str, int]:
-        """Number of deadline misses by code. They do not count as false trips."""
+        """Dictionary from event codes to numbers of deadline misses, which are not false trips."""
         total: Counter[str] = Counter()
         for run in self.runs:
             total.update(run.misses)
@@ -162,7 +162,7 @@ class FaultlessTime:
 
 @dataclass
 class Results:
-    """Everything that a campaign has done.
+    """Results of all runs of a campaign.
 
     Attributes:
         nominal: Faultless run in lockstep.
@@ -188,17 +188,17 @@ class Results:
 
     @property
     def ended(self) -> Counter[Ended]:
-        """Number of trials by how they ended."""
+        """Number of trials for each kind of ending."""
         return Counter(run.ended for run in self.trials)
 
     @property
     def faults(self) -> list[Judgement]:
-        """Judgements of all trials, without the trials for curves of size."""
+        """Judgements of the faults of all trials, except the trials for curves of size."""
         return [fault for run in self.trials for fault in run.faults]
 
 
 def _judge_faults(trial: Trial) -> FaultVerdict:
-    """Judge the faults of a trial."""
+    """Evaluate the faults of a trial."""
     if trial.run is None:
         # A fault that prevents a launch is detected by the refusal of the launch.
         tables = trial.plan.faults
@@ -208,7 +208,10 @@ def _judge_faults(trial: Trial) -> FaultVerdict:
 
 
 def _judge_start_fault(kind: str, board: str, trial: Trial) -> Judgement:
-    """Judge a fault of a rack whose launch was refused."""
+    """Evaluate a fault of a rack whose launch was refused.
+
+    A fault of the self-test is detected if the refusal names its board. Others did not act.
+    """
     if KINDS[kind].where != "start":
         return Judgement(kind, board, -1, "not struck")
     is_found = f"'{board}'" in trial.refused
@@ -227,7 +230,7 @@ def _judge_start_fault(kind: str, board: str, trial: Trial) -> Judgement:
 
 
 def _classify_end(trial: Trial) -> Ended:
-    """Return how a trial ended."""
+    """Return how a trial ended: see `TrialResult.ended`."""
     outcome = trial.outcome
     if trial.refused:
         is_to_be_refused = any(KINDS[table["kind"]].where == "start" for table in trial.plan.faults)
@@ -242,7 +245,7 @@ def _classify_end(trial: Trial) -> Ended:
 
 
 def _list_shortfalls(trial: Trial, verdict: FaultVerdict, ended: Ended) -> tuple[str, ...]:
-    """Return what was wrong in a trial, a line each."""
+    """Return a line for each shortfall of a trial. Empty for a successful trial."""
     lines = [
         line
         for fault in verdict.faults
@@ -280,7 +283,7 @@ def _explain_not_done(trial: Trial) -> str:
 
 
 def _list_fault_shortfalls(fault: Judgement) -> Iterator[str]:
-    """Yield what was wrong with the detection of a fault, the reactions to it and its recovery."""
+    """Yield a line for each shortfall in the detection of a fault, its reactions and recovery."""
     target = f"{fault.mailbox or fault.board} {fault.joint}".rstrip()
     strike = f"{fault.kind} of {target} at tick {fault.struck}"
     if fault.seen == "missed":

@@ -90,7 +90,7 @@ class SizeCurve:
 
 
 def compute_by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, KindFigures]:
-    """Return the figures of each kind in the order of `KINDS`.
+    """Return a dictionary from each kind to its figures, in the order of `KINDS`.
 
     Only faults that must be detected are counted.
     """
@@ -103,7 +103,7 @@ def compute_by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, Kin
 
 
 Z95 = 1.959964
-"""Number of standard deviations of the normal distribution between which 95 % lie."""
+"""95 % of a normal distribution are within this many standard deviations."""
 RULE_95 = 0.05
 
 
@@ -162,7 +162,7 @@ def count_faults(faults: Iterable[Judgement]) -> FaultCounts:
 
 
 def list_size_points(faults: Iterable[Judgement], kind: str, clock_ns: int) -> list[SizePoint]:
-    """Return the points of size against delay for one kind, the smallest size first.
+    """Return the points of a kind's curve of size against delay, sorted by size.
 
     Args:
         faults: Judged faults of any kind.
@@ -178,7 +178,7 @@ def list_size_points(faults: Iterable[Judgement], kind: str, clock_ns: int) -> l
 
 
 def compute_spread(values: Iterable[float | None]) -> Spread | None:
-    """Return median and maximum of the values that are not None, or None if all are None."""
+    """Return median and maximum of the values, ignoring None. None if no value remains."""
     numbers = [value for value in values if value is not None]
     return Spread(round(median(numbers), 3), round(max(numbers), 3)) if numbers else None
 

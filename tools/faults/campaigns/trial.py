@@ -1,4 +1,4 @@
-"""One trial: a run of the whole task with its faults, and everything that its judgement needs."""
+"""One trial: a run of the whole task with faults, and the data for its evaluation."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ RETRY_S = 0.02
 
 
 class Killer:
-    """Kills boards of one rack by SIGKILL at given times, without the fault table.
+    """Kills boards of one rack with SIGKILL at given times, without the fault table.
 
     Attributes:
         done: The kills so far.
@@ -91,7 +91,7 @@ class Killer:
             self._retry_at = time.monotonic() + RETRY_S
 
     def _compute_instant_ns(self) -> int:
-        """Return the CLOCK_MONOTONIC in ns at which the next kill is due."""
+        """Return the CLOCK_MONOTONIC time in ns at which the next kill is due."""
         kill = self._waiting[0]
         words = self._words
         return words[System.EPOCH_NS] + round((kill.tick + kill.phase) * words[System.PERIOD_NS])
@@ -119,7 +119,7 @@ class Killer:
 
 
 def build_external_kill(layout: Layout, board: str, tick: int, time_ns: int) -> Strike:
-    """Return the record of an external kill.
+    """Return an external kill in the form of a recorded fault.
 
     Args:
         layout: Layout of the rack.
@@ -145,7 +145,7 @@ class Trial:
 
     Attributes:
         plan: Plan of the trial.
-        run: Facts about the run for the judge. None if the launch was refused.
+        run: Facts about the run for its evaluation. None if the launch was refused.
         outcome: Outcome of the run.
         refused: Why the rack did not launch. Empty if it did.
         events: Events of the whole run, including those before the `start`.
@@ -154,9 +154,9 @@ class Trial:
         left: Everything that the rack left behind.
         wall_s: Duration in s of real time.
         levels: Last state of each level, as text.
-        is_late: Whether a level gave up because it could not meet a time.
+        is_late: Whether a level ended with an error because it could not meet a time.
         again: Outcome of a second run, without the faults, after a refused launch.
-        start: Where the trial started.
+        start: Starting point of the trial.
         is_cut: Whether the trial was ended early because the verdict on each fault was certain.
     """
 
@@ -186,7 +186,7 @@ def run_trial(
     base: BaseRack | None = None,
     crate: WarmCrate | None = None,
 ) -> Trial:
-    """Run a plan and return everything that its judgement needs.
+    """Run a plan and return the data for its evaluation.
 
     If possible, the trial continues from a snapshot of the faultless rack. It then ends as soon as
     the verdict on each of its faults is certain.
@@ -258,7 +258,7 @@ def run_trial(
 
 
 def format_levels(segment: Segment) -> str:
-    """Return the last state of each level with its reason, as one text."""
+    """Return a text with the last state of each level and the reason for it."""
     states = []
     for writer, status in iterate_statuses(segment, "state"):
         reason = f" ({why})" if (why := get_reason(status)) else ""
@@ -267,7 +267,7 @@ def format_levels(segment: Segment) -> str:
 
 
 def is_late(segment: Segment) -> bool:
-    """Return True if a level gave up because it could not meet a time."""
+    """Return True if a level ended with an error because it could not meet a time."""
     return any(
         status.state == State.ERROR and status.error == Error.TOO_LATE
         for _, status in iterate_statuses(segment, "error")
@@ -275,7 +275,7 @@ def is_late(segment: Segment) -> bool:
 
 
 def _collect_circumstances(rack: Rack, plan: Plan) -> Circumstances:
-    """Collect the facts that the judge needs about a run."""
+    """Collect the facts about a run for the evaluation of its faults."""
     config = rack.config
     return Circumstances(
         layout=rack.segment.layout,
@@ -290,7 +290,10 @@ def _collect_circumstances(rack: Rack, plan: Plan) -> Circumstances:
 def _watch_run(
     rack: Rack, killer: Killer, ticks: int, seconds: float | None, certainty: EarlyEnd | None
 ) -> None:
-    """Watch a run to its end and kill boards as planned. Stop it if it takes too long."""
+    """Start the run and watch it to its end. Kill boards as planned.
+
+    The run is stopped if it takes too long, or ended early if `certainty` permits it.
+    """
     rack.start(seconds)
     words = rack.segment.words
     extra_s = GRACE_S if ticks else NOMINAL_S

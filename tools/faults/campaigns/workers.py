@@ -46,7 +46,7 @@ class TrialJob:
 
 
 class Workers:
-    """Processes that run trials, used as a context manager.
+    """Context manager for processes that run trials.
 
     They end with the context and with the process that created them. With `whole`, every trial runs
     from tick 0 instead of continuing from a snapshot.
@@ -78,11 +78,11 @@ class Workers:
     def run(self, jobs: Sequence[TrialJob], alone: bool) -> Iterator[TrialJob]:
         """Run trials and yield each one when its file is written.
 
-        If a signal arrives, the trials in progress are ended and leave no file.
+        After an interrupt, the trials in progress are ended and leave no file.
 
         Args:
             jobs: Trials to run.
-            alone: Whether each trial has the whole machine. Otherwise each gets one core, which
+            alone: Whether each trial gets the whole machine. Otherwise each gets one core, which
                 also makes the exchange of messages between its boards faster.
 
         Raises:
@@ -109,7 +109,7 @@ class Workers:
             self._stop()
 
     def _stop(self) -> None:
-        """End the workers at once. The racks of trials in progress are removed, not stopped."""
+        """Terminate the workers. The racks of trials in progress are removed, not stopped."""
         for process in active_children():
             process.terminate()
 
@@ -129,7 +129,7 @@ class TrialRunner:
         self._base = BaseRack(config, f"camp-{os.getpid()}x")
 
     def run_and_save(self, job: TrialJob) -> None:
-        """Run a trial and save its result."""
+        """Run a trial and save its result. In lockstep, use one core only."""
         is_lockstep = job.plan.lockstep
         os.sched_setaffinity(0, {self._core} if is_lockstep else self._cores)
         crate = self._prepare_crate(is_lockstep)
@@ -141,7 +141,7 @@ class TrialRunner:
         save_result(trial, job.path)
 
     def _prepare_crate(self, lockstep: bool) -> WarmCrate | None:
-        """Return the crate for the next trial, or None if the rack must start a new one.
+        """Return the crate for the next trial. None if the rack is to start a new one.
 
         Each real-time trial gets a fresh crate, because a warm one has different cache and
         page-fault behaviour.
@@ -167,7 +167,7 @@ def _prepare_worker(config: RackConfig, whole: bool, cores: SimpleQueue[int], pa
 
 
 def _run_job(job: TrialJob) -> str:
-    """Run a trial in a worker. Return what went wrong, or an empty string."""
+    """Run a trial in a worker process. Return the error as text, empty if there is none."""
     try:
         _runner.run_and_save(job)
     except Exception as error:
