@@ -71,7 +71,7 @@ def norm(vector: ArrayLike) -> float:
 
 
 def apply_elementwise(function: Callable[[float], float], values: Array) -> Array:
-    """Apply a function of `math` to every element of `values`; the shape stays the same."""
+    """Apply `function`, such as `math.tanh`, to each element; return an array of the same shape."""
     return np.fromiter(map(function, values.ravel().tolist()), float, values.size).reshape(
         values.shape
     )

@@ -68,14 +68,15 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     def load_machine_code(self) -> Callable[_P, _R]:
         """Return the function in its compiled form.
 
-        numba compiles it, or reads it from the cache, at the first call with new argument types.
+        numba compiles the function, or reads it from the cache, when it is first called with new
+        argument types.
         """
         if self._machine is None:
             self._machine = self._build()
         return self._machine
 
     def _build(self) -> Any:
-        """Return what other compiled functions call: numba's version of this function."""
+        """Return numba's version of this function, which other compiled functions call."""
         return _compile_function(self)
 
     def preload(self) -> None:
@@ -93,8 +94,8 @@ class compiled(Generic[_P, _R]):  # noqa: N801  # a decorator
     def iterate_source(self) -> Iterator[bytes]:
         """Yield everything that determines the machine code.
 
-        This includes the instructions, the constants and the values of global names, also those of
-        the functions that it calls. It excludes comments, docstrings and line numbers.
+        This includes the instructions, the constants and the values of global names, also for the
+        functions that it calls. It excludes comments, docstrings and line numbers.
         """
         function: Any = self._function
         code = function.__code__
@@ -140,7 +141,7 @@ class c_function(compiled[..., Any]):  # noqa: N801  # stands for a function
 def compiled_for(
     types: str, records: np.dtype[Any] | None = None
 ) -> Callable[[Callable[_A, _T]], compiled[_A, _T]]:
-    """Mark a function that is to be compiled before a run, for arguments of given types.
+    """Return a decorator that marks a function for compilation before a run, for given types.
 
     Args:
         types: Types as numba writes them: "f8, i8, f8[:, ::1]" are a float, an integer and an array
@@ -152,7 +153,7 @@ def compiled_for(
 
 
 def preload(*modules: ModuleType) -> None:
-    """Load the machine code of all functions in `modules` that are marked with types."""
+    """Load the machine code of all functions in `modules` that are marked with `compiled_for`."""
     for module in modules:
         for function in [*vars(module).values()]:
             if isinstance(function, compiled):
@@ -160,10 +161,11 @@ def preload(*modules: ModuleType) -> None:
 
 
 def _compile_function(marked: compiled[..., Any]) -> Any:
-    """Compile a marked function. It calls other marked functions in their compiled form."""
+    """Compile a marked function, so that it calls the compiled form of other marked functions."""
     from numba import config, njit
 
-    # NUMBA_DISABLE_JIT is meant for a user's own functions. Ours call C functions by address.
+    # NUMBA_DISABLE_JIT is meant for users' functions. These functions need compilation, because
+    # they call C functions by address.
     # numba creates the attribute at run time.
     config.DISABLE_JIT = 0  # type: ignore[attr-defined]
     function: Any = marked._function
@@ -188,8 +190,9 @@ def _compile_function(marked: compiled[..., Any]) -> Any:
 class _CodeCache:
     """Cache of the machine code of one function, which numba consults before it compiles.
 
-    Each tuple of types has its own file, which begins with a digest of the rest. Files are replaced
-    as a whole, so that processes that compile the same function at once do not disturb each other.
+    Each tuple of argument types has a separate file, which begins with a digest of the code. A file
+    is replaced in one step, so that several processes can compile the same function at the same
+    time.
     """
 
     def __init__(self, name: str, source: bytes) -> None:
@@ -197,9 +200,9 @@ class _CodeCache:
         self._source = source.hex()
 
     def load_overload(self, types: Any, target: Any) -> Any:
-        """Return the cached code for these types. None if it is missing or damaged.
+        """Return the cached code for these types, or None if it is missing or damaged.
 
-        After None, numba compiles the function.
+        If the result is None, numba compiles the function.
         """
         from numba.core.compiler import CompileResult
 
@@ -248,7 +251,7 @@ class _CodeCache:
             )
 
     def _build_path(self, types: Any, codegen: Any) -> Path:
-        """Return the path of the file for a tuple of types."""
+        """Return the path of the cache file for a tuple of types."""
         from numba import __version__
 
         build = repr((__version__, sys.version, types, codegen.magic_tuple())).encode()

@@ -69,7 +69,7 @@ class ActiveFault:
     def recall_first_sample(self, sample: Sample) -> Sample:
         """Return the sample with which the fault began.
 
-        This is a copy of the sample that was given in the first call.
+        The first call stores a copy of `sample`, which all calls return.
         """
         if self.key not in self.first_samples:
             copy = sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
@@ -138,7 +138,7 @@ def add_position_noise(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool
 
 
 def repeat_last_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
-    """Repeat the fault's first sample, with the tick of the cycle before it, as if none arrived."""
+    """Return the fault's first sample, dated one cycle earlier, as if no new sample arrived."""
     first = fault.recall_first_sample(sample)
     return first._replace(tick=first.tick - fault.every), True
 
@@ -154,10 +154,10 @@ def freeze_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool | No
 
 
 def set_torque_nan(torque: Array, limits: Array, fault: ActiveFault) -> Array:
-    """Command NaN instead of every torque."""
+    """Replace all torques by NaN."""
     return np.full_like(torque, np.nan)
 
 
 def exceed_torque(torque: Array, limits: Array, fault: ActiveFault) -> Array:
-    """Command the fault's `factor` times the torque limit, in the direction of the torque."""
+    """Replace each torque by `factor` times its limit, with the same sign."""
     return fault["factor"] * np.copysign(limits, torque)

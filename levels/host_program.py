@@ -45,7 +45,7 @@ M_co = TypeVar("M_co", bound=Message, covariant=True)
 
 
 class Bus(Protocol):
-    """Operations of a host program on the bus, apart from its ports."""
+    """Access of a host program to the bus, in addition to its ports."""
 
     @property
     def tick(self) -> int:
@@ -81,15 +81,16 @@ class Bus(Protocol):
     def words(self, address: int, count: int = 1) -> list[int]:
         """Return 8-byte words of the crate's memory, starting at a bus address.
 
-        `rack check` prints the addresses. Any word may be read without a message, whichever board
-        writes it. Another board may be writing it at the same time, in lockstep too.
+        `rack check` prints the addresses. A program may read any word directly, without a message,
+        no matter which board writes it. Even in lockstep, another board may be writing it at the
+        same time.
 
         Raises:
             ValueError: The address is not aligned to a word, or the words extend beyond the memory.
         """
 
     def finish(self) -> None:
-        """Declare that the program's work is done, as a return from `run` does."""
+        """Report that the program has finished its work, as returning from `run` does."""
 
 
 class HostReceiver(Protocol[M_co]):
@@ -109,20 +110,21 @@ class HostSender(Protocol[M_co]):
     def message(self) -> M_co:
         """The next message to send.
 
-        All its fields are 0, except the `id` of a command, which is the number of the message.
+        At first all its fields are 0, except the `id` of a command, which is the number of the
+        message.
         """
 
     def send(self) -> bool:
         """Send a copy of the message and clear it for the next one.
 
         Returns:
-            True if the message was sent. False if too many messages wait at the adapter; the
-            message is then unchanged.
+            True if the message was sent. False if too many messages are waiting at the adapter, in
+            which case the message stays unchanged.
         """
 
     @property
     def sent(self) -> int:
-        """Number of messages sent so far, including those of earlier processes of this board."""
+        """Number of messages sent so far, also by earlier processes of this board."""
 
 
 class ProgramInput(InputPort[M]):
@@ -195,10 +197,13 @@ class HostProgram:
         self.context = context
 
     def run(self, bus: Bus) -> None:
-        """Do the program's work. The default does nothing until the run ends."""
+        """Run the program. By default, wait until the run ends."""
         while not bus.is_over:
             bus.wait(1.0)
 
     def list_prompt_names(self, bus: Bus) -> Mapping[str, Any]:
-        """Return further objects, by name, for an interactive prompt with `bus` and `program`."""
+        """Return a dictionary from names to further objects for an interactive prompt.
+
+        The prompt also has the names `bus` and `program`.
+        """
         return {}

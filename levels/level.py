@@ -166,11 +166,11 @@ class Program(Table):
     @model_validator(mode="before")
     @classmethod
     def _with_frozen_tables(cls, table: Any) -> Any:
-        """Convert all lists to tuples, including those in tables whose keys the user chooses."""
+        """Convert all lists to tuples, including lists in tables whose keys the user chooses."""
         return freeze_lists(table)
 
     def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
-        """Yield each entry that disagrees with the arm or the scene, as key, value and reason.
+        """Yield key, value and reason of each entry that is inconsistent with arm or scene.
 
         A key is the path of the entry, such as "action[0].object". `robot` is None for a rack
         without an arm.
@@ -208,7 +208,7 @@ class Program(Table):
     def list_goals(self) -> Iterable[GoalConfig]:
         """Yield the final positions of the objects, in the order of the program.
 
-        They are checked when the program reports that it is done.
+        The positions are checked when the program reports that it is done.
         """
         return ()
 
@@ -232,7 +232,7 @@ class Finding(NamedTuple):
 
 @dataclass(frozen=True)
 class LevelContext:
-    """The rack as a level knows it, from the config. Times are ticks of the system clock."""
+    """Data from the config that a level needs. Times are in ticks of the system clock."""
 
     board: str  # name of the board, and of the level
     every: int  # ticks from cycle to cycle
@@ -306,7 +306,7 @@ class LevelSection:
             self.settings = read_params(self.params, context.params)
 
     def find_input_table(self, port: str) -> dict[str, Any]:
-        """Return the dict in which the board stores the readings of `port` under its name.
+        """Return the dictionary in which the board stores readings of `port`, keyed by port name.
 
         Raises:
             LevelError: The constructor uses the name of the port for something else.
@@ -348,13 +348,13 @@ class LevelSection:
     def self_test(self) -> None:
         """Raise `LevelError` if the level must not start.
 
-        The board then holds SYSFAIL, and the launch fails.
+        If it raises an error, the board keeps SYSFAIL asserted, and the launch fails.
         """
 
     def max_messages(self, port: str) -> int:
         """Return the maximum number of messages to take from each queue that `port` reads.
 
-        Called before each read. The default is no maximum.
+        Called before each read. By default, there is no maximum.
         """
         return UNLIMITED
 
@@ -368,7 +368,7 @@ OPERATOR_PORT.name = "operator"
 
 
 class Executor(LevelSection, ABC):
-    """The foreground of a level, which runs every cycle, at high priority, in bounded time.
+    """The foreground part of a level. It runs in every cycle, at high priority and in bounded time.
 
     Subclasses declare their ports and write `process`. Output messages keep their values from cycle
     to cycle. Each is written to its mailbox `<board>.<port>` at the end of every cycle.
@@ -433,7 +433,7 @@ class Executor(LevelSection, ABC):
         event.
 
         Args:
-            name: One of the class's `FindingKind`s.
+            name: Name of one of the class's `FindingKind`s.
             value: The measured value, in the declared unit.
             unit: The unit of `value`, to have it checked against the declaration. Not checked if
                 empty.
@@ -456,11 +456,11 @@ class Executor(LevelSection, ABC):
 
     @property
     def is_set_by_board(self) -> bool:
-        """True if the board handles the operator's settings of live parameters for the level."""
+        """True if the board, rather than the level, sets live parameters for the operator."""
         return self.inputs.get(OPERATOR_PORT.name) is OPERATOR_PORT
 
     def take_settings(self, tick: int) -> None:
-        """Set the live parameters that the operator commands, and answer in the status.
+        """Set live parameters as the operator commands, and answer in the status.
 
         Called by the board before `process`. There is no answer if the status does not derive from
         `AnsweringStatus`.
@@ -480,9 +480,9 @@ class Executor(LevelSection, ABC):
 
     @classmethod
     def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
-        """Return names, such as those of control modifications, which alarms give by their index.
+        """Return the names to which alarms refer by index, such as control modifications.
 
-        By default these are also the names that an operator may give. `params` may be invalid.
+        By default, an operator may give the same names. `params` may be invalid.
         """
         return ()
 
@@ -490,7 +490,9 @@ class Executor(LevelSection, ABC):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield each parameter that disagrees with the neighbours. Called before the launch.
+        """Yield each parameter that is inconsistent with a neighbouring level.
+
+        Called before the launch, with parameters that are valid by themselves.
 
         Args:
             context: The level.
@@ -498,8 +500,7 @@ class Executor(LevelSection, ABC):
             below: The levels below it.
 
         Returns:
-            Key of `[board.<name>]`, value and reason of each disagreement. The parameters of each
-            board are valid by themselves.
+            Key of `[board.<name>]`, value and reason of each inconsistency.
         """
         return ()
 
@@ -522,16 +523,16 @@ class Executor(LevelSection, ABC):
     def build_ports(
         cls, params: Mapping[str, Any], types: Mapping[str, type[Message]]
     ) -> ConfiguredPorts:
-        """Return the ports that the parameters of a board add to those of the class.
+        """Return the ports that a board's parameters add to the ports of the class.
 
         Args:
             params: Parameters of the level, which may be invalid.
-            types: Message class of each mailbox that a class declares.
+            types: Message classes of the mailboxes that classes declare, keyed by mailbox.
         """
         return ConfiguredPorts()
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the injected faults. `faults` are all faults that are active from now on."""
+        """Replace the injected faults. `faults` contains all faults that are now active."""
 
     @abstractmethod
     def process(self, tick: int) -> None:
@@ -539,7 +540,7 @@ class Executor(LevelSection, ABC):
 
 
 class Planner(LevelSection, ABC):
-    """The background of a level, which plans ahead, at low priority.
+    """The background part of a level. It plans ahead, at low priority.
 
     Each plan must be ready within `within_cycles` cycles. A planner runs in a separate process and
     shares nothing with the executor except mailboxes. Its single output is its mailbox
@@ -552,9 +553,10 @@ class Planner(LevelSection, ABC):
         cls.outputs = {"plan": plan} if (plan := cls.outputs.get("output")) is not None else {}
 
     def wanted(self, tick: int) -> bool:
-        """Return True if a plan has to be computed now. Must take much less than a cycle.
+        """Return True if a plan has to be computed now.
 
-        By default a plan is computed for each new command.
+        The check must take much less than a cycle. By default, a plan is computed for each new
+        command.
         """
         command: Reading[Message] = getattr(self, "above")  # noqa: B009
         return command.is_new

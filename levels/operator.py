@@ -153,12 +153,12 @@ def format_commands(commands: Commands) -> str:
 
 
 def format_goals(goals: Sequence[Goal]) -> str:
-    """Return forms of goals as one word, such as "joints|pose"."""
+    """Return goal forms as one word, such as "joints|pose"."""
     return "|".join(goal.name.lower() for goal in goals)
 
 
 def describe_command(what: int, goal: int) -> str:
-    """Return a command, which may be invalid, as text, such as "goto pose"."""
+    """Return a command as text, such as "goto pose". Unknown values are shown as numbers."""
     names = [
         kind(number).name.lower() if number in set(kind) else str(number)
         for kind, number in ((Operation, what), (Goal, goal))
@@ -177,12 +177,12 @@ class _CommandAnswer(NamedTuple):
 class Orders:
     """Operator's commands to one level, and the answers to them.
 
-    The command in force is the newest one that was not refused and is neither one of `SETTINGS` nor
-    one of `DRIVE_OPERATIONS`. It keeps the level from its normal work, unless it is RESUME. After a
-    restart the board processes all commands again in order, so the same command is in force. If a
-    setting or a refused command arrives before the command in force is done, both are answered. A
-    status shows one answer at a time. Several answers of one cycle are shown in the following
-    cycles, oldest first.
+    The command in force is the newest command that was not refused and is neither one of `SETTINGS`
+    nor one of `DRIVE_OPERATIONS`. While it is in force, the level does not do its normal work,
+    unless the command is RESUME. After a restart, the board processes all commands again in order,
+    so that the same command is in force again. If a setting or a refused command arrives before the
+    command in force is done, both are answered. A status shows one answer at a time. If there are
+    several answers in one cycle, the following cycles show them, oldest first.
     """
 
     def __init__(self, commands: Commands) -> None:
@@ -209,7 +209,7 @@ class Orders:
 
     @property
     def is_in_force(self) -> bool:
-        """True if the command in force keeps the level from its normal work."""
+        """True if a command other than RESUME is in force and suspends the normal work."""
         return self.standing is not Operation.NONE
 
     @property
@@ -226,11 +226,12 @@ class Orders:
 
         Args:
             operator: Reading of the mailbox.
-            judge: Called with each accepted command, to apply a setting. It may still refuse the
-                command by `refuse_newest`. None if the level has nothing to check or set.
+            judge: Function to call with each accepted command, which checks it or applies a
+                setting. It may refuse the command by calling `refuse_newest`. None if the level has
+                nothing to check or set.
 
         Returns:
-            True in the cycle that accepts a command other than a setting.
+            True if a command other than a setting or an operation on the drives was accepted.
         """
         if not operator.is_new:
             return False
@@ -246,7 +247,7 @@ class Orders:
         return taken
 
     def _accept_command(self, message: OperatorCommand) -> bool:
-        """Accept or refuse a command, unless it has been processed. Return True if accepted."""
+        """Accept or refuse a command, unless it was processed before. Return True if accepted."""
         # A clock board that is restarted while it sends a command sends it again.
         if message.id <= self.serial:
             return False
@@ -274,12 +275,12 @@ class Orders:
         return True
 
     def refuse_newest(self, why: str) -> None:
-        """Refuse the command just accepted. The previous command in force is restored."""
+        """Refuse the newest command, and restore the command that was in force before it."""
         self.basis, self.standing, self._in_force = self._before
         self._queue_answer(_CommandAnswer(self.serial, Answer.REFUSED, why))
 
     def abandon_command(self, why: str) -> None:
-        """Abandon the command in force. The level holds instead."""
+        """Abandon the command in force and hold. The answer to it becomes REFUSED, with `why`."""
         self.standing = Operation.HOLD
         self._answer_command_in_force(Answer.REFUSED, why)
 
@@ -293,17 +294,20 @@ class Orders:
             self._answer_command_in_force(Answer.DONE)
 
     def report_setting_started(self) -> None:
-        """Report that the setting just accepted takes time. Call `report_drives_done` when done."""
+        """Report that the newest setting takes time. Call `report_drives_done` when it is done."""
         self._queue_answer(_CommandAnswer(self.serial, Answer.TAKEN))
 
     def report_drives_done(self, serial: int) -> None:
-        """Report that command `serial`, to the drives or a setting that took time, is done."""
+        """Report that command `serial` is done.
+
+        It is a command to the drives, or a setting that took time.
+        """
         self._queue_answer(_CommandAnswer(serial, Answer.DONE))
 
     def format_reason(self, board: str) -> str:
-        """Return text that says why an operator keeps level `board` from its normal work.
+        """Return the reason why an operator's command suspends the work of level `board`, as text.
 
-        Empty if no operator does.
+        Empty if no command suspends it.
         """
         if self.answer is Answer.REFUSED:
             return f"{board} held, `resume` releases it: {self._in_force.objection}"
@@ -311,7 +315,7 @@ class Orders:
         return f"{board} {effect} by the operator: `resume` releases it" if effect else ""
 
     def _answer_command_in_force(self, answer: Answer, why: str = "") -> None:
-        """Change the answer to the command in force."""
+        """Change the answer to the command in force, and queue it."""
         self._in_force = _CommandAnswer(self.in_force, answer, why)
         self._queue_answer(self._in_force)
 
@@ -324,14 +328,18 @@ class Orders:
         self._news.append(answer)
 
     def find_basis(self, above: int) -> int:
-        """Return the serial of the newest operator's command on which this cycle is based.
+        """Return the serial of the newest operator command on which this cycle is based.
 
-        `above` is the serial of the one on which the command from the level above is based.
+        `above` is the serial of the operator command on which the command from the level above is
+        based.
         """
         return max(self.basis, above)
 
     def fill_status(self, status: AnsweringStatus, above: int = 0) -> None:
-        """Write the next answer to a status. For `above` see `find_basis`."""
+        """Write the oldest queued answer to a status, or the last answer again.
+
+        For `above` see `find_basis`.
+        """
         if self._news:
             self._shown = self._news.pop(0)
         status.operator = self.find_basis(above)
@@ -344,7 +352,7 @@ class Orders:
 def find_answered_serial(status: AnsweringStatus | AnyMessage) -> int:
     """Return the serial of the newest command that a level had processed when it wrote a status.
 
-    A restarted board uses it so that it does not execute a command twice.
+    A restarted board needs it to avoid executing a command twice.
     """
     # The status may show a late answer to an earlier command.
     return max(status.order, status.operator)

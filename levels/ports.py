@@ -38,7 +38,7 @@ class Port(Generic[M]):
         self.name = name
 
     def build_connection_error(self) -> LevelError:
-        """Return the error for using the port before a board has connected it."""
+        """Return the error to raise if the port is used before a board has connected it."""
         return LevelError(f"port '{self.name}': no board has connected it to a mailbox")
 
 
@@ -114,13 +114,13 @@ class Output(Port[M]):
 
     Args:
         message: The class of its messages.
-        cycles: Write the message in every n-th cycle. Counted from the board's phase, this is the
-            last cycle of each group of n, so that readers released at the start of the next group
-            find it fresh. If that cycle is missed, the message is missing too.
-        rests_on: The input whose information the port passes on. Its messages carry the tick of
-            that information, or of the oldest information of an `Inputs`. By default they carry the
-            tick of the cycle's release. The response of the whole hierarchy is measured by these
-            ticks.
+        cycles: Write the message in every n-th cycle: the last cycle of each group of n, counted
+            from the board's phase. Readers that are released at the start of the next group
+            therefore read a fresh message. If that cycle is missed, no message is written.
+        rests_on: The input on whose information the messages are based. A message carries the tick
+            of that information, or of the oldest information of an `Inputs`. By default it carries
+            the tick of the cycle's release. The response of the whole hierarchy is measured by
+            these ticks.
     """
 
     queued = False
@@ -149,11 +149,11 @@ class Output(Port[M]):
         return vars(level).setdefault(self.name, message)  # type: ignore[no-any-return]
 
     def is_due(self, tick: int, every: int, phase: int) -> bool:
-        """Return True if the cycle released at `tick` is one of those that write the port.
+        """Return True if the cycle released at `tick` writes the port.
 
         Args:
-            tick: Release of the cycle.
-            every: Ticks from cycle to cycle.
+            tick: Tick of the cycle's release.
+            every: Length of a cycle, ticks.
             phase: First tick of the level.
         """
         return (tick - phase + every) % (self.cycles * every) == 0
@@ -216,7 +216,7 @@ class TimedOutput(SentOutput[M]):
 class ConfiguredPorts(NamedTuple):
     """Ports that a config creates, in addition to the ports that a class declares.
 
-    `is_whole` is False if the parameters are invalid, so that some ports are unknown.
+    `is_complete` is False if the parameters are invalid, so that some ports are unknown.
     """
 
     inputs: Mapping[str, InputPort[Any]] = MappingProxyType({})
@@ -249,7 +249,7 @@ class FindingKind:
 
     @property
     def mistake(self) -> str:
-        """Description of the mistake in the declaration. Empty if it is valid."""
+        """Description of the mistake in the declaration, or an empty string if it is valid."""
         if not self.unit or not self.doc:
             return 'needs a unit ("1": a plain number) and a meaning, doc="..."'
         if self.name.upper() in RESERVED_NAMES:
@@ -262,9 +262,9 @@ RESERVED_NAMES = frozenset((*Alarm.__members__, "BEGINS", "ENDS", "DIED", "RESTA
 
 
 def collect_ports(level: type, attribute: str, kinds: tuple[type, ...]) -> dict[str, Any]:
-    """Return the ports, or findings, of a class: first inherited ones, then the class's own.
+    """Return the ports or findings of a class, keyed by name: inherited ones, then its own.
 
-    A class drops an inherited one by setting it to None.
+    A class removes an inherited port or finding by setting the attribute to None.
 
     Args:
         level: The class.

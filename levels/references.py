@@ -47,7 +47,7 @@ Configs of users and of recorded runs name the old places.
 
 
 def resolve_moved(reference: str) -> str:
-    """Return the present name of "package.module:Name"."""
+    """Return a reference "package.module:Name", with its present name if it has moved."""
     for old, new in MOVED_REFERENCES.items():
         remainder = reference.removeprefix(old)
         if remainder != reference and remainder[:1] in ("", ".", ":"):
@@ -56,7 +56,7 @@ def resolve_moved(reference: str) -> str:
 
 
 def import_reference(reference: str, in_child_first: bool = True) -> tuple[ModuleType, str]:
-    """Import the module that "package.module:Name" names.
+    """Import the module of a reference "package.module:Name".
 
     Args:
         reference: The reference.
@@ -64,7 +64,7 @@ def import_reference(reference: str, in_child_first: bool = True) -> tuple[Modul
             cannot end or block this process.
 
     Returns:
-        The module, and the name in it.
+        The module, and "Name".
 
     Raises:
         LookupError: The module cannot be imported.
@@ -81,7 +81,7 @@ def import_reference(reference: str, in_child_first: bool = True) -> tuple[Modul
 
 
 def find_class(reference: str, base: type[T], in_child_first: bool = True) -> type[T]:
-    """Return the subclass of `base` that "package.module:Class" names.
+    """Return the subclass of `base` that a reference "package.module:Class" names.
 
     Args:
         reference: The reference.
@@ -89,7 +89,7 @@ def find_class(reference: str, base: type[T], in_child_first: bool = True) -> ty
         in_child_first: As for `import_reference`.
 
     Raises:
-        LookupError: The class is missing, abstract, or no subclass of `base`.
+        LookupError: The class is missing, abstract, or not a subclass of `base`.
     """
     module, name = import_reference(reference, in_child_first)
     named = getattr(module, name, None)
@@ -115,8 +115,8 @@ def _try_import(module: str) -> str:
     """Import a module in a child process, to find out whether this process may import it.
 
     Returns:
-        Why this process must not import it: the import ends the process or takes too long. Empty if
-        it may, even if the module raises an exception.
+        The reason why this process must not import the module: the import ends the process or takes
+        too long. Empty if it may import it, even if the module raises an exception.
     """
     parent = os.getpid()
     try:
@@ -126,7 +126,7 @@ def _try_import(module: str) -> str:
         return ""
     if child == 0:
         try:
-            # The parent alone responds to signals of the terminal.
+            # Only the parent responds to signals from the terminal.
             os.setsid()
             die_with_parent(parent)
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

@@ -82,11 +82,11 @@ class Table(BaseModel):
 
 
 def describe_keys(kind: type[BaseModel]) -> dict[str, FieldInfo]:
-    """Return the fields of a table by their keys, each with its description.
+    """Return the fields of a table, each with its description, keyed by config key.
 
-    The description of a field is the text below it, unless the field states another. pydantic can
-    find such texts itself (`use_attribute_docstrings`), but does so for every class when it is
-    defined, so that each start of a rack would take 0.2 s longer.
+    The description of a field is the text below it, unless the field defines another one. pydantic
+    can find such texts itself (`use_attribute_docstrings`), but would do so for every class when it
+    is defined, which would delay each start of a rack by 0.2 s.
     """
     below = ChainMap(*(_find_field_texts(base) for base in kind.__mro__ if issubclass(base, Table)))
     for name, field in kind.model_fields.items():
@@ -96,7 +96,7 @@ def describe_keys(kind: type[BaseModel]) -> dict[str, FieldInfo]:
 
 @cache
 def _find_field_texts(table: type[Table]) -> dict[str, str]:
-    """Return the text below each field in the source of a table, by field name."""
+    """Return the text below each field in the source of a table, keyed by field name."""
     texts = {}
     # A class typed at a prompt has no source.
     with suppress(OSError, TypeError):
@@ -143,10 +143,10 @@ def list_live_keys(kind: type[Table] | None) -> tuple[str, ...]:
 
 
 def read_setting(setting: str) -> tuple[str, Any]:
-    """Return the key and the value of a text "key=value", whose value is in TOML.
+    """Parse a text "key=value", whose value is in TOML. Return the key and the value.
 
     Raises:
-        LevelError: The text has another form.
+        LevelError: The text does not have this form.
     """
     key, _, text = setting.partition("=")
     try:
@@ -160,8 +160,8 @@ def set_live(params: Params, setting: str) -> tuple[Params, str]:
     """Set a live parameter by "key=value".
 
     Returns:
-        The new params, and an empty text. If the parameter cannot be set, the unchanged params, and
-        why.
+        The new params and an empty string or, if the parameter cannot be set, the unchanged params
+        and the reason.
     """
     kind = type(params)
     try:
@@ -174,10 +174,10 @@ def set_live(params: Params, setting: str) -> tuple[Params, str]:
 
 
 def validate_class(reference: str, base: type[T]) -> type[T]:
-    """Return the subclass of `base` that "package.module:Class" names.
+    """Return the subclass of `base` that a reference "package.module:Class" names.
 
     Raises:
-        ValueError: The class is missing, abstract, or no subclass of `base`.
+        ValueError: The class is missing, abstract, or not a subclass of `base`.
     """
     try:
         return find_class(reference, base)

@@ -29,8 +29,8 @@ class WorldModel(Executor):
     """Executor that tracks the bodies of the scene: poses, velocities, and a revision.
 
     The revision increases when a body starts or stops moving. It is the tick after the last such
-    change, so that it also increases across a restart of this board. Until it receives a scene, a
-    restarted board publishes its last model, with its age.
+    change, so that it also increases across a restart of this board. Until a restarted board
+    receives a scene, it publishes its last model with the tick of the last scene.
     """
 
     scene = Input(Scene, "servo.scene")

@@ -20,5 +20,5 @@ __all__ = [
 
 
 def preload() -> None:
-    """Load the compiled functions of an arm, for any robot: see `Executor.preload`."""
+    """Load the compiled functions that any arm needs; see `Executor.preload`."""
     compiled.preload(dynamics, substeps, drives, sensors)

@@ -25,12 +25,12 @@ from rack.levels.tables import SensorConfig
 
 
 class Arm(BrakedArm):
-    """Base class of every arm. A guard protects the arm, unless its drives keep the limits.
+    """Base class of every arm. A guard protects the arm, unless its drives enforce the limits.
 
     Subclasses write `sense`, `brake`, `step`, and `drive` or `follow`, depending on whether the
-    drives take torques or set points. They keep the attributes of `DrivableArm` up to date.
-    Everything else has a default that suits an arm without contact sensors whose state survives its
-    board.
+    drives take torques or set points. They keep the attributes of `DrivableArm` up to date. All
+    other methods have defaults, which suit an arm without contact sensors whose state survives a
+    restart of its board.
     """
 
     keeps_limits = False
@@ -66,7 +66,7 @@ class Arm(BrakedArm):
 
     @classmethod
     def find_connect_error(cls, cell: Cell, speed_fraction: float) -> str:
-        """Return why `connect` would fail for a cell. Empty if it would not.
+        """Return the reason why `connect` would fail for a cell, or an empty string.
 
         Called before the launch.
         """

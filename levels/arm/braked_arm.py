@@ -59,7 +59,8 @@ class BrakedArm(Plant, DrivableArm):
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and apply torques in N m and a grip force in N; see `Link.drive`.
 
-        Implementations set `waited` to 0. The base class has none; see `has_interface`.
+        Implementations set `waited` to 0. The base class does not implement it; see
+        `has_interface`.
         """
         raise NotImplementedError
 
@@ -67,15 +68,15 @@ class BrakedArm(Plant, DrivableArm):
         """Release the brakes and follow a set point; see `Link.follow`.
 
         Implementations set `waited` to 0, and `torque` to the predicted or reported torque. The
-        base class has none; see `has_interface`.
+        base class does not implement it; see `has_interface`.
         """
         raise NotImplementedError
 
     @classmethod
     def has_interface(cls, interface: Interface) -> bool:
-        """Return True if the drives accept commands of the kind `interface`.
+        """Return True if the drives accept commands of type `interface`.
 
-        `rack check` refuses a config that names another kind. By default, drives accept torques if
+        `rack check` refuses a config that names another type. By default, drives accept torques if
         the class implements `drive`, and set points if it implements `follow`.
         """
         if interface == "torque":
@@ -85,8 +86,8 @@ class BrakedArm(Plant, DrivableArm):
     def enable(self) -> None:
         """Request that the drives be enabled, without blocking.
 
-        `state` becomes ENABLED in a later `step`. Until then, and whenever the arm is not enabled,
-        it is braked in every cycle. By default drives have no states and are enabled at once.
+        `state` becomes ENABLED in a later `step`. While the arm is not enabled, it is braked in
+        every cycle. The default suits drives without states, which are enabled at once.
         """
         self.state = DriveState.ENABLED
 
@@ -98,14 +99,14 @@ class BrakedArm(Plant, DrivableArm):
     def reset(self) -> None:
         """Request that drives in FAULT change to DISABLED, and clear `fault`.
 
-        By default drives have no faults to reset.
+        The default does nothing, which suits drives that report no faults.
         """
 
     def refused(self, torque: Array) -> Finding | None:
-        """Return why a torque must not be applied. None if it may be applied.
+        """Return a finding if a torque must not be applied, or None if it may be applied.
 
-        A torque that is NaN, infinite or beyond a limit is refused. The method counts
-        and reports the refusal; the caller has to engage the brakes. `torque` is (joints,), N m.
+        A torque that is NaN, infinite or beyond a limit is refused. This method counts and reports
+        the refusal; the caller has to engage the brakes. `torque` is (joints,), N m.
         """
         if np.count_nonzero(np.abs(torque) <= self._permitted) == torque.size:
             return None
@@ -126,7 +127,7 @@ class BrakedArm(Plant, DrivableArm):
                 self._report_brakes(BRAKED_WITHOUT_TORQUE, since, self.waited - self.every)
 
     def report_cycle(self) -> None:
-        """Report every change of the brakes in this cycle and its reason, however short it was."""
+        """Report an engagement or release of the brakes, with the reason."""
         super().report_cycle()
         why = self.brake_cause
         self.brake_cause = Error.NONE
@@ -140,15 +141,14 @@ class BrakedArm(Plant, DrivableArm):
                 self.findings.append(Finding(Alarm.BRAKES_OPENED, why, self.tick - since))
 
     def _report_brakes(self, why: int, since: int, missed: int = 0) -> None:
-        """Report that the brakes engaged at tick `since`, with `missed` ticks without command."""
+        """Report that the brakes engaged at tick `since`, with a command `missed` ticks overdue."""
         self._brakes = why, since
         self.findings.append(Finding(Alarm.BRAKES_CLOSED, why, missed, since))
 
     def restore(self, state: ArmState) -> None:
         """Continue from an `ArmState`.
 
-        By default drives have no states of their own: they are enabled, unless the state says that
-        they had been disabled.
+        By default, drives that were disabled stay disabled, and all other drives are enabled.
         """
         super().restore(state)
         was_disabled = state.error == Error.DISABLED
@@ -170,15 +170,16 @@ class BrakedArm(Plant, DrivableArm):
         return f"geom {contact[0]} touches geom {contact[1]}"
 
     def weaken(self, most: Array | None) -> None:
-        """Limit the motor torques as if the motors were weak.
+        """Limit the motor torques, to simulate weak motors.
 
-        Injected faults of motors act through this. By default they have no effect. `most` is
-        (joints,), N m, or None for intact motors.
+        Injected faults of motors call this method. The default does nothing, so these faults have
+        no effect. `most` is the largest torque of each joint, (joints,), N m, or None for intact
+        motors.
         """
 
     def sense_wrist(self) -> Array | None:
         """Return the newest force in N and torque in N m at the wrist, (6,), in the sensor's frame.
 
-        None, the default, if the arm has no wrist sensor.
+        Return None, which is the default, if the arm has no wrist sensor.
         """
         return None

@@ -10,13 +10,13 @@ from rack.levels.robot.limits import MotorPatience
 
 
 class CommandsAbove:
-    """Checks that the commands of all boards above are present and fresh.
+    """Checks that every board above has sent a command and that no command is stale.
 
-    A command is based on a status of the previous cycle, and its board needs `cycles` cycles for
-    it. After that, the motors or valves keep it for their patience.
+    A command is stale if its age exceeds one cycle of this level, plus `cycles` cycles of the board
+    that sends it, plus the patience of the motors or valves that keep applying it.
 
     Attributes:
-        oldest: Maximum age of a command in ticks, by board.
+        oldest: Maximum age of a command in ticks, keyed by board.
     """
 
     def __init__(
@@ -41,10 +41,10 @@ class CommandsAbove:
     def find_missing(
         self, commands: Mapping[str, Reading[SampledCommand]], tick: int, since: int
     ) -> str:
-        """Return the reason why a command is missing or stale. Empty if all are fresh.
+        """Return the reason why a command is missing or stale, or an empty string if all are fresh.
 
         Args:
-            commands: Readings of the commands, by board.
+            commands: Readings of the commands, keyed by board.
             tick: Present tick.
             since: Tick of the oldest status on which a command may be based.
         """

@@ -53,7 +53,7 @@ class LimitViolation(NamedTuple):
 
 
 def copy_sample(sample: Sensed) -> Sensed:
-    """Return a copy of a sample, whose arrays stay valid when the next sample is taken."""
+    """Return a copy of a sample; its arrays stay valid when the next sample is taken."""
     return sample._replace(position=sample.position.copy(), velocity=sample.velocity.copy())
 
 
@@ -69,20 +69,21 @@ class Link(Protocol):
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and apply torques for one torque cycle.
 
-        A torque that must not be applied (see `BrakedArm.refused`) engages the brakes.
+        If a torque must not be applied (see `BrakedArm.refused`), the brakes engage instead.
 
         Args:
             torque: Joint torques, (joints,), N m.
             grip_force: Force of the gripper, N.
 
         Returns:
-            Why the torque was refused. None if it was applied.
+            The reason why the torque was refused, or None if it was applied.
         """
 
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
-        """Release the brakes and let the drives reach `target` at the end of the cycle.
+        """Release the brakes and make the drives reach `target` at the end of the cycle.
 
-        After that they continue at its velocity. `grip_force` and the result are as for `drive`.
+        After the end of the cycle, the drives continue at the velocity of `target`. For
+        `grip_force` and the result see `drive`.
         """
 
 
@@ -90,7 +91,7 @@ class FaultyPath(Link, Protocol):
     """Link with injected faults."""
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the active faults by `faults`."""
+        """Make `faults` the active faults, instead of the previous ones."""
 
 
 class ArmLinks(NamedTuple):
@@ -103,8 +104,9 @@ class ArmLinks(NamedTuple):
 class DrivableArm(ABC):
     """An arm whose joints have drives and brakes, and a force-controlled gripper.
 
-    Its drives, or the link that `connect` returns, keep its limits. Do not subclass it directly,
-    but `rack.levels.arm.Arm`, which has that link, the counters and the reports.
+    The drives, or the link that `connect` returns, enforce the limits. Derive an arm from
+    `rack.levels.arm.Arm` rather than from this class: `Arm` implements the link, the counters and
+    the reports.
     """
 
     keeps_limits: ClassVar[bool]
@@ -163,8 +165,9 @@ class DrivableArm(ABC):
         Args:
             tick_s: Duration of a tick, s.
             speed_fraction: Fraction of the velocity limits that is permitted.
-            acted: Collects the faults that have an effect, for `Executor.acted`.
-            holds: Returns True if the gripper may hold an object, as far as the level knows.
+            acted: Receives the faults that have an effect, for `Executor.acted`.
+            holds: Function that returns True if, as far as the level knows, the gripper may hold an
+                object.
 
         Raises:
             RobotError: The encoders are too coarse to detect a violated limit.
@@ -177,7 +180,7 @@ class DrivableArm(ABC):
     @classmethod
     @abstractmethod
     def find_connect_error(cls, cell: Cell, speed_fraction: float) -> str:
-        """Return why `connect` would fail for a cell. Empty if it would not.
+        """Return the reason why `connect` would fail for a cell, or an empty string.
 
         Called before the launch.
         """
@@ -185,24 +188,24 @@ class DrivableArm(ABC):
     @classmethod
     @abstractmethod
     def has_interface(cls, interface: Interface) -> bool:
-        """Return True if the drives accept commands of the kind `interface`.
+        """Return True if the drives accept commands of type `interface`.
 
-        `rack check` refuses a config that names another kind.
+        `rack check` refuses a config that names another type.
         """
 
     @abstractmethod
     def brake(self) -> None:
         """Engage the brakes, which stop and hold the joints.
 
-        The motors give no torque, and the gripper keeps its force.
+        The motors apply no torque, and the gripper keeps its force.
         """
 
     @abstractmethod
     def step(self, ticks: int) -> None:
-        """Let time pass: advance `tick` and `waited`, and engage the brakes after `patience`.
+        """Advance `tick` and `waited` by `ticks`, and brake once `waited` reaches `patience`.
 
-        Hardware needs no more; a simulation also simulates the ticks. `ticks` exceeds the level's
-        cycle after missed cycles, and may be 0.
+        A simulation also simulates these ticks. After missed cycles, `ticks` is more than one cycle
+        of the level. It may be 0.
         """
 
     @abstractmethod
@@ -213,8 +216,8 @@ class DrivableArm(ABC):
     def enable(self) -> None:
         """Request that the drives be enabled, without blocking.
 
-        `state` becomes ENABLED in a later `step`. Until then, and whenever the arm is not enabled,
-        it is braked in every cycle.
+        `state` becomes ENABLED in a later `step`. While the arm is not enabled, it is braked in
+        every cycle.
         """
 
     @abstractmethod
@@ -233,7 +236,7 @@ class DrivableArm(ABC):
     def sense_wrist(self) -> Array | None:
         """Return the newest force in N and torque in N m at the wrist, (6,), in the sensor's frame.
 
-        None if the arm has no wrist sensor.
+        Return None if the arm has no wrist sensor.
         """
 
     @abstractmethod
@@ -253,9 +256,9 @@ class DrivableArm(ABC):
 
 
 def find_arm(reference: str) -> type[DrivableArm]:
-    """Return the class of an arm that "package.module:Class" names.
+    """Return the class of an arm, given a reference "package.module:Class".
 
     Raises:
-        ValueError: The class is missing, abstract, or no arm.
+        ValueError: The class is missing, abstract, or not the class of an arm.
     """
     return validate_class(reference, DrivableArm)

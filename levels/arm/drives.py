@@ -34,13 +34,13 @@ SOFT = 8
 
 
 class LimitGate:
-    """Cuts torques so that the next cycle ends within limits, and the arm can still be stopped.
+    """Cuts torques so that the joints end the next cycle within limits and can still be stopped.
 
-    A joint may only be so fast that it can brake, with deceleration `braking`, before the end of
-    its range. The arm's equation of motion predicts the velocities. Torques that lead too far are
-    replaced by the torques with the nearest permitted acceleration. They are found by a small
-    quadratic program, in which torque limits take precedence. Far from all limits, which is nearly
-    always, one rough prediction shows that nothing has to be cut.
+    A joint must be slow enough to stop, with deceleration `braking`, before the end of its range.
+    The arm's equation of motion predicts the velocities. Torques that would violate a limit are
+    replaced by the torques with the nearest permitted acceleration. A small quadratic program finds
+    them, with precedence for torque limits. In most cycles the arm is far from all limits, and one
+    rough prediction shows that nothing has to be cut.
     """
 
     def __init__(self, bounds: Bounds, braking: Array, period_s: float, dynamics: Dynamics) -> None:
@@ -68,7 +68,7 @@ class LimitGate:
         self._kinds = np.repeat(np.array([SOFT, HARD], dtype=np.int32), joints)
 
     def limit_torque(self, torque: Array, q: Array, qd: Array) -> tuple[Array, bool]:
-        """Return the commanded torques, cut where necessary.
+        """Return the commanded torques, cut to the limits.
 
         Args:
             torque: Commanded torques, (joints,), N m. They must be finite.
@@ -85,8 +85,8 @@ class LimitGate:
         lowest_gain = -self._limit_speed(q - self._low, -qd) - qd
         highest_gain = self._limit_speed(self._high - q, qd) - qd
         gain = np.clip(self._predict_gain(passed, q, qd), lowest_gain, highest_gain)
-        # Light joints change speed so much within a cycle that only the state in the middle of the
-        # cycle predicts its end.
+        # Light joints change speed so much within a cycle that its end must be predicted from the
+        # state in the middle of the cycle.
         gain = self._predict_gain(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
         if (gain < lowest_gain).any() or (gain > highest_gain).any():
             passed = self._find_nearest_torque(gain, lowest_gain, highest_gain)
@@ -99,10 +99,10 @@ class LimitGate:
         return np.asarray(solve(self._inertia, torque - self._resisting) * self._period_s)
 
     def _find_nearest_torque(self, gain: Array, lowest_gain: Array, highest_gain: Array) -> Array:
-        """Return the torques whose velocity change is nearest to `gain` within bounds.
+        """Return the torques that change the velocity as nearly by `gain` as the bounds permit.
 
         Args:
-            gain: Wanted velocity change in a cycle, (joints,), rad/s.
+            gain: Desired velocity change in a cycle, (joints,), rad/s.
             lowest_gain: Lower bound of the change, rad/s.
             highest_gain: Upper bound of the change, rad/s.
         """
@@ -136,11 +136,11 @@ def is_clear(
     limits: Array,
     period_s: float,
 ) -> bool:
-    """Return True if `torque` certainly violates no limit, by a rough prediction.
+    """Return True if a rough prediction shows that `torque` violates no limit.
 
-    This is so if the velocity stays within its bounds, with some margin, both with no change and
-    with twice the predicted change. That margin exceeds the change of inertia and bias within a
-    cycle.
+    The velocity must stay within its bounds, with a margin, both if it does not change and if it
+    changes by twice the predicted value. The margin covers the change of inertia and bias within a
+    cycle. False does not imply that a limit would be violated.
 
     Args:
         torque: Commanded torques, (joints,), N m.
@@ -208,14 +208,14 @@ def cholesky_solve(matrix: Array, vector: Array) -> Array:
 def compute_stoppable_speed(
     distance: Array, speed: Array, fastest: Array, braking: Array, period_s: float
 ) -> Array:
-    """Return the highest permitted speed, at the end of the cycle, towards an end of the range.
+    """Return the highest permitted speed towards an end of the range at the end of the cycle.
 
-    With speed v' at the end of the cycle the joint has come (v + v') T / 2 nearer, and must stop
-    within the remaining distance: v'^2 / 2 a <= distance - (v + v') T / 2.
+    If the speed changes from v to v' during the cycle T, the joint moves by (v + v') T / 2 and must
+    be able to stop within the remaining distance: v'^2 / 2 a <= distance - (v + v') T / 2.
 
     Args:
         distance: Distance from the end of the range, rad.
-        speed: Present speed towards it, rad/s.
+        speed: Present speed towards the end of the range, rad/s.
         fastest: Maximum speed, rad/s.
         braking: Deceleration of the joint, rad/s2.
         period_s: Length of the cycle, s.
@@ -237,11 +237,11 @@ smaller factor makes drives overshoot less.
 class SetPointGate:
     """Cuts set points so that an arm that follows them stays within its limits.
 
-    The motion from one set point to the next requires torques, by the equation of motion. These
-    pass a `LimitGate`. Set points therefore stay within the range, at a velocity from which the arm
-    can still be stopped within it, and change their velocity only as fast as the motors can. A set
-    point that is farther away is approached over several cycles. Velocity set points start from the
-    sensed state, position set points from the last set point.
+    The equation of motion gives the torques that move the arm from one set point to the next, and a
+    `LimitGate` cuts them. Set points therefore stay within the range, have a velocity from which
+    the arm can stop within the range, and change their velocity only as fast as the motors permit.
+    A set point that is farther away is approached over several cycles. The motion starts from the
+    sensed state for velocity set points, and from the last set point for position set points.
     """
 
     def __init__(
@@ -272,10 +272,10 @@ class SetPointGate:
         self._last = last
 
     def limit_set_point(self, target: JointTarget, q: Array, qd: Array) -> JointTarget | Finding:
-        """Return the set point, cut to what may be given to the arm.
+        """Return the set point, cut so that the arm stays within its limits.
 
-        A set point is refused if a number is not finite, a predicted torque is beyond its limit, or
-        it is the first set point and too far from the arm. A refusal engages the brakes.
+        A set point is refused if a number is not finite, if a predicted torque is beyond its limit,
+        or if it is the first set point and too far from the arm. A refusal engages the brakes.
 
         Args:
             target: Commanded set point.
@@ -310,10 +310,13 @@ class SetPointGate:
         return JointTarget(position.copy(), velocity.copy(), target.torque)
 
     def _check_set_point(self, target: JointTarget, q: Array, qd: Array) -> Finding | None:
-        """Check a set point. While the arm is braked, motion starts at the sensed state.
+        """Return a finding if a set point is not finite, or too far away for a first set point.
+
+        While the arm is braked, and before the first set point, the sensed state becomes the last
+        set point, and the joints must be able to reach the set point from it in one cycle.
 
         Returns:
-            Why the set point is invalid. None if it is valid.
+            The finding. None if the set point is valid.
         """
         error = target.position - q
         is_invalid = ~np.isfinite(error + target.velocity)
@@ -348,7 +351,7 @@ class SetPointGate:
         return target.velocity + closing, bool(cut)
 
     def _compute_resistance(self) -> tuple[Array, Array]:
-        """Return the inertia, and the torques of bias and dry friction, at the last set point."""
+        """Return the inertia, and the sum of bias and friction torques, at the last set point."""
         inertia, bias = self._dynamics.terms(*self._last)
         return inertia, bias + self._dynamics.friction(self._last[1])
 
@@ -356,8 +359,8 @@ class SetPointGate:
 def narrow_bounds(bounds: Bounds, limits: Limits) -> Bounds:
     """Return bounds halfway between `bounds` and the limits of planned motion.
 
-    Where `limits` are wider than `bounds`, `bounds` apply. The margin is for drives, which
-    overshoot a little.
+    Where `limits` are wider than `bounds`, `bounds` apply. The margin allows for the overshoot of
+    drives.
     """
     low, high = bounds.position.T
     planned_low, planned_high = 0.5 * (bounds.position + limits.position).T

@@ -31,7 +31,7 @@ MIN_TURNING_SPEED = 5.0 * FRICTION_SPEED
 
 
 class FaultyLink:
-    """Implements `Link`, and applies the injected faults on the way to and from the arm."""
+    """Implements `Link`, and applies the injected faults to samples, torques and set points."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class FaultyLink:
         self._torque = np.zeros(len(limits))
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the active faults. A fault of a joint that the arm lacks has no effect."""
+        """Replace the active faults. Faults of joints that the arm does not have are ignored."""
         active = [
             ActiveFault(place, fault, joints, self._arm.every, self._first_samples)
             for place, fault in enumerate(faults)
@@ -116,7 +116,7 @@ class FaultyLink:
         return finding
 
     def _record_motor_faults(self) -> None:
-        """Record which motor faults had an effect, and whether it was detectable."""
+        """Record which motor faults had an effect, and whether the effect was detectable."""
         if self._motors and not self._arm.braked:
             asked = np.abs(self._arm.torque)
             hidden = self._hidden + self._compute_hidden_torque()
@@ -126,7 +126,10 @@ class FaultyLink:
                     self._effects[active.place] = bool((missing > hidden[active.joints]).any())
 
     def _compute_hidden_torque(self) -> Array | float:
-        """Return how much of a motor's missing torque a contact may hide, in N m."""
+        """Return the largest lack of motor torque that a contact may hide, in N m.
+
+        The result is (joints,), or 0 without contact.
+        """
         if self._arm.is_touching_surroundings:
             return self._pressed
         turning = np.count_nonzero(np.abs(self._arm.sense().velocity) > MIN_TURNING_SPEED)
@@ -137,7 +140,7 @@ class FaultyLink:
         )
 
     def _corrupt_torque(self, torque: Array) -> Array:
-        """Return the torques as the active command faults corrupt them, (joints,), in N m."""
+        """Return the torques after applying the active command faults, (joints,), in N m."""
         corrupt = self._torque
         np.copyto(corrupt, torque)
         for step, active in self._commands:

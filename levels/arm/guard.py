@@ -47,15 +47,15 @@ def narrow_bounds_by_errors(cell: Cell, speed_fraction: float) -> Bounds:
 
 
 class GuardedArm:
-    """Implements `Link` around an arm, and protects it, using nothing but its samples.
+    """Implements `Link` around an arm, and protects the arm, using nothing but its samples.
 
     A torque that is not finite, or beyond its limit, is refused and engages the brakes. Other
-    torques are cut so that the arm stays within the limits, and can still be stopped (`LimitGate`).
-    This holds for as long as the motors keep a torque, which is the arm's patience, as later cycles
-    may be missed. The largest possible error of the encoders is kept as a margin on each limit. A
-    sample that exceeds a limit by more than that error, or is not finite, is a violation. It is
-    counted, stored in the arm's `exceeded`, and stops the arm. Contacts and true positions, which
-    only a simulation knows, are not checked.
+    torques are cut so that the arm stays within the limits and can still be stopped (`LimitGate`).
+    Later cycles may be missed, so the limits must hold for the whole time for which the motors may
+    keep applying the torque (the arm's patience). Each limit has a margin for the largest error of
+    the encoders. A sample that exceeds a limit by more than that error, or is not finite, is a
+    violation. It is counted, stored in the arm's `exceeded`, and stops the arm. Contacts and true
+    positions are not checked, because only a simulation knows them.
     """
 
     def __init__(

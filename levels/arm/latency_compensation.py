@@ -36,7 +36,10 @@ class PresentState(NamedTuple):
 
 
 def build_present_link(arm: BrakedArm, tick_s: float) -> Link:
-    """Return a link with samples of the present: the arm itself if its samples need no change."""
+    """Return a link that corrects the latency and the offset of an arm's samples.
+
+    If there is nothing to correct, the link is the arm itself.
+    """
     encoders = arm.cell.encoders
     is_present = encoders.offset is None and not encoders.latency_ticks
     return arm if is_present else PresentLink(arm, tick_s)
@@ -46,8 +49,8 @@ class PresentLink:
     """Implements `Link` around an arm with delayed samples or an offset of positions.
 
     Samples are up to `robot.latency_ticks` old, and `robot.calibration.offset` is added to them. A
-    sample is extrapolated to the tick at which it is read, by the torques given since, or by the
-    deceleration of the brakes. The cell's `encoders` include the largest error of the
+    sample is extrapolated to the tick at which it is read, using the torques applied since it was
+    taken, or the deceleration of the brakes. The cell's `encoders` include the largest error of the
     extrapolation. A sample that is older than the latency is passed on without extrapolation.
     """
 
@@ -100,7 +103,7 @@ class PresentLink:
         return self._arm.follow(target, grip_force)
 
     def _extrapolate(self, sample: Sensed) -> Sensed:
-        """Return a sample extrapolated to the present."""
+        """Return a copy of a sample, extrapolated to the present tick."""
         led = copy_sample(sample)._replace(tick=self._arm.tick)
         begun = sample.tick
         for until, torque in self._driven:
@@ -119,8 +122,8 @@ class PresentLink:
         Args:
             position: (joints,), rad.
             velocity: (joints,), rad/s.
-            torque: (joints,), N m. None while the brakes were engaged.
-            time_s: Duration for which to advance, s.
+            torque: (joints,), N m. None if the brakes were engaged.
+            time_s: Duration, s.
         """
         if torque is None:
             change = -np.copysign(np.minimum(np.abs(velocity), time_s * self._braking), velocity)

@@ -21,9 +21,9 @@ read_saved = attrgetter(*SAVED_ATTRIBUTES)
 class Plant:
     """Time, counters and state of a driven mechanism in a cell.
 
-    It fills `ArmState` and `Scene` messages. It shares `findings` with the executor that constructs
-    it. Findings therefore reach the board, and counters the state, even if the level reports
-    nothing.
+    It fills `ArmState` and `Scene` messages. It shares the list `findings` with the executor that
+    constructs it. The board therefore receives its findings, and the `ArmState` its counters, even
+    if the level itself reports nothing.
     """
 
     def __init__(self, cell: Cell) -> None:
@@ -56,11 +56,11 @@ class Plant:
         self._data = cell.build_start_data()
 
     def _fill_scene(self, scene: Scene) -> None:
-        """Fill a `Scene` from `_data`."""
+        """Fill a `Scene` with the poses of bodies and tool in `_data`."""
         data = self._data
         bodies = self.cell.bodies
         tool = self.cell.tool
-        # After a step, MuJoCo's poses are still those before it.
+        # After a step, MuJoCo's poses are still the poses before the step.
         mujoco.mj_kinematics(self._model, data)
         scene.position[: len(bodies)] = data.xpos[bodies]
         scene.quaternion[: len(bodies)] = data.xquat[bodies]
@@ -70,8 +70,8 @@ class Plant:
     def save(self, state: ArmState) -> None:
         """Fill an `ArmState` with the state that a restarted board needs.
 
-        By default these are the attributes in `SAVED_ATTRIBUTES`. A simulation adds its state to
-        `state.state`, see `rack.levels.robot.engine`.
+        By default, this state consists of the attributes in `SAVED_ATTRIBUTES`. A simulation also
+        fills `state.state`, see `rack.levels.robot.engine`.
         """
         self.report_cycle()
         state.tick = self.tick
@@ -96,13 +96,13 @@ class Plant:
         return finding
 
     def report_cycle(self) -> None:
-        """Report the events of the cycle. Called at its end."""
+        """Report the events of the cycle. Called at the end of the cycle."""
         self._reported_tick = self.tick
 
     def complete_cycle(self, state: ArmState | None) -> None:
-        """Report a cycle and fill its `ArmState`, unless the level has already done it.
+        """Report a cycle and fill its `ArmState`, unless the level has already done both.
 
-        `state` is None if the level publishes no such message.
+        `state` is None if the level publishes no `ArmState`.
         """
         if self._reported_tick != self.tick:
             if state is not None:

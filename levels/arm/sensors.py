@@ -65,7 +65,7 @@ class WristSensor:
     def sample(self, tick: int) -> Array:
         """Return force in N and torque in N m, in the sensor's frame, (6,).
 
-        They are the values of the last simulation step before `tick`.
+        The values are from the last simulation step before `tick`.
         """
         # The second row is not used.
         sample = np.zeros((2, AXES))
@@ -102,14 +102,14 @@ def sense_coarsely(sample: Array, tick: int, seed: int, noise: Array, step: Arra
 
 @compiled_for("i8, i8, i8")
 def draw_uniform(seed: int, tick: int, count: int) -> Array:
-    """Return random numbers between 0 and 1, both excluded.
+    """Return uniform random numbers between 0 and 1, both excluded.
 
-    They depend on nothing but the arguments.
+    The same arguments always give the same numbers.
 
     Args:
         seed: Seed.
-        tick: Tick, for which the numbers are drawn.
-        count: How many numbers to return.
+        tick: Tick for which the numbers are drawn.
+        count: Number of values to return.
     """
     bits = mix_bits(np.zeros(count, dtype=np.uint64) + np.uint64(seed))
     bits = mix_bits(mix_bits(bits + np.uint64(tick)) + np.arange(count).astype(np.uint64))
@@ -118,7 +118,7 @@ def draw_uniform(seed: int, tick: int, count: int) -> Array:
 
 @compiled
 def mix_bits(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Mix the bits of each number by SplitMix64 (Steele, Lea and Flood, OOPSLA 2014)."""
+    """Mix the bits of each number with SplitMix64 (Steele, Lea and Flood, OOPSLA 2014)."""
     bits = bits + np.uint64(0x9E3779B97F4A7C15)
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

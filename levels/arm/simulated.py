@@ -36,13 +36,14 @@ is at least twice as fast as the loop around it, and all are slow compared with 
 
 
 class SimulatedArm(Simulation, Arm):
-    """Implements `Arm` in MuJoCo, in `substeps` steps per tick.
+    """An `Arm` simulated with MuJoCo, in `substeps` steps per tick.
 
-    Simulated time is always tick times period. Samples have the resolution and noise of the cell's
-    encoders. Brakes and limit gate belong to the drives and use the true state. A command is for
-    one torque cycle. It passes the limit gate in every tick, even while the servo level misses
-    cycles. Drives that follow set points (`[robot] interface`) compute a new torque in every tick.
-    Their state is in MuJoCo's user data.
+    Simulated time is always the tick number times the duration of a tick. Samples have the
+    resolution and noise of the cell's encoders. Brakes and limit gate are part of the drives and
+    use the true state. A command applies for one torque cycle. The torques pass the limit gate in
+    every tick, even while the servo level misses cycles. Drives that follow set points (`[robot]
+    interface`) compute a new torque in every tick. The state of these drives is in MuJoCo's user
+    data.
     """
 
     keeps_limits = True
@@ -129,7 +130,7 @@ class SimulatedArm(Simulation, Arm):
     def follow(self, target: JointTarget, grip_force: float) -> Finding | None:
         """Release the brakes and follow a set point for the coming cycle; see `Link.follow`."""
         self._apply_grip_force(grip_force)
-        # The origin of the encoders differs from that of the model.
+        # The encoders and the model measure positions from different origins.
         if (offset := self.cell.encoders.offset) is not None:
             target = target._replace(position=target.position + offset)
         passed = self._set_points.limit_set_point(target, *self._state)
@@ -152,7 +153,7 @@ class SimulatedArm(Simulation, Arm):
             self._data.ctrl[self._gripper.actuator] = self.grip_force = force
 
     def brake(self) -> None:
-        """Engage the brakes. The motors give no torque, and the gripper keeps its force."""
+        """Engage the brakes. The motors apply no torque, and the gripper keeps its force."""
         self._engage_brakes()
         self._apply_command()
 
@@ -163,9 +164,9 @@ class SimulatedArm(Simulation, Arm):
             np.copyto(self._rest, self._state[0])
 
     def weaken(self, most: Array | None) -> None:
-        """Limit the motor torques from the next command on.
+        """Limit the motor torques, beginning with the next command.
 
-        `most` is (joints,), N m, or None for intact motors.
+        `most` is the largest torque of each joint, (joints,), N m, or None for intact motors.
         """
         self._weak_limits = most
 
@@ -204,9 +205,9 @@ class SimulatedArm(Simulation, Arm):
         state.rest = self._rest
 
     def restore(self, state: ArmState) -> None:
-        """Continue, bit for bit, from an `ArmState`.
+        """Restore an `ArmState`, so that the simulation continues bit for bit.
 
-        Its last torques become the last command.
+        The torques in the state become the last command.
         """
         super().restore(state)
         d = self._data
@@ -221,9 +222,10 @@ class SimulatedArm(Simulation, Arm):
         self._given = self._drives is None or self.braked or self.waited == 0
 
     def _apply_command(self) -> None:
-        """Apply torques to the joints through the limit gate.
+        """Apply torques to the joints, cut by the limit gate.
 
-        These are the command for the motors or, while the arm is braked, the torques of the brakes.
+        While the arm is braked, these are the torques of the brakes. Otherwise they are the
+        commanded torques, or the torques with which the drives follow a set point.
         """
         cell = self.cell
         braked = self.braked
@@ -247,7 +249,7 @@ class SimulatedArm(Simulation, Arm):
     def _compute_braking_torque(self, q: Array, qd: Array) -> Array:
         """Return the torques with which the brakes stop or hold the joints, (joints,), in N m.
 
-        They act even with the motors off.
+        The brakes act even if the motors are off.
         """
         max_acceleration = self.cell.limits.acceleration
         np.copyto(self._rest, q, where=np.abs(qd) > STANDSTILL)
@@ -262,10 +264,10 @@ class SimulatedArm(Simulation, Arm):
 class CascadedDrives:
     """Position servos with cascaded loops: P on position around PI on velocity, limited in torque.
 
-    Like the controllers of such arms, they use the arm's present inertia. The inertia of each joint
-    at home would suit arms with gears, whose inertia is nearly constant, but makes the K-1607,
-    which has none, swing. Gravity, friction and load are compensated by the integral, which starts
-    from the predicted torque when the brakes are released.
+    Like the controllers of such arms, they use the arm's present inertia. A constant inertia,
+    computed at home, would suit arms with gears, but makes the K-1607, which has no gears,
+    oscillate. Gravity, friction and load are compensated by the integral, which starts from the
+    predicted torque when the brakes are released.
     """
 
     def __init__(
@@ -292,8 +294,8 @@ class CascadedDrives:
         """Initialize the integral so that the drives continue without a step in torque.
 
         Args:
-            torque: Predicted torque of the motion, (joints,), N m, of which the part for
-                acceleration is subtracted.
+            torque: Predicted torque of the motion, (joints,), N m. Its share for acceleration is
+                subtracted.
             q: Positions, (joints,), rad.
             qd: Velocities, (joints,), rad/s.
         """
@@ -304,8 +306,8 @@ class CascadedDrives:
         """Return the torques of the coming tick, (joints,), in N m.
 
         Args:
-            q: Positions at its start, (joints,), rad.
-            qd: Velocities at its start, (joints,), rad/s.
+            q: Positions at the start of the tick, (joints,), rad.
+            qd: Velocities at the start of the tick, (joints,), rad/s.
             waited: Ticks since the set point arrived.
         """
         position, velocity, integral = self._rows

@@ -35,17 +35,18 @@ CHECKED_QUANTITIES = (("position", "rad"), ("velocity", "rad/s"), ("torque", "N 
 
 
 class Simulation(Plant):
-    """A plant in MuJoCo, in `substeps` steps per tick. Simulated time is always tick times period.
+    """A plant simulated with MuJoCo, in `substeps` steps per tick.
 
-    Subclasses call `prepare_simulation` in their constructor, and give the drives their commands
-    before each `_simulate_tick`.
+    Simulated time is always the tick number times the duration of a tick. Subclasses call
+    `prepare_simulation` in their constructor, and set the controls of the drives before each
+    `_simulate_tick`.
     """
 
     sleeps: ClassVar[bool] = True
     """True if bodies may sleep, because nothing except MuJoCo moves them."""
 
     def prepare_simulation(self, scene: SceneConfig, clock_ns: int) -> None:
-        """Prepare the steps of a tick, which lasts `clock_ns`, and their checks."""
+        """Prepare the steps of a tick, which lasts `clock_ns`, and the checks on the steps."""
         cell = self.cell
         if self.sleeps:
             self._model = enable_sleep(cell.model, scene)
@@ -76,19 +77,19 @@ class Simulation(Plant):
     def _read_joint_state(self) -> None:
         """Read positions and velocities of the joints from MuJoCo's data.
 
-        Call this after every change of the data that is not made by a step.
+        Call this after every change of the data other than a simulation step.
         """
         position, velocity = self._state
         position[:] = self._data.qpos[self.cell.qpos]
         velocity[:] = self._data.qvel[self.cell.dof]
 
     def describe_contact(self, contact: tuple[int, int] | NDArray[np.int32]) -> str:
-        """Describe a `contact` by the names of the geoms."""
+        """Describe a `contact` as text, with the names of the geoms."""
         first, second = (find_geom_name(self.cell.model, geom) for geom in contact)
         return f"'{first}' touches '{second}'"
 
     def look(self, scene: Scene) -> None:
-        """Fill a `Scene` with the simulated poses."""
+        """Fill a `Scene` with the simulated poses of bodies and tool."""
         self._fill_scene(scene)
 
     def save(self, state: ArmState) -> None:
@@ -126,9 +127,10 @@ class Simulation(Plant):
             self.struck -= 1
 
     def _finish_failed_tick(self, steps_made: int) -> None:
-        """Finish a tick whose step number `steps_made` failed a check.
+        """Complete a tick in which step `steps_made` failed a check.
 
-        If the cause is a fault of the simulation, the state before the tick is restored.
+        The remaining steps are made, and contacts and violated limits are counted and reported. If
+        the simulation itself has failed, the state before the tick is restored instead.
         """
         touches = self.touches
         self._count_contacts()
@@ -150,7 +152,7 @@ class Simulation(Plant):
         self._data.time = self._tick_end_s
 
     def _count_contacts(self) -> None:
-        """Count the unintended contacts of the last step. Store one that involves arm or load."""
+        """Count the unintended contacts of the last step, and store one of the arm or its load."""
         pairs = find_unintended_contacts(self._data, self.cell.geoms.touch)
         if not len(pairs):
             return
@@ -174,11 +176,12 @@ class Simulation(Plant):
         return np.asarray(self._is_arm | self._mark_held_geoms())
 
     def _check_limits(self) -> bool:
-        """Check the joint limits in all steps of a tick. Return True if any is broken.
+        """Check the joint limits in all steps of a tick. Return True if any is violated.
 
         Positions, velocities and torques (of motor and brake together) are checked. The check
-        shares no code with the limit gate, which enforces the limits. For some time after a blow
-        the arm may break limits of position and velocity, because no drive can prevent that.
+        shares no code with the limit gate, which enforces the limits. For some time after an
+        unintended contact, violated limits of position and velocity are counted separately, because
+        no drive can prevent them.
         """
         seen = self._steps.seen
         low, high = self._steps.judged[:2]
@@ -195,7 +198,7 @@ class Simulation(Plant):
         return bool(is_wrong.any())
 
     def _report_violation(self, violated: Mask, step: int) -> None:
-        """Report the first limit that step `step` broke. `violated` is (steps, 3, joints)."""
+        """Report the first limit violated in step `step`. `violated` is (steps, 3, joints)."""
         row, joint = (int(at[0]) for at in np.nonzero(violated[step]))
         value = float(self._steps.seen[step, row, joint])
         if not self.first_violation:
@@ -207,7 +210,7 @@ class Simulation(Plant):
         self.report_finding(Finding(Alarm.LIMIT_EXCEEDED, joint, value))
 
     def _find_fault(self) -> str:
-        """Return a description of the fault of the simulation. Empty if there is none."""
+        """Return a description of a failure of the simulation, or an empty string."""
         d = self._data
         warned = np.flatnonzero(d.warning.number)
         if warned.size:
@@ -220,12 +223,12 @@ class Simulation(Plant):
 def compute_obstacle_position(
     start: Array, moves: tuple[MotionConfig, ...], time_s: float
 ) -> Array:
-    """Return the origin of a moving obstacle, (3,), in m.
+    """Return the position of a moving obstacle at a given time, (3,), in m.
 
     A move that starts before the previous one has ended replaces it.
 
     Args:
-        start: Origin before the first move, (3,), m.
+        start: Position before the first move, (3,), m.
         moves: Moves of the obstacle.
         time_s: Simulated time, s.
     """
@@ -257,19 +260,19 @@ def compute_push_force(pushes: tuple[PushConfig, ...], time_s: float) -> Array:
 
 
 def enable_sleep(model: mujoco.MjModel, scene: SceneConfig) -> mujoco.MjModel:
-    """Return a copy of the model in which bodies at rest sleep, if that is safe.
+    """Return a copy of the model in which bodies at rest may sleep, if that is safe.
 
-    It is not safe if a mocap body moves, because that does not wake others, nor with tendon
-    equalities and flexible bodies, because MuJoCo ends the process if these might sleep. Where
-    steps are short, or gravity is weak, a body would sleep in the air, at the turning point of its
-    flight. Use the model for whole steps only: parts of a step, called separately, leave out bodies
-    that do not move.
+    Sleep is not safe if a mocap body moves, because its motion does not wake other bodies. It is
+    not safe with tendon equalities or flexible bodies, because MuJoCo ends the process if these
+    might sleep. If steps are short or gravity is weak, it is not safe because a body would fall
+    asleep in the air, at the top of its flight. Use the model for whole steps only, because the
+    separate functions for parts of a step omit bodies that do not move.
     """
     result = copy(model)
     option = result.opt
-    gained = STEPS_AT_REST * option.timestep * norm(option.gravity)  # m/s, by falling
+    gained = STEPS_AT_REST * option.timestep * norm(option.gravity)  # m/s, in a fall
     tendons = model.eq_type == mujoco.mjtEq.mjEQ_TENDON
-    # A body would be slow at the turning point of its flight for longer than those steps.
+    # At the top of its flight, a body would be slow for more than `STEPS_AT_REST` steps.
     may_float = gained < 4.0 * option.sleep_tolerance
     if not (may_float or scene.motion or tendons.any() or model.nflex):
         option.enableflags |= SLEEP
@@ -277,7 +280,7 @@ def enable_sleep(model: mujoco.MjModel, scene: SceneConfig) -> mujoco.MjModel:
 
 
 def restore_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
-    """Restore `data`, so that its next steps repeat the saved simulation bit for bit."""
+    """Restore a saved state to `data`, so that the simulation continues bit for bit."""
     data.tree_asleep[:] = -1
     mj_update_sleep(model._address, data._address)
     view_state(model, data, state)

@@ -29,7 +29,7 @@ PHYSICS = int(mujoco.mjtState.mjSTATE_PHYSICS)
 class Substeps(NamedTuple):
     """Constant arguments of `make_steps`, prepared once.
 
-    They are few, because each array costs more than the arithmetic on it.
+    There are few arrays, because passing an array takes longer than the arithmetic on it.
     """
 
     model: int  # address
@@ -91,7 +91,7 @@ def copy_state(model: int, data: int, asleep: NDArray[np.int32], state: Array) -
     Args:
         model: Address of the model.
         data: Address of the data.
-        asleep: MuJoCo's `tree_asleep`, (trees,), which becomes the end of the state.
+        asleep: MuJoCo's `tree_asleep`, (trees,), which is stored at the end of the state.
         state: Receives the state, (state_size,).
     """
     mj_get_state(model, data, state.ctypes.data, INTEGRATION)
@@ -120,10 +120,10 @@ def make_steps(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.
     distance: Array,
     touch: Mask,
 ) -> int:
-    """Make the steps of a tick, up to a step that fails a check.
+    """Simulate the steps of a tick, until all are made or one fails a check.
 
-    A step fails if it breaks a limit, or has an unintended contact, a warning, or a state that is
-    not finite. For the arguments from `model` on see `Substeps`.
+    A step fails if it violates a limit, has an unintended contact or a MuJoCo warning, or ends in a
+    state that is not finite. For the arguments from `model` on see `Substeps`.
 
     Args:
         begin: Number of the first step to make.
@@ -142,7 +142,7 @@ def make_steps(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.
         touch: See `Substeps`.
 
     Returns:
-        The number of steps made in this tick. Negative if the last one failed a check.
+        The number of steps made in this tick, as a negative number if the last one failed a check.
     """
     before = states[0]
     after = states[1]
@@ -165,7 +165,8 @@ def make_steps(  # noqa: PLR0913  # flat arguments: a field of a record takes 0.
             )
         for warned in warnings:
             is_valid &= warned == 0
-        # A state of an earlier step that is not finite makes MuJoCo warn in the next step.
+        # Only the last step is checked, because MuJoCo warns in a step whose initial state is not
+        # finite.
         if step + 1 == len(seen):
             mj_get_state(model, data, after.ctypes.data, PHYSICS)
             for value in after:

@@ -109,16 +109,19 @@ class BlendedPath:
         )
 
     def evaluate(self, s: float) -> PathPoint:
-        """Return the point at `s`, clamped to the path. The next call overwrites its arrays."""
+        """Return the point at `s`, which is clamped to the path.
+
+        The next call overwrites the arrays of the point.
+        """
         compute_point.load_machine_code()(
             self._marks, self._table, min(max(s, 0.0), self.length), self._point
         )
         return PathPoint(*self._point)
 
     def find_pieces(self, s: ArrayLike) -> Ints:
-        """Return the index of the piece that contains each of `s`, in rad.
+        """Return the index of the piece that contains each of the path parameters `s`, in rad.
 
-        A break belongs to the piece that follows it.
+        A boundary between two pieces belongs to the second one.
         """
         pieces = np.searchsorted(self.breaks, s, side="right") - 1
         return np.clip(pieces, 0, len(self.breaks) - 2)
@@ -134,7 +137,7 @@ class BlendedPath:
         )
 
     def _divide_into_pieces(self) -> tuple[list[tuple[int, float]], list[float]]:
-        """Divide the path into lines and corners.
+        """Divide the path into lines and corners, and add its stops to `stops`.
 
         Returns:
             The pieces, and the values of s at their ends, in rad. A corner is given as the index of
@@ -168,8 +171,8 @@ def compute_point(
     Args:
         marks: (pieces, 3), rad: s at the start of each piece, s of its waypoint, its blend (0 for a
             line).
-        table: (pieces, 3, joints): the waypoint, rad, the unit direction before it, and its change
-            there.
+        table: (pieces, 3, joints): the waypoint, rad, the unit direction before it, and the change
+            of direction there.
         s: Path parameter, rad.
         point: Receives the result, (3, joints), in the row order of `PathPoint`.
     """
@@ -245,7 +248,7 @@ def _merge_coincident(points: Array, radii: Array) -> tuple[Array, Array]:
 
 
 def _check_overlap(radii: Array, lengths: Array) -> None:
-    """Check that the blends at both ends of each line fit on it. Raises `ValueError`."""
+    """Raise `ValueError` if the blends at the two ends of a line overlap."""
     for k, length in enumerate(lengths):
         if radii[k] + radii[k + 1] > length * (1.0 + OVERLAP_ROUNDING) + COINCIDENT_RAD:
             raise ValueError(

@@ -79,15 +79,16 @@ class SpeedLimits(NamedTuple):
 
 
 def compute_speed_limits(piece: PathBounds, limits: Limits, share: float) -> SpeedLimits:
-    """Return limits of the motion of s that keep all joints within theirs on a piece of a path.
+    """Return limits of ds/dt on a piece of a path that keep all joints within their limits.
 
-    The joints move with q' ds, q'' ds^2 + q' dds and q''' ds^3 + 3 q'' ds dds + q' ddds.
+    A joint has the velocity q' ds, the acceleration q'' ds^2 + q' dds and the jerk
+    q''' ds^3 + 3 q'' ds dds + q' ddds.
 
     Args:
         piece: Bounds of the derivatives on the piece, (joints,) each.
         limits: Limits of the joints.
         share: Fraction, 0 to 1, of the highest speed that the bend of a curve permits. A smaller
-            fraction leaves more acceleration.
+            fraction leaves more of the limits for acceleration along the path.
     """
     first, second, third = piece
     velocity = limits.velocity
@@ -141,9 +142,9 @@ def compute_reachable_speed(start: float, length: float, limits: SpeedLimits) ->
 
 
 def compute_boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimits]) -> list[float]:
-    """Return the highest speeds in rad/s at the ends of consecutive stretches of a path.
+    """Return the highest possible speeds at the ends of consecutive stretches of a path, in rad/s.
 
-    The motion starts and ends at rest. Each stretch has a length in rad and an entry in `limits`.
+    The motion starts and ends at rest. `lengths` are in rad. Each stretch has an entry in `limits`.
     """
     speeds = [0.0]
     for k, (length, limit) in enumerate(zip(lengths, limits, strict=True)):
@@ -155,7 +156,10 @@ def compute_boundary_speeds(lengths: Sequence[float], limits: Sequence[SpeedLimi
 
 
 def compute_least_ratio(room: Array, rate: Array) -> float:
-    """Return the smallest room / rate of all joints with a rate above 0. Infinite without any."""
+    """Return the smallest room / rate of all joints with a rate above 0.
+
+    Return infinity if no joint has a rate above 0.
+    """
     return float(np.divide(room, rate, out=np.full(len(rate), np.inf), where=rate > 0.0).min())
 
 
@@ -195,7 +199,7 @@ class Trajectory:
     def stretch_by(self, factor: float) -> Trajectory:
         """Return the same motion slowed down by `factor`, which must be at least 1.
 
-        It stays within all limits within which this motion stays.
+        The result keeps all limits that this motion keeps.
         """
         powers = np.array([factor, 1.0, 1.0 / factor, 1.0 / factor**2, 1.0 / factor**3])
         return Trajectory(self.sections * powers, self.duration * factor)
@@ -213,9 +217,9 @@ def _integrate_jerk(t: Any, s: Any, ds: Any, dds: Any, jerk: Any) -> tuple[Any, 
 def make_trajectory(path: BlendedPath, limits: Limits, begin: float = 0.0) -> Trajectory:
     """Compute a fast motion from rest to rest at the end of a path.
 
-    The motion also rests at the stops of the path. Analytic bounds of the path, not samples, ensure
-    that joint velocity, acceleration and jerk keep the limits everywhere. The result has at most
-    `SECTIONS` sections.
+    The motion also comes to rest at the stops of the path. Joint velocity, acceleration and jerk
+    keep the limits everywhere, because the motion is computed from analytic bounds of the path
+    instead of samples. The result has at most `SECTIONS` sections.
 
     Args:
         path: The path.
@@ -232,7 +236,7 @@ def make_trajectory(path: BlendedPath, limits: Limits, begin: float = 0.0) -> Tr
 
 
 def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory | None:
-    """Compute a short ramp to rest along a path that keeps the joint limits.
+    """Compute a short ramp to rest along a path, within the joint limits.
 
     The computing time is bounded for every path.
 
@@ -242,8 +246,9 @@ def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory
         state: State at the start of the ramp.
 
     Returns:
-        The shortest ramp found. None if every ramp would exceed a limit or overrun the path. Motion
-        may then follow its trajectory, which itself ends at rest, and try again a cycle later.
+        The shortest ramp found. None if every ramp tried would exceed a limit or the end of the
+        path. In that case the motion can follow its trajectory, which also ends at rest, and try
+        again in the next cycle.
     """
     if state.ds < MAX_REST_RAD_S:
         return _join_sections([], state.s)
@@ -273,7 +278,7 @@ def _find_fastest(path: BlendedPath, start: float, end: float, limits: Limits) -
     bounds = PathBounds(*(bound[first : last + 1] for bound in path.bounds))
     corners = int(bounds.second.any(axis=1).sum())
     candidates = [([start, *path.breaks[first + 1 : last + 1].tolist(), end], bounds)]
-    # One set of limits for all pieces suits many small corners.
+    # With many small corners, one set of limits for all pieces may be faster.
     if last > first:
         candidates.append(
             ([start, end], PathBounds(*(bound.max(axis=0, keepdims=True) for bound in bounds)))
@@ -379,7 +384,8 @@ def _is_within_limits(stop: Trajectory, path: BlendedPath, limits: Limits) -> bo
     # The result of ** 3 on an array differs between processors.
     cubed = speed * speed * speed
     tolerance = 1.0 + LIMIT_ROUNDING
-    # A jerk too small to end the present deceleration in time would reverse the motion.
+    # The motion must not reverse, which it does if the jerk is too small to end the present
+    # deceleration in time.
     return bool(
         (ds > -LIMIT_ROUNDING).all()
         and (first * speed <= limits.velocity * tolerance).all()
@@ -407,7 +413,10 @@ def _find_check_times(stop: Trajectory) -> Array:
 
 
 def _find_bounds_over(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
-    """Return bounds of the derivatives by s between consecutive `s`, (n - 1, joints) each."""
+    """Return bounds of the path's first three derivatives between consecutive values of `s`.
+
+    Each bound is (n - 1, joints).
+    """
     piece = path.find_pieces(s)
     low = piece[:-1]
     high = piece[1:]

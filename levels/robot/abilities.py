@@ -39,7 +39,7 @@ class Abilities:
 
 
 def compute_abilities(cell: Cell) -> Abilities:
-    """Compute the abilities of a cell's arm, in many random poses and stretched out."""
+    """Compute the abilities of a cell's arm from random poses and a stretched-out pose."""
     statics = Statics(cell)
     poses = statics.draw_poses()
     stretched = statics.stretch_out(max(poses, key=statics.compute_reach))
@@ -93,11 +93,11 @@ class Statics:
         return norm(np.cross(out, data.xaxis[self._base]))
 
     def compute_load_limits(self, position: Array) -> tuple[Array, float]:
-        """Return the torque that gravity leaves, and the payload, in a pose.
+        """Return the torque reserve of each joint, and the payload, in a pose.
 
         Returns:
-            Fraction of each joint's torque that gravity leaves, (joints,), and the smallest mass at
-            the tool with which a joint reaches its torque limit, kg.
+            Fraction of each joint's torque limit that gravity does not use, (joints,), and the
+            smallest mass at the tool with which a joint reaches its torque limit, kg.
         """
         cell = self._cell
         data = self._data

@@ -175,7 +175,7 @@ def build_unchecked_cell(robot: RobotConfig, scene: SceneConfig, clock_ns: int) 
 
 
 def replace_encoders(cell: Cell, robot: RobotConfig, sensors: SensorConfig) -> Cell:
-    """Return the cell with `sensors` as its encoders, unless `[robot.sensors]` states others."""
+    """Return the cell with `sensors` as its encoders, unless `[robot.sensors]` defines others."""
     tick_s = robot.substeps * cell.model.opt.timestep
     return replace(cell, encoders=Encoders.from_config(robot, tick_s, sensors))
 
@@ -309,8 +309,8 @@ def find_gripper(
 ) -> tuple[Gripper | None, Mask]:
     """Find the gripper and its bodies.
 
-    The bodies are the body that carries the linkage and all its descendants. The driven joint may
-    be anywhere in the linkage.
+    The gripper consists of the body that carries the linkage and all descendants of that body. The
+    driven joint may be anywhere in the linkage.
 
     Args:
         model: The compiled model.
@@ -372,12 +372,12 @@ def find_unintended_contacts(
 def fix_gripper_model(
     cell: Cell, spec: mujoco.MjSpec, config: GripperConfig, tick_s: float
 ) -> bool:
-    """Change the model where it would prevent the gripper from moving.
+    """Change a model that would prevent the gripper from moving or make it oscillate.
 
     Links that overlap when the gripper is open or half open, before its fingers meet, are excluded
-    from contact. They overlap because links meet at their pins, and because meshes are simulated by
-    their convex hulls. A drive whose inertia is too small for the damping of its loop would
-    oscillate. It gets the inertia that it lacks, as `min_armature` does for the joints of the arm.
+    from contact. Links overlap at their pins, and because MuJoCo simulates meshes by their convex
+    hulls. If the inertia of the drive is too small for the damping of its position loop, the
+    missing inertia is added, as `min_armature` does for the joints of the arm.
 
     Args:
         cell: The cell, with a gripper.
@@ -411,7 +411,7 @@ def fix_gripper_model(
 
 
 def build_start_qpos(cell: Cell, position: Array) -> Array:
-    """Return qpos with the arm at `position`, (joints,), rad, for the start.
+    """Return the initial qpos, with the arm at `position`, (joints,), rad.
 
     The gripper and its linkage are open. Everything else is as in the model.
     """
@@ -453,7 +453,8 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> No
                 f"robot.{key}: joint '{name}' needs {needed:.4g} N m to hold; its torque limit is"
                 f" {limit:g}"
             )
-    # Surfaces at a distance of 0.0 mm do not touch yet, but would in the first motion.
+    # Surfaces at a distance of 0.0 mm are not in contact yet, but the first motion would make them
+    # touch.
     padded = copy(cell.model)
     set_margins(padded, padded.geom_margin + TOUCHING_M)
     data = replace(cell, model=padded).build_start_data()
@@ -468,7 +469,7 @@ def check_start(cell: Cell, robot: RobotConfig, key: str, position: Array) -> No
 def check_fingers(cell: Cell, config: GripperConfig) -> None:
     """Check by simulation that the gripper moves and its fingers settle where planning expects.
 
-    Only a gripper whose couplings yield needs the check.
+    A gripper is only checked if its couplings yield.
 
     Raises:
         RobotError: The gripper does not open or close, or fingers settle farther than

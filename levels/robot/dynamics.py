@@ -68,7 +68,7 @@ INERTIA_ROW = 3
 class Dynamics:
     """Evaluates the equation of motion of a cell's arm, with open fingers.
 
-    An evaluation at the same state as the previous one returns the same terms without computing.
+    If the state is the same as in the previous evaluation, the terms are not computed again.
     """
 
     def __init__(self, cell: Cell) -> None:
@@ -99,7 +99,7 @@ class Dynamics:
         self.dry = np.array(cell.model.dof_frictionloss[cell.dof])  # (joints,), N m: dry friction
 
     def terms(self, q: Array, qd: Array, payload: Payload | None = None) -> Terms:
-        """Return the terms of the equation at a state. The arrays are valid until the next call.
+        """Return inertia and bias at a state. The arrays are valid until the next call.
 
         Args:
             q: Positions, (joints,), rad.
@@ -116,7 +116,7 @@ class Dynamics:
 
     @property
     def evaluated(self) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """MuJoCo's model and data as the last evaluation left them."""
+        """MuJoCo's model and data, in the state of the last evaluation."""
         return self._model, self._data
 
     def friction(self, velocity: Array) -> Array:
@@ -127,12 +127,12 @@ class Dynamics:
 def find_places(
     model: mujoco.MjModel, data: mujoco.MjData, cell: Cell
 ) -> tuple[NDArray[np.int64], Array]:
-    """Return the places in MuJoCo's memory that an evaluation reads and writes.
+    """Return the indices of the elements of MuJoCo's memory that an evaluation uses.
 
     Returns:
-        Indices, (4 + joints, joints), and the memory of `data` that they refer to. The rows are
-        position, velocity, bias, passive force, and the rows of the inertia, with -1 for elements
-        that are always zero.
+        Indices, (4 + joints, joints), and a view of the memory of `data` to which they refer. The
+        rows are for position, velocity, bias, passive force, and each row of the inertia. An
+        element of the inertia that is always zero has the index -1.
     """
     memory, (qpos, qvel, bias, passive, inertia) = build_common_view(
         data.qpos, data.qvel, data.qfrc_bias, data.qfrc_passive, data.M
@@ -160,7 +160,7 @@ def evaluate_terms(
     Args:
         model: Address of the model.
         data: Address of the data.
-        places: Indices in `memory`, see `find_places`.
+        places: Indices in `memory`, see `find_memory_indices`.
         memory: Memory of the data.
         evaluations: (2, 3 + joints, joints). The first is the last evaluation, and the second has
             the state at which to evaluate. Afterwards both contain the new evaluation.
@@ -207,14 +207,14 @@ def add_payload(  # noqa: PLR0913  # flat, as `make_steps` in levels/arm/substep
 
     Args:
         mass: Mass, kg.
-        offset: Its centre in the tool's frame, (3,), m.
+        offset: Centre of the mass in the tool's frame, (3,), m.
         model: Address of the model.
         data: Address of the data.
         dof: Addresses of the joints in qvel.
         hand: Body of the tool.
         tool: Position of the tool, (3,), m.
         turned: Rotation matrix of the tool, (9,).
-        gravity: (3,), m/s2.
+        gravity: Gravity, (3,), m/s2.
         jacobians: Work space, (2, 3, nv).
         evaluation: The evaluation to change, (3 + joints, joints).
     """

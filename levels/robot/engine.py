@@ -59,21 +59,21 @@ def compute_state_size(model: mujoco.MjModel) -> int:
 
 
 def view_state(model: mujoco.MjModel, data: mujoco.MjData, state: Array) -> None:
-    """Set `data` to a saved state, except for which bodies sleep. This suffices to read poses.
+    """Set `data` to a saved state, without restoring which bodies sleep.
 
-    Call this only with `data` in which no body sleeps.
+    This is enough to read poses. No body in `data` may be asleep.
     """
     end = mujoco.mj_stateSize(model, INTEGRATION)
     mujoco.mj_setState(model, data, np.ascontiguousarray(state[:end]), INTEGRATION)
 
 
 def build_common_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return one view of the memory that contains several arrays of one `MjData`.
+    """Return one view of the memory that spans several arrays of one `MjData`.
 
     The view is valid as long as the data exists.
 
     Returns:
-        The view, and the index in it at which each array begins.
+        The view, and for each array the index in the view at which it begins.
     """
     begins = np.array([array.ctypes.data for array in arrays])
     ends = [int(begin) + array.nbytes for begin, array in zip(begins, arrays, strict=True)]
@@ -88,8 +88,9 @@ def build_common_view(*arrays: Array) -> tuple[Array, NDArray[np.int64]]:
 def set_margins(model: mujoco.MjModel, margins: ArrayLike) -> None:
     """Set the margins of geoms, so that MuJoCo finds pairs within the sum of their margins.
 
-    MuJoCo first excludes pairs of bodies by the margins of the bodies, which its compiler sets.
-    Therefore these are set as well. `margins` is (geoms,), or one value for all geoms, in m.
+    MuJoCo first excludes pairs of bodies, using margins of bodies that its compiler has set. The
+    margins of the bodies are therefore set as well. `margins` is (geoms,), or one value for all
+    geoms, in m.
     """
     model.geom_margin[:] = margins
     model.body_margin[:] = 0.0
@@ -105,11 +106,11 @@ class ContactViews(NamedTuple):
 
 
 def build_contact_views(model: mujoco.MjModel, data: mujoco.MjData) -> ContactViews:
-    """Return views of the contacts.
+    """Return views of the number, geoms and distances of the contacts.
 
-    The bindings only give a copy of the number of contacts, and views that are valid until the
-    contacts change. In memory, however, contacts are always at the start of the arena, and their
-    number follows warnings and timers (mjdata.h).
+    MuJoCo's bindings only return a copy of the number, and arrays that are valid until the contacts
+    change. In memory, however, contacts are always at the start of the arena, and their number
+    follows warnings and timers (mjdata.h).
 
     Raises:
         RuntimeError: This version of MuJoCo stores the number of contacts elsewhere.

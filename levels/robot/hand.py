@@ -31,8 +31,8 @@ NET_FORCE = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3, 1
 class Hand:
     """The hand of a cell.
 
-    Joints are in the order of `robot.joints`. Where there are two rows, they are flexors and
-    extensors.
+    Joints are in the order of `robot.joints`. An array with two rows has flexors in the first row
+    and extensors in the second.
     """
 
     names: tuple[str, ...]  # names of the fingers
@@ -49,9 +49,9 @@ class Hand:
 
     @property
     def torque(self) -> Array:
-        """Largest torque of a joint in both directions, (joints,), in N m.
+        """Largest torque of each joint in both directions, (joints,), in N m.
 
-        One tendon then has its largest tension, and the other the least.
+        A joint has this torque if one tendon has its largest tension, and the other the least.
         """
         return np.asarray(self.arms * self.most - self.arms * self.least)
 
@@ -90,7 +90,7 @@ def check_hand(robot: RobotConfig, hand: HandConfig) -> None:
 
 
 def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
-    """Check that fingers have distinct names, and that each joint belongs to one finger."""
+    """Check that fingers have distinct names, and that each joint belongs to exactly one finger."""
     names = [finger.name for finger in hand.finger]
     for finger in hand.finger:
         if names.count(finger.name) > 1:
@@ -121,9 +121,9 @@ def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
 def fit_tendons(
     spec: mujoco.MjSpec, robot: RobotConfig, hand: HandConfig, step_s: float
 ) -> tuple[list[str], Array]:
-    """Prepare a model for a hand: remove all drives of its joints except the tendons.
+    """Prepare a model for a hand: only the tendons continue to drive its joints.
 
-    Each tip gets a force sensor. Actuators that delay their controls get memory for the delay.
+    Each fingertip gets a force sensor. Actuators with a delay get memory for the delayed controls.
 
     Args:
         spec: The model, which is changed.
@@ -236,7 +236,7 @@ def check_tensions(model: mujoco.MjModel, actuators: Ints, least: float) -> None
         least: Tension that every actuator must be able to exceed, N.
 
     Raises:
-        RobotError: An actuator does anything but pull one tendon.
+        RobotError: An actuator does anything other than pull one tendon.
     """
     low, high = np.moveaxis(model.actuator_ctrlrange[actuators], -1, 0)
     pulls = (
@@ -261,7 +261,8 @@ def _find_moment_arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints
     """Return the moment arm of the two tendons of each joint, (joints,), in m.
 
     Raises:
-        RobotError: Two tendons are not a pair of one joint, or their moment arm varies.
+        RobotError: The two tendons of a joint do not pull in opposite directions with equal,
+            constant moment arms, or they turn another joint.
     """
     joints = np.array([model.joint(name).id for name in robot.joints])
     home = np.array(robot.home)
@@ -290,12 +291,12 @@ def _find_moment_arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints
 
 
 def compute_moments(model: mujoco.MjModel, joints: Ints, position: Array) -> Array:
-    """Return the moment arms of all actuators on joints, (actuators, joints), in m.
+    """Return the moment arms of all actuators on the given joints, (actuators, joints), in m.
 
     Args:
         model: The compiled model.
-        joints: The joints.
-        position: Positions of the joints, rad.
+        joints: Ids of the joints.
+        position: Positions of these joints, rad.
     """
     data = mujoco.MjData(model)
     moments = np.zeros((model.nu, model.nv))

@@ -92,7 +92,7 @@ class Limits:
 class Encoders:
     """Resolution, noise and latency of the joints' sensors.
 
-    For velocities, resolution and noise are divided by `EDGE_TIMING_S`, in rad/s.
+    The resolution and noise of velocities, in rad/s, are these values divided by `EDGE_TIMING_S`.
     """
 
     resolution: Array  # (joints,), rad: step of a position
@@ -108,13 +108,14 @@ class Encoders:
     ) -> Encoders:
         """Return the encoders that `[robot]` describes.
 
-        The arm's equation of motion extrapolates a delayed sample to the present. The assumed error
-        of its acceleration is the acceleration limit of planned motion.
+        Delayed samples are extrapolated to the present with the arm's equation of motion. The error
+        of the extrapolated acceleration is assumed to be at most the acceleration limit of planned
+        motion.
 
         Args:
             robot: The `[robot]` table.
             tick_s: Duration of a tick, s.
-            default: Encoders if the table states none. None for exact ones.
+            default: Encoders to use if the table describes none. None for exact encoders.
         """
         joints = len(robot.joints)
         sensors = robot.sensors or default or SensorConfig()
@@ -137,12 +138,12 @@ class Encoders:
 
     @property
     def position_error(self) -> Array:
-        """Largest error of the position in a good sample, (joints,), in rad."""
+        """Largest error of the position in a valid sample, (joints,), in rad."""
         return self._sampling_error + self.late_position_error
 
     @property
     def velocity_error(self) -> Array:
-        """Largest error of the velocity in a good sample, (joints,), in rad/s."""
+        """Largest error of the velocity in a valid sample, (joints,), in rad/s."""
         return self._sampling_error / EDGE_TIMING_S + self.late_velocity_error
 
     @property
@@ -154,7 +155,7 @@ class Encoders:
 class MotorPatience(NamedTuple):
     """Time for which motors keep their last torque when no new one arrives.
 
-    Then the brakes engage.
+    After this time the brakes engage.
     """
 
     seconds: float
@@ -163,20 +164,21 @@ class MotorPatience(NamedTuple):
     def ticks(self, every: int, tick_s: float) -> int:
         """Return the patience in ticks, as a multiple of the torque cycle.
 
-        `every` is the length of a torque cycle in ticks, and `tick_s` the duration of a tick.
+        `every` is the length of a torque cycle in ticks, and `tick_s` is the duration of a tick.
         """
         # Adding a millionth makes 5 ms two cycles of 2.5 ms, in spite of rounding.
         return every * max(int(self.seconds / (every * tick_s) + 1e-6), self.min_cycles)
 
 
 def compute_patience(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPatience:
-    """Compute the patience of the motors.
+    """Return the patience of the motors.
 
     By default, it is the longest time that lengthens a stop from full speed by at most
-    `PATIENCE_FRACTION`, by two criteria. The first compares the angle that joints turn at full
-    speed in this time with the angle in which the brakes stop them. The second compares the energy
-    that all motors add at full torque with the energy that the brakes absorb anyway. (The limits
-    hold without this, because the limit gate checks the torque in every tick.)
+    `PATIENCE_FRACTION`, according to two criteria. The first compares the angle through which
+    joints turn at full speed in this time with the angle in which the brakes stop them. The second
+    compares the energy that all motors add at full torque with the kinetic energy that the brakes
+    have to absorb anyway. (The limits do not depend on the patience, because the limit gate checks
+    the torque in every tick.)
 
     Args:
         robot: The `[robot]` table.

@@ -68,7 +68,7 @@ class Linkage:
     yields: bool  # True if couplings contradict each other or a stop; positions are approximate
 
     def set_opening(self, qpos: Array, opening: float) -> None:
-        """Set the driven joint in `qpos` to `opening`, m or rad, and all joints that follow it."""
+        """Set the joints of the linkage in `qpos` to their positions at `opening`, in m or rad."""
         qpos[self.driven] = opening
         for address, positions in zip(self.joints, self.positions, strict=True):
             qpos[address] = np.interp(opening, self.openings, positions)
@@ -164,9 +164,9 @@ class _Solver:
         return np.array(data.qpos)
 
     def _minimize_residual(self, yielding: bool) -> Array:
-        """Minimize the sum of squared residuals. Return its factored matrix.
+        """Minimize the sum of squared residuals. Return the factored matrix of the problem.
 
-        With `yielding`, every row is weighted by its stiffness in the simulation.
+        If `yielding` is True, every row is weighted by its stiffness in the simulation.
         """
         data = self._data
         count = len(self.joints)
@@ -198,7 +198,10 @@ class _Solver:
         return matrix
 
     def find_largest_residual(self) -> tuple[float, int]:
-        """Return the largest residual of the last pose, in m or rad, and the id of its equality."""
+        """Return the largest residual of the last pose, in m or rad, and the id of its equality.
+
+        Return 0 and -1 if no equality couples the joints.
+        """
         data = self._data
         jacobian = self._compute_jacobian()
         rows = np.any(jacobian[:, [*self._dof, self._driven_dof]] != 0.0, axis=1)
@@ -209,7 +212,7 @@ class _Solver:
         return abs(float(data.efc_pos[worst])), int(data.efc_id[worst])
 
     def check_residual(self, opening: float) -> None:
-        """Record in `yields` whether an equality yields in the last pose.
+        """Set `yields` to True if an equality yields in the last pose.
 
         Raises:
             RobotError: A loop stays open by more than the config permits.
@@ -243,7 +246,7 @@ class _Solver:
             )
 
     def _build_rows(self) -> tuple[Array, Array, Array]:
-        """Return the rows of equalities and exceeded joint stops.
+        """Return the constraint rows of equalities and of exceeded joint stops.
 
         Returns:
             Residuals, (rows,), their Jacobian, (rows, joints), and their stiffness in the
@@ -258,10 +261,10 @@ class _Solver:
         return np.array(data.efc_pos[rows]), np.ascontiguousarray(jacobian[rows]), stiffness
 
     def _build_tendon_rows(self, most: float) -> tuple[Array, Array]:
-        """Return the rows of tendons that are springs.
+        """Return the constraint rows of tendons that act as springs.
 
         Args:
-            most: Value by which their stiffness is divided.
+            most: Stiffness by which the stiffness of each tendon is divided.
 
         Returns:
             Residuals, (tendons,), and their Jacobian, (tendons, joints).
@@ -280,15 +283,15 @@ class _Solver:
 
 
 def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask) -> None:
-    """Check that every actuator on the gripper's joints is commanded.
+    """Check that no joint of the gripper has an actuator that nothing commands.
 
     Args:
         model: The compiled model.
         config: The `[robot.gripper]` table.
-        carried: Joints of the gripper that follow, (njnt,).
+        carried: Mask of the gripper's joints that follow the driven joint, (njnt,).
 
     Raises:
-        RobotError: A joint has an actuator that is not the gripper's.
+        RobotError: A joint has an actuator other than the gripper's actuator.
     """
     for k in range(model.nu):
         name = model.actuator(k).name
@@ -302,7 +305,10 @@ def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask)
 
 
 def describe_equality(model: mujoco.MjModel, equality: int) -> str:
-    """Return the name of an equality. If it has none, return its kind and what it couples."""
+    """Return the name of an equality.
+
+    If it has no name, return its kind and the elements that it couples.
+    """
     if name := model.equality(equality).name:
         return f"'{name}'"
     kind = mujoco.mjtEq(int(model.eq_type[equality]))
@@ -317,7 +323,7 @@ def describe_equality(model: mujoco.MjModel, equality: int) -> str:
 
 
 def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: bool = True) -> None:
-    """Refuse a model with an equality that ties a joint of the arm.
+    """Check that no active equality of a model couples a joint of the arm.
 
     Planning, inverse kinematics, dynamics and the servo loop treat these joints as independent.
 
@@ -327,7 +333,7 @@ def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: boo
         of_bodies: True to check equalities between bodies as well.
 
     Raises:
-        RobotError: An equality ties a joint of the arm.
+        RobotError: An equality couples a joint of the arm.
     """
     for equality in range(model.neq):
         tied = [model.joint(joint).name for joint in sorted(find_tied_joints(model, equality))]
@@ -342,9 +348,9 @@ def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: boo
 
 
 def find_tied_joints(model: mujoco.MjModel, equality: int) -> set[int]:
-    """Return the ids of the joints that an equality ties.
+    """Return the ids of the joints that an equality couples.
 
-    An equality between two bodies ties the joints that move only one of them.
+    An equality between two bodies couples the joints that move only one of them.
     """
     ends = np.array([model.eq_obj1id[equality], model.eq_obj2id[equality]])
     ends = ends[ends >= 0]

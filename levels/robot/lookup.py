@@ -39,7 +39,7 @@ def find(model: mujoco.MjModel, kind: mujoco.mjtObj, name: str, place: str) -> i
         model: The compiled model.
         kind: Kind of the element.
         name: Name of the element.
-        place: Key of the config that has the name, for the error.
+        place: Config key that contains the name, for the error.
 
     Raises:
         RobotError: The model has no such element.
@@ -65,16 +65,16 @@ def find_all(
         model: The compiled model.
         kind: Kind of the elements.
         names: Names of the elements.
-        place: Key of the config that has the names, for the error.
+        place: Config key that contains the names, for the error.
 
     Raises:
-        RobotError: The model lacks an element.
+        RobotError: The model does not have one of the elements.
     """
     return np.array([find(model, kind, name, place) for name in names], dtype=int)
 
 
 def find_unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
-    """Yield a line for every name in the config that the model lacks.
+    """Yield an error line for each name in the config that the model does not contain.
 
     Raises:
         RobotError: The model is invalid.
@@ -177,7 +177,7 @@ def find_geom_name(model: mujoco.MjModel, geom: int) -> str:
 
 
 def derive_robot(robot: RobotConfig) -> RobotConfig:
-    """Return the table, with missing joints, tool and home filled in from the model.
+    """Return the `[robot]` table, with missing joints, tool and home filled in from the model.
 
     Raises:
         RobotError: The model does not determine them.
@@ -204,7 +204,7 @@ def derive_robot(robot: RobotConfig) -> RobotConfig:
 
 
 def _find_driven_joints(model: mujoco.MjModel, robot: RobotConfig) -> tuple[str, ...]:
-    """Return the names of the joints with an actuator, except those of the gripper."""
+    """Return the names of the joints with an actuator, except the joints of the gripper."""
     of_joint = np.isin(model.actuator_trntype, JOINT_DRIVES)
     driven = np.unique(model.actuator_trnid[of_joint, 0])
     names = [str(model.joint(k).name) for k in driven]

@@ -58,7 +58,8 @@ def load_spec(path: Path) -> mujoco.MjSpec:
 def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
     """Compile a model.
 
-    If MuJoCo refuses inertias of bodies that never move, these inertias are dropped.
+    If MuJoCo refuses inertias of bodies that never move, the model is compiled without these
+    inertias.
 
     Raises:
         RobotError: The model cannot be compiled. The text is MuJoCo's reason in one line.
@@ -72,7 +73,7 @@ def compile_spec(spec: mujoco.MjSpec, path: Path) -> mujoco.MjModel:
 
 
 def drop_fixed_inertias(body: mujoco.MjsBody) -> bool:
-    """Remove stated inertias of all descendants of `body` that no joint moves.
+    """Remove explicit inertias from all descendants of `body` that no joint moves.
 
     Returns:
         True if any was removed.
@@ -104,7 +105,7 @@ def check_joint_count(joints: Sequence[str]) -> None:
 
 
 def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
-    """Check the joints of the arm, and the lengths of lists.
+    """Check that the arm's joints are valid, and that each list has one value per joint.
 
     Raises:
         RobotError: A list has the wrong length, or a joint is missing, not scalar or named twice.
@@ -205,7 +206,8 @@ def fit_motors(spec: mujoco.MjSpec, robot: RobotConfig) -> tuple[list[str], Arra
 def fit_gripper(spec: mujoco.MjSpec, gripper: GripperConfig) -> None:
     """Replace the gripper's actuator by a force motor on the same joint or tendon.
 
-    It is limited to `gripper.force`.
+    The force of the motor is limited to `gripper.force`. Joints in `gripper.follow` are coupled to
+    the driven joint.
 
     Raises:
         RobotError: The model has no such actuator, or it drives neither a joint nor a tendon.
@@ -263,10 +265,7 @@ def couple_joint(spec: mujoco.MjSpec, gripper: GripperConfig, follower: FollowCo
 
 
 def is_arm_drive(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator, robot: RobotConfig) -> bool:
-    """Return True if an actuator drives a joint of the arm.
-
-    It may do so directly or through a fixed tendon.
-    """
+    """Return True if an actuator drives a joint of the arm, directly or by a fixed tendon."""
     return not {*robot.joints}.isdisjoint(find_driven_joints(spec, actuator))
 
 
@@ -283,9 +282,9 @@ def find_driven_joints(spec: mujoco.MjSpec, actuator: mujoco.MjsActuator) -> lis
 def find_torque_limit(
     spec: mujoco.MjSpec, joint: str, drives: Iterable[mujoco.MjsActuator]
 ) -> float:
-    """Return the tightest torque limit, in N m, that a model states for a joint.
+    """Return the tightest torque limit, in N m, that a model contains for a joint.
 
-    The result is 0 if the model states none, or only limits that a `[robot]` table must not have,
+    The result is 0 if the model contains none, or only values that a `[robot]` table must not have,
     such as infinity.
 
     Args:
@@ -302,7 +301,7 @@ def find_torque_limit(
 
 
 def compute_drive_limit(actuator: mujoco.MjsActuator) -> float:
-    """Return the torque limit in N m that an actuator on a joint implies. 0 if it has none."""
+    """Return the torque limit that an actuator on a joint implies, in N m, or 0 if it has none."""
     gear = abs(float(actuator.gear[0]))
     limits = [compute_symmetric_range(actuator.forcelimited, actuator.forcerange) * gear]
     if (
@@ -319,7 +318,10 @@ def compute_drive_limit(actuator: mujoco.MjsActuator) -> float:
 
 
 def compute_symmetric_range(limited: mujoco.mjtLimited, span: Array) -> float:
-    """Return the largest x for which -x to x is within `span`. 0 without limits or such an x."""
+    """Return the largest x for which -x to x is within `span`.
+
+    Return 0 if there is no limit, or no such x.
+    """
     if limited == mujoco.mjtLimited.mjLIMITED_FALSE or not span[0] < span[1]:
         return 0.0
     return max(0.0, min(-float(span[0]), float(span[1])))
@@ -354,12 +356,12 @@ def remove_actuators(spec: mujoco.MjSpec, actuators: list[mujoco.MjsActuator]) -
 
 
 def format_one_line(problem: Exception) -> str:
-    """Return the message of MuJoCo's error as one line."""
+    """Return the message of a MuJoCo error as one line."""
     return " ".join(str(problem).split()).removeprefix("Error: ")
 
 
 def format_names(names: list[str], most: int = 24) -> str:
-    """Return names as a list for an error message, with at most `most` of them."""
+    """Return a comma-separated list of names for an error message, with at most `most` names."""
     named = [n for n in names if n]
     more = f" and {len(named) - most} more" if len(named) > most else ""
     return (", ".join(named[:most]) or "none") + more

@@ -69,12 +69,13 @@ class _Place(NamedTuple):
 class ModelReader:
     """Reads the XML file of a model, and all files that it includes or attaches.
 
-    Elements and attributes with a prefix are left out, because they are for other programs.
+    Elements and attributes with a namespace prefix are left out, because they are for other
+    programs.
 
     Attributes:
         root: Root of the model's main file.
-        texts: Content of all files, the main file first, by the names under which MuJoCo finds
-            them.
+        texts: Content of all files, the main file first, keyed by the names under which MuJoCo
+            finds them.
     """
 
     def __init__(self, path: Path) -> None:
@@ -130,7 +131,7 @@ class ModelReader:
         return root
 
     def _read_reference(self, element: ElementTree.Element, path: Path, folder: Path) -> None:
-        """Read the file to which an element refers, and point the element to the checked text.
+        """Read the file to which an element refers, and make the element refer to the text read.
 
         Args:
             element: Includes the file, or declares it as a model to attach.
@@ -151,7 +152,10 @@ class ModelReader:
         element.set("file", str(Path(name).with_name(text_name)))
 
     def _check_element(self, element: ElementTree.Element, place: _Place) -> None:
-        """Check an element, its children and the files that it includes, and count their parts."""
+        """Check an element, its children and the files that it includes.
+
+        Also count the bodies, joints, geoms and sites among them, including replicas.
+        """
         file, owner, copies, depth = place
         tag = element.tag
         if name := element.get("name"):
@@ -193,13 +197,13 @@ class ModelReader:
 
 
 def parse_xml(text: bytes) -> ElementTree.Element:
-    """Parse a file, leaving out elements and attributes with a prefix, declared or not.
+    """Parse a file, without elements and attributes that have a prefix, declared or not.
 
-    Every start tag stays on its line, because MuJoCo names the line in its messages.
+    Every start tag stays on its line, because MuJoCo reports the line in its messages.
 
     Raises:
         ExpatError: The text is malformed.
-        ValueError: The text declares entities, or contains xacro that is not expanded.
+        ValueError: The text declares entities, or contains unexpanded xacro.
     """
     builder = ElementTree.TreeBuilder()
     parser = expat.ParserCreate()
@@ -239,7 +243,7 @@ def parse_xml(text: bytes) -> ElementTree.Element:
 
 
 def find_file(paths: Iterable[Path]) -> Path | None:
-    """Return the first path that exists. None if there is none."""
+    """Return the first path that exists, or None."""
     for path in paths:
         with suppress(OSError):
             path.stat()
@@ -248,7 +252,7 @@ def find_file(paths: Iterable[Path]) -> Path | None:
 
 
 def check_asset(file: Path, model: Path) -> None:
-    """Check that an asset of a model is a regular file and not too large, also when decoded.
+    """Check that an asset of a model is a regular file, and not too large even when decoded.
 
     Raises:
         RobotError: The asset is not a regular file, or it is too large.
@@ -269,7 +273,7 @@ def _find_mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> I
     Args:
         element: The element.
         owner: Kind and name of the nearest named element.
-        is_urdf: Whether the file is a URDF.
+        is_urdf: True if the file is a URDF.
     """
     place = owner if "name" in element.attrib else f"<{element.tag}>" + f" of {owner}" * bool(owner)
     is_part = owner.startswith(("link", "joint"))
@@ -299,7 +303,7 @@ def _find_mistakes(element: ElementTree.Element, owner: str, is_urdf: bool) -> I
 
 
 def parse_numbers(text: str) -> list[float]:
-    """Return the numbers among the words of an attribute. As in C, nan(7) is a number."""
+    """Return the words of an attribute that are numbers. As in C, "nan(7)" is a number."""
     values = []
     for word in text.split():
         with suppress(ValueError):

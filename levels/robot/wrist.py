@@ -33,7 +33,7 @@ class Wrist(NamedTuple):
 
 
 def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -> Wrist | None:
-    """Find the sensor in the compiled model.
+    """Find the force/torque sensor at the wrist in the compiled model.
 
     Args:
         model: The compiled model.
@@ -44,7 +44,8 @@ def find_wrist(model: mujoco.MjModel, config: WristConfig | None, moved: Mask) -
         The sensor. None if the arm has none.
 
     Raises:
-        RobotError: The sensor is missing, not on the arm, or has no range.
+        RobotError: The sensor is missing, not on the arm, at two sites, or without a range, or a
+            contact limit is beyond its range.
     """
     if config is None:
         return None

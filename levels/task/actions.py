@@ -62,7 +62,8 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
         The rehearsal after the last action.
 
     Raises:
-        Refused: An action cannot be done. The reason names the place, and a possible alternative.
+        Refused: An action cannot be done. The reason names the position, and a possible
+            alternative.
     """
     rehearsal = start
     for k, action in enumerate(program.action):
@@ -160,19 +161,19 @@ def rehearse_transfer(
         ]
 
     def pair_takes_with_goals() -> Iterator[tuple[list[Spot], list[Pose]]]:
-        """Yield each group of spots to take the object with each group of goals, in that order."""
+        """Yield each pair of a group of pick spots and a group of goals, sorted by pick group."""
         with _label_refusals(k, pick):
             for takes in planner.find_takes():
                 yield from ((takes, group) for group in standing_goals)
 
     def rehearse_pair(pair: tuple[list[Spot], list[Pose]]) -> Rehearsal:
-        """Rehearse the quickest feasible way from a group of spots to a group of goals."""
+        """Rehearse the quickest feasible transfer from the pick spots to the goals."""
         with _label_refusals(k, place):
             ways = planner.find_ways(*pair)
         return _rehearse_first(ways[:MAX_WAYS], rehearse_way)
 
     def rehearse_way(way: Way) -> Rehearsal:
-        """Rehearse the moves that take the object and put it down."""
+        """Rehearse the moves that pick the object up and put it down."""
         with _label_refusals(k, pick):
             taken = planner.rehearse_moves(rehearsal, k, way.take, Verb.GRASP)
         with _label_refusals(k, place):
@@ -194,10 +195,10 @@ class TransferPlanner(NamedTuple):
     def find_takes(self) -> Iterator[list[Spot]]:
         """Yield the spots at which the object can be taken and held, one list per group of grasps.
 
-        The groups are in the order of `find_grasps`. Those without a spot are left out.
+        The groups are in the order of `find_grasps`. Groups without a spot are left out.
 
         Raises:
-            Refused: No group has a spot. The reason is the first refusal.
+            Refused: No group has a spot. The refusal is from the first group.
         """
         start = self.start
         refusal: Refused | None = None
@@ -225,14 +226,14 @@ class TransferPlanner(NamedTuple):
             raise refusal
 
     def find_ways(self, takes: list[Spot], standing_goals: list[Pose]) -> list[Way]:
-        """Return ways to do the transfer, the quickest first.
+        """Return pairs of a pick spot and a place spot, sorted by travel time.
 
         Args:
             takes: Spots at which the object can be taken.
             standing_goals: Poses in which the object may be put down.
 
         Raises:
-            Refused: There is no way.
+            Refused: No pair exists, because no place spot can be reached.
         """
         situation = self.start.situation
         start_q = self.start.q
@@ -262,7 +263,7 @@ class TransferPlanner(NamedTuple):
         Args:
             rehearsal: Rehearsal of the moves before them.
             k: Number of the action.
-            spot: Where the object is taken or put down.
+            spot: Spot at which the object is taken or put down.
             verb: GRASP or RELEASE.
 
         Raises:
@@ -277,9 +278,9 @@ class TransferPlanner(NamedTuple):
         return rehearsal.add_move(k, Verb.DEPART, tool=above, row=row)
 
     def _find_spots(self, tool: Pose, situation: Situation, grasps: bool = False) -> list[Spot]:
-        """Return spots at pose `tool` to which the arm can come down without collision.
+        """Return spots at tool pose `tool` to which the arm can descend without collision.
 
-        With `grasps`, the gripper must also be able to close there without collision.
+        If `grasps` is True, the gripper must also be able to close there without collision.
         """
         motion = self.start.motion
         situation.apply_to(motion.checker, None)
@@ -301,7 +302,7 @@ class TransferPlanner(NamedTuple):
         """Return the spots at which gripper and motors can hold the object.
 
         Raises:
-            Refused: The object can be held at none of the spots. The reason is the first refusal.
+            Refused: The object can be held at none of the spots. The refusal is for the first spot.
         """
         payloads = self.start.motion.payloads
         seen = self.start.situation.object_pose(self.row)
@@ -326,10 +327,10 @@ class TransferPlanner(NamedTuple):
 
 
 def _rehearse_first(options: Iterable[Option], do: Callable[[Option], Rehearsal]) -> Rehearsal:
-    """Rehearse options by `do` until one succeeds, and return its rehearsal.
+    """Call `do` with one option after another until one succeeds, and return its rehearsal.
 
     Raises:
-        Refused: No option succeeds. The refusal is from the first option.
+        Refused: No option succeeds. The refusal is for the first option.
     """
     refusals: list[Refused] = []
     for option in options:

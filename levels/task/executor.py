@@ -25,9 +25,9 @@ from rack.levels.task.window import Detour, ShownWindow
 class TaskExecutor(Executor):
     """Hands down the moves of the plan and reports when the program is done.
 
-    It also reports the error that ends the program: the plan is refused, a move fails in the level
-    below, an action is late, or nothing moves. An operator may hold the program, or send the arm
-    elsewhere between two moves.
+    It ends the program with an error if the plan is refused, a move fails in the level below, an
+    action is late, or nothing moves. An operator may hold the program, or send the arm elsewhere
+    between two moves.
     """
 
     below = Input(MoveStatus, "below.status")
@@ -73,7 +73,7 @@ class TaskExecutor(Executor):
         below = self.below.message
         if not self._error:
             self._track_progress(plan, below)
-            # Fail when an action is not done by its time.
+            # Fail if an action is not done by its deadline.
             now_s = tick * self.context.tick_s + self._ahead_s
             done = self._count_done_actions(plan)
             for k in range(done, len(self._actions)):
@@ -91,11 +91,11 @@ class TaskExecutor(Executor):
         self._answer_operator(below)
 
     def _read_first_actions(self) -> tuple[AnyAction, ...]:
-        """Return the actions at the start, which are the whole program."""
+        """Return the actions with which the level starts, which are the whole program."""
         return read_program(self.context.task, self.context.robot, self.context.scene).action
 
     def _find_plan(self, tick: int) -> TaskPlan:
-        """Return the plan of the present actions, with all fields 0 if there is none yet."""
+        """Return the plan for the present actions. If there is none yet, all its fields are 0."""
         return self.plan.message
 
     def _restore_state(self) -> None:
@@ -113,7 +113,8 @@ class TaskExecutor(Executor):
     def _check_command(self, command: OperatorCommand, answered: int) -> None:
         """Accept or refuse a goto. Other commands need no check.
 
-        A goto up to serial `answered` was answered before a restart of this board, and is not new.
+        A goto with a serial up to `answered` was answered before this board was restarted, so it is
+        not new.
         """
         if self._orders.standing is Operation.GOTO:
             self._detour.accept_command(command, command.id > answered)
@@ -132,11 +133,11 @@ class TaskExecutor(Executor):
             self._reason = self._format_reason(action, f": {below.reason}")
 
     def _format_reason(self, action: int, why: str) -> str:
-        """Return a reason with the number of its action. `why` begins with the separator."""
+        """Return "action N" followed by `why`, which begins with a separator."""
         return f"action {action}{why}"
 
     def _interrupt_program(self, plan: TaskPlan, below: MoveStatus) -> int:
-        """Interrupt the program for an operator. Return how many moves of the plan are done."""
+        """Interrupt the program for an operator. Return the number of completed moves."""
         return self._detour.step(plan, self._done, below)
 
     def _find_reason_to_wait(self, below: Reading[MoveStatus]) -> str:
@@ -155,7 +156,7 @@ class TaskExecutor(Executor):
         return below.message.reason if is_held else ""
 
     def _check_progress(self, plan: TaskPlan, waits: str, tick: int) -> None:
-        """Fail if nothing has moved for too long, unless an operator prevents motion."""
+        """Report an error if nothing has moved for too long, unless an operator prevents motion."""
         below = self.below.message
         reported = below.done, below.planned, below.current, below.progress
         progress = (
@@ -181,7 +182,7 @@ class TaskExecutor(Executor):
         return ()
 
     def _count_done_actions(self, plan: TaskPlan) -> int:
-        """Return how many actions of the program are done."""
+        """Return the number of completed actions of the program."""
         if not plan.count:
             return 0
         if self._done == plan.count:
@@ -199,7 +200,7 @@ class TaskExecutor(Executor):
             self._window.show_moves(plan, self._done, command, until)
 
     def _find_first_barred_move(self, plan: TaskPlan) -> int:
-        """Return the number of the first move of the plan that must not begin yet."""
+        """Return the index of the first move of the plan that must not begin yet."""
         return plan.count if self._detour.until is None else self._detour.until
 
     def _write_status(self, plan: TaskPlan, waits: str) -> None:
@@ -220,7 +221,7 @@ class TaskExecutor(Executor):
         status.detour = self._detour.move
 
     def _answer_operator(self, below: MoveStatus) -> None:
-        """Pass the operator's command down, and write the answer to it to the status."""
+        """Pass the operator's command to the level below, and answer the operator in the status."""
         orders = self._orders
         self.command.hold = orders.is_holding or self._detour.holds
         self.command.operator = orders.find_basis(0)
@@ -238,7 +239,7 @@ class TaskExecutor(Executor):
 
 
 def _format_awaited(plan: TaskPlan, below: MoveStatus) -> str:
-    """Return text that names the event for which a task waits that is not held."""
+    """Return text that names the event for which a task waits if it is not held."""
     if not plan.id:
         return "no plan yet: the objects must be at rest and the position of the arm known"
     if below.current:

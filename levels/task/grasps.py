@@ -61,9 +61,9 @@ MAX_STANDING_GAP_M = 0.02
 
 
 def find_grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
-    """Yield groups of tool poses that grasp object `row`, in the order of trying.
+    """Yield groups of tool poses that grasp object `row`, in the order in which to try them.
 
-    First come the poses straight down, from the lowest height up, then the poses that lean over
+    The first groups point straight down, from the lowest height up. The following groups lean over
     each side of the object. The fingers close along the tool's y axis, across the object's x or y
     axis.
     """
@@ -91,7 +91,7 @@ def find_grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pos
 def build_leaning_quaternion(yaw: float, tilt: float) -> Array:
     """Return the quaternion of a tool that points down, tilted by `tilt`, rad, towards `yaw`.
 
-    The tool's y axis is level.
+    The tool's y axis is horizontal.
     """
     across = math.sin(tilt)
     return build_pointing_quaternion(
@@ -113,10 +113,10 @@ def compute_bearing(cell: Cell, position: Array) -> float:
 
 
 def find_goals(action: Transfer, at: Pose, cell: Cell) -> Iterator[list[Pose]]:
-    """Yield groups of poses in which the object may be put down, in the order of trying.
+    """Yield groups of poses in which the object may be put down, in the order in which to try them.
 
-    The object stays upright. It is turned about the vertical by quarter turns, then by angles in
-    between, unless the action states the angle.
+    The object stays upright. If the action specifies no angle, the first group turns the object
+    about the vertical by quarter turns, and the second group by angles in between.
 
     Args:
         action: The transfer.
@@ -145,12 +145,12 @@ def _build_turned_pose(action: Transfer, at: Pose, turn: float) -> Pose:
 
 
 def find_standing_pose(cell: Cell, data: mujoco.MjData, row: int, situation: Situation) -> Pose:
-    """Return the pose of an object at the height at which it stands on the support below it.
+    """Return the goal pose of an object, at the height at which it stands on its support.
 
     Args:
         cell: The cell.
         data: Work space, which is changed.
-        row: Row of the object.
+        row: Row of the object in the world model.
         situation: Poses of the objects, with the object at its goal.
 
     Raises:
@@ -183,9 +183,9 @@ def find_standing_pose(cell: Cell, data: mujoco.MjData, row: int, situation: Sit
 
 
 def _find_geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) -> int:
-    """Return the id of the first geom below a point, except those of the arm and object `row`.
+    """Return the id of the first geom below a point, or -1 if there is none.
 
-    -1 if there is none.
+    Geoms of the arm and of object `row` are ignored.
     """
     geom = np.full(1, -1, dtype=np.int32)
     body = int(cell.bodies[row])
@@ -198,7 +198,7 @@ def _find_geom_below(cell: Cell, data: mujoco.MjData, row: int, point: Array) ->
 
 
 def _place_bodies(cell: Cell, data: mujoco.MjData, situation: Situation) -> None:
-    """Place the bodies in `data` as in `situation`."""
+    """Set the poses of the bodies in `data` to their poses in `situation`."""
     place_bodies(cell, data, situation.positions, situation.quaternions)
     mujoco.mj_kinematics(cell.model, data)
 

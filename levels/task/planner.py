@@ -66,7 +66,8 @@ class TaskPlanner(Planner):
     def wanted(self, tick: int) -> bool:
         """Return True if the program has no plan yet, and the world is known and at rest.
 
-        Also True if the plan of this process was lost, so that `plan` publishes it again.
+        Also return True if the plan of this process has not reached the executor, so that `plan`
+        publishes it again.
         """
         self._since = tick if self._since is None else self._since
         followed = self.status.message.echo == self._id
@@ -81,9 +82,9 @@ class TaskPlanner(Planner):
         return bool(np.all(speeds < MAX_REST_M_S))
 
     def plan(self, tick: int) -> None:
-        """Plan the whole program into `output`, or refuse it.
+        """Plan the whole program and write the plan, or the refusal, to `output`.
 
-        A plan that was lost is published again.
+        If this process has already planned the program, the same plan is published again.
         """
         self._visible_at = tick + self._planning_ticks
         if self._plan is not None:
@@ -100,7 +101,7 @@ class TaskPlanner(Planner):
         self._plan = copy_message(self.output)
 
     def _format_reason(self, refused: Refused) -> str:
-        """Return why the program is refused, with the number of the action."""
+        """Return the reason why the program is refused, with the number of the action if known."""
         return str(refused) if refused.action is None else f"action {refused.action}, {refused}"
 
     @property
@@ -109,9 +110,10 @@ class TaskPlanner(Planner):
         return self.context.within_cycles * self.context.every
 
     def _may_be_reported(self, tick: int, since: int) -> bool:
-        """Return True while a published plan may not have reached the executor's status yet.
+        """Return True while the executor's status may not acknowledge a published plan yet.
 
-        The plan may be from this process or an earlier one. `since` is the tick of the first cycle.
+        This process or an earlier one may have published the plan. `since` is the tick of the first
+        cycle of this process.
         """
         if self._plan is not None:
             # The status acknowledges a plan one cycle after it becomes visible.
@@ -138,15 +140,19 @@ class TaskPlanner(Planner):
         self.output.count = len(moves)
 
     def _compute_visible_s(self, tick: int) -> float:
-        """Return when, in s, the level below sees the first moves of a plan begun at `tick`."""
+        """Return the time in s at which the level below sees the first moves of a plan.
+
+        The planner begins the plan at `tick`.
+        """
         # The plan is ready within its cycles, is read and handed down at once, and is visible below
         # a cycle later.
         return (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
 
     def _add_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
-        """Return the moves, with a deadline for the last move of each action that has one.
+        """Return the moves, with deadlines for the actions that have one.
 
-        The move must end one cycle before the action's deadline, so that this level can report it.
+        The deadline is for the last move of the action. It is one cycle before the action's
+        deadline, so that this level can report the action in time.
         """
         timed = list(moves)
         for k, (move, duration_s) in enumerate(moves):
@@ -160,10 +166,10 @@ class TaskPlanner(Planner):
         return timed
 
     def _check_times(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
-        """Check that every action can be done by its time.
+        """Check that every action with a deadline can be completed in time.
 
         Raises:
-            Refused: An action cannot be done by its time. The text has the earliest possible time.
+            Refused: An action cannot meet its deadline. The text has the earliest possible time.
         """
         finish_s = compute_finish_times(moves, visible_s, self.context, self._needs)
         for (move, _), finished_s in zip(moves, finish_s, strict=True):

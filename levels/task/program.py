@@ -58,7 +58,7 @@ class Goto(Action):
 
     @model_validator(mode="after")
     def _check_goal(self) -> Goto:
-        """Check that there is one goal, without a zero quaternion or direction."""
+        """Check that there is exactly one goal, and that no quaternion or direction is zero."""
         if (self.position is None) == (self.joints is None):
             raise ValueError("a goto has either position or joints")
         if self.quaternion is not None and self.direction is not None:
@@ -102,7 +102,7 @@ class TaskConfig(Program):
                 yield GoalConfig(object=action.object, position=action.to)
 
     def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
-        """Yield key, value and reason of every entry that disagrees with the arm or the scene."""
+        """Yield key, value and reason of each entry that is inconsistent with arm or scene."""
         if robot is None:
             return
         for k, action in enumerate(self.action):
@@ -132,7 +132,7 @@ read_program = TaskConfig.read
 
 
 def find_mismatches(action: Action, robot: RobotConfig, scene: SceneConfig) -> Mismatches:
-    """Yield key, value and reason of every entry of an action that disagrees with arm or scene.
+    """Yield key, value and reason of each entry of an action that conflicts with arm or scene.
 
     Args:
         action: The action.

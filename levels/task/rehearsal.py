@@ -55,9 +55,9 @@ class Rehearsal:
             action: Number of the action.
             verb: Kind of the move.
             tool: Pose of the tool at the end. None if it follows from the joints.
-            row: Row of the object concerned. None if there is none.
-            joints: Joint positions at the end, (joints,), rad, or the posture at `tool`. None to
-                keep the present positions.
+            row: Row of the object in the world model. None if the move concerns none.
+            joints: Joint positions at the end, (joints,), rad, or the preferred posture at `tool`.
+                None to keep the present positions.
 
         Raises:
             Refused: The move cannot be done.
@@ -91,7 +91,7 @@ class Rehearsal:
 def compute_finish_times(
     moves: Sequence[Rehearsed], visible_s: float, context: LevelContext, needs: TaskParams
 ) -> list[float]:
-    """Return for each move the latest time, in s, at which the task level reads that it is done.
+    """Return the latest times, in s, at which the task level reads that each move is done.
 
     A move begins when the previous move is done, its path is planned, and the window of segments
     has space for it. Each message waits at most one cycle to be read and one to become visible. The
@@ -114,8 +114,8 @@ def compute_finish_times(
                 visible_s, done_s[k - WINDOW_MOVES] + 2.0 * below_s + 2.0 * context.period_s
             )
         if move.is_motion:
-            # The planner computes one plan after the other. Only a move for which it has waited
-            # takes another cycle.
+            # The planner computes one plan at a time. It needs another cycle only if it has to wait
+            # for the move.
             planned_s = max(planned_s, shown_s + below_s) + below_s * pace.within_cycles
         ready_s = max(planned_s, shown_s) if move.is_motion else shown_s
         space_s = done_s[k - SEGMENTS] + below_s if k >= SEGMENTS else 0.0

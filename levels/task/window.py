@@ -48,18 +48,18 @@ class ShownWindow:
         self.before = before
 
     def reserve_id(self) -> int:
-        """Return an id that makes the level below start over."""
+        """Return a new id, with a gap that makes the level below start over."""
         self.newest += ID_JUMP
         self.before = self.newest - 1
         return self.newest
 
     def renumber_plan(self, done: int) -> None:
-        """Give new ids to the moves of the plan, so that it continues with its move `done`."""
+        """Give new ids to the plan's moves, so that the level below continues at move `done`."""
         self.first = self.newest + ID_JUMP - done
         self.before = self.first + done - 1
 
     def count_done(self, below: MoveStatus) -> int:
-        """Return how many of the plan's moves the level below reports as done."""
+        """Return the number of the plan's moves that the level below reports as done."""
         return below.done - self.first + 1
 
     def find_interruption(self, plan: TaskPlan, done: int, below: MoveStatus) -> tuple[int, bool]:
@@ -71,9 +71,9 @@ class ShownWindow:
             below: Status of the level below.
 
         Returns:
-            The number of the first move that must not begin, and True if the arm may come to rest
-            now. This is permitted during a free motion and right after one. Otherwise work on an
-            object is completed first.
+            The index of the first move that must not begin, and True if the arm may come to rest
+            now. It may do so during a free motion and right after one. Otherwise it first completes
+            its work on an object.
         """
         is_begun = below.current == self.first + done
         if not is_free_motion(plan, done) and (is_begun or not is_free_motion(plan, done - 1)):
@@ -81,9 +81,9 @@ class ShownWindow:
         return done, True
 
     def show_moves(self, plan: TaskPlan, done: int, command: TaskCommand, until: int) -> None:
-        """Show the moves from the first one that is not done up to `until`.
+        """Show the moves from the first one that is not done to the last one before `until`.
 
-        At the end of the plan the window keeps its size, and so shows moves that are done. Moves
+        At the end of the plan, the window keeps its size by including moves that are done. Moves
         that were done under other ids are not shown, because the level below would repeat them.
 
         Args:
@@ -99,7 +99,7 @@ class ShownWindow:
         self._finish_window(command, count)
 
     def show_one(self, move: Move, command: TaskCommand) -> None:
-        """Show a single move."""
+        """Show `move` as the only move of the window."""
         move.write_to(command.moves[0])
         self._finish_window(command, 1)
 
@@ -138,7 +138,7 @@ class Detour:
     def is_known(self) -> bool:
         """True if the goal is known.
 
-        It is lost if this board was restarted and a hold came after the goto.
+        The goal is lost if this board is restarted after a hold has followed the goto.
         """
         return self._target is not None
 
@@ -149,7 +149,7 @@ class Detour:
         return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
 
     def accept_command(self, message: OperatorCommand, is_new: bool) -> None:
-        """Accept or refuse a goto. If it is not new, its move keeps its id."""
+        """Accept a goto, or refuse an invalid one. If it is not new, its move keeps its id."""
         try:
             self._target = self._read_goal(message)
         except ValueError as error:
@@ -167,7 +167,8 @@ class Detour:
             below: Status of the level below.
 
         Returns:
-            How many of the plan's moves are done: `done`, or one less if a move must be repeated.
+            Number of the plan's moves that are done: `done`, or one less if a move must be
+            repeated.
         """
         self.holds = False
         self.until = None
@@ -185,10 +186,11 @@ class Detour:
         return done
 
     def _interrupt_program(self, plan: TaskPlan, done: int, below: MoveStatus) -> int:
-        """Interrupt the program if possible. Until then let the moves end that must be done first.
+        """Interrupt the program as soon as the moves that must be completed first are done.
 
         Returns:
-            How many of the plan's moves are done: `done`, or one less if a move must be repeated.
+            Number of the plan's moves that are done: `done`, or one less if a move must be
+            repeated.
         """
         self.until, self.holds = self._window.find_interruption(plan, done, below)
         if not self.holds:
@@ -202,7 +204,7 @@ class Detour:
         return done
 
     def to_move(self, action: int) -> Move:
-        """Return the goto as an elemental move. Call this only when `is_known`.
+        """Return the goto as an elemental move. Call this only if `is_known`.
 
         `action` is the number of the program's next action, although the move does not belong to
         it.
