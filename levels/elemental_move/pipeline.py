@@ -91,7 +91,7 @@ class PlanStore:
             self._by_move[message.move] = message
 
     def find_plan(self, move: int) -> MovePlan | None:
-        """Return the stored plan of a move, which may be a refusal. None if there is none."""
+        """Return the stored plan of a move, which may be a refusal, or None."""
         return self._by_move.get(move)
 
     def find_answer(self, request: int) -> MovePlan | None:

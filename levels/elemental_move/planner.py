@@ -281,7 +281,7 @@ def find_next_motion(window: Sequence[Move], newest: int) -> Move | None:
     """Return the first move after `newest` that needs a path.
 
     Returns:
-        The move, or None if there is none or the window has a gap before it.
+        The move, or None if no later move needs a path or the window has a gap before it.
     """
     for move in window:
         if move.id == newest + 1:

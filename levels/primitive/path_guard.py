@@ -20,7 +20,7 @@ NEAR_CHECKS = 9
 FAR_CHECKS = 3
 """Number of configurations checked per cycle on the rest of the path."""
 PHASES = 4
-"""Number of cycles in which the near checks cover the gaps between them."""
+"""Number of cycles in which the checks within the look-ahead also cover the gaps between them."""
 FAR_STEP_RAD = 0.04
 """Spacing of the configurations checked on the rest of the path."""
 CLEARANCE_PART = 0.5

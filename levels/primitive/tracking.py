@@ -31,9 +31,9 @@ MAX_UNEXPLAINED_CYCLES = 50
 class Tracking:
     """Decides from the status of the servo whether it is in step, that is, follows the set points.
 
-    The servo falls out of step when either level restarts, when it misses so many set points that
-    it holds by itself, or when it is stopped. It gets back into step when it holds the arm at rest
-    and is not stopped. Motion then continues from the position at which the arm is held.
+    The servo falls out of step when either level restarts, when it has missed so many set points
+    that it holds the arm, or when it is stopped. It gets back into step when it holds the arm at
+    rest and is not stopped. Motion then continues from the position at which the arm is held.
 
     Attributes:
         in_step: The servo follows set points.

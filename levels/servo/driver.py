@@ -193,7 +193,7 @@ class ArmDriver(Executor):
     @property
     @abstractmethod
     def payload(self) -> Payload | None:
-        """Payload in the gripper. None if there is none or it is not known."""
+        """Payload in the gripper. None if the gripper is empty or the payload is unknown."""
 
     @property
     @abstractmethod

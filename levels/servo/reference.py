@@ -22,9 +22,9 @@ of a planned motion needs a little more than 1."""
 JOINING_SPEED_PART = 0.25
 """Part of the velocity limits that the transition to the set points may add to their motion."""
 ASTRAY_RAD = 0.005
-"""Distance from the reference beyond which an arm is led back smoothly after missed cycles."""
+"""Distance from the wanted motion at which it restarts from the arm after missed cycles."""
 MAX_AHEAD_S = 2.0
-"""Largest time ahead at which a set point may be due. If it is due later, the command is broken."""
+"""Largest time until a set point is due. A set point that is due later counts as invalid."""
 
 
 class SetPoint(NamedTuple):
@@ -146,7 +146,7 @@ class Reference:
         return self._evaluate_motion(tick)
 
     def move_to(self, goal: Array, tick: int) -> Motion:
-        """Return the motion wanted at `tick` on the way to a goal, ignoring the level above.
+        """Return the motion wanted at `tick` for a move to a goal that ignores the level above.
 
         The motion ramps to rest, then goes straight to the goal within the limits of every joint.
 

@@ -212,7 +212,8 @@ class SensorMonitor:
         if not self.fresh:
             self._estimate_without_sample(passed_s, tick - sampled)
             return
-        # The arm was driven, then braked, so it may have been faster than in both samples.
+        # During missed cycles the arm was driven and then braked, so it may have been faster than
+        # in either sample.
         braked_s = 4.0 * self._every * self._tick_s if passed > self._every else 0.0
         blow = STRUCK_SPEED if struck else 0.0
         driven = wanted is not None
