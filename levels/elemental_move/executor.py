@@ -150,9 +150,10 @@ class ElementalMoveExecutor(Executor):
     def _replan_if_blocked(
         self, status: PrimitiveStatus, segments: SegmentWindow, tick: int
     ) -> None:
-        """Request another path while an obstacle blocks the arm at rest, and use the answer.
+        """Request another path if an obstacle blocks the arm at rest, and hand down the answer.
 
-        The request is cancelled when the path is free again.
+        The request is cancelled when the path is free again. If the arm is still blocked after
+        `replans` other paths for the same move, the error is set.
 
         Args:
             status: Status of the primitive level.
@@ -215,7 +216,8 @@ class ElementalMoveExecutor(Executor):
         """Hand down one move as a segment.
 
         Returns:
-            False if the move has no path yet, or needs a gripper that the robot does not have.
+            True if the move was handed down. False if it has no path yet, or if it needs a gripper
+            and the robot has none.
         """
         if move["verb"] in (Verb.GRASP, Verb.RELEASE):
             gripper = self._gripper
@@ -235,14 +237,17 @@ class ElementalMoveExecutor(Executor):
                 self._wait_for_path(plan, tick)
             return False
         # A status from below is read up to a cycle late, and the status of this level becomes
-        # visible another cycle later.
+        # visible another cycle later. The segment must therefore end before the move's deadline.
         by_s = float(move["by"])
         below_s = by_s - 2.0 * self.context.period_s - self.settings.answer
         segments.add_path(move, plan, below_s if by_s > 0.0 else 0.0)
         return True
 
     def _wait_for_path(self, refusal: MovePlan, tick: int) -> None:
-        """Wait up to `patience` for a free path. Fail at once if the refusal has another reason."""
+        """Wait for a free path after the planner has refused a move.
+
+        The error is set after `patience`, or at once if the refusal is not NO_PATH.
+        """
         if self._waiting_since is None:
             self._waiting_since = tick
         self._reason = refusal.reason
@@ -251,11 +256,12 @@ class ElementalMoveExecutor(Executor):
             self._set_error(Error(refusal.error), refusal.reason)
 
     def _describe_empty_grip(self, status: PrimitiveStatus, wanted: float | None = None) -> str:
-        """Describe how far the gripper has closed if it holds nothing, else return an empty text.
+        """Return how far the gripper has closed, as text. Empty if it seems to hold something.
 
         Args:
             status: Status with the opening.
-            wanted: Commanded opening. The grip is only checked if this is the closed one or None.
+            wanted: Commanded opening. If it is neither the closed opening nor None, nothing is
+                checked and the text is empty.
         """
         gripper = self._gripper
         if gripper is None or wanted not in (None, gripper.closed):
@@ -301,7 +307,8 @@ class ElementalMoveExecutor(Executor):
         report.planned = self._plans.find_last_planned_move(window, self._handed_down)
         end = self._plans.find_path_end(report.planned)
         if end is None:
-            # No plan is stored: the path was handed down before a restart, or replaced such a path.
+            # No plan is stored if the path was handed down before a restart, or replaced such a
+            # path. The window of segments still contains it.
             end = segments.find_path_end()
         if report.planned <= self._done and status.resting:
             report.end = status.position
@@ -311,7 +318,7 @@ class ElementalMoveExecutor(Executor):
         report.start = status.position
 
     def _answer_operator(self) -> None:
-        """Report on the operator's commands, and pass down the newest one that this cycle obeys."""
+        """Report the operator's commands, and pass down the serial of the newest one in effect."""
         above = self.above.message.operator
         below = self.below.message
         self.command.operator = self._orders.find_basis(above)
@@ -338,7 +345,7 @@ class ElementalMoveExecutor(Executor):
         return HELD_FROM_ABOVE if command.message.hold else ""
 
     def _find_state(self, command: TaskCommand) -> State:
-        """Return the state to report. EXECUTING becomes HOLDING while the level waits."""
+        """Return the state of the moves. During a wait, `_write_status` reports HOLDING instead."""
         if self._error:
             return State.ERROR
         if not command.id:

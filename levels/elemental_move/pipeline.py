@@ -45,7 +45,7 @@ class ElementalMoveParams(Table):
 
 
 class PlanStore:
-    """Stores the newest plan of each move that lies ahead, and the answer to the open request."""
+    """Stores the newest plan of each unfinished move, and the answer to the open request."""
 
     def __init__(self) -> None:
         self._by_move: dict[int, MovePlan] = {}
@@ -54,15 +54,16 @@ class PlanStore:
     def store_plan(self, plan: Reading[MovePlan], done: int, handed_down: int, end: Array) -> None:
         """Store a new plan if its move was not handed down and its path joins the previous one.
 
-        A path that does not join begins at the end of a path that has been lost or replaced since;
-        the planner will plan the move again. Plans of finished moves are dropped. If the new plan
-        is a refusal, or its path ends elsewhere than the move's previous path, the plans of all
-        later moves are dropped.
+        A path that does not join was planned from the end of a path that was lost or replaced
+        later; it is ignored, and the planner plans the move again. Plans of finished moves are
+        dropped. If the new plan is a refusal, or its path ends elsewhere than the move's previous
+        path, the plans of all later moves are dropped. An answer to a request for another path is
+        always stored.
 
         Args:
             plan: Newest plan and its verdict.
-            done: Newest move done.
-            handed_down: Newest move handed down.
+            done: Id of the newest finished move.
+            handed_down: Id of the newest move handed down.
             end: End of the path that precedes the stored ones, (joints,), rad.
         """
         if not plan.is_new:
@@ -90,7 +91,7 @@ class PlanStore:
             self._by_move[message.move] = message
 
     def find_plan(self, move: int) -> MovePlan | None:
-        """Return the stored plan of a move, which may be a refusal. None if there is none."""
+        """Return the stored plan of a move, which may be a refusal, or None."""
         return self._by_move.get(move)
 
     def find_answer(self, request: int) -> MovePlan | None:
@@ -98,11 +99,12 @@ class PlanStore:
         return self._answer if self._answer is not None and self._answer.replan == request else None
 
     def find_last_planned_move(self, window: Any, handed_down: int) -> int:
-        """Return the last move before the first one that still lacks a path.
+        """Return the id of the last move before the first motion without a path.
 
         Args:
             window: Moves of the level above, an array of `ElementalMove`.
-            handed_down: Newest move handed down, which is returned if no later move is planned.
+            handed_down: Id of the newest move handed down. It is returned if the next move has no
+                path.
         """
         reached = handed_down
         for move in window:
@@ -115,7 +117,7 @@ class PlanStore:
         return reached
 
     def find_path_end(self, move: int) -> Array | None:
-        """Return the end of the last stored path among the moves up to `move`.
+        """Return the end of the last stored path of the moves up to and including `move`.
 
         Returns:
             Last waypoint, (joints,), rad, or None if there is no such path.
@@ -125,11 +127,11 @@ class PlanStore:
 
 
 def can_join(plan: MovePlan, position: Array) -> bool:
-    """Return True if the path of a plan begins where the arm or another path is.
+    """Return True if the path of a plan begins close enough to a position.
 
     Args:
         plan: Plan with a path.
-        position: Position at which the path should begin, (joints,), rad.
+        position: Position of the arm, or end of the preceding path, (joints,), rad.
     """
     return is_close(np.asarray(plan.waypoints[0]), position)
 
@@ -176,7 +178,7 @@ class SegmentWindow:
         return self._segments[0]
 
     def pop_done(self, done: int) -> Any:
-        """Remove and return the oldest segment if its serial is at most `done`, else None."""
+        """Remove and return the oldest segment if its serial is at most `done`. Otherwise None."""
         if not self.count or self._segments["id"][0] > done:
             return None
         segment = self._segments[0].copy()
@@ -223,7 +225,7 @@ class SegmentWindow:
         segment["force"] = force
 
     def find_path_end(self, move: int | None = None) -> Array | None:
-        """Return the end of the newest path in the window, or of the path of `move`.
+        """Return the end of the path of `move`. None selects the newest path in the window.
 
         Returns:
             Last waypoint, (joints,), rad, or None if there is no such path.
@@ -250,5 +252,5 @@ class SegmentWindow:
         segment["blend"] = plan.blend
 
     def _clear_unused(self) -> None:
-        """Clear the unused segments, so that equal windows have equal bytes."""
+        """Set unused segments to zero, so that equal windows have equal bytes."""
         self._segments[self.count :] = np.zeros((), self._segments.dtype)

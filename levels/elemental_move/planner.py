@@ -65,9 +65,9 @@ class Refusal(NamedTuple):
 class ElementalMovePlanner(Planner):
     """Plans the path of one move at a time.
 
-    A path that the executor requests comes first, then a path that has become blocked, then the
-    next move without a path, from the end of the previous path. After a restart the planner
-    continues from the status of the executor.
+    The first priority is a path that the executor requests, the second a path that has become
+    blocked, the third the next move without a path. The path of that move begins at the end of the
+    previous one. After a restart the planner continues from the status of the executor.
     """
 
     above = Input(TaskCommand, "above.command")
@@ -240,13 +240,13 @@ class ElementalMovePlanner(Planner):
         return situation
 
     def _can_try(self, job: PlanningJob, revision: int, tick: int) -> bool:
-        """Return True if a job is new, or was refused and may be tried again.
+        """Return True if a job is new, or if it was refused and may be tried again.
 
-        A job without a free path is tried again after a change of the world or after `retry`.
+        A job refused with NO_PATH may be tried again after a change of the world, or after `retry`.
 
         Args:
             job: Job to try.
-            revision: Revision of the present world.
+            revision: Revision of the newest world model.
             tick: Tick of the cycle.
         """
         refusal = self._refusal
@@ -281,7 +281,7 @@ def find_next_motion(window: Sequence[Move], newest: int) -> Move | None:
     """Return the first move after `newest` that needs a path.
 
     Returns:
-        The move, or None if there is none or the window has a gap before it.
+        The move, or None if no later move needs a path or the window has a gap before it.
     """
     for move in window:
         if move.id == newest + 1:

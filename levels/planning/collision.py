@@ -124,7 +124,7 @@ class CollisionChecker:
         place_bodies(self.cell, self._data, positions, quaternions)
 
     def open_gripper(self, opening: float) -> None:
-        """Set the opening of the gripper, which is open at first.
+        """Set the opening of the gripper. Initially it is fully open.
 
         Args:
             opening: Opening, m or rad.
@@ -158,13 +158,13 @@ class CollisionChecker:
         self._update_required()
 
     def permit_contact(self, row: int | None, touch: bool = True) -> None:
-        """Permit contact of an object with supports and gripper, or forbid it again.
+        """Permit contact of one object with supports and gripper, and of no other object.
 
-        While it is permitted, the gripper may also come closer to supports.
+        While contact is permitted, the gripper only has to keep `margin` from supports.
 
         Args:
             row: Row of the object, or None for no object.
-            touch: False forbids the contact.
+            touch: False permits contact of no object.
         """
         self._touched = row if touch else None
         self._update_required()
@@ -209,7 +209,7 @@ class CollisionChecker:
         close = short > 0
         if np.any(close & (required <= 0)):
             return -1.0
-        # A pair that needs less than the clearance limits it by the difference, too.
+        # The distance of a close pair limits the clearance, even if the pair needs less.
         lacking = short[close] + (self.clearance - required[close])
         return self.clearance - max(0.0, float(np.max(lacking, initial=0.0)))
 
@@ -239,9 +239,9 @@ class CollisionChecker:
         return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {required * 1e3:.1f} mm"
 
     def _compute_shortfalls(self) -> Array:
-        """Return how much each close pair of geoms lacks to its required distance, in m.
+        """Return by how much each close pair of geoms is closer than required, in m.
 
-        The pairs are those of the configuration checked last.
+        The pairs were found at the configuration checked last. Negative values are permitted.
         """
         contact = self._data.contact
         pairs = contact.geom
@@ -300,12 +300,12 @@ class CollisionChecker:
 def restrict_to_arm(cell: Cell, clearance: float, margin: float) -> mujoco.MjModel:
     """Return a copy of the model in which MuJoCo only finds close pairs that involve the arm.
 
-    A check of this copy takes a tenth of the time. Pairs within the gripper are omitted.
+    A collision check with the copy takes a tenth of the time. Pairs within the gripper are omitted.
 
     Args:
         cell: Cell with the model.
-        clearance: Distance up to which other pairs are found, m.
-        margin: Distance up to which pairs of links are found, m.
+        clearance: Distance up to which pairs of the arm and its surroundings must be found, m.
+        margin: Distance up to which pairs of links must be found, m.
     """
     model = copy.copy(cell.model)
     solid = (model.geom_contype | model.geom_conaffinity) != 0
@@ -414,7 +414,7 @@ def find_first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/sub
     clearance: float,  # m
     path: Array,  # (n, joints), rad
 ) -> int:
-    """Find the first configuration in which a pair of geoms misses its required distance.
+    """Find the first configuration in which two geoms are closer than their required distance.
 
     Args:
         model: Address of the model.
@@ -425,7 +425,7 @@ def find_first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/sub
         turned: Rotation matrix of the tool in the data.
         offset: Pose of the held object in the frame of the tool.
         required: Required distances.
-        number: Counts of contacts and more, see `ContactViews`.
+        number: Number of contacts in its first element; see `ContactViews`.
         geoms: Pairs of geoms in contact.
         distance: Distances of the pairs.
         held: Address of the held object in `qpos`, or -1.
@@ -433,7 +433,7 @@ def find_first_blocked(  # noqa: PLR0913  # flat, as `advance` in levels/arm/sub
         path: Configurations to check.
 
     Returns:
-        Index of that configuration, or n if there is none.
+        Index of that configuration, or the length of `path` if there is none.
     """
     for k in range(len(path)):
         for j in range(len(joints)):

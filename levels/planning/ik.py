@@ -72,7 +72,7 @@ class InverseKinematics:
     def find_configuration(
         self, target: Pose, start: Array, match_orientation: bool = True
     ) -> Array | None:
-        """Find a configuration that puts the tool at a pose, by one descent from `start`.
+        """Find a configuration that puts the tool at a pose, by one iteration from `start`.
 
         Args:
             target: Pose for the tool.
@@ -80,7 +80,7 @@ class InverseKinematics:
             match_orientation: False accepts any orientation of the tool.
 
         Returns:
-            Configuration, (joints,), rad, or None if the descent finds none.
+            Configuration, (joints,), rad, or None if the iteration does not converge.
         """
         q = np.clip(start, self._inner_low, self._inner_high)
         errors: list[float] = []
@@ -103,7 +103,7 @@ class InverseKinematics:
         return None
 
     def find_nearby(self, target: Pose, start: Array) -> Array | None:
-        """Return the configuration at `target` on the branch of `start`, or None."""
+        """Return a configuration that reaches `target` on the same branch as `start`, or None."""
         solution = self.find_configuration(target, start)
         return (
             solution
@@ -123,7 +123,7 @@ class InverseKinematics:
         Args:
             target: Pose for the tool.
             reference: Configuration from which the arm moves to them, (joints,), rad.
-            free: Decides whether a configuration is free.
+            free: Returns True if a configuration is free.
             restarts: Maximum number of random starts.
 
         Returns:
@@ -219,8 +219,8 @@ def find_sampling_range(cell: Cell) -> tuple[Array, Array]:
     """Return the range from which random configurations are drawn.
 
     Returns:
-        Lowest and highest positions, (joints,), rad: the position limits, or one turn for a joint
-        without limits.
+        Lowest and highest positions, (joints,), rad: the position limits, or -pi and pi where a
+        joint has none.
     """
     low, high = cell.limits.position.T
     return np.where(np.isfinite(low), low, -np.pi), np.where(np.isfinite(high), high, np.pi)

@@ -77,13 +77,13 @@ class MotionPlanner:
             start: Configuration at the start, (joints,), rad.
             situation: Poses of bodies and the held object.
             attempt: Number of earlier tries in the same situation, which changes the random search.
-            goal: Required end, (joints,), rad, so that paths planned from there remain valid. None
-                finds one.
+            goal: Required configuration at the end, (joints,), rad. Paths already planned from
+                there remain valid. None lets the planner choose the end.
             searches: See `PathPlanner.plan`.
 
         Raises:
-            Refused: UNREACHABLE if no configuration serves, NO_PATH if all are blocked, OVERLOAD if
-                the motors cannot carry the load along the path.
+            Refused: UNREACHABLE if no configuration reaches the goal, NO_PATH if the goal or every
+                path is blocked, OVERLOAD if the motors cannot carry the load along the path.
         """
         self.set_situation(move, situation)
         if move.can_touch:
@@ -114,7 +114,7 @@ class MotionPlanner:
         """Return the configuration at the end of a free motion, in the situation set last.
 
         Raises:
-            Refused: No configuration can be reached, or all are blocked.
+            Refused: No configuration reaches the goal, or all that reach it are blocked.
         """
         if move.verb is Verb.MOVE_JOINTS:
             low, high = self.cell.limits.position.T

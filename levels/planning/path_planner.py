@@ -82,9 +82,8 @@ class PathPlanner:
             start: Configuration at the start, (joints,), rad.
             goal: Configuration at the end, (joints,), rad.
             first_blocked: Finds the first configuration that is not free.
-            attempt: Selects other random numbers, for another try in the same world.
-            searches: Number of paths to find. With fewer, the result comes sooner but is never
-                quicker.
+            attempt: Number of the attempt in the same world. Each one uses other random numbers.
+            searches: Number of paths among which the quickest is selected.
         """
         ends = np.array([start, goal])
         if first_blocked(ends) < len(ends):
@@ -130,7 +129,9 @@ class PathPlanner:
     def _search_paths(
         self, ends: Array, first_blocked: FirstBlocked, attempt: int, searches: int
     ) -> list[Path]:
-        """Search for paths around obstacles until there are enough, or too many checks were made.
+        """Search for paths around obstacles, and return at most `searches` of them.
+
+        The search ends early after `MAX_CHECKS` collision checks or `MAX_SEARCHES` attempts.
 
         Args:
             ends: Start and goal, (2, joints), rad.
@@ -179,7 +180,8 @@ class PathPlanner:
             ends: Start and goal, (2, joints), rad.
             first_blocked: Finds the first configuration that is not free.
             seed: Seed of the random numbers.
-            budget: Maximum number of checks of the search; the short cuts add a few.
+            budget: Number of collision checks after which the search ends. Shortening the result
+                takes a few more.
 
         Returns:
             Polyline, (k, joints), rad, or None, and the number of configurations checked.
@@ -285,11 +287,11 @@ class MotionCheck(base.MotionValidator):  # type: ignore[misc]  # untyped
 
 @compiled_for("f8[:,::1], i8")
 def list_bisection_points(ends: Array, count: int) -> Array:
-    """Return the points of a line in the order of checking: its end, then repeated bisection.
+    """Return points of a line in the order in which to check them: its end, then by bisection.
 
     Args:
         ends: Ends of the line, (2, joints).
-        count: Number of parts of the line.
+        count: Number of equal sections of the line.
 
     Returns:
         Points, (count, joints).
@@ -313,13 +315,13 @@ def list_bisection_points(ends: Array, count: int) -> Array:
 
 
 def compute_lever_arms(cell: Cell, seed: int) -> Array:
-    """Return how far a unit motion of each joint can move any geom of the arm.
+    """Return the largest distance by which a unit motion of each joint can move a geom of the arm.
 
     A joint step dq moves no point of the arm by more than sum |lever_j dq_j|.
 
     Args:
         cell: Model of the arm.
-        seed: Seed of the random configurations that are measured.
+        seed: Seed of the random configurations at which the distances are measured.
 
     Returns:
         Lever arms, (joints,), m per rad. They are 1 for sliding joints.
@@ -338,7 +340,7 @@ def compute_lever_arms(cell: Cell, seed: int) -> Array:
         axes[sample] = data.xaxis
 
     def measure_lever(joint: int) -> float:
-        """Return the lever arm of a joint: its largest distance from a geom that it moves."""
+        """Return the largest distance from the axis of a joint to a geom that it moves."""
         if m.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE:
             return 1.0
         carried = list_geoms(m, mark_descendants(m, m.jnt_bodyid[[joint]]))

@@ -65,7 +65,7 @@ class Payloads:
         """Check that friction can hold an object at `grip`, its pose in the frame of the tool.
 
         Raises:
-            Refused: The grip is too weak; the text contains both forces.
+            Refused: The grip is too weak. The text contains the needed and the available force.
         """
         gravity = float(np.sqrt(np.sum(np.square(self._cell.model.opt.gravity))))
         needed = MIN_GRIP_FACTOR * self._find_mass(row) * gravity
@@ -83,7 +83,7 @@ class Payloads:
             configurations: Configurations to check, (k, joints), rad.
 
         Raises:
-            Refused: A motor is too weak; the text contains both torques.
+            Refused: A motor is too weak. The text contains the needed and the available torque.
         """
         model = self._cell.model
         centre = grip @ make_pose(model.body_ipos[self._cell.bodies[row]], (1.0, 0.0, 0.0, 0.0))
@@ -110,7 +110,10 @@ class Payloads:
         return f"'{self._names[row]}' {self._find_mass(row):.3g} kg"
 
     def _compute_holding_force(self, row: int, grip: Pose) -> float | None:
-        """Return the friction force that can hold object `row`, in N. None if it is unknown."""
+        """Return the largest friction force on object `row`, in N.
+
+        None if no two consecutive samples of the jaws enclose the width of the object.
+        """
         width = self._measure_width(row, grip)
         # Find the last jaws that are wider than the object, and the first that are not.
         pairs = (pair for pair in pairwise(self.jaws) if pair[0].gap > width >= pair[1].gap)
@@ -137,7 +140,7 @@ class Payloads:
             grip: Pose of the object in the frame of the tool.
 
         Returns:
-            Width, or -inf if the axis does not meet the object.
+            Width, or -inf if the axis does not intersect the object.
         """
         cell = self._cell
         data = self._data
@@ -152,7 +155,7 @@ class Payloads:
         )
 
     def _find_jaws(self) -> list[Jaws]:
-        """Return the jaws at openings from open to closed, while a gap separates two fingers."""
+        """Return the jaws at openings from open to closed, as long as there is a gap."""
         cell = self._cell
         gripper = cell.gripper
         if gripper is None:
@@ -166,13 +169,13 @@ class Payloads:
             cell.geoms.gripper,
             np.flatnonzero(cell.model.geom_bodyid == cell.model.body_parentid[hand]),
         )
-        # A single finger closes on a jaw of the body that carries the finger.
+        # If only one finger moves, the other jaw belongs to the body that carries the finger.
         return self._sample_jaws(fingers, openings) or self._sample_jaws(
             cell.geoms.gripper, openings
         )
 
     def _sample_jaws(self, fingers: Ints, openings: Array) -> list[Jaws]:
-        """Return the jaws that geoms form at each of some openings, until there is no gap.
+        """Return the jaws that geoms form at each opening, up to the first without a gap.
 
         Args:
             fingers: Ids of the geoms that may form the jaws.
@@ -188,7 +191,8 @@ class Payloads:
             mujoco.mj_fwdPosition(cell.model, data)
             sides = [self._find_nearest_geom(fingers, 0.0, side) for side in SIDES]
             gap = sides[0][0] + sides[1][0]
-            # When closed, the tool's origin is inside a finger, and the line hits its far side.
+            # When closed, the tool's origin is inside a finger, and the ray hits the far side of
+            # that finger, so the gap seems to grow.
             if not np.isfinite(gap) or (jaws and gap >= jaws[-1].gap):
                 break
             length = float(data.actuator_length[gripper.actuator])
@@ -255,7 +259,7 @@ STILL_TOLERANCE = 1e-6
 
 
 class FixedJaw:
-    """The jaw that does not move, of a gripper with one moving finger."""
+    """The fixed jaw of a gripper with one moving finger."""
 
     def __init__(self, cell: Cell, geoms: Ints, side: float) -> None:
         self._cell = cell
@@ -264,7 +268,7 @@ class FixedJaw:
         self._data = cell.build_start_data()
 
     def move_beside(self, tool: Pose, row: int, object_pose: Pose) -> Pose:
-        """Move the pose of a tool along its y axis until the jaw is next to the object to grasp.
+        """Shift the pose of the tool along its y axis, so that the jaw is next to the object.
 
         Args:
             tool: Pose of the tool for the grasp.
@@ -272,7 +276,7 @@ class FixedJaw:
             object_pose: Pose of the object in the world.
 
         Returns:
-            The moved pose, or `tool` if the jaw does not meet the object.
+            The shifted pose, or `tool` if the jaw would not meet the object.
         """
         present_tool = read_site_pose(self._data, self._cell.tool)
         relative = present_tool @ tool.inverse() @ object_pose
@@ -292,7 +296,7 @@ class FixedJaw:
         return Pose(tool.position - (travel - GAP_M) * across, tool.quaternion)
 
     def _measure_distance(self, row: int, at: Pose) -> float:
-        """Return the distance of an object from the fixed geoms, in m. 0 if they touch.
+        """Return the distance of an object from the jaw, in m. 0 if they touch.
 
         Args:
             row: Row of the object.

@@ -57,7 +57,7 @@ class Pose(NamedTuple):
 
         Args:
             other: Pose at the end of the motion.
-            part: Part of the motion that is done, 0 to 1.
+            part: Fraction of the motion, 0 to 1.
         """
         quaternion = self.quaternion.copy()
         mujoco.mju_quatIntegrate(quaternion, self._compute_turn(other), part)
@@ -71,7 +71,7 @@ class Pose(NamedTuple):
 
 
 def make_pose(position: ArrayLike, quaternion: ArrayLike) -> Pose:
-    """Return a pose with copies of the arrays and the quaternion normalized."""
+    """Return a pose with a copy of the position and a normalized copy of the quaternion."""
     turned = np.array(quaternion, dtype=float)
     mujoco.mju_normalize4(turned)
     return Pose(np.array(position, dtype=float), turned)

@@ -57,7 +57,7 @@ during this time."""
 
 
 class PrimitiveExecutor(Executor):
-    """Executes the segments of the window in order, while its planner times the next one.
+    """Executes the segments of the window in order, while the planner prepares the next one.
 
     Every segment begins and ends at rest. A set point is due `LEAD_CYCLES` cycles after the cycle
     that writes it. After a restart the level restores its state from its own last messages. It
@@ -121,7 +121,7 @@ class PrimitiveExecutor(Executor):
         serials = list_serials(self.above.message)
         self._plans.accept_plan(self.plan, serials)
         if servo.error == Error.DISABLED:
-            # While the arm is not enabled it may be moved by hand, so plan from where it is.
+            # An arm that is not enabled may be moved by hand, so plan from its sensed position.
             self._displaced = True
             if not self._memory.is_known:
                 self._position[:] = servo.position
@@ -157,7 +157,7 @@ class PrimitiveExecutor(Executor):
             work.restart_wait()
 
     def _carry_object(self, row: int, tick: int) -> None:
-        """Tell the guard which object the tool carries, once a new scene shows it.
+        """Attach an object to the tool in the guard's model, as soon as a new scene shows it there.
 
         Args:
             row: Row of the object, or -1 for none.
@@ -232,7 +232,7 @@ class PrimitiveExecutor(Executor):
         return False
 
     def _begin_segment(self, serials: list[int], hold: bool) -> None:
-        """Begin the oldest segment that is not done. With `hold`, a gripper segment must wait."""
+        """Begin the oldest unfinished segment. During a `hold`, a gripper segment must wait."""
         memory = self._memory
         serial = next((s for s in serials if s > memory.done), 0)
         if not serial:
@@ -278,7 +278,7 @@ class PrimitiveExecutor(Executor):
         return work
 
     def _find_wanted_trajectory(self, serials: list[int]) -> tuple[int, float]:
-        """Find the segment that needs a trajectory next.
+        """Find the first segment that still needs a trajectory.
 
         Returns:
             Serial of the segment, or 0 for none, and the path parameter, rad, at which its
@@ -303,7 +303,7 @@ class PrimitiveExecutor(Executor):
         return tick + LEAD_CYCLES * self.context.every
 
     def _write_set_point(self, command: JointCommand, tick: int) -> None:
-        """Write the set point. While the servo is out of step there is none, and `due` is 0."""
+        """Write the set point. `due` is 0 while the servo is out of step and must not follow it."""
         work = self._work
         memory = self._memory
         in_step = self._tracking.in_step
@@ -320,7 +320,7 @@ class PrimitiveExecutor(Executor):
             command.held = memory.held
 
     def _write_status(self, status: PrimitiveStatus, serials: list[int], tick: int) -> None:
-        """Fill the status: the state, the current segment and the trajectory that is wanted."""
+        """Fill the status: state, current segment and the trajectory requested from the planner."""
         memory = self._memory
         work = self._work
         status.echo = self.above.message.id
@@ -346,7 +346,7 @@ class PrimitiveExecutor(Executor):
         status.ends = 0.0
         if isinstance(work, PathWork):
             status.progress = work.progress
-            # While out of step, motion holds for that reason, not because of an obstacle.
+            # If the servo is out of step, that is the reason for the hold, not an obstacle.
             status.blocked = work.blocked and self._tracking.in_step
             status.resting = work.motion.is_resting
             status.ends = work.compute_end_s(self._compute_due_tick(tick) * self.context.tick_s)
@@ -375,7 +375,7 @@ class PrimitiveExecutor(Executor):
         return ""
 
     def _answer_operator(self, above: int) -> None:
-        """Report on the operator's commands, and pass down the newest one that this cycle obeys.
+        """Report the operator's commands, and pass down the serial of the newest one in effect.
 
         Args:
             above: Serial of the operator's command on which the command from above is based.
@@ -386,7 +386,7 @@ class PrimitiveExecutor(Executor):
         self._orders.fill_status(self.status, above)
 
     def _find_state(self, serials: list[int]) -> State:
-        """Return the state to report. EXECUTING becomes HOLDING while the level waits."""
+        """Return the state of the segments. `_write_status` reports HOLDING during a wait."""
         if self._fault is not None:
             return State.ERROR
         if self._work is not None or any(serial > self._memory.done for serial in serials):

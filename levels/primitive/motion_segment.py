@@ -40,7 +40,7 @@ class MotionSegment(MoveSegment):
         return BlendedPath(self.waypoints[: self.count], self.blend[: self.count])
 
     def build_lateness_fault(self, earliest_s: float) -> SegmentFault:
-        """Return the fault of a segment that cannot be done before `earliest_s`."""
+        """Return the fault to report if the segment cannot be finished before `earliest_s`."""
         # Round up, so that the reported time can be met.
         earliest_s = ceil(earliest_s * 1e3) / 1e3
         reason = (
@@ -92,7 +92,7 @@ class Memory:
 
 
 def restore_memory(status: Reading[PrimitiveStatus], command: Reading[JointCommand]) -> Memory:
-    """Return the state from the level's last messages. It is not known if there are none."""
+    """Return the state in the level's last messages. Without them, `is_known` is False."""
     if not (status.has_message and command.has_message and command.message.id):
         return Memory()
     return Memory(

@@ -20,7 +20,7 @@ NEAR_CHECKS = 9
 FAR_CHECKS = 3
 """Number of configurations checked per cycle on the rest of the path."""
 PHASES = 4
-"""Number of cycles in which the near checks cover the gaps between them."""
+"""Number of cycles in which the checks within the look-ahead also cover the gaps between them."""
 FAR_STEP_RAD = 0.04
 """Spacing of the configurations checked on the rest of the path."""
 CLEARANCE_PART = 0.5
@@ -34,9 +34,9 @@ class PathGuard:
 
     In every cycle it checks the path over the next `lookahead_s`, with every obstacle extrapolated
     by its velocity to the time at which the arm arrives. It also checks a few configurations of the
-    whole remaining path against all bodies where they are now. The results of these count only
-    while no obstacle moves, because a moving obstacle may be gone by the time the arm arrives. A
-    cycle makes at most 13 checks. It watches one path at a time.
+    rest of the path against all bodies at their present poses. These results count only while no
+    obstacle moves, because a moving obstacle may be gone by the time the arm arrives. A cycle makes
+    at most 13 checks. Only one path is watched at a time.
 
     Attributes:
         obstacle: Last pair of geoms found too close, with their distance and the required distance.
@@ -66,7 +66,7 @@ class PathGuard:
         self.obstacle = ""
 
     def carry_object(self, row: int, q: Array, world: WorldState) -> None:
-        """Carry an object with the tool from now on.
+        """Attach an object to the tool in the model that is checked.
 
         Args:
             row: Row of the object in the world model.
@@ -79,7 +79,7 @@ class PathGuard:
         )
 
     def carry_nothing(self) -> None:
-        """Carry no object with the tool from now on."""
+        """Detach the object from the tool in the model that is checked."""
         self._checker.hold_object(None)
 
     def watch_path(
@@ -88,8 +88,8 @@ class PathGuard:
         """Begin to watch the path of a segment.
 
         Args:
-            segment: Segment, which names the object that may be touched.
-            path: Its path.
+            segment: Segment with the object that may be touched.
+            path: Path of the segment.
             opening: Opening of the gripper, m or rad.
             world: Newest world model.
         """
@@ -116,7 +116,8 @@ class PathGuard:
             world: Newest world model.
 
         Returns:
-            True if no checked configuration is blocked.
+            False if a configuration within the look-ahead is blocked or, while no obstacle moves,
+            one of the rest of the path.
         """
         begin = trajectory.evaluate_at(time_s).s
         obstacles = world.velocity[self._objects : self._rows]
@@ -136,7 +137,7 @@ class PathGuard:
             path: Watched path.
             trajectory: Trajectory along it.
             time_s: Present time on the trajectory.
-            moving: World model if an obstacle moves, else None.
+            moving: World model from which obstacles are extrapolated. None if none of them moves.
         """
         self._phase = (self._phase + 1) % PHASES
         for k in range(NEAR_CHECKS):
@@ -153,13 +154,13 @@ class PathGuard:
         return True
 
     def _is_remainder_clear(self, path: BlendedPath, begin: float) -> bool:
-        """Return True if the remaining path is clear where this cycle checks it.
+        """Return True if a few configurations of the rest of the path are clear.
 
-        It checks the configuration that was blocked last, then the next few of the remaining path.
+        These are the configuration that was blocked last, and the next few of a cyclic scan.
 
         Args:
             path: Watched path.
-            begin: Path parameter at which the remaining path begins, rad.
+            begin: Path parameter at which the rest of the path begins, rad.
         """
         if self._obstructed is not None and self._obstructed >= begin:
             if not self._is_free(path, self._obstructed):
@@ -183,17 +184,17 @@ class PathGuard:
 
 
 class SceneWatch:
-    """Checks that the world model is fresh, and tells the guard the pose of a held object.
+    """Checks that the world model is fresh, and passes the pose of a held object to the guard.
 
-    The model may be stale because its board is lost or because it receives no scene, so the time at
-    which the scene was sensed decides.
+    The age of the model is the time since its scene was sensed. It also grows if the board of the
+    model runs but receives no scene.
     """
 
     def __init__(self, guard: PathGuard, blind_ticks: int, has_bodies: bool) -> None:
         """Watch the world model.
 
         Args:
-            guard: Guard to tell about a held object.
+            guard: Guard that needs the pose of a held object.
             blind_ticks: Age from which a scene is stale.
             has_bodies: False for a scene without bodies, which is never stale.
         """
@@ -204,18 +205,18 @@ class SceneWatch:
         self._waiting: tuple[int, int] | None = None
 
     def carry_object(self, row: int, since: int) -> None:
-        """Tell the guard which object the tool carries, once a new scene shows its pose.
+        """Let the guard attach an object to the tool, as soon as a new scene shows its pose.
 
         Args:
             row: Row of the object, or -1 for none.
-            since: Earliest tick at which the scene may have been sensed.
+            since: Earliest tick at which that scene may have been sensed.
         """
         self._waiting = (row, since) if row >= 0 else None
         if row < 0:
             self._guard.carry_nothing()
 
     def update_scene(self, world: Reading[WorldState], q: Array, tick: int) -> None:
-        """Process the newest world model.
+        """Check the age of the world model, and attach a newly held object that it shows.
 
         Args:
             world: Newest world model and its verdict.

@@ -71,7 +71,7 @@ class PathMotion:
         return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
 
     def rest_at(self, position: Array) -> float:
-        """Place the set point at rest at the start of the path.
+        """Reset the motion to rest at the start of the path, with the set point at the arm.
 
         Args:
             position: Position of the arm, (joints,), rad.
@@ -82,9 +82,10 @@ class PathMotion:
         return self._place_at_rest(0.0, position)
 
     def rest_near(self, position: Array, progress: float) -> float:
-        """Place the set point at rest at the point of the path that is nearest to the arm.
+        """Reset the motion to rest at the point of the path that is nearest to the arm.
 
-        A path may return to itself. Of equally near points, the one closest to `progress` is taken.
+        If several points are equally near, because the path returns to an earlier position, take
+        the one closest to `progress`. The set point is at the arm.
 
         Args:
             position: Position of the arm, (joints,), rad.
@@ -102,7 +103,7 @@ class PathMotion:
             & (distances <= after)
             & (distances <= distances.min() + NEAREST_STEP_RAD)
         )
-        # `linspace` returns the exact end. No trajectory could begin at a value beyond the end.
+        # `linspace` returns the exact end. A value beyond it would permit no trajectory.
         places = np.linspace(0.0, self.path.length, len(points))[minima]
         nearest = np.argmin(np.abs(places - progress * self.path.length))
         return self._place_at_rest(float(places[nearest]), position)
@@ -154,7 +155,7 @@ class PathMotion:
             self._come_to_rest()
 
     def _place_at_rest(self, s: float, position: Array) -> float:
-        """Place the set point at rest at path parameter `s`.
+        """Reset the motion to rest at path parameter `s`, with the set point at the arm.
 
         Args:
             s: Path parameter, rad.

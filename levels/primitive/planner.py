@@ -41,7 +41,7 @@ class PrimitivePlanner(Planner):
         self._answered_at = 0
 
     def wanted(self, tick: int) -> bool:
-        """Return True if the executor wants a trajectory that it has not received."""
+        """Return True if the executor requests a trajectory that it has not received yet."""
         status = self.status.message
         if status.wants not in list_serials(self.above.message):
             return False
@@ -50,7 +50,7 @@ class PrimitivePlanner(Planner):
         return (status.wants, status.begin) != self._made or tick > self._answered_at
 
     def plan(self, tick: int) -> None:
-        """Compute the trajectory of the wanted segment, or write why there is none."""
+        """Compute the trajectory of the requested segment, or write the reason for a refusal."""
         plan = self.output
         status = self.status.message
         context = self.context
@@ -132,6 +132,6 @@ class Plans:
         return self.find_trajectory(serial, begin) is None and self.find_refusal(serial) is None
 
     def find_refusal(self, serial: int) -> SegmentFault | None:
-        """Return why the planner refuses a segment, or None if it does not."""
+        """Return the fault with which the planner has refused a segment, or None."""
         plan = self._plans.get(serial)
         return plan if isinstance(plan, SegmentFault) else None

@@ -65,7 +65,7 @@ class PrimitiveParams(Table):
 
 @dataclass(frozen=True)
 class WorkRules:
-    """The bounds within which segments are executed."""
+    """Limits and parameters for the execution of segments."""
 
     joints: tuple[str, ...]
     limits: Limits
@@ -74,9 +74,9 @@ class WorkRules:
 
     @property
     def braking_limits(self) -> Limits:
-        """Limits of the ramp to rest on a hold.
+        """Limits of the ramp to rest when motion must hold.
 
-        They exceed the planned limits, because motion along a curve may already use all of those.
+        They exceed the planned limits, which motion along a curve may already use up.
         """
         planned = self.limits
         factor = self.params.braking
@@ -85,7 +85,7 @@ class WorkRules:
         )
 
     def count_cycles(self, time_s: float) -> int:
-        """Return the number of cycles that fill `time_s`, at least 1."""
+        """Convert a time to a number of cycles, at least 1."""
         return max(1, round(time_s / self.period_s))
 
     @property
@@ -95,10 +95,9 @@ class WorkRules:
 
 
 class SettlingCounter:
-    """Counts cycles to decide whether arm or gripper has settled, or takes too long.
+    """Decides whether the arm or the gripper has settled, or takes too long to settle.
 
-    It has settled after enough consecutive quiet cycles: those in which its error or speed is
-    small.
+    It has settled after `settled_cycles` consecutive cycles in which its error or speed is small.
     """
 
     def __init__(self, rules: WorkRules) -> None:
@@ -111,10 +110,10 @@ class SettlingCounter:
         """Count one cycle.
 
         Args:
-            quiet: The error or speed in this cycle is small.
+            quiet: True if the error or speed in this cycle is small.
 
         Returns:
-            True if arm or gripper has settled.
+            True if the arm or the gripper has settled.
         """
         self._cycles += 1
         self._quiet = self._quiet + 1 if quiet else 0
@@ -144,9 +143,9 @@ class PathWork:
         segment: The segment.
         motion: Motion of the set point along its path.
         fault: Why the segment cannot be done, or None.
-        blocked: An obstacle is in the way, or the arm is off the path.
-        astray: The arm is off the path.
-        obstacle: What blocked the motion last.
+        blocked: An obstacle is on the path, or the arm is too far from the path.
+        astray: The arm is too far from the path.
+        obstacle: Description of what blocked the motion last.
         unplanned_cycles: Consecutive cycles in which the motion waits for a trajectory.
     """
 
@@ -167,7 +166,7 @@ class PathWork:
         self._fresh = True
 
     def begin_at(self, position: Array) -> None:
-        """Prepare to start at the beginning of the path. It is a fault if the arm is not near it.
+        """Prepare to start at the beginning of the path. Set `fault` if the arm is not near it.
 
         Args:
             position: Position of the arm, (joints,), rad.
@@ -244,7 +243,7 @@ class PathWork:
         return self.motion.s / length if length > 0.0 else 1.0
 
     def compute_end_s(self, due_s: float) -> float:
-        """Return the simulated time at which the segment should be done, or 0 if it is not known.
+        """Return the simulated time at which the segment will be done, or 0 if it is not known.
 
         Args:
             due_s: Simulated time at which the set point commanded last is due.
@@ -254,7 +253,10 @@ class PathWork:
         return due_s + self.motion.remaining_s + self._rules.latency_s
 
     def _start(self, cycle: WorkCycle, plan: Trajectory) -> None:
-        """Start the trajectory if the path has been clear for long enough."""
+        """Start the trajectory, unless motion must hold or the path has not been clear long enough.
+
+        It is stretched to the permitted speed and to the deadline of the segment.
+        """
         if cycle.speed_scale < 1.0:
             plan = plan.stretch_by(1.0 / cycle.speed_scale)
         clear = self._guard.is_clear(self.motion.path, plan, 0.0, cycle.world)
@@ -283,8 +285,8 @@ class PathWork:
             due_s: Simulated time of its start.
 
         Returns:
-            The trajectory. If a path that was not started would end too late, `fault` is set and
-            None returned.
+            The stretched trajectory. If a path that was not started before would end too late,
+            `fault` is set and the result is None.
         """
         if not self.segment.by or not trajectory.duration:
             return trajectory
@@ -312,7 +314,7 @@ class GripperWork:
         self.restart_wait()
 
     def restart_wait(self) -> None:
-        """Start to wait until the gripper is at rest.
+        """Begin or restart the time in which the gripper must come to rest.
 
         Called at the start of the segment, and again when the servo gets back into step.
         """
@@ -321,16 +323,16 @@ class GripperWork:
 
     @property
     def held_after(self) -> int:
-        """Row of the object in the gripper after the segment, or -1.
+        """Row of the object in the gripper after the segment, or -1 for none.
 
         It is the object of the segment if the gripper ends nearer to closed than to open.
         """
         return self.segment.object if self._closes else -1
 
     def check_done(self, status: DrivenArm) -> bool:
-        """Return True if the gripper rests.
+        """Return True if the gripper is at rest.
 
-        Call this once for each new status. It sets `fault` if the gripper does not rest in time.
+        Call this once for each new status. It sets `fault` if the gripper takes too long.
         """
         self._cycles += 1
         # The gripper is also at rest before the command reaches it.

@@ -31,9 +31,9 @@ MAX_UNEXPLAINED_CYCLES = 50
 class Tracking:
     """Decides from the status of the servo whether it is in step, that is, follows the set points.
 
-    The servo falls out of step when either level restarts, when it misses so many set points that
-    it holds by itself, or when it is stopped. It gets back into step when it holds the arm at rest
-    and is not stopped. Motion then continues from the position at which the arm is held.
+    The servo falls out of step when either level restarts, when it has missed so many set points
+    that it holds the arm, or when it is stopped. It gets back into step when it holds the arm at
+    rest and is not stopped. Motion then continues from the position at which the arm is held.
 
     Attributes:
         in_step: The servo follows set points.
@@ -47,7 +47,7 @@ class Tracking:
         self._unexplained_cycles = 0
 
     def update_status(self, status: Reading[DrivenArm]) -> bool:
-        """Process one status. Return True in the cycle in which the servo gets into step."""
+        """Process one status. Return True in the cycle in which the servo gets back into step."""
         heard = status.is_new and not status.is_lost
         self.silent_cycles = 0 if heard else self.silent_cycles + 1
         self._cycles_in_step += 1
@@ -71,7 +71,7 @@ class Tracking:
         return True
 
     def describe_wait(self, servo: DrivenArm) -> str:
-        """Return a text that tells what a level waits for while the servo is out of step."""
+        """Describe what a level waits for while the servo is out of step."""
         if self.silent_cycles > MAX_MISSED_STATUSES:
             return f"waiting for servo: no status for {self.silent_cycles} cycles"
         if servo.state == State.HOLDING and servo.reason:
@@ -88,7 +88,7 @@ class Tracking:
 class DeviationMonitor:
     """Counts cycles in which a joint is too far from its set point.
 
-    A few such cycles are permitted; motion holds during them.
+    A few consecutive cycles are permitted; during them, motion must hold.
 
     Attributes:
         description: Text with the joint and its distance. Empty if no joint is too far away.
@@ -117,7 +117,7 @@ class DeviationMonitor:
         return self._cycles > 0
 
     def reset_count(self) -> None:
-        """Reset the count, and clear `place` and `fault`."""
+        """Reset the count, and clear `description` and `fault`."""
         self._cycles = 0
         self.description = ""
         self.fault = None

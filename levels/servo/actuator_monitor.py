@@ -65,11 +65,11 @@ ASTRAY = 2
 class ActuatorMonitor:
     """Compares the torques that the sensed motion requires with the commanded torques.
 
-    They differ if a motor gives less than commanded, or if something pushes the arm. A push is
-    assumed from the first difference that weak motors cannot explain, until the difference is gone.
-    Meanwhile a motor only counts as failed if it lacks more than the part `MAX_CONTACT_FRACTION` of
-    its torque limit. For a cycle or two, a load that pulls at the arm looks like a weak motor. But
-    a working motor gives more torque when more is commanded.
+    They differ if a motor gives less than commanded, or if something pushes the arm. The first
+    difference that weak motors cannot explain is attributed to a push, and so are all further ones
+    until there is no difference. During a push, a motor only counts as failed if it lacks more than
+    `MAX_CONTACT_FRACTION` of its torque limit. For a cycle or two, a load that pulls at the arm
+    looks like a weak motor. But a working motor gives more torque when more is commanded.
 
     A motor also counts as failed if its joint is farther than `following`, in rad, from its set
     point. That is the only criterion for drives that do not report the torque that they give.
@@ -117,11 +117,11 @@ class ActuatorMonitor:
         self._alone = True  # it is the only motor that lacks torque
 
     def begin_cycle(self) -> None:
-        """Begin a cycle in which the motors are commanded `torque`, in the state judged last."""
+        """Begin a cycle with the commanded `torque`, at the state of the last `check_cycle`."""
         self._begun = True
 
     def drop_cycle(self) -> None:
-        """Do not judge the present cycle.
+        """Exclude the present cycle from the check.
 
         Call this if the arm was braked, cycles were missed or there was no usable sample.
         """
@@ -129,13 +129,13 @@ class ActuatorMonitor:
         self._cycles = 0
 
     def check_cycle(self, wanted: Array, state: Array, terms: Terms, holds: bool) -> Finding | None:
-        """Judge the cycle that ends now. Its final state becomes the initial state of the next one.
+        """Check the cycle that ends now, and store its final state as the start of the next one.
 
         Args:
             wanted: Set points now; the first row is positions, (joints,), rad.
             state: Sensed positions, rad, and velocities, rad/s, (2, joints).
             terms: Equation of motion at that state.
-            holds: The gripper holds a part, which may touch something.
+            holds: True if the gripper holds a part, which may touch something.
 
         Returns:
             Finding that names a failed motor, or None.
@@ -154,14 +154,14 @@ class ActuatorMonitor:
         return self._track_lacking_torque(state[1], holds)
 
     def _track_lacking_torque(self, velocity: Array, holds: bool) -> Finding | None:
-        """Track the motor whose lack of torque explains the difference, until it counts as failed.
+        """Track the motor whose lack of torque explains the difference.
 
         Args:
             velocity: Sensed velocities, (joints,), rad/s.
-            holds: The gripper holds a part, which may touch something.
+            holds: True if the gripper holds a part, which may touch something.
 
         Returns:
-            Finding that names the motor once it is certain that it has failed, else None.
+            Finding that names the motor once its failure is certain. Until then None.
         """
         motors = self._motors
         residual = motors["left"]
@@ -209,16 +209,16 @@ class ActuatorMonitor:
         return None
 
     def _is_certain(self, joint: int, commanded: float, lacks: float) -> bool:
-        """Return True if it is certain that the motor has failed.
+        """Return True if the failure of the motor is certain.
 
-        Then the motor gives no torque, gives no more when more is commanded, or lacks more than a
-        push can explain. Dry friction that changes sign can hide a dead motor: it looks like torque
-        of up to twice its value.
+        In several cycles the motor must have given no torque, have given no more when more was
+        commanded, or have lacked more than a push can explain. Dry friction that changes sign can
+        hide a dead motor, because it looks like a torque of up to twice the friction.
 
         Args:
             joint: Joint of the motor.
             commanded: Size of the commanded torque, N m.
-            lacks: Part of it that was not given, N m.
+            lacks: Part of the commanded torque that was not given, N m.
         """
         if self._cycles < SURE_CYCLES:
             return False
@@ -243,7 +243,7 @@ def compute_residuals(
     inertia: Array,  # (joints, joints), kg m2
     bias: Array,  # (joints,), N m
 ) -> int:
-    """Compare the torques that a motion required with those commanded, and store the final state.
+    """Compare the torques that a motion required with the commanded ones; store the final state.
 
     Args:
         motors: State of the monitor.

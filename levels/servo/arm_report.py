@@ -54,7 +54,8 @@ class ArmReport:
 
         Args:
             sensed: Sample of this cycle, which gives the opening of the gripper.
-            wanted: Motion wanted for the joints; its first rows are rad and rad/s.
+            wanted: Motion wanted for the joints. Its first rows are positions, rad, and velocities,
+                rad/s.
         """
         joints = self._joints
         self._estimate[:] = self.sensors.estimate

@@ -55,7 +55,7 @@ class JointPdParams(Table):
 class JointPd(Modification):
     """Controls each joint separately by proportional-derivative (PD) control.
 
-    It ignores the wanted acceleration, coupling between joints and friction.
+    It ignores the wanted acceleration, friction, and the coupling between joints.
     """
 
     hook = Hook.INSTEAD

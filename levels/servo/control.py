@@ -98,7 +98,7 @@ class ComputedTorque:
         self.inertia: Array | None = None
 
     def set_gains(self, gains: LoopGains) -> None:
-        """Use new gains from now on."""
+        """Replace the gains."""
         gains.fill_constants(self._constants)
 
     def compute_torque(self, wanted: Motion, sensed: SensedMotion, terms: Terms) -> Array:
@@ -178,7 +178,7 @@ class SetPointLaw:
         self.set_gains(params)
 
     def set_gains(self, gains: LoopGains) -> None:
-        """Use new gains from now on."""
+        """Replace the gains."""
         self._gain = 0.5 * gains.bandwidth / gains.damping if self._is_velocity else 0.0  # 1/s
 
     def compute_target(self, wanted: Motion, position: Array, torque: Array) -> JointTarget:
@@ -224,7 +224,7 @@ class Grip:
         self._kept = force
 
     def take_command(self, command: ArmSetPoint) -> None:
-        """Take opening and force from a new set point."""
+        """Adopt opening and force of a valid set point, limited to the range of the gripper."""
         if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
             self._opening = min(max(command.opening, self._least), self._most)
             self._limit = min(max(command.force, 0.0), self._most_force)

@@ -55,8 +55,8 @@ class ArmDriver(Executor):
 
     A cycle first advances the arm by the ticks since the last cycle, so that its time equals the
     clock even if cycles were missed. Safety comes first: while the rack demands a stop, or sensors
-    or motors are at fault, the arm holds, stops or is braked. Afterwards motion resumes from where
-    the arm is.
+    or motors are at fault, the arm holds, stops or is braked. Afterwards motion resumes from the
+    position of the arm.
 
     A subclass declares the input `before`, which reads its own last state, and the outputs
     `status`, `state` and `scene`.
@@ -163,8 +163,8 @@ class ArmDriver(Executor):
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
         """Return the motion wanted in this cycle, or None to brake.
 
-        After braking (`abandoned`) the motion must begin where the arm is. If there is a reaction,
-        the motion must come to rest.
+        After braking (`abandoned`) the motion must begin at the position of the arm. If there is a
+        reaction, the motion must come to rest.
 
         Args:
             reaction: Reaction of this cycle, weaker than BRAKE.
@@ -178,7 +178,7 @@ class ArmDriver(Executor):
 
     @abstractmethod
     def compute_efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
-        """Compute what the motors must do for the wanted motion.
+        """Compute the torques and the force of the gripper for the wanted motion.
 
         Implementations may use `terms`, the equation of motion of this cycle.
 
@@ -193,7 +193,7 @@ class ArmDriver(Executor):
     @property
     @abstractmethod
     def payload(self) -> Payload | None:
-        """Payload in the gripper. None if there is none or it is not known."""
+        """Payload in the gripper. None if the gripper is empty or the payload is unknown."""
 
     @property
     @abstractmethod
@@ -202,7 +202,7 @@ class ArmDriver(Executor):
 
     @abstractmethod
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return how the level follows its set points. The status reports it."""
+        """Return the report on set points, which becomes a part of the status."""
 
     @cached_property
     def _report(self) -> ArmReport:
@@ -218,7 +218,7 @@ class ArmDriver(Executor):
         """Carry out one of `rack.levels.operator.DRIVE_OPERATIONS`.
 
         Returns:
-            Why the command is refused, or an empty text.
+            Reason for the refusal, or an empty string.
         """
         if command.what != Operation.RELEASE:
             return self.enabling.obey_command(command)
@@ -230,10 +230,10 @@ class ArmDriver(Executor):
         """Read further sensors before the reaction is decided. The default does nothing."""
 
     def on_adopted(self) -> None:
-        """React to the adopted pose of an arm that was just enabled. The default does nothing."""
+        """Handle the adoption of a newly enabled arm's pose. The default does nothing."""
 
     def on_restored(self) -> None:
-        """React to a restart after the arm was restored. The default does nothing."""
+        """Handle the restoration of the arm after a restart. The default does nothing."""
 
     def process(self, tick: int) -> None:
         """Run one cycle: advance the arm to `tick`, check it, drive or brake it, and report."""
@@ -259,7 +259,7 @@ class ArmDriver(Executor):
             self.arm.look(self.scene)
 
     def _advance_arm(self, tick: int) -> bool:
-        """Advance the arm to `tick`. In the first cycle, take the arm over before that.
+        """Advance the arm to `tick`. In the first cycle, take over the arm before that.
 
         Returns:
             True if cycles were missed since the last one.
@@ -310,7 +310,8 @@ class ArmDriver(Executor):
     def _drive_arm(self, sensed: Sensed, reaction: Reaction, missed: bool, tick: int) -> None:
         """Drive the arm for one cycle.
 
-        It is braked instead if a motor fails, a torque is refused, or a stop is complete.
+        The arm is braked instead if there is no wanted motion, a motor fails, the arm refuses the
+        command, or a stop is complete.
         """
         wanted = self.next_motion(reaction, missed, tick)
         if wanted is None:

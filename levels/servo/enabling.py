@@ -14,7 +14,7 @@ from rack.levels.servo.stopping import Stopping
 
 
 class Enabling:
-    """Tracks whether the drives of an arm are enabled. Only an enabled arm is driven and judged.
+    """Tracks whether the drives of an arm are enabled. Only an enabled arm is driven and checked.
 
     Whoever enables an arm must be able to see it. An operator must therefore enable it again after
     a fault, or after the drives have switched off by themselves. A restart of the board does not
@@ -46,7 +46,7 @@ class Enabling:
         """Carry out one of `rack.levels.operator.DRIVE_OPERATIONS`.
 
         Returns:
-            Why the command is refused, or an empty text.
+            Reason for the refusal, or an empty string.
         """
         arm = self._arm
         goal: Collection[DriveState] = list(DriveState)
@@ -73,8 +73,8 @@ class Enabling:
     def pop_finished_command(self) -> int:
         """Return the serial of a command that the drives have just carried out, else 0.
 
-        Call this once per cycle, after the commands of the cycle: a `disable` among them takes
-        effect here.
+        Call this once per cycle, after `obey_command`, because a `disable` takes effect only in
+        this call.
         """
         self._restarted = False
         if self._disables:
@@ -121,7 +121,7 @@ class Takeover:
     is_complete: bool = False  # the arm is enabled, and its pose was adopted since
 
     def start(self, before: Reading[ArmState]) -> bool:
-        """Start in the first cycle. Return True if the arm was restored from its last state."""
+        """Take over the arm in the first cycle. Return True if it was restored after a restart."""
         self.is_started = True
         self.enabling.start(before.has_message)
         if before.has_message:

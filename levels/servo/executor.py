@@ -35,7 +35,7 @@ class ServoExecutor(ServoLaw):
         self._loop.inertia = plan.inertia.copy()
 
     def _obey_command(self, command: OperatorCommand) -> str:
-        """Carry out a command, and pass gains that it may have changed to the loops."""
+        """Carry out a command, and update the gains of the loops, which it may have changed."""
         refusal = super()._obey_command(command)
         self._loop.set_gains(self.settings)
         if self.set_point_law is not None:

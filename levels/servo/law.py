@@ -144,10 +144,10 @@ class ServoLaw(ArmDriver):
         self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
 
     def _obey_command(self, command: OperatorCommand) -> str:
-        """Carry out a setting or a command to the drives. HOLD and SETPOINT remain in effect.
+        """Carry out a setting or a command to the drives. It does not end a HOLD or SETPOINT.
 
         Returns:
-            Why the command is refused, or an empty text.
+            Reason for the refusal, or an empty string.
         """
         if command.what == Operation.MODIFY:
             return self._modified.switch_modification(command.name, command.goal == Goal.ON)
@@ -170,7 +170,8 @@ class ServoLaw(ArmDriver):
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion:
         """Return the motion wanted in this cycle, from the operator or from the level above.
 
-        After braking it begins where the arm is. With a reaction it ramps to rest.
+        After braking, the motion begins at the position of the arm. If there is a reaction, the
+        motion ramps to rest.
 
         Args:
             reaction: Reaction of this cycle.
@@ -200,7 +201,7 @@ class ServoLaw(ArmDriver):
         grip_force = (
             0.0 if grip is None else grip.compute_force(sensed.opening, sensed.opening_velocity)
         )
-        # For set points the torques are predicted, as if the arm were at its set point.
+        # For drives that follow set points, predict the torques of an arm at its set point.
         state = self._sensed if self.set_point_law is None else SensedMotion(wanted.table[:2])
         if not self._modified.has_modifications:
             return self._compute_limited_torque(wanted, state), grip_force
@@ -246,7 +247,7 @@ class ServoLaw(ArmDriver):
         return self._holds
 
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return how the level follows its set points. The status reports it."""
+        """Return the report on set points, which becomes a part of the status."""
         operator = self.operator_control
         stands = operator.is_in_control
         cut = self.reference.refused + self._cut

@@ -184,7 +184,7 @@ class ModifiableParams(Table):
     def _check_instead(
         cls, entries: dict[str, ModificationConfig]
     ) -> dict[str, ModificationConfig]:
-        """Check that at most one modification replaces the law from the start."""
+        """Check that at most one modification that replaces the law is initially on."""
         active = [
             name for name, entry in entries.items() if entry.on and entry.kind.hook == Hook.INSTEAD
         ]
@@ -203,7 +203,7 @@ def list_names(params: Mapping[str, Any]) -> Sequence[str]:
 
 
 def find_misfits(context: LevelContext) -> Mismatches:
-    """Yield the modifications of a board that do not suit its law, with the reasons."""
+    """Yield a mismatch for each modification that does not suit the law of its board."""
     params = read_params(
         ModifiableParams, {"modifications": context.params.get("modifications", {})}
     )

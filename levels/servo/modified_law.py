@@ -64,7 +64,7 @@ class ModificationState:
             changed: Array of the sample that the modification may change.
 
         Returns:
-            Why the modification failed, or an empty text.
+            Why the modification failed, or an empty string if it did not.
         """
         original = changed.copy()
         failure = ""
@@ -141,7 +141,7 @@ class ModifiedLaw:
             is_on: True to switch it on.
 
         Returns:
-            Why that is refused, or an empty text.
+            Why the switch is refused, or an empty string.
         """
         state = self._all.get(name)
         if state is None:
@@ -156,7 +156,7 @@ class ModifiedLaw:
         return ""
 
     def forget_torque(self) -> None:
-        """Forget the last torque, which a braked arm no longer applies."""
+        """Forget the last torque of an arm that is now braked. The next switch is not blended."""
         self._is_driving = False
 
     def compute_torque(self, law: Law, inputs: LawInputs) -> Array:
@@ -184,7 +184,7 @@ class ModifiedLaw:
         return self._last
 
     def _compute_modified(self, law: Law, inputs: LawInputs) -> Array:
-        """Run the active modifications around, or in place of, the law; return the torques."""
+        """Return the torques of the law with all active modifications applied."""
         sample = self._sample
         sample.tick = inputs.tick
         sample.inertia = inputs.inertia
@@ -211,7 +211,7 @@ class ModifiedLaw:
         return not failure
 
     def _blend_torque(self, torque: Array, ticks: int) -> Array:
-        """Add the part of the last switch's step in torque that has not decayed yet.
+        """Add the torque step of the last switch, faded out over the time since the switch.
 
         Args:
             torque: Torques of the law after the switch, (joints,), N m.
@@ -220,7 +220,7 @@ class ModifiedLaw:
         Returns:
             Torques, (joints,), N m.
         """
-        passed = ticks / self._ticks  # part of the transfer time that has passed
+        passed = ticks / self._ticks  # fraction of the transfer time that has passed
         if passed >= 1.0:
             self._since = None
             return torque
@@ -231,7 +231,7 @@ class ModifiedLaw:
         return [state for state in self._in if state.modification.hook == hook]
 
     def _update_hooks(self) -> None:
-        """Sort the active modifications by hook, and describe them in `reason`."""
+        """Group the active modifications by hook, and list them and the failed ones in `reason`."""
         self._in = [state for state in self._all.values() if state.is_on]
         self._before, self._instead, self._after = (self._list_hooked(hook) for hook in Hook)
         self._switched = True

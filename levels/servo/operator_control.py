@@ -25,9 +25,9 @@ class OperatorControl:
     """Follows the commands of the operator.
 
     An operator's HOLD or SETPOINT remains in force until RESUME. To resume, the arm returns through
-    the positions from which the operator moved it: the way through them was free, and the level
-    above finds the arm on its path. A restarted board has lost these positions; the level above
-    then continues from where the arm is.
+    the positions from which the operator moved it. There were no obstacles between them, and the
+    last one is on the path of the level above. A restarted board has lost these positions; the
+    level above then continues from the present position of the arm.
 
     Attributes:
         orders: Commands of the operator and the answers to them.
@@ -66,7 +66,7 @@ class OperatorControl:
         self._way: list[Array] = []
 
     def take_commands(self, operator: Reading[OperatorCommand], position: Array) -> None:
-        """Accept new commands.
+        """Accept the operator's new commands.
 
         Args:
             operator: Newest command and its verdict.
@@ -80,7 +80,7 @@ class OperatorControl:
         self.is_in_control = self.orders.is_in_force or bool(self._way)
 
     def forget_return_path(self) -> None:
-        """Discard the return path, so that the level above continues from where the arm is."""
+        """Discard the return path, so that motion continues from the present position."""
         self._way.clear()
 
     @property

@@ -22,9 +22,9 @@ of a planned motion needs a little more than 1."""
 JOINING_SPEED_PART = 0.25
 """Part of the velocity limits that the transition to the set points may add to their motion."""
 ASTRAY_RAD = 0.005
-"""Distance from the reference beyond which an arm is led back smoothly after missed cycles."""
+"""Distance from the wanted motion at which it restarts from the arm after missed cycles."""
 MAX_AHEAD_S = 2.0
-"""Largest time ahead at which a set point may be due. If it is due later, the command is broken."""
+"""Largest time until a set point is due. A set point that is due later counts as invalid."""
 
 
 class SetPoint(NamedTuple):
@@ -45,7 +45,7 @@ class Reference:
             up to 1.
         goal: Goal of `move_to`, (joints,), rad, until another motion begins, else None.
         holding: No set point is followed: the motion ramps to rest or is at rest.
-        refused: Number of set points cut at the bounds, and of cycles with one that is NaN or due
+        refused: Number of set points cut at the bounds, and of cycles in which one is NaN or due
             too far ahead.
     """
 
@@ -79,12 +79,12 @@ class Reference:
         self.start(np.zeros(joints), np.zeros(joints), 0)
 
     def start(self, position: Array, velocity: Array, tick: int) -> None:
-        """Restart from a motion at `tick`: ramp to rest, then hold.
+        """Restart from a position and velocity: ramp to rest, then hold.
 
         Args:
             position: Position at `tick`, (joints,), rad.
             velocity: Velocity at `tick`, (joints,), rad/s.
-            tick: Tick of that motion.
+            tick: Tick at which the ramp begins.
         """
         self._curve: Curve = Ramp(position, velocity, self._limits.acceleration)
         self._from = tick
@@ -97,7 +97,7 @@ class Reference:
     ) -> None:
         """After missed cycles, restart from the arm's position if it is too far from the motion.
 
-        The arm is then led back to the set points smoothly.
+        From there the motion joins the present curve smoothly, or ramps to rest if there is none.
 
         Args:
             position: Sensed positions, (joints,), rad.
@@ -125,7 +125,7 @@ class Reference:
         self._offered = command.due
 
     def compute_motion(self, tick: int) -> Motion:
-        """Return the motion wanted at `tick`. Its acceleration is taken half a tick later."""
+        """Return the motion wanted at `tick`, with the acceleration half a tick later."""
         if self._next is not None and (self.holding or tick >= self._due):
             self._begin_curve(self._next, tick)
         offered = self._offered
@@ -146,12 +146,13 @@ class Reference:
         return self._evaluate_motion(tick)
 
     def move_to(self, goal: Array, tick: int) -> Motion:
-        """Return the motion wanted at `tick` on the way to a goal, ignoring the level above.
+        """Return the motion wanted at `tick` for a move to a goal that ignores the level above.
 
         The motion ramps to rest, then goes straight to the goal within the limits of every joint.
 
         Args:
-            goal: Position to reach at rest, (joints,), rad; the same array in every cycle.
+            goal: Position to reach at rest, (joints,), rad. It must be the same array object in
+                every cycle.
             tick: Tick of the motion.
         """
         if self.goal is goal:
@@ -242,7 +243,7 @@ class Reference:
         self._differs_from = tick
 
     def _evaluate_motion(self, tick: int) -> Motion:
-        """Evaluate the present curves at `tick`. The acceleration is taken half a tick later.
+        """Evaluate the present curves at `tick`, and their acceleration half a tick later.
 
         The result is valid until the next call.
         """

@@ -172,9 +172,9 @@ class SensorMonitor:
         self._tick = state.tick
 
     def adopt_pose(self, sensed: Sensed, tick: int) -> bool:
-        """Take the sensed pose as the true one, without comparing it with earlier samples.
+        """Accept the sensed pose without comparing it with earlier samples.
 
-        This is for an arm that is not driven yet; it may have been moved by hand.
+        Use this for an arm that is not driven yet, because it may have been moved by hand.
 
         Returns:
             False if the sample is not of `tick` or not finite.
@@ -212,7 +212,8 @@ class SensorMonitor:
         if not self.fresh:
             self._estimate_without_sample(passed_s, tick - sampled)
             return
-        # The arm was driven, then braked, so it may have been faster than in both samples.
+        # During missed cycles the arm was driven and then braked, so it may have been faster than
+        # in either sample.
         braked_s = 4.0 * self._every * self._tick_s if passed > self._every else 0.0
         blow = STRUCK_SPEED if struck else 0.0
         driven = wanted is not None
@@ -245,7 +246,7 @@ class SensorMonitor:
             offset = q - self.position - joints["way"]
             for joint in np.flatnonzero(np.abs(offset) > tolerance):
                 self.findings.append(Finding(Alarm.RE_REFERENCED, int(joint), float(offset[joint])))
-            # A sensor that does not change may be stuck, so its joint remains in doubt.
+            # A sensor whose value does not change may be stuck, so its joint remains in doubt.
             self.doubt[~joints["unchanged"]] = 0.0
         self.position[:] = q
         self.velocity[:] = joints["velocity"]
@@ -386,14 +387,14 @@ class SensorMonitor:
         Args:
             alarm: Alarm to report.
             wrong: Joints that are wrong.
-            values: Value to report, by joint.
+            values: Value to report for each joint.
         """
         if wrong.any():
             joint = int(wrong.argmax())
             self._report_fault(Finding(alarm, joint, float(values[joint])))
 
     def _report_fault(self, finding: Finding) -> None:
-        """Report a fault, once per episode, and restart the count of good samples."""
+        """Report a fault once per alarm and episode, and restart the count of good samples."""
         self.faulty = True
         self._streak = 0
         if finding.alarm not in self._rung:
@@ -401,7 +402,7 @@ class SensorMonitor:
             self.findings.append(finding)
 
     def _count_good_sample(self, good: bool) -> bool:
-        """Count consecutive good samples. Return True if they are enough to end the episode."""
+        """Count consecutive good samples. Return True if they were enough to end the episode."""
         self._streak = self._streak + 1 if good else 0
         needed = self._retry_cycles if self._unproven.any() else self._good_cycles
         if self._streak < needed:
@@ -442,7 +443,7 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
         sensed_velocity: Velocities of the sample.
         wanted: Motion that the arm was driven to follow.
         passed_s: Time since the last sample.
-        braked_s: Time for which the arm may have braked, after unusual cycles.
+        braked_s: Time for which the arm may have braked. 0 unless cycles were missed.
         blow: Multiple of the fastest velocity that a blow may have added.
         driven: The arm was driven.
         faulty: An episode of faults has not ended.

@@ -34,7 +34,7 @@ class Cause(NamedTuple):
 
 
 class Stopping:
-    """Weighs demands of the rack, faults and blows against each other; the strongest reaction wins.
+    """Selects the strongest of the reactions to demands of the rack, to faults and to blows.
 
     A blow is an unintended or too strong contact, or a joint beyond its limit. After a blow the arm
     stays stopped until `retry` has passed without another one.
@@ -43,8 +43,8 @@ class Stopping:
     `good_cycles` without a fault. If the motor fails again before that, the brakes engage.
 
     Faults may keep the arm from its set points for `patience`. That time counts up during faults
-    and down while the arm follows its set points, so recurring faults use it up too. Then the fault
-    is latched, and the brakes stay engaged.
+    and down while the arm follows its set points, so recurring faults use it up too. At its
+    end the fault is latched, and the brakes stay engaged.
 
     Attributes:
         refused: Finding about the last cycle's torque or set point, if the arm refused it.
@@ -158,9 +158,9 @@ class Stopping:
         self._blow = blow
 
     def wait_for_enabling(self, error: Error, why: str, tick: int) -> Reaction:
-        """Return the reaction of this cycle while the arm is not enabled.
+        """Return the reaction of this cycle while the arm is not enabled, which is always BRAKE.
 
-        There is no limit on this time: no fault is latched.
+        No fault is latched, however long the arm is not enabled.
 
         Args:
             error: DISABLED or DRIVES.
@@ -217,12 +217,12 @@ class Stopping:
         return max(reaction, Reaction[demand.name]) if demand else reaction
 
     def _set_cause(self, cause: Cause, tick: int) -> None:
-        """Set `cause` and `reason`. The reason tells at which tick the fault will be latched."""
+        """Set `cause` and `reason`, which contains the tick at which the fault will be latched."""
         self.cause = cause.error
         self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 
     def _weigh_faults(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
-        """Return the strongest reaction to the present faults, and the fault to report, if any."""
+        """Return the strongest reaction to the present faults, and the fault to report or None."""
         reaction = Reaction.NONE
         cause = None if self.refused is None else self._describe_refusal(self.refused)
         if sensors.faulty:

@@ -60,7 +60,7 @@ class ContactWrench:
         self.saturated = True
 
     def take_sample(self, raw: Array, state: Array, acceleration: Array) -> None:
-        """Compute the contact from a sample.
+        """Compute the wrench of the contact from a sample of the sensor.
 
         Args:
             raw: Sample, (6,), N, N m.
@@ -106,15 +106,15 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     The limits are `most_force` and `most_torque` in `[robot.wrist]`. A contact beyond them stops
     the arm while it lasts and for `retry` longer. After `patience` the fault is latched, as other
-    faults are. With brakes the arm springs back a little; an arm that holds keeps pressing. A
+    faults are. A braked arm springs back a little, whereas an arm that holds keeps pressing. A
     sensor at the end of its range counts as beyond the limits, because the contact is unknown. A
     held object counts as contact.
 
     Weight and inertia of the tool are subtracted. The acceleration for this comes from the
     velocities of the joints or, with coarse encoders, from the set points. Without the subtraction,
-    a tool of 1.1 kg at the acceleration limits would show up as 7 N. With velocities, at 1 kHz, 0.2
-    N remain. With set points at most 2.3 N remain, where dry friction changes sign, and 2.6 N with
-    encoders of 1 mrad, whose velocities would cause 10 N of noise.
+    a tool of 1.1 kg at the acceleration limits would show up as 7 N. With velocities at 1 kHz, an
+    error of 0.2 N remains. With set points it is at most 2.3 N, where dry friction changes sign,
+    and 2.6 N with encoders of 1 mrad. The velocities of such encoders would cause 10 N of noise.
     """
 
     felt = Input(Wrench, "own.wrench")
@@ -138,7 +138,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         """Check that the class of the arm has a wrist sensor.
 
         Raises:
-            LevelError: It has none.
+            LevelError: The class has no wrist sensor.
         """
         if self.arm.sense_wrist() is None:
             raise LevelError(
@@ -179,7 +179,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         return velocity
 
     def _check_limits(self, tick: int) -> None:
-        """Stop the arm if the contact is beyond a limit, or may be because it is unknown."""
+        """Stop the arm if the contact exceeds a limit, or if the sensor is saturated."""
         contact = self.contact
         if contact.saturated:
             finding = Finding(Alarm.FORCE_LIMIT, -1, norm(contact.raw[:3]))
@@ -206,7 +206,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         self.stopping.register_blow(cause, finding, tick, self._on_limit)
 
     def on_restored(self) -> None:
-        """Compute the next acceleration from the velocities of the restored state."""
+        """Store the restored velocities, from which the next acceleration is computed."""
         self._before[:] = self._velocity
         self._since = self.arm.tick
 

@@ -51,7 +51,7 @@ class FrameConfig(Table):
     """its z axis, at a right angle to x"""
 
     def find_objection(self) -> str:
-        """Return why the axes define no frame, or an empty text if they do."""
+        """Return the reason why the axes do not define a frame, or an empty string if they do."""
         lengths = norm(self.x) * norm(self.z)
         if not lengths > 0.0:
             return "an axis of length 0: no frame"
@@ -106,7 +106,11 @@ class ForceProgram(Program):
                 yield f"contact.{name}", contact.model_dump(exclude_defaults=True), reason
 
     def find_objection(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
-        """Return why a contact is impossible, or an empty text if it is possible."""
+        """Return the reason why a contact is invalid, or an empty string if it is valid.
+
+        Its frame must be in the program, only axes of force may have a speed, and its wrenches must
+        be within the limits of the arm.
+        """
         if contact.frame not in self.frame:
             return (
                 f"frame '{contact.frame}' is not in [task.frame]; valid values:"
@@ -138,14 +142,14 @@ class ForceProgram(Program):
 
 
 def to_vector(values: Mapping[Axis, float]) -> Array:
-    """Convert values by axis to a vector, (6,), with 0 for axes without a value."""
+    """Convert a mapping from axes to values to a vector, (6,), with 0 for missing axes."""
     return np.array([values.get(name, 0.0) for name in AXIS_NAMES])
 
 
 class ForceMotions(Motions):
     """Calls that request forces and motions from the server.
 
-    A call raises `LevelError` at once if its contact is impossible.
+    A call raises `LevelError` at once if its contact is invalid.
     """
 
     def __init__(
@@ -199,7 +203,7 @@ class ForceMotions(Motions):
         return self._queue_request(kind=MotionKind.GUARD, frame=wanted.frame, guard=wanted.guard)
 
     def free(self) -> int:
-        """Request the end of compliance and guards. It is done when the arm is at rest.
+        """Request the end of compliance and guards. The request is done when the arm is at rest.
 
         Returns:
             Number of the request.
@@ -212,7 +216,7 @@ class ForceMotions(Motions):
         return self._server.read().message
 
     def wrench(self) -> Mapping[str, float]:
-        """Return the wrench of the tool on the surroundings by axis, in N and N m."""
+        """Return the wrench of the tool on the surroundings: N or N m for each axis name."""
         values = self._status.wrench
         return {
             name: round(float(value), 3) for name, value in zip(AXIS_NAMES, values, strict=True)
@@ -235,7 +239,7 @@ class ForceMotions(Motions):
             changes: Entries of the contact to replace.
 
         Raises:
-            LevelError: There is no such contact, or it is impossible.
+            LevelError: There is no such contact, or it is invalid.
         """
         contact = self._program.contact.get(name)
         if contact is None:

@@ -112,7 +112,10 @@ class Contact:
         self.guard[:] = 0.0
 
     def find_objection(self, frame: Array, guard: Array) -> str:
-        """Return why guards in a frame are impossible at present. Empty if they are possible."""
+        """Return the reason why guards cannot be set at present, or an empty string.
+
+        While there are axes of force, guards must be given in the same task frame.
+        """
         if self.is_compliant and guard.any() and not self._is_frame(frame):
             return (
                 "the guard's frame is not that of the axes of force; permitted while complying: the"
@@ -121,7 +124,7 @@ class Contact:
         return ""
 
     def _is_frame(self, frame: Array) -> bool:
-        """Return True if `frame` is the present task frame; q and -q are the same orientation."""
+        """Return True if `frame` equals the present task frame. q and -q count as equal."""
         return bool(1.0 - abs(float((frame * self.frame).sum())) / norm(frame) < SAME)
 
     def fill_message(self, compliance: Compliance) -> None:
@@ -139,12 +142,12 @@ class Contact:
 
 
 def find_misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) -> str:
-    """Return why a task frame or a wrench in it is impossible. Empty if both are possible.
+    """Check a task frame and the wrenches given in it. Return what is invalid, or an empty string.
 
     Args:
-        frame: Orientation of the frame, as w, x, y, z.
+        frame: Orientation of the frame, as w, x, y, z. Its length must be 1.
         vectors: Wrenches, (6,) each.
-        most: Largest force, N, and torque, N m, of a contact.
+        most: Largest permitted force, N, and torque, N m, of a contact.
     """
     # Written so that NaN is rejected.
     if not abs(norm(frame) - 1.0) <= MAX_UNIT_ERROR:
@@ -166,7 +169,7 @@ class WristLevel(Executor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield a mismatch if the arm has no wrist sensor, and those of the base class."""
+        """Yield the mismatches of the base class, and one if the arm has no wrist sensor."""
         yield from super().find_mismatches(context, above, below)
         if context.robot.wrist is None:
             yield (

@@ -37,8 +37,8 @@ NO_FORCE = np.zeros((2, AXES))
 class ComplianceWatch:
     """Checks the commanded contact against the newest wrench in every cycle.
 
-    A guard is struck when the wrench on its axis exceeds the limit; that ends the motion, once for
-    each command.
+    A guard is struck when the wrench on its axis exceeds the limit. This ends the motion, but only
+    once for each command.
 
     Attributes:
         task: Axes of force, or None if there are none.
@@ -68,9 +68,9 @@ class ComplianceWatch:
         self.reason = ""
 
     def restore_guard(self, last: Reading[ForceStatus]) -> None:
-        """Restore the guard that was struck last, after a restart.
+        """After a restart, restore which guard was struck last.
 
-        A guard must not end the motion a second time.
+        It must not end the motion a second time.
 
         Args:
             last: Last `ForceStatus` of this board.
@@ -116,12 +116,12 @@ class ComplianceWatch:
                 self._check_guards(wanted)
 
     def _require_rest(self, reason: str) -> None:
-        """Let the motion end, for `reason`."""
+        """Require that the motion ends, and set `reason`."""
         self.must_rest = True
         self.reason = reason
 
     def _explain_missing_wrench(self, wrench: Reading[Wrench], tick: int) -> str:
-        """Return why the present contact is unknown, or an empty text if it is known."""
+        """Return why the present contact is unknown, or an empty string if it is known."""
         if not wrench.has_message or wrench.is_lost:
             return "no wrench from the board of the arm: waiting for it"
         if tick - self.sensed > self._oldest:
@@ -169,7 +169,7 @@ class ComplianceWatch:
 
 
 def find_objection(compliance: Compliance) -> str:
-    """Return why a command is invalid, or an empty text if it is valid."""
+    """Return the reason why a command is invalid, or an empty string if it is valid."""
     numbers = np.concatenate(
         (compliance.frame, compliance.wrench, compliance.speed, compliance.guard)
     )

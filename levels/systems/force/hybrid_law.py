@@ -117,13 +117,13 @@ class HybridLaw:
         self._there = ToolKinematics(cell)
         self._here = ToolKinematics(cell)
         self._by_joint = np.zeros((3, joints))
-        # dq, its velocity, and dq when no axis was of force last.
+        # dq, its velocity, and the last dq without axes of force.
         self._away, self._speed, self._base = self._by_joint
         self._by_axis = np.zeros((2, AXES))
         # Wrench fed forward, N, N m, in the world frame. Velocity on the axes of force, m/s, rad/s,
         # in the task frame.
         self._forward, self._forced = self._by_axis
-        # (3,), m: offset of the tool from its place without force control.
+        # (3,), m: offset of the tool from its position without force control.
         self.offset = np.zeros(3)
 
     def reset_offset(self) -> None:

@@ -110,7 +110,7 @@ class ServerWork(RequestWork):
         """End all requests with an error. The arm ramps to rest on the axes of motion.
 
         Args:
-            how: End to report.
+            how: How the requests end, to report.
             reason: Reason to report.
             code: Error code to report.
         """
@@ -145,7 +145,7 @@ class ServerWork(RequestWork):
         return params
 
     def _check_forces(self) -> None:
-        """Count how long forces have been within tolerance. End compliance if they never settle."""
+        """Update the time within tolerance. End compliance if forces do not settle in `reach`."""
         errors = self.compute_force_errors()
         current = self.agenda.current
         params = self._params
@@ -173,7 +173,7 @@ class ServerWork(RequestWork):
         self.interrupt_motion()
 
     def _find_request_error(self, request: MotionRequest) -> str:
-        """Return why a request is impossible, or an empty text if it is possible."""
+        """Return the reason why a request is invalid, or an empty string if it is valid."""
         wanted = WantedContact.from_record(request.record)
         frame = wanted.frame
         if request.kind == MotionKind.COMPLY:
@@ -277,7 +277,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
             self._since = self._now
 
     def _follow_boards(self) -> None:
-        """Process the statuses of the boards below, the contact and the client."""
+        """Process the statuses of the boards below and of the contact, and watch the client."""
         super()._follow_boards()
         for below in self.boards.values():
             if below.has_message:
@@ -331,7 +331,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         return (self._now - tick) * self.context.tick_s
 
     def _write_server_status(self, status: ServerStatus) -> None:
-        """Fill the fields of the status that a trajectory level's status does not have."""
+        """Fill those fields of the status that only a force and motion server has."""
         work = self._work
         force = work.force
         status.mode = self.mode

@@ -27,7 +27,7 @@ HELD = "held by the operator; `resume` releases it"
 class JointTorques(CommandsAbove):
     """Adds up the `JointTorque` messages of the boards above.
 
-    A message is 0 for joints that its board does not drive.
+    The values of a message are 0 for joints that its board does not drive.
 
     Attributes:
         torque: Torques of all boards, (joints,), N m.
@@ -73,9 +73,9 @@ class ArmExecutor(ArmDriver):
     """Drives an arm with the torques of the boards above: all of its joints, or none.
 
     While it reports `stopped`, these boards must bring the joints to rest and hold them. If they do
-    not do so in time, the arm is braked. A board that is lost or late brakes the arm, too. The
-    brakes are released when all boards have seen that the arm was braked; their torques then hold
-    it where it is. See `ArmDriver`.
+    not do so in time, the arm is braked. It is also braked if a board is lost or late. The brakes
+    are released when all boards have received the status that reports them; from that cycle their
+    torques hold the arm at its position. See `ArmDriver`.
     """
 
     joint_torques = Inputs(JointTorque, "above.command")
@@ -105,9 +105,9 @@ class ArmExecutor(ArmDriver):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield each joint, and the gripper, unless exactly one board above drives it.
+        """Yield a mismatch if a joint or the gripper is not driven by exactly one board above.
 
-        Also yields the mismatches of `ArmDriver`.
+        Also yield the mismatches of `ArmDriver`.
         """
         yield from super().find_mismatches(context, above, below)
         everything = context.robot.joints
@@ -169,10 +169,10 @@ class ArmExecutor(ArmDriver):
         return self.joints.wanted
 
     def _is_astray(self) -> bool:
-        """Return True if the boards above want the braked arm far from where it is.
+        """Return True if the boards above want the braked arm too far from its position.
 
-        This happens for two cycles when sensors are trusted again and show another position than
-        the estimated one.
+        This happens for two cycles when sensors are trusted again and their position differs from
+        the estimate.
         """
         distance = self.joints.wanted.position - self.sensors.position
         joint = int(np.abs(distance).argmax())
@@ -185,7 +185,7 @@ class ArmExecutor(ArmDriver):
         return True
 
     def _must_rest(self, stops: bool, tick: int) -> bool:
-        """Return True if the boards above have had enough time to bring the arm to rest.
+        """Return True if the time for the boards above to bring the arm to rest is over.
 
         Args:
             stops: The arm must stop.
@@ -198,7 +198,7 @@ class ArmExecutor(ArmDriver):
         return self._rest_by is not None and tick >= self._rest_by
 
     def brake_arm(self) -> None:
-        """Engage the brakes, until the boards above have seen the arm braked."""
+        """Engage the brakes until the boards above have received a status that reports them."""
         if self._braked_at is None:
             self._braked_at = self.arm.tick
         self._rest_by = None
@@ -219,7 +219,7 @@ class ArmExecutor(ArmDriver):
         return self.payload.mass > 0.0
 
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return how the arm follows the torques from above. The status reports it."""
+        """Return the report on the torques from above, which becomes a part of the status."""
         is_held = self.orders.is_holding
         reason = self.stopping.reason or self._waiting
         if is_held and not reason:

@@ -40,8 +40,8 @@ class JointGateway(Executor):
 
     A reference that does not arrive in time is extrapolated from the newest one at its velocity.
     After `missing` extrapolated references it passes none down, so the boards below ramp to rest
-    and hold; when references arrive again, these boards join them. To the level above, the boards
-    below appear as one.
+    and hold; when references arrive again, these boards follow them again. To the level above, the
+    boards below appear as one.
 
     Attributes:
         latency: Ticks that are added to the due tick of a reference.
@@ -89,7 +89,7 @@ class JointGateway(Executor):
         deliver_arrived(self._up, self.status, tick)
 
     def _take_reference(self, command: Reading[JointReference], tick: int) -> None:
-        """Put a new reference on the delayed link, and take the one that arrives."""
+        """Put a new reference on the delayed link, and accept the newest one that has arrived."""
         if command.is_new:
             self._down.append((tick + self._delay, bytes(command.message.raw)))
         deliver_arrived(self._down, self._newest, tick)
@@ -144,7 +144,7 @@ class JointGateway(Executor):
 
 
 def deliver_arrived(link: Link, message: Message, tick: int) -> None:
-    """Copy the newest message that has arrived by `tick`. Without one, `message` is unchanged.
+    """Replace `message` with the newest one that has arrived by `tick`, if there is one.
 
     Args:
         link: Link, from which arrived messages are removed.
@@ -173,11 +173,11 @@ class NetworkGatewayParams(GatewayParams):
 
 
 class NetworkGateway(JointGateway):
-    """Passes on references of another rack. They become due later by `delay`.
+    """Passes on references of another rack, and adds `delay` to the time at which they are due.
 
-    References must arrive within this time. Their due ticks count on the clock of the other rack,
-    whose time relative to this rack is in its `PeerPresence`. The board reports DONE or ERROR when
-    the program of the other rack does, so that it can end the run.
+    References must arrive within this delay. Their due ticks refer to the clock of the other rack;
+    its `PeerPresence` contains the difference between the clocks. The board reports DONE or ERROR
+    when the program of the other rack does, so that it can end the run.
     """
 
     above = Input(JointReference, "lan.reference")
@@ -221,13 +221,13 @@ class NetworkGateway(JointGateway):
             self.status.reason = program.reason
 
     def _follow_clock(self, ahead_s: float) -> None:
-        """Update the time of the other rack relative to this one, because their clocks drift apart.
+        """Update the difference between the clocks of the two racks, because they drift apart.
 
-        While references are followed it only changes in small steps, so that the motion does not
+        While references are followed, it only changes in small steps, so that the motion does not
         jolt.
 
         Args:
-            ahead_s: Newest time of the other rack relative to this one.
+            ahead_s: Newest time of the other rack minus the time of this one.
         """
         apart_s = ahead_s - self._their_s
         if not self._due:
@@ -237,9 +237,9 @@ class NetworkGateway(JointGateway):
             self._their_s += step_s if apart_s > 0.0 else -step_s
 
     def _take_reference(self, command: Reading[JointReference], tick: int) -> None:
-        """Pass a new reference on when the boards below need it, with its due tick on this clock.
+        """Convert a new reference to this rack's clock, and pass it on when the boards need it.
 
-        A reference that is due too far away is refused.
+        A reference that is due too far in the future or past is refused.
 
         Args:
             command: Newest reference and its verdict.
@@ -248,7 +248,7 @@ class NetworkGateway(JointGateway):
         if command.is_new:
             arrived = self._arrived
             arrived.copy_from(command.message)
-            arrived.operator = 0  # serials of the other rack's operators are unknown here
+            arrived.operator = 0  # serials of the other rack's operators have no meaning here
             self._refused = ""
             if arrived.due:
                 due_s = arrived.due * self._tick_s - self._their_s

@@ -47,7 +47,7 @@ class JointLoads:
         self._computed_at = np.full(joints, np.nan)
 
     def find_misfit(self, command: JointReference) -> str:
-        """Return the first field of a reference that exceeds the arm's limits, or an empty text."""
+        """Return the name of the first field beyond the arm's limits, or an empty string."""
         # Written so that NaN is rejected.
         within = {
             "position": (self._low <= command.position) & (command.position <= self._high),
@@ -67,7 +67,7 @@ class JointLoads:
         return bool(mass >= 0.0 and (np.abs(bias) <= self._most).all())
 
     def take_reference(self, command: JointReference, tick: int) -> None:
-        """Begin to interpolate to the loads of a `JointReference`, until it is due."""
+        """Interpolate from the present loads to the loads of a reference, which apply when due."""
         self.table[AT] += self.compute_passed_part(tick) * (self.table[DUE] - self.table[AT])
         self.table[DUE] = command.inertia, command.load
         self._begin = tick
@@ -76,7 +76,7 @@ class JointLoads:
         self._computed_at[:] = np.nan
 
     def compute_passed_part(self, tick: int) -> float:
-        """Return the part of the present interval between references that has passed, 0 to 1."""
+        """Return the fraction of the interval between references that has passed, 0 to 1."""
         return 1.0 if tick >= self._due else (tick - self._begin) / (self._due - self._begin)
 
     def compute_at_rest(self, position: Array) -> None:
@@ -114,7 +114,7 @@ def servo_joints(
         constants: Stiffness, damping, dry friction, torque limits, and 1 for each joint of this
             board.
         loads: Inertia and load at the start of an interval and at its end.
-        part: Part of the interval that has passed.
+        part: Fraction of the interval that has passed.
         cycle_s: Time until the torques act.
         age_s: Age of the sample at that time.
         arm: Sampled positions and velocities.

@@ -49,8 +49,8 @@ class JointServo(Executor):
     """Follows references with the torques of some joints; other boards drive the others.
 
     Set points are interpolated for all joints, so that all of them come to rest at the same time
-    even if different boards drive them. While the arm is braked, motion begins where it is. While
-    the arm reports `stopped`, the joints come to rest.
+    even if different boards drive them. While the arm is braked, the set point is its position.
+    While the arm reports `stopped`, the joints come to rest.
     """
 
     above = Input(JointReference, "above.command")
@@ -110,7 +110,7 @@ class JointServo(Executor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield invalid joints, a board that drives nothing, and unsuitable modifications."""
+        """Yield a mismatch for each invalid joint and modification, or if nothing is driven."""
         params = read_params(JointServoParams, context.params)
         known = context.robot.joints
         named = known if params.joints is None else params.joints
@@ -173,7 +173,7 @@ class JointServo(Executor):
         operator.orders.fill_status(self.status, self._rests_on)
 
     def _obey_command(self, command: OperatorCommand) -> str:
-        """Switch a modification or set a parameter. Return why it is refused, or an empty text."""
+        """Switch a modification or set a parameter. Return why that failed, or an empty string."""
         if command.what == Operation.MODIFY:
             return self._modified.switch_modification(command.name, command.goal == Goal.ON)
         self.settings, refusal = set_live(self.settings, command.name)
@@ -186,8 +186,8 @@ class JointServo(Executor):
         """Replace the torques just computed with the torques of the modified law.
 
         Args:
-            times: Passed part of the interval, time until the torques act, s, and age of the
-                sample, s.
+            times: Fraction of the interval that has passed, time until the torques act, s, and age
+                of the sample at that time, s.
             wanted: Motion to follow.
             tick: Tick of the cycle.
         """

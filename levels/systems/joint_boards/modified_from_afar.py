@@ -139,7 +139,8 @@ class ModifiedFromAfar(JointServo):
                 for name in sorted(wanted ^ self._asked)
                 if (refusal := self._modified.switch_modification(name, name in wanted))
             }
-            # Refused modifications are requested again and again; every answer reports the refusal.
+            # A refused modification is tried again with every message, so that every answer reports
+            # the refusal.
             self._asked = wanted.difference(refused)
             self.modified.echo = self.asked.message.id
             self.modified.error = len(refused)
