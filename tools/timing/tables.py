@@ -169,7 +169,10 @@ def format_side(value: float, unit: str) -> str:
 
 
 def _build_response_table(responses: Iterable[TaskResponse]) -> TextTable:
-    """Build a table with a row per task that shares a core, with its worst case by priority."""
+    """Build a table with the worst-case response of each task that shares a core.
+
+    Its rows are sorted by core, then by descending priority.
+    """
     rows: Iterable[Row] = (
         {
             "core": response.core,

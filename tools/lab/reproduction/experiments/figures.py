@@ -57,7 +57,7 @@ class FigureRack:
 
     @cached_property
     def schedule(self) -> Schedule:
-        """Schedule that follows from the budget."""
+        """Schedule computed from the budget."""
         return Schedule(self.rack, resolve_layout(self.rack), {})
 
     @property
@@ -74,7 +74,7 @@ class FigureRack:
 
     @property
     def window_ns(self) -> int:
-        """Length of the charts, in ns."""
+        """Duration that the charts show, in ns."""
         return self.cycles * self.rack.find_period(LEVEL) * self.rack.clock_ns
 
     def build_panel(self) -> Panel:
@@ -179,7 +179,7 @@ def _measure_figure(figure: FigureRack, workshop: Workshop) -> FigureRun:
 
 
 def _count_updates_around(updates: np.ndarray, times_ns: np.ndarray) -> int:
-    """Return the number of updates of a plan that contain one of these times."""
+    """Return the number of plan updates during which at least one of `times_ns` occurred."""
     first, last = (np.searchsorted(times_ns, updates[field]) for field in ("process_ns", "end_ns"))
     return int(np.count_nonzero(last > first))
 

@@ -97,7 +97,7 @@ def parse_response(report: Mapping[str, Any] | None) -> SystemResponse | None:
 
 
 def _parse_way_response(direction: Mapping[str, Any]) -> WayResponse:
-    """Return the response in one direction, from its part of a report."""
+    """Return the response in one direction from its entry in a report."""
     delays = [beyond["delayed_by"] for beyond in direction["beyond"]]
     times = direction["measured_ms"]
     return WayResponse(
@@ -221,8 +221,8 @@ def _compute_missed_share(*recordings: Recording) -> float:
 def _measure_two_racks(later_ms: int, workshop: Workshop) -> NetworkRun:
     """Run Brown's racks with a network that is slower by `later_ms`.
 
-    Two recorders share two cores with eight boards and may lose records. The run is then repeated,
-    up to `MAX_ATTEMPTS` runs in total.
+    Two recorders share two cores with eight boards and may lose records. A run with lost records is
+    repeated, up to `MAX_ATTEMPTS` runs in total.
     """
     lost: list[str] = []
     for attempt in range(1, MAX_ATTEMPTS + 1):
@@ -312,9 +312,9 @@ def _compute_response_ms(general: Recording, servo: Recording) -> float | None:
 
 
 def _find_first_ns(recording: Recording, box: str, field: str) -> int | None:
-    """Return when the first message that names the modification became visible, in ns.
+    """Return the time, in ns, at which a message that names the modification first became visible.
 
-    It is CLOCK_MONOTONIC time, or simulated time in lockstep.
+    It is CLOCK_MONOTONIC time, or simulated time in lockstep. None if there is no such message.
     """
     is_named = [MODIFICATION in str(text) for text in recording.read_signal(box, field)]
     ticks = recording.read_signal(box, "visible_at")[is_named]
