@@ -58,7 +58,7 @@ class JudgedConfig:
         }
 
     def try_change(self, board: str, settings: Settings) -> Change | None:
-        """Change the settings of a board, and load and judge the new config.
+        """Change the settings of a board, and load and evaluate the new config.
 
         Returns:
             The change. None if the new config is invalid.

@@ -120,7 +120,7 @@ class Grasp:
 
     @property
     def object_position(self) -> Array:
-        """Position of the object, (3,), in m: as sensed, or its anchor if it is not sensed."""
+        """Sensed position of the object, (3,), in m, or its anchor if it is not sensed."""
         return self.anchor if self.object is None else self.object.position
 
     @property
@@ -299,7 +299,7 @@ class GrippingWork(StepWork):
         self.apply_grip()
 
     def apply_grip(self) -> None:
-        """Apply the current grip. Raises `Refused` if the object is lost."""
+        """Set the target forces to those of the grip. Raises `Refused` if the object is lost."""
         grasp = self.grasp
         params = grasp.params
         close = grasp.close

@@ -147,7 +147,7 @@ class HandLoop(Executor):
         self.orders.fill_status(self.status, self.followed.operator)
 
     def compute_sample_age_s(self, hand: HandStatus, tick: int) -> float:
-        """Return the age, in s, of a sample of the hand when the command of this cycle acts."""
+        """Return the age of a hand sample, in s, when the command of this cycle takes effect."""
         return float(
             (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
         )

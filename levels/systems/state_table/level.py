@@ -409,7 +409,7 @@ class StateTableExecutor(Executor):
         elif reason and self.detail:
             reason = f"{reason}: {self.detail}"
         if row.next == SAME and state is State.ERROR and status.state == state:
-            # A row that stays in an error keeps the first reason, with its detail from below.
+            # While a row stays in an error, keep the first reason with its detail from below.
             reason = status.reason
         is_operators, serial, words = self._taken
         status.ordered = 0

@@ -276,7 +276,7 @@ class JointLeg:
 class ToolLeg:
     """A straight line of the tool with a constant rate of turn, to a goal that may move.
 
-    Inverse kinematics stays on the branch of the start.
+    Inverse kinematics stays on the branch of the first joint positions.
     """
 
     def __init__(

@@ -43,7 +43,8 @@ class SampledMotion:
     Position and velocity are continuous, and every joint stays within its limits.
 
     Attributes:
-        leg: Current or completed leg. None if the arm is stopping, or has stopped elsewhere.
+        leg: Current or completed leg. None if the arm is stopping, or has stopped without reaching
+            a goal.
         time_s: Time of the current sample, s.
     """
 

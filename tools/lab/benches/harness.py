@@ -192,8 +192,8 @@ class Comparison:
         name: Name of the bench in the command, one word.
         title: Description of the measured quantity.
         samples: Samples of all cases and contestants.
-        baselines: Contestant of each case with which the others are compared. A case without a
-            baseline has no ratios.
+        baselines: Dictionary from cases to the contestants with which the others are compared. A
+            case without a baseline has no ratios.
         absent: Contestants that are not available.
         conclusion: Conclusion from the figures, in one line. Empty if there is none.
     """

@@ -46,8 +46,8 @@ def measure_launches(
 
     Args:
         name: Config of the rack, by name or path.
-        rounds: Rounds of launches and commands.
-        kills: Kills of the board that drives the arm.
+        rounds: Number of rounds of launches and commands.
+        kills: Number of kills of the board that drives the arm.
         against: Another checkout, launched alternately. None if there is none.
         share: Whether to run racks even on cores that another one uses.
         progress: Shows both parts.

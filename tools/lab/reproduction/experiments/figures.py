@@ -88,7 +88,7 @@ class FigureRack:
 
 
 def build_settings(name: str, process_ms: float) -> tuple[str, ...]:
-    """Return the settings that give the executor of a figure a certain X.
+    """Return the settings that change X of a figure's executor.
 
     They change both the budget and the parameters of the board.
 
@@ -148,7 +148,7 @@ class FigureRun(ChartedRecord):
     """A run of a figure.
 
     Attributes:
-        tasks: Number of jobs and late jobs by task.
+        tasks: Dictionary from tasks to their numbers of jobs and late jobs.
         met: Number of updates of the plan during which the executor was released.
         preempted: Number of updates of the plan during which the executor began.
     """

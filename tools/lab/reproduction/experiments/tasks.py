@@ -67,7 +67,7 @@ class WayResponse:
     """Response in one direction, ms of simulated time.
 
     Attributes:
-        longest_ms: Longest measured response. None if no message went all the way.
+        longest_ms: Longest measured response. None if no response was measured.
         bound_ms: Longest response on the grid.
         unexplained: Number of responses beyond the bound that no missed cycle delayed.
     """
@@ -79,7 +79,10 @@ class WayResponse:
 
 @dataclass(frozen=True)
 class SystemResponse:
-    """Response of a rack by direction, "command" and "status", and the sum of equation 3.3, ms."""
+    """Response of a rack in each direction, and the sum of equation 3.3, ms.
+
+    The directions are "command" and "status".
+    """
 
     sum_eq_3_3_ms: float
     ways: dict[str, WayResponse]
@@ -115,7 +118,7 @@ class TaskRun:
         ended: Reason for its end.
         lasted_s: Simulated time, s.
         missed: Fraction of all cycles that were missed or skipped.
-        messages: Number of messages by mailbox.
+        messages: Dictionary from mailboxes to numbers of messages.
         response: Response of the system. None if it has no bounded response.
     """
 
