@@ -87,7 +87,7 @@ class FigureExecutor(FigureLoop):
 
 
 class FigurePlanner(Planner):
-    """Planner that consumes the processor time P per plan and always wants the next plan."""
+    """Planner that consumes the processor time P per plan and plans without a pause."""
 
     status = Input(FigureStatus, "own.status")
     output = Output(FigurePlan)
@@ -99,7 +99,7 @@ class FigurePlanner(Planner):
         self._time_ns = round(read_params(FigureParams, context.params).plan_ms * NS_PER_MS)
 
     def wanted(self, tick: int) -> bool:
-        """Return True: the next plan is wanted as soon as the last one is finished."""
+        """Return True, so that the next plan begins as soon as the last one is finished."""
         return True
 
     def plan(self, tick: int) -> None:

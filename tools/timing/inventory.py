@@ -36,7 +36,7 @@ def build_inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Doc
     Addresses and sizes are in bytes. `slice_ms` of a task and `delay_ms` of a mailbox are the time
     from a release until the messages are visible. `depth` is the number of slots of a mailbox,
     `size` the size of one message, and `capacity` the largest number of unread messages in a queue,
-    or 0.
+    or 0 for other mailboxes.
 
     Args:
         config: Config of the rack.
@@ -102,7 +102,7 @@ def build_inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Doc
 
 
 def _describe_patience(config: RackConfig, layout: Layout) -> Iterator[Document]:
-    """Yield how long each arm or hand continues without a new torque, and how far it moves."""
+    """Yield how long each arm or hand continues without new torques, and how far it can move."""
     for board in [box.writer for box in layout.mailboxes if box.message == "arm_state"]:
         cell = build_rack_cell(config)
         every = config.find_period(board)
@@ -120,7 +120,7 @@ def _describe_patience(config: RackConfig, layout: Layout) -> Iterator[Document]
 
 
 def _describe_monitors(config: RackConfig) -> Iterator[Document]:
-    """Yield the largest sensor errors that an arm accepts before it is braked, for each joint."""
+    """Yield, for each arm, the largest sensor error of each joint that does not brake the arm."""
     robot = config.robot
     if robot is None:
         return
@@ -219,7 +219,7 @@ def format_inventory(data: Document) -> Blocks:
 
 
 def _format_hosts(hosts: Sequence[Document]) -> Blocks:
-    """Yield a table of the host boards, which have no rate and no place in the timing model."""
+    """Yield a table of the host boards, which have no rate and are not in the timing model."""
     if hosts:
         rows = [
             {

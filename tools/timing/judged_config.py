@@ -39,7 +39,7 @@ class JudgedConfig:
 
     @classmethod
     def judge(cls, config: RackConfig, budgets: Mapping[str, Budget] | None = None) -> JudgedConfig:
-        """Resolve a config and judge it by `budgets`, or by its own budgets if they are None.
+        """Resolve a config and evaluate its timing with `budgets`, or with its own budgets if None.
 
         Raises:
             ConfigError: If the config is invalid.
@@ -50,7 +50,7 @@ class JudgedConfig:
 
     @property
     def budgets(self) -> dict[str, Budget]:
-        """Known budgets by board."""
+        """Dictionary from board names to known budgets."""
         return {
             name: board.budget
             for name, board in self.timing.boards.items()
@@ -58,7 +58,7 @@ class JudgedConfig:
         }
 
     def try_change(self, board: str, settings: Settings) -> Change | None:
-        """Change the settings of a board, and load and judge the new config.
+        """Change the settings of a board, and load and evaluate the new config.
 
         Returns:
             The change. None if the new config is invalid.

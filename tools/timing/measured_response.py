@@ -72,7 +72,9 @@ def _measure_response(recording: Recording, rack: RackTiming, chains: ParallelCh
 def _judge_direction(
     recording: Recording, rack: RackTiming, chains: Sequence[Sequence[str]], levels: Sequence[str]
 ) -> Document:
-    """Judge the response along chains, from the first board's release to the last one's cycle.
+    """Compare the responses along chains with their bound.
+
+    A response lasts from the first board's release to the last board's cycle.
 
     Args:
         recording: Recording of the run.
@@ -159,7 +161,7 @@ def _measure_chain(
 def _list_delays(
     recording: Recording, levels: Sequence[str], since: int, until: int
 ) -> Iterator[str]:
-    """Yield the faults, losses and misses of some boards between two ticks.
+    """Yield a text for each fault, lost board and board with late cycles between two ticks.
 
     Args:
         recording: Recording of the run.

@@ -228,7 +228,7 @@ def _find_answers(
 ) -> Iterator[AnsweredCommand]:
     """Yield the commands given to a level.
 
-    Each has the first cycle of the lowest level that depends on it, if there is one.
+    Each contains the first cycle of the lowest level that depends on it, if any.
 
     Args:
         recording: Recording of the run.

@@ -39,8 +39,8 @@ class Repair:
     """Changes that make a rack fit.
 
     Attributes:
-        steps: Alternative changes for one board each, cheapest first. A step builds on the first
-            change of the previous step.
+        steps: Each step contains alternative changes of one board, cheapest first. It builds on the
+            first change of the previous step.
         end: The rack after the last step.
     """
 
@@ -120,7 +120,8 @@ def find_changes(rack: JudgedConfig, board: str) -> list[Change]:
 
     Priorities and cores already in use are cheapest, then new slots and cores, then older plans and
     longer cycles by their factor. The cycle may be that of another board on the same core. If no
-    single change helps, another place for the planner is combined with a longer cycle.
+    single change helps, loose coupling of the planner on another core is combined with a longer
+    cycle.
     """
     changes = [*_find_own_changes(rack, board), *_find_changes_of_others(rack, board)]
     if not changes:
@@ -133,13 +134,13 @@ def find_changes(rack: JudgedConfig, board: str) -> list[Change]:
 
 
 def _find_own_changes(rack: JudgedConfig, board: str) -> Iterator[Change]:
-    """Yield the smallest helpful change of each kind to the board itself."""
+    """Yield the smallest helpful change of each kind to the board's own settings."""
     older = [{"within_cycles": d} for d in _list_plan_cycles(rack.timing.build_level(board))]
     cores = [{"core": core} for core in _list_other_cores(rack, rack.config.board[board].core)]
     places = list(_list_planner_places(rack, board))
     planner = _try_each(rack, board, places)
     if planner is None:
-        # Another place alone is not enough. Try it with more cycles for a plan.
+        # Moving the planner is not enough. Try it with more cycles for a plan.
         moves = (_search_first(rack, board, [{**d, **place} for d in older]) for place in places)
         planner = _find_cheapest(moves)
     kinds = (
@@ -213,7 +214,7 @@ def _list_longer_cycles(
     Args:
         rack: Rack to change.
         board: Board to change.
-        place: Settings for another place of its planner. None to keep the place.
+        place: Settings that move its planner. None to leave it where it is.
     """
     every = rack.timing.boards[board].every
     timing = rack.timing if place is None else rack.timing.replace_board(board, coupling="loose")
@@ -237,7 +238,7 @@ def _list_longer_cycles(
 
 
 def _list_planner_places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
-    """Yield the settings of each place where the board's planner could be loosely coupled."""
+    """Yield settings that couple the board's planner loosely, one for each core it could use."""
     slot = rack.config.board[board].planner_slot
     if slot is None:
         tables = rack.config.board.values()

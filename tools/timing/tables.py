@@ -109,7 +109,7 @@ def _format_frame_numbers(frames: Sequence[int], count: int) -> str:
 
 
 def build_level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> TextTable:
-    """Build a table with a row per level: its cycle, the parts of it, and the residual, in ms.
+    """Build a table with the cycle of each level, the parts of the cycle and the residual, in ms.
 
     Args:
         levels: Levels, each with a word for the first column after its name.
@@ -169,7 +169,10 @@ def format_side(value: float, unit: str) -> str:
 
 
 def _build_response_table(responses: Iterable[TaskResponse]) -> TextTable:
-    """Build a table with a row per task that shares a core, with its worst case by priority."""
+    """Build a table with the worst-case response of each task that shares a core.
+
+    Its rows are sorted by core, then by descending priority.
+    """
     rows: Iterable[Row] = (
         {
             "core": response.core,

@@ -110,7 +110,7 @@ class HandExecutor(Executor):
                 yield "above", [other.board for other in above], why
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Replace the set of torn tendons. Faults for joints that the hand lacks have no effect."""
+        """Tear the tendons in `faults` and mend all others. Unknown joints are ignored."""
         joints = np.arange(len(self.hand.hand.arms))
         torn = np.zeros((2, len(joints)), dtype=bool)
         self._torn = {}
@@ -122,7 +122,7 @@ class HandExecutor(Executor):
         self.hand.tear_tendons(torn)
 
     def process(self, tick: int) -> None:
-        """Advance the hand to `tick`, read its sensors, command the valves and report."""
+        """Advance the hand to `tick`, read its sensors, command the valves and write the status."""
         hand = self.hand
         # Advance the hand to tick. A restarted board first restores it.
         if not self._started:
@@ -147,7 +147,7 @@ class HandExecutor(Executor):
             hand.look(self.scene)
 
     def _command_valves(self, tick: int) -> None:
-        """Apply the tensions of the boards above, or close the valves and note the reason."""
+        """Apply the tensions of the boards above, or close the valves and store the reason."""
         since = self._closed_at if self._opened else 0
         self._waiting = self.wanted_tensions.find_missing(self.tensions, tick, since or 0)
         if not self._waiting:
@@ -224,7 +224,10 @@ class SlackMonitor:
         self.note = ""  # text that lists the slack tendons, empty without any
 
     def check_tensions(self, tension: Array, wanted: Array) -> list[Finding]:
-        """Return a finding for each tendon that counts as torn from this cycle on.
+        """Return a finding for each tendon that is detected as torn in this cycle.
+
+        A tendon counts as torn after `SLACK_CYCLES` successive cycles in which it is slack although
+        tension is commanded.
 
         Args:
             tension: Sensed tensions, (2, joints), N.
@@ -261,7 +264,10 @@ class Tensions(CommandsAbove):
         self.rests_on = 0  # serial of the newest operator command on which the tensions depend
 
     def merge_commands(self, tensions: Mapping[str, Reading[TensionCommand]]) -> None:
-        """Merge the tensions of all boards. Call this only if `find_missing` returned no reason."""
+        """Merge the commands of all boards into `tension`.
+
+        Call this only if `find_missing` has found no missing command.
+        """
         self.rests_on = 0
         for board in self.oldest:
             value = tensions[board].message
@@ -272,8 +278,8 @@ class Tensions(CommandsAbove):
         """Limit `tension` to its range, and reject it if it contains NaN.
 
         Returns:
-            The finding if a tension was limited or is NaN, else None; and the reason for rejecting
-            the tensions, empty if they are accepted.
+            The finding, or None if every tension is in range; and the reason for rejecting the
+            tensions, empty if they are accepted.
         """
         tension = self.tension
         low = self._low

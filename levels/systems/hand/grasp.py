@@ -126,7 +126,7 @@ class GraspExecutor(Executor):
             yield "above", [], "a step 'close' without points needs a planner of grasps there"
 
     def process(self, tick: int) -> None:
-        """Read fingers and object, continue the current step, write targets and status."""
+        """Read fingers and object, continue the current step, and write targets and status."""
         grasp = self._grasp
         self._orders.take_commands(self.operator)
         grasp.fingers.read_statuses(self.fingers)
@@ -159,7 +159,7 @@ class GraspExecutor(Executor):
         self._fill_status(self.status, waits)
 
     def _find_row(self, close: CloseStep) -> int:
-        """Return the row in the world model of the object of a CLOSE step."""
+        """Return the index of a CLOSE step's object in the world model."""
         return self.context.scene.objects.index(close.object)
 
     def _join_posture(self, posture: Posture) -> Array:
@@ -235,7 +235,7 @@ class GraspExecutor(Executor):
         self._work = WORKS[type(step)](grasp, step, self._elapsed_s)
 
     def _adopt_close_step(self, close: CloseStep) -> None:
-        """Set up the grip for the fingers of a CLOSE step."""
+        """Make `close` the current CLOSE step and build the grip for its fingers."""
         grasp = self._grasp
         gripping = np.array([name in close.points for name in grasp.names])
         grasp.close = close
@@ -243,7 +243,7 @@ class GraspExecutor(Executor):
         grasp.grip = HandGrip(grasp.params, gripping, self._opposing, self.context.period_s)
 
     def _prepare_step(self, index: int) -> Step:
-        """Return a step with its plan values filled in and its displacement in the palm frame."""
+        """Return a step to execute, with the plan's values and displacements in the palm frame."""
         step = self._program.step[index]
         plan = self._plan
         if isinstance(step, ShiftStep):

@@ -152,7 +152,7 @@ class GraspProgram(Program):
 
 
 def _check_posture(key: str, posture: Posture, hand: HandConfig) -> Mismatches:
-    """Yield unknown fingers, missing fingers, and fingers with a wrong number of values."""
+    """Yield a mismatch for each unknown or missing finger and each wrong number of joint values."""
     names = {finger.name: len(finger.joints) for finger in hand.finger}
     for name, values in posture.items():
         if name not in names:
@@ -174,7 +174,10 @@ def _check_posture(key: str, posture: Posture, hand: HandConfig) -> Mismatches:
 def _check_close_step(
     key: str, step: CloseStep, opposing: str, names: list[str], scene: SceneConfig
 ) -> Mismatches:
-    """Yield an unknown object, unknown fingers, and points that lack an opposed pair."""
+    """Yield a mismatch for an unknown object or finger, and for an incomplete set of points.
+
+    There must be a point for the opposing finger and for at least one other finger.
+    """
     if step.object not in scene.objects:
         yield (
             f"{key}.object",

@@ -120,7 +120,7 @@ class Grasp:
 
     @property
     def object_position(self) -> Array:
-        """Position of the object, (3,), in m: as sensed, or its anchor if it is not sensed."""
+        """Sensed position of the object, (3,), in m, or its anchor if it is not sensed."""
         return self.anchor if self.object is None else self.object.position
 
     @property
@@ -133,7 +133,7 @@ class StepWork(ABC):
     """Execution of one step.
 
     Args:
-        grasp: State that all steps share; `grasp.target` is filled.
+        grasp: State that all steps share. The step fills `grasp.target`.
         step: The step of the program.
         resumed_s: Time for which the step was executed before a restart, s.
     """
@@ -146,7 +146,7 @@ class StepWork(ABC):
 
     @abstractmethod
     def set_start(self) -> None:
-        """Take the current state as the start of the step."""
+        """Store the current state as the start of the step."""
 
     @abstractmethod
     def run(self, elapsed_s: float) -> bool:
@@ -191,7 +191,7 @@ class PreshapeWork(StepWork):
         self._posture = self.grasp.postures[self.step.posture]
 
     def run(self, elapsed_s: float) -> bool:
-        """Move the joints towards the posture."""
+        """Move the joints towards the posture. Returns True when they have reached it."""
         grasp = self.grasp
         target = grasp.target
         part, rate = self.find_progress(elapsed_s)
@@ -239,7 +239,7 @@ class CloseWork(StepWork):
         self._touch = step.touch / min(grasp.grip.shares[grasp.grip.fingers])
 
     def run(self, elapsed_s: float) -> bool:
-        """Move the tips that do not touch the object yet."""
+        """Move the tips that do not touch the object yet. Returns True when all touch it."""
         grasp = self.grasp
         target = grasp.target
         part = min((elapsed_s - self.resumed_s) / self._seconds, 1.0)
@@ -265,7 +265,7 @@ class CloseWork(StepWork):
         return not missing
 
     def _hold_contact(self, finger: int, force: Array) -> None:
-        """Make a tip act as a spring about its position and press with `force`, (3,), in N."""
+        """Keep a tip at its current position, as a spring that presses with `force`, (3,), in N."""
         grasp = self.grasp
         target = grasp.target
         target.mode[finger] = FingerMode.FORCE
@@ -299,7 +299,7 @@ class GrippingWork(StepWork):
         self.apply_grip()
 
     def apply_grip(self) -> None:
-        """Apply the current grip. Raises `Refused` if the object is lost."""
+        """Set the target forces to those of the grip. Raises `Refused` if the object is lost."""
         grasp = self.grasp
         params = grasp.params
         close = grasp.close
@@ -325,8 +325,8 @@ class GrippingWork(StepWork):
 class SqueezeWork(GrippingWork):
     """Raises the grip force.
 
-    The object settles between the fingers. Its position at the end becomes its anchor, which is its
-    target position from then on.
+    The object settles between the fingers. Its position at the end of the step becomes its anchor,
+    the position at which later steps keep it.
     """
 
     step: SqueezeStep
@@ -337,7 +337,7 @@ class SqueezeWork(GrippingWork):
         self._from = self.grasp.base
 
     def run(self, elapsed_s: float) -> bool:
-        """Raise the grip force."""
+        """Set the grip force for `elapsed_s`. Returns True when it has reached `step.grip`."""
         grasp = self.grasp
         part, _ = self.find_progress(elapsed_s)
         grasp.anchor[:] = grasp.object_position
@@ -352,14 +352,14 @@ class ShiftWork(GrippingWork):
     step: ShiftStep
 
     def set_start(self) -> None:
-        """Start with the remaining displacement."""
+        """Compute the remaining displacement, which is shorter than `step.by` after a restart."""
         super().set_start()
         done, _ = minimum_jerk(self.resumed_s / self.step.seconds)
         self._way = (1.0 - done) * np.array(self.step.by)
         self._part = 0.0
 
     def run(self, elapsed_s: float) -> bool:
-        """Shift the anchor and the tips by the progress of this cycle."""
+        """Shift the anchor and the tips. Returns True when the shift is complete."""
         grasp = self.grasp
         target = grasp.target
         part, rate = self.find_progress(elapsed_s)
@@ -378,7 +378,7 @@ class HoldWork(GrippingWork):
     step: HoldStep
 
     def run(self, elapsed_s: float) -> bool:
-        """Hold the object."""
+        """Hold the object. Returns True after `step.seconds`."""
         self.keep_grip()
         return elapsed_s >= self.step.seconds
 
@@ -397,7 +397,7 @@ class ReleaseWork(StepWork):
         self._out = grasp.grip.find_outward_directions(grasp.fingers.tip)
 
     def run(self, elapsed_s: float) -> bool:
-        """Reduce the forces in the first half of the time, and withdraw the tips in the second."""
+        """Reduce the forces, then withdraw the tips. Returns True when they are withdrawn."""
         grasp = self.grasp
         target = grasp.target
         half = 0.5 * self.step.seconds
@@ -429,4 +429,4 @@ WORKS: dict[type[Table], type[StepWork]] = {
     HoldStep: HoldWork,
     ReleaseStep: ReleaseWork,
 }
-"""Class that executes a step, by the class of the step."""
+"""Dictionary from the class of a step to the class that executes it."""

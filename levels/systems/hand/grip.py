@@ -86,7 +86,11 @@ class HandGrip:
         self.force = max(wanted, self.force - FALL_N_S * self._period_s)
 
     def recover_position(self, away: Array) -> None:
-        """Integrate the displacement `away`, (3,), in m, of the object from its anchor."""
+        """Adjust the load to pull the object back to its anchor (integral control).
+
+        Args:
+            away: Displacement of the object from its anchor, (3,), m.
+        """
         self.load -= self._gains.recover * self._period_s * away
         excess = norm(self.load)
         if excess > self._gains.most_load:

@@ -307,7 +307,8 @@ class TendonGains(Table):
 class TendonLaw:
     """Computes the tensions for some joints of a hand.
 
-    The corrections of the valves are not saved. A restarted board learns them again.
+    The learned corrections of the valves are not saved, therefore a restarted board learns them
+    again.
     """
 
     def __init__(self, hand: Hand, driven: Mask, gains: TendonGains, context: LevelContext) -> None:

@@ -112,7 +112,7 @@ class HandLoop(Executor):
 
     @abstractmethod
     def start_from(self, hand: HandStatus) -> None:
-        """Start from the first `HandStatus`, or continue from the level's own last messages."""
+        """Start from the first `HandStatus`, or after a restart from the last messages."""
 
     @abstractmethod
     def follow_command(self, hand: HandStatus, tick: int) -> None:
@@ -147,7 +147,7 @@ class HandLoop(Executor):
         self.orders.fill_status(self.status, self.followed.operator)
 
     def compute_sample_age_s(self, hand: HandStatus, tick: int) -> float:
-        """Return the age, in s, of a sample of the hand when the command of this cycle acts."""
+        """Return the age of a hand sample, in s, when the command of this cycle takes effect."""
         return float(
             (min(tick - hand.tick, self._oldest) + self.context.every) * self.context.tick_s
         )
@@ -160,7 +160,7 @@ class HandLoop(Executor):
         return min(tick - self._taken, self._period) * self.context.tick_s
 
     def _take_command(self, command: Reading[RelayedCommand], tick: int) -> None:
-        """Accept a new command, unless an operator holds the loop."""
+        """Copy a new, finite command to `followed`. During a hold, zero its velocities instead."""
         released = self._held
         self._held = self.orders.is_holding
         if self._held:
@@ -244,7 +244,7 @@ class FingertipLoop(HandLoop):
         self._law = FingertipLaw(kinematics, range(len(self.driven)), gains, context.period_s)
 
     def start_from(self, hand: HandStatus) -> None:
-        """Start at the current joint positions, or at the last targets."""
+        """Start at the last targets after a restart, otherwise at the current joint positions."""
         last = self.last.message
         begin = last if self.last.has_message and last.active else hand
         self._law.start(begin.position)
@@ -296,8 +296,8 @@ class JointLoop(HandLoop):
 class TendonLoop(HandLoop):
     """Commands a tension for each tendon in every cycle. See `TendonLaw`.
 
-    The command names the status of the hand on which the torques depend, so that the hand also
-    detects the loss of the joint loop.
+    Each command contains the tick of the oldest hand status on which it depends, so that the hand
+    also detects the loss of the joint loop.
     """
 
     above = Input(TendonTorque, "above.command")

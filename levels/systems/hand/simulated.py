@@ -138,10 +138,10 @@ class SimulatedHand(Simulation):
             self._data.time = self._now_s
 
     def _simulate_tick(self) -> None:
-        """Simulate one tick. Tensions behind closed valves, and their controls, follow the joints.
+        """Simulate one tick. While the valves are closed, the tensions follow the joints.
 
-        Controls may become negative, although MuJoCo limits them to 0: a slack tendon is then tight
-        again at the position at which it became slack.
+        The stored controls may be negative, which MuJoCo clamps to 0. A slack tendon therefore
+        becomes tight at the same joint position at which it became slack.
         """
         if not self.braked:
             super()._simulate_tick()

@@ -100,7 +100,7 @@ class GraspPlanner:
         self._bases = self._data.xanchor[cell.model.dof_jntid[cell.dof[first]]].copy()
 
     def plan(self, row: int, position: Array, quaternion: Array) -> PlannedGrasp | None:
-        """Return the best grasp of an object, or None if no line is possible.
+        """Return the grasp farthest from the joint limits, or None if none is feasible.
 
         Args:
             row: Index of the object in the scene.
@@ -118,7 +118,7 @@ class GraspPlanner:
         return max(grasps, key=lambda grasp: grasp.margin, default=None)
 
     def _plan_along_line(self, row: int, angle: float) -> PlannedGrasp | None:
-        """Return the grasp along a line across the palm, or None if it is impossible.
+        """Return the grasp that closes along a line across the palm, or None if it is not feasible.
 
         Args:
             row: Index of the object in the scene.
@@ -154,7 +154,7 @@ class GraspPlanner:
         )
 
     def _find_contact(self, row: int, base: Array, way: Array) -> Array | None:
-        """Return the point at which a ray first meets the object, (3,), in m; None if it misses.
+        """Return the point at which a ray first meets the object, (3,), in m, or None.
 
         Args:
             row: Index of the object in the scene.
@@ -186,7 +186,9 @@ class GraspPlanner:
         return np.flatnonzero(self._cell.model.geom_bodyid == self._cell.bodies[row])
 
     def _find_joints(self, tips: Array, start: Array) -> Array | None:
-        """Return joint positions, (joints,), in rad, that place the tips at given points, or None.
+        """Return joint positions, (joints,), in rad, for given tip positions.
+
+        The result is None if the iteration does not reach them.
 
         Args:
             tips: Points in the world, (fingers, 3), m.
@@ -218,7 +220,10 @@ class GraspPlanner:
         return bool((hand & (data.contact.dist < 0.0)).any())
 
     def _find_grip_force(self, row: int) -> float:
-        """Return the force per finger, in N, at which friction bears the weight and the pull."""
+        """Return the force per finger, in N, at which friction carries the load.
+
+        The load is the object's weight and the permitted pull, with a reserve.
+        """
         model = self._cell.model
         body = self._cell.bodies[row]
         friction = float(model.geom_friction[self._list_object_geoms(row), 0].max())
@@ -303,7 +308,7 @@ class Workstation(HostProgram):
         return grasp
 
     def list_prompt_names(self, bus: Bus) -> Mapping[str, Any]:
-        """Return the functions that a prompt offers, by name."""
+        """Return a dictionary from names to the functions that a prompt offers."""
         return {
             "plan": self.plan_grasp,
             "boards": lambda: self.read_counts(bus),

@@ -46,7 +46,7 @@ def find_flaws(table: StateTable, vocabulary: Vocabulary, lexicon: Lexicon | Non
             for why in _find_row_flaws(row, vocabulary, lexicon)
         ]
     lines += _find_state_flaws(table)
-    # Cases can be counted only once every condition and value is known, and every row is readable.
+    # Rows can be compared only if all are readable and all their conditions and values are known.
     if not table.flaws and not any(
         _find_condition_flaws(row, vocabulary) for row in table.configs.values()
     ):
@@ -62,7 +62,7 @@ def _format_row_name(number: int, row: RowConfig) -> str:
 def _find_row_flaws(
     row: RowConfig, vocabulary: Vocabulary, lexicon: Lexicon | None
 ) -> Iterator[str]:
-    """Yield unknown words of a row, and required keys that it lacks."""
+    """Yield a line for each unknown word in a row and each required key that is missing."""
     yield from _find_condition_flaws(row, vocabulary)
     for phrase in row.do:
         if lexicon is not None and (why := find_objection(phrase, vocabulary.actions, lexicon)):
@@ -99,7 +99,7 @@ def _find_condition_flaws(row: RowConfig, vocabulary: Vocabulary) -> list[str]:
 
 
 def _find_state_flaws(table: StateTable) -> Iterator[str]:
-    """Yield next states that do not exist, and states that are unreachable from the start."""
+    """Yield a line for each next state that does not exist and each state that is unreachable."""
     names = [*table.rows]
     known = ", ".join(names)
     if SAME in names:
@@ -130,12 +130,12 @@ def _find_state_flaws(table: StateTable) -> Iterator[str]:
 def _find_case_flaws(
     state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary
 ) -> Iterator[str]:
-    """Yield overlapping rows of a state, rows that never fire, and cases that no row takes.
+    """Yield a line for each overlap of two rows, row that never fires, and uncovered case.
 
     Args:
         state: Name of the state.
         rows: Its rows by number, in the order in which they are tried.
-        vocabulary: Gives the values of each condition.
+        vocabulary: Vocabulary with the possible values of each condition.
     """
     conditions = [
         name for name in vocabulary.conditions if any(name in row.when for row in rows.values())
@@ -211,6 +211,7 @@ def _format_cases(box: Box, vocabulary: Vocabulary) -> str:
 
 
 def _format_box(box: Box) -> str:
+    """Format a box such as "arm = moving|resting, hold = no", or "any case" if it is empty."""
     return (
         ", ".join(f"{name} = {'|'.join(sorted(values))}" for name, values in box.items())
         or "any case"

@@ -133,7 +133,7 @@ class MoveTable(StateTableExecutor):
         return {"object": scene.objects, "place": tuple(plan.place), "pose": (*plan.pose, HOME)}
 
     def restore_state(self) -> None:
-        """Continue after a restart with the command that was sent down last."""
+        """Restore the newest command to the level below after a restart."""
         super().restore_state()
         if self.last_status.has_message and self.last_command.has_message:
             last = self.last_status.message
@@ -143,7 +143,7 @@ class MoveTable(StateTableExecutor):
             self._put_row = last.put
 
     def evaluate_conditions(self, tick: int) -> dict[str, str]:
-        """Return the conditions of the level below, the objects and the gripper."""
+        """Return the values of the conditions on the level below, the objects and the gripper."""
         self._below_status = self.below.message
         self._world = self.world.message
         self.detail = self._below_status.reason
@@ -164,7 +164,11 @@ class MoveTable(StateTableExecutor):
         }
 
     def _classify_target(self, row: int) -> str:
-        """Return the value of the condition `target` for an object's row; -1 means a place."""
+        """Return the value of the condition `target`.
+
+        Args:
+            row: Index of the target object in the world model. -1 if the target is a place.
+        """
         if row < 0:
             return "there"
         if norm(self._world.velocity[row]) > MAX_REST_SPEED_M_S:
@@ -172,7 +176,7 @@ class MoveTable(StateTableExecutor):
         return "there" if self._is_at_aim(row) else "displaced"
 
     def _is_at_aim(self, row: int) -> bool:
-        """Return True if an object is at the position at which the newest motion aims."""
+        """Return True if an object is within `plan.moved` of the aim of the newest motion."""
         distance = norm(self._world.position[row] - self._command.aim)
         return bool(distance <= self.table.plan.moved)
 

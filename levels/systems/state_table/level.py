@@ -83,7 +83,7 @@ class TableStatus(AnsweringStatus, version=1):
 
 YES_NO = ("no", "yes")
 UNKNOWN = "unknown"
-"""Value of the condition `command` for a command that the level does not know."""
+"""Value of the condition `command` for a command that the level does not accept."""
 BELOW = ("waiting", "executing", "done", "error", "lost")
 """Values of the condition `below`, the answer of the level below.
 
@@ -189,7 +189,7 @@ class StateTableExecutor(Executor):
 
     @classmethod
     def build_lexicon(cls, scene: SceneConfig, plan: Any) -> Lexicon:
-        """Return the sets of words that depend on the scene and on a table's plan, by name."""
+        """Return the sets of words that depend on the scene and a table's plan, keyed by name."""
         return {"object": scene.objects}
 
     @classmethod
@@ -201,7 +201,7 @@ class StateTableExecutor(Executor):
     def find_mismatches(
         cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
     ) -> Mismatches:
-        """Yield every mistake in every table, and commands that only some of the tables know.
+        """Yield every mistake in every table, and the commands that only some of the tables accept.
 
         Args:
             context: Context of this level.
@@ -225,7 +225,7 @@ class StateTableExecutor(Executor):
     ) -> Iterator[tuple[str, str]]:
         """Yield the name of each table that lacks a command of another one, and the reason.
 
-        All tables must know the same commands, because a switch between them does not change the
+        All tables must accept the same commands, because a switch between them does not change the
         current command.
         """
         commands = {name: cls._list_commands(scene, table) for name, table in tables.items()}
@@ -292,8 +292,7 @@ class StateTableExecutor(Executor):
             (tick - self._state_since_tick) * self.context.tick_s > self.table.patience_s
         ]
         if self.vocabulary.commands:
-            # Compare without the words. They differ for one command only if an edited table knows
-            # other commands.
+            # Do not compare the words: the same command has other words only if a table was edited.
             is_new = self._newest[:2] != self._taken[:2] and self._newest.serial > 0
             command = self._newest if is_new else self._taken
             values["command"] = command.words.partition(" ")[0] or "none"
@@ -326,7 +325,7 @@ class StateTableExecutor(Executor):
 
     @property
     def is_held(self) -> bool:
-        """Whether the level is held, by an operator, the level above, or the loss of that board."""
+        """Whether an operator or the level above holds the level, or the level above is lost."""
         return bool(self._hold_reason)
 
     def restore_state(self) -> None:
@@ -342,7 +341,7 @@ class StateTableExecutor(Executor):
         self._taken = WordCommand(last.ordered > 0, last.ordered or last.echo, last.words)
 
     def _take_commands(self) -> None:
-        """Take the commands of the operator and of the level above."""
+        """Read the commands of operator and level above, and update the reason for holding."""
         orders = self.orders
         orders.take_commands(self.operator, self._accept_operator_command)
         self._hold_reason = ""
@@ -374,7 +373,7 @@ class StateTableExecutor(Executor):
             self._hold_reason = HELD_FROM_ABOVE
 
     def _find_objection(self, words: str) -> str:
-        """Return why the level does not know a command, or an empty string if it does."""
+        """Return why a command is invalid, or an empty string if it is valid."""
         lexicon = self.build_lexicon(self.context.scene, self.table.plan)
         return find_objection(words, self.vocabulary.commands, lexicon)
 
@@ -410,7 +409,7 @@ class StateTableExecutor(Executor):
         elif reason and self.detail:
             reason = f"{reason}: {self.detail}"
         if row.next == SAME and state is State.ERROR and status.state == state:
-            # A row that stays in an error keeps the first reason, with its detail from below.
+            # While a row stays in an error, keep the first reason with its detail from below.
             reason = status.reason
         is_operators, serial, words = self._taken
         status.ordered = 0

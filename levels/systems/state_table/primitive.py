@@ -137,7 +137,7 @@ class PrimitiveTable(StateTableExecutor):
     def restore_state(self) -> None:
         """Restore the state of the gripper and the goal of the newest motion after a restart.
 
-        The arm starts again from the position in which the boards below hold it.
+        The next motion starts at the position at which the boards below hold the arm.
         """
         super().restore_state()
         if self.last_status.has_message:
@@ -150,7 +150,7 @@ class PrimitiveTable(StateTableExecutor):
             self.command.copy_from(self.last_command.message)
 
     def evaluate_conditions(self, tick: int) -> dict[str, str]:
-        """Return whether the arm follows and has arrived, and the state of the gripper."""
+        """Return the values of the conditions `arm`, `gripper` and `hold`."""
         for reading in self.above.values():
             self._goal = reading.message.joints
             self._speed = reading.message.speed
@@ -176,7 +176,7 @@ class PrimitiveTable(StateTableExecutor):
         }
 
     def _update_following(self) -> Array:
-        """Check whether the boards below follow, and return the joint positions in rad."""
+        """Update how long the boards below have followed, and return the joint positions, rad."""
         readings = list(self.statuses.values())
         statuses = [reading.message for reading in readings]
         position: Array = statuses[0].position
@@ -200,7 +200,7 @@ class PrimitiveTable(StateTableExecutor):
         return position
 
     def _classify_gripper(self, arm: ArmStatus) -> str:
-        """Return the value of the condition `gripper`, and update whether something is held."""
+        """Return the value of the condition `gripper`, and update whether an object is held."""
         self._gripper_wait_cycles = max(0, self._gripper_wait_cycles - 1)
         if self._gripper_wait_cycles or abs(arm.opening_velocity) > MAX_GRIPPER_REST_M_S:
             return "moving"
@@ -258,7 +258,7 @@ class PrimitiveTable(StateTableExecutor):
         self._held_row = self._target_row
 
     def write_outputs(self, tick: int) -> None:
-        """Write the set point with its inertia and load, and the status that a restart needs."""
+        """Write the set point with inertia and load, and the status fields that a restart needs."""
         command = self.command
         status = self.status
         if self._curve is not None:

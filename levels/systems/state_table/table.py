@@ -49,15 +49,15 @@ MAX_NAME_BYTES = 24
 MAX_PHRASE_BYTES = 64
 """Maximum length of a command or action with its parameters."""
 TAKE = "take"
-"""Action that makes the newest command the current one. From then on the status answers it."""
+"""Action that makes the newest command the current one. The status then refers to this command."""
 
 
 Values = tuple[str, ...]
 """Possible values of a condition. In every cycle it has exactly one of them."""
 Phrases = Mapping[str, tuple[str | Values, ...]]
-"""Accepted commands, or actions, by their first word.
+"""Dictionary from the first word of each accepted command or action to its parameters.
 
-Each parameter that follows the word is a tuple of permitted words, or the name of a set of words in
+Each parameter is a tuple of permitted words, or the name of a set of words in
 `Lexicon`.
 """
 Lexicon = Mapping[str, Sequence[str]]
@@ -85,14 +85,17 @@ class Vocabulary:
 
 
 def list_phrases(verbs: Phrases, lexicon: Lexicon) -> Iterator[str]:
-    """Yield every command or action with its parameters, such as "pick block1"."""
+    """Yield every verb with every combination of permitted parameters, such as "pick block1"."""
     for word, parameters in verbs.items():
         for arguments in product(*(_list_words(parameter, lexicon) for parameter in parameters)):
             yield " ".join((word, *arguments))
 
 
 def _list_words(parameter: str | Values, lexicon: Lexicon) -> Sequence[str]:
-    """Return the permitted words of a parameter, which may be the name of a set."""
+    """Return the permitted words of a parameter.
+
+    The parameter contains the words, or is the name of a set of words in `lexicon`.
+    """
     return lexicon[parameter] if isinstance(parameter, str) else parameter
 
 
@@ -101,7 +104,7 @@ def find_objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
 
     Args:
         phrase: Command or action with its parameters.
-        verbs: Commands or actions of the level, by first word.
+        verbs: Dictionary from the first word of each command or action to its parameters.
         lexicon: Sets of words that depend on the scene and the plan.
     """
     if len(phrase) > MAX_PHRASE_BYTES:
@@ -122,7 +125,7 @@ def find_objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
 MAX_FILE_BYTES = 200_000
 MAX_ROW_NAME_BYTES = 48
 STATES = {state.name.lower(): state for state in State}
-"""States of a level, by the words of a row's `status`."""
+"""Dictionary from the words of a row's `status` to states of a level."""
 Name = Annotated[str, StringConstraints(pattern=rf"^[a-z][a-z0-9_-]{{0,{MAX_NAME_BYTES - 1}}}$")]
 RowName = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{MAX_ROW_NAME_BYTES}}}$")]
 Reason = Annotated[str, StringConstraints(pattern=rf"^[ -~]{{1,{REASON_BYTES}}}$")]
@@ -204,7 +207,7 @@ class StateTable:
     Attributes:
         start: Initial state.
         patience_s: Time in one state after which the condition `late` is yes, s.
-        configs: Readable rows by number. Rows with formal mistakes are missing.
+        configs: Dictionary from row numbers to rows. Rows with formal mistakes are left out.
         plan: The level's record of `[plan]`. None if it has mistakes.
         checksum: CRC-32 of the file.
         flaws: Formal mistakes of the file, one line each.
@@ -219,7 +222,7 @@ class StateTable:
 
     @cached_property
     def rows(self) -> Mapping[str, Mapping[int, RowConfig]]:
-        """The rows by state and number, in file order within each state."""
+        """Dictionary from each state to its rows, which are keyed by number and in file order."""
         rows: dict[str, dict[int, RowConfig]] = {}
         for number, row in self.configs.items():
             for state in row.state:
@@ -229,8 +232,8 @@ class StateTable:
     def choose_row(self, state: str, values: Mapping[str, str]) -> tuple[int, RowConfig]:
         """Return the number of the row that fires, and the row.
 
-        Number 0 with an error row means that no row takes the case, which cannot happen in a table
-        that passed the check.
+        If no row matches, the number is 0 and the row reports an error. This cannot happen in a
+        table that passed the check.
         """
         for number, row in self.rows.get(state, {}).items():
             if row.matches_case(values):

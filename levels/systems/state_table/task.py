@@ -133,7 +133,7 @@ class TaskTable(StateTableExecutor):
             self._newest_command.id = self.last_status.message.sent
 
     def evaluate_conditions(self, tick: int) -> dict[str, str]:
-        """Return the answer of the level below, and whether a step is left."""
+        """Return the values of the conditions `below` and `step`."""
         self.detail = self.below.message.reason
         self.resting = self.below.message.resting
         is_left = self._steps_done < len(self.table.plan.step)
@@ -155,7 +155,7 @@ class TaskTable(StateTableExecutor):
         self._steps_done += 1
 
     def write_outputs(self, tick: int) -> None:
-        """Write the command and the progress."""
+        """Write the command for the level below and the number of completed steps."""
         self._newest_command.hold = self.is_held
         self.command.copy_from(self._newest_command)
         status = self.status

@@ -54,7 +54,7 @@ class JointBoards:
         self.wait_reason = "no board servoes a joint"
 
     def update(self, statuses: Mapping[str, Reading[JointStatus]]) -> bool:
-        """Evaluate the statuses. Returns True in the cycle in which the boards come into step."""
+        """Update `in_step` from the statuses. Returns True if it changes to True."""
         self._cycles_in_step += 1
         for board, reading in statuses.items():
             has_status = reading.is_new and not reading.is_lost
@@ -77,7 +77,7 @@ class JointBoards:
         self.wait_reason = reason
 
     def _find_board_not_following(self, statuses: Mapping[str, Reading[JointStatus]]) -> str:
-        """Return the name of a board that does not follow with the reason, or an empty string."""
+        """Return the name of a board that does not follow and why. Empty if all boards follow."""
         for board, reading in statuses.items():
             status = reading.message
             silent_cycles = self._silent_cycles[board]
@@ -93,7 +93,7 @@ class JointBoards:
         """Copy the joint positions at which the boards hold the joints to `position`.
 
         Returns:
-            True if the boards hold all joints at rest. Otherwise `wait_reason` tells why not.
+            True if the boards hold all joints at rest. Otherwise `wait_reason` is set.
         """
         is_driven = np.zeros(len(self._joints), dtype=bool)
         for board, reading in statuses.items():

@@ -129,7 +129,7 @@ class Motions:
         )
 
     def stay(self, seconds: float) -> int:
-        """Stay at the previous goal for some seconds, following it if it is live."""
+        """Stay at the previous goal for `seconds`. If the goal is live, keep following it."""
         return self._queue_request(kind=MotionKind.STAY, segment=seconds)
 
     def grip(self, opening: float | None = None, force: float | None = None) -> int:
@@ -156,7 +156,7 @@ class Motions:
         return self._queue_request(kind=MotionKind.CANCEL)
 
     def end_of(self, request: int) -> RequestEnd:
-        """Return how a request ended. NONE if it is still open or ended too long ago."""
+        """Return how a request ended. NONE if it is still open or no longer listed."""
         status = self._status
         ends = dict(zip(status.ended.tolist(), status.ends.tolist(), strict=True))
         return RequestEnd(ends.get(request, RequestEnd.NONE))
@@ -169,7 +169,7 @@ class Motions:
         """Wait until a request, by default the newest, has ended.
 
         Returns:
-            False if `until` became true before, or the run ended.
+            True if the request has ended. False if `until()` returned True or the run ended first.
         """
         while not self.done(request):
             if until() or self._bus.is_over:
@@ -178,7 +178,7 @@ class Motions:
         return True
 
     def where(self) -> list[float]:
-        """Return the tool position that was commanded last, in m."""
+        """Return the newest commanded position of the tool, in m."""
         return [round(float(x), 4) for x in self._status.tool]
 
     @property
@@ -210,7 +210,7 @@ class Motions:
         return self._requests.send()
 
     def _wait_and_resend(self) -> None:
-        """Wait for a new status. Send open requests again if none was executed for too long."""
+        """Wait for `POLL_S`. Send open requests again if none was executed for `RESEND_DELAY_S`."""
         self._bus.wait(POLL_S)
         status = self._status
         now = self._bus.time_s
@@ -225,7 +225,7 @@ class Motions:
             self._idle_since = now
         elif now - self._idle_since > RESEND_DELAY_S:
             self._idle_since = None
-            # A request that was only waiting is now queued twice, but carried out once.
+            # A request that was still in the queue is now queued twice, but executed once.
             for request in self._open_requests.values():
                 self._send_request(request)
 
@@ -259,7 +259,7 @@ class CommandEnvironment(HostProgram):
         )
 
     def list_prompt_names(self, bus: Bus) -> Mapping[str, Any]:
-        """Return the calls that a script may use, by name."""
+        """Return a dictionary from names to the calls that a script may use."""
         motions = self.motions(bus)
         calls = {name: getattr(motions, name) for name in dir(motions) if name[0] != "_"}
         return {"motions": motions, **calls}

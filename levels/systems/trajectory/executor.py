@@ -91,7 +91,7 @@ class TrajectoryExecutor(Executor):
         self._saved_ids: tuple[int, ...] = ()
 
     def max_messages(self, port: str) -> int:
-        """Return how many requests to take now. The others stay in the queue."""
+        """Return how many requests to take from the queue in this cycle. The others stay queued."""
         # Take none before the requests of an earlier process are restored.
         return 0 if self._last_tick is None else self._agenda.free_places
 
@@ -106,7 +106,8 @@ class TrajectoryExecutor(Executor):
         self._sight.update_model(self.world)
         cancelled = self._agenda.take_new_requests(self.requests)
         if cycles > HANDOVER_CYCLES and self._boards.in_step:
-            # The boards hold by now. Over a network their statuses would show it too late.
+            # By now the boards hold their joints. Over a network, their statuses would arrive too
+            # late to show it.
             self._boards.leave_step(f"{cycles} cycles missed: the boards hold")
             self._work.interrupt_motion()
         self._follow_boards()
@@ -142,7 +143,10 @@ class TrajectoryExecutor(Executor):
             self._work.grip = command.opening, command.force
 
     def _follow_boards(self) -> None:
-        """Interrupt the motion when the boards leave step; restart it where they hold the arm."""
+        """Interrupt the motion when the boards leave step.
+
+        When they return to step, rest at the positions at which they hold the joints.
+        """
         was_in_step = self._boards.in_step
         if self._boards.update(self.boards):
             self._work.interrupt_motion()
@@ -175,7 +179,7 @@ class TrajectoryExecutor(Executor):
         """Write the set point with its inertia, load and grip. `due` is 0 while out of step."""
         state = self._motion.state
         command.id = tick // self.context.every + 1
-        # Out of step the arm's position is uncertain, and no set point is better than a wrong one.
+        # Out of step, the arm's position is uncertain. A wrong set point is worse than none.
         command.due = self._compute_due_tick(tick) if self._boards.in_step else 0
         command.position, command.velocity, command.acceleration = state
         terms = self._dynamics.terms(state.position, state.velocity)
@@ -251,11 +255,11 @@ class TouchGuard:
         self._torques: deque[Array] = deque(maxlen=5 * self._median_samples)
 
     def clear_window(self) -> None:
-        """Forget all torques so far."""
+        """Discard the torques collected so far."""
         self._torques.clear()
 
     def detect_contact(self, boards: Mapping[str, Reading[JointStatus]], max_change: float) -> bool:
-        """Add the torques of this cycle, and check whether they have changed.
+        """Add the torques of this cycle to the window, and compare its end with its start.
 
         Args:
             boards: Statuses of the boards that servo joints.

@@ -77,7 +77,11 @@ class WorldView:
         return self._model is not None
 
     def find_body_error(self, row: int) -> str:
-        """Return why `row` is no body of the world model, or an empty string if it is one."""
+        """Return why the number of a body is invalid, or an empty string if it is valid.
+
+        Args:
+            row: Row of the body in the world model. -1 for the world.
+        """
         if -1 <= row < len(self._bodies):
             return ""
         return (
@@ -136,7 +140,9 @@ class ToolGoal:
         self.pose = self._goal
 
     def update_pose(self, time_s: float) -> None:
-        """Evaluate the goal for the sample at `time_s`. A second call for a sample has no effect.
+        """Update `pose` for the sample at `time_s`.
+
+        A second call for the same sample has no effect.
 
         Raises:
             InfeasibleMotion: If no world model has been received.
@@ -216,9 +222,9 @@ class TimeLaw:
 
     @property
     def nominal_s(self) -> float:
-        """Time, in s, at which the goal would be reached at full speed.
+        """Time, in s, at which the goal would be reached without slowing down.
 
-        It is the middle of a blend into another leg.
+        A blend into another leg is centred on this time.
         """
         return self.half_blend_s + self.segment_s
 
@@ -270,7 +276,7 @@ class JointLeg:
 class ToolLeg:
     """A straight line of the tool with a constant rate of turn, to a goal that may move.
 
-    Inverse kinematics stays on the branch of the start.
+    Inverse kinematics stays on the branch of the first joint positions.
     """
 
     def __init__(
@@ -331,8 +337,8 @@ class ToolLeg:
     def _sample_derivatives(self, start: Array, goal: Pose) -> tuple[Array, Array]:
         """Return the largest first and second derivatives of the joints along the path.
 
-        Both have shape (joints,). They are taken with respect to the progress, at a number of
-        poses.
+        Both have shape (joints,). The derivatives are with respect to the progress. They are
+        estimated from sampled poses and increased by `SAMPLING_MARGIN`.
         """
         distance = norm(goal.position - self._from.position)
         turn = self._from.compute_angle(goal)
@@ -358,7 +364,7 @@ Leg = JointLeg | ToolLeg
 def build_time_law(times: LegTimes, speed: Array, curvature: Array, limits: Limits) -> TimeLaw:
     """Build the time law of a leg.
 
-    A segment time that is too short for a limit, or for two blends, is stretched.
+    A segment time that is too short for a limit, or for two blends, is lengthened.
 
     Args:
         times: Times that the request asks for.

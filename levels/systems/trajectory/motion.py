@@ -43,7 +43,8 @@ class SampledMotion:
     Position and velocity are continuous, and every joint stays within its limits.
 
     Attributes:
-        leg: Current or completed leg. None if the arm is stopping, or has stopped elsewhere.
+        leg: Current or completed leg. None if the arm is stopping, or has stopped without reaching
+            a goal.
         time_s: Time of the current sample, s.
     """
 
@@ -68,7 +69,7 @@ class SampledMotion:
         self.rest_at(rest)
 
     def rest_at(self, position: Array) -> None:
-        """Rest at `position`, (joints,), in rad, without a leg."""
+        """Drop the leg and rest at `position`, (joints,), in rad. The sample time restarts at 0."""
         self.leg = None
         self._ramp = None
         self._rest = np.array(position)
@@ -174,12 +175,14 @@ class SampledMotion:
         self._rest = self._ramp.end
 
     def _evaluate_next_sample(self) -> None:
-        """Evaluate the next sample. Call this again after a change of the motion."""
+        """Compute the next sample. This must be called again whenever the motion changes."""
         before, present, _ = self._samples
         self._samples = before, present, self._compute_position(self.time_s + self._period_s)
 
     def _compute_position(self, time_s: float) -> Array:
-        """Return the joint positions at `time_s`: the leg and the decaying previous motion.
+        """Return the joint positions at `time_s`.
+
+        They are the sum of the leg and the remainder of the previous motion, which decays.
 
         Raises:
             InfeasibleMotion: If the leg has no joint positions at that time.

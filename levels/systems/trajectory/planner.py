@@ -159,7 +159,7 @@ class MotionProgram(Program):
     """steps, in the order of execution"""
 
     def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
-        """Yield key, value and reason of every entry that does not match the arm or the scene."""
+        """Yield the key, value and reason of each entry that does not match arm or scene."""
         if robot is None:
             return
         for k, step in enumerate(self.step):
@@ -263,8 +263,8 @@ class RequestPlanner(Planner):
     def wanted(self, tick: int) -> bool:
         """Return True if a step may be planned now.
 
-        It also records which requests the level below has taken and begun, and schedules a request
-        that was lost to be sent again.
+        Also records which requests the level below has taken and begun, and schedules lost requests
+        to be sent again.
         """
         below = self.below.message
         if not self.below.has_message or below.error:
@@ -348,7 +348,7 @@ class RequestPlanner(Planner):
     def _find_goal_before(self, k: int, world: WorldState) -> Array:
         """Return the joint positions at the end of the step before step k.
 
-        The step is planned if necessary, for example after a restart.
+        The goal is computed if it is not known, for example after a restart.
         """
         if k == 0:
             return self._home

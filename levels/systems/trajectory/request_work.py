@@ -83,7 +83,7 @@ class RequestWork:
         self._remaining_fraction = 1.0 - progress
 
     def interrupt_motion(self) -> None:
-        """Record that the motion was interrupted, and what fraction of it remains."""
+        """Record that the motion was interrupted, and the fraction of it that remains."""
         if not self._is_interrupted:
             self._remaining_fraction = 1.0 - self.progress
         self._is_interrupted = True
@@ -170,7 +170,7 @@ class RequestWork:
             self._begin_leg(goal, 0.0, segment_s)
 
     def _is_done(self, current: MotionRequest) -> bool:
-        """Return True if the current request is done. Advances the time of STAY and GRIP."""
+        """Return True if the current request is done. Also advances `passed_s`."""
         if not self.motion.is_settled:
             return False
         if current.kind in MOVING_KINDS or current.kind == MotionKind.CANCEL:
@@ -221,7 +221,7 @@ class RequestWork:
         return remaining_s if remaining_s < half_s + self._tools.period_s else None
 
     def _can_begin(self, request: MotionRequest) -> bool:
-        """Return False if the goal is in the frame of a body and no world model has arrived."""
+        """Return True unless the request needs a world model and none has been received."""
         return request.kind not in MOVING_KINDS or request.body < 0 or self._tools.sight.has_model
 
     def _begin_next_request(self, half_s: float) -> None:
@@ -242,14 +242,14 @@ class RequestWork:
             self._start_at_rest(request)
 
     def _find_request_error(self, request: MotionRequest) -> str:
-        """Return why a request cannot be executed, or an empty string if it may be possible."""
+        """Return why a request cannot be executed, or an empty string if no reason is found."""
         tools = self._tools
         return find_request_error(request, tools.limits.position) or tools.sight.find_body_error(
             request.body
         )
 
     def _start_at_rest(self, request: MotionRequest) -> None:
-        """Begin a request that does not move the arm."""
+        """Begin a request that does not move the arm. A GRIP sets the command of the gripper."""
         if request.kind == MotionKind.GRIP:
             self.grip = request.opening, request.force
 
@@ -269,6 +269,7 @@ class RequestWork:
             goal = ToolGoal(request, tools.sight, tools.params.follow)
 
         def build_leg(start: Array) -> Leg:
+            """Build the leg to the goal from the joint positions `start`."""
             if goal is None:
                 return JointLeg(start, request.joints, times, tools.limits)
             goal.update_pose(self.motion.time_s + tools.period_s)

@@ -73,13 +73,13 @@ class Agenda:
     """Accepted requests that have not ended, and the outcomes of the last ones that have.
 
     After an error all requests are dropped, and new ones are refused until a CANCEL. While a
-    request of the sequence is missing, later ones are ignored. The sender continues after
-    `taken`, or sends a CANCEL.
+    request of the sequence is missing, later ones are ignored. The sender continues after `taken`,
+    or sends a CANCEL.
 
     Attributes:
         held: Requests that have not ended, oldest first.
         goal: Request whose goal the arm has reached or is moving to. None if there is none.
-        taken: Newest request taken.
+        taken: Id of the newest request that was taken.
         rests_on: Serial of the newest operator command on which a request depends.
         error: Error that stopped the requests.
         reason: Reason for the error.
@@ -110,7 +110,7 @@ class Agenda:
 
     @property
     def done(self) -> int:
-        """Newest request that has ended in any way. 0 if none has."""
+        """Id of the newest request that has ended, whatever its outcome. 0 if none has."""
         return self._ended[0][0] if self._ended else 0
 
     @property
@@ -119,7 +119,7 @@ class Agenda:
         return MAX_HELD_REQUESTS - len(self.held)
 
     def take_new_requests(self, requests: Reading[MotionRequest]) -> bool:
-        """Take new requests. Returns True if a CANCEL was among them, and the arm must stop."""
+        """Take new requests. Returns True if the arm must stop because a CANCEL is among them."""
         is_cancelled = False
         if requests.is_new:
             for message in (*requests.earlier, requests.message):
@@ -127,9 +127,9 @@ class Agenda:
         return is_cancelled
 
     def _take_request(self, request: MotionRequest) -> bool:
-        """Take or ignore a request. Returns True for a CANCEL."""
+        """Accept, refuse or ignore a request. Returns True for a new CANCEL."""
         # A planning level sends a request again after its own restart, or if the status does not
-        # show the request. Such a repetition is ignored.
+        # show the request. Ignore the repetition.
         if request.id <= self.taken:
             return False
         if request.kind != MotionKind.CANCEL and self.taken and request.id != self.taken + 1:
@@ -168,7 +168,7 @@ class Agenda:
         self.has_begun = False
 
     def fail_first(self, outcome: RequestEnd, code: Error, reason: str) -> None:
-        """Fail the oldest request, cancel the others, and refuse new ones from now on.
+        """Fail the oldest request, cancel the others, and refuse new ones until a CANCEL.
 
         Args:
             outcome: REFUSED or FAILED.
@@ -191,7 +191,7 @@ class Agenda:
         self.has_begun = False
 
     def _record_end(self, request: MotionRequest, outcome: RequestEnd) -> None:
-        """Remember how a request ended."""
+        """Record how a request ended."""
         self._ended.appendleft((request.id, outcome))
 
     def fill_status(self, status: MotionStatus) -> None:

@@ -19,10 +19,10 @@ BOARD_PRIORITY = 80
 
 
 class Chain(NamedTuple):
-    """A rack whose boards pass a message along, one cycle at every tick of the clock.
+    """A rack whose boards pass on a message from one to the next, with one cycle per tick.
 
-    The clock runs on the first core. The boards are distributed over the cores from the last one
-    on.
+    The clock runs on the first core. The boards are distributed over the cores, starting with the
+    last core.
 
     Attributes:
         boards: Number of boards.

@@ -77,7 +77,7 @@ class CycleCosts(Comparison):
     """Comparison of whole cycles, with the parts of each.
 
     Attributes:
-        parts: Median processor time of each part, us, by case and contestant.
+        parts: Dictionary from case and contestant to the median processor time of each part, us.
     """
 
     parts: Mapping[tuple[str, str], Mapping[str, float]] = field(default_factory=dict)
@@ -147,7 +147,7 @@ def _run_kind(
 ) -> CycleRun:
     """Run one rack and return its cycles.
 
-    For this tree's arm in lockstep, the physics are replayed directly afterwards.
+    A lockstep run of this tree's arm is followed by a replay of its physics.
     """
     folder = Path(mkdtemp(dir=scratch))
     lockstep = kind.mode == "lockstep"
@@ -177,7 +177,7 @@ def compute_costs(
     """Compute the costs of all measured cycles.
 
     Args:
-        cycles: Cycles of all runs, by case and contestant.
+        cycles: Dictionary from case and contestant to the cycles of each run.
         physics_us: Processor time of ticks of bare physics, us.
         baseline: Name of the checkout with which this one is compared. None to compare the servo
             level's cycle with its physics.
@@ -203,9 +203,9 @@ def compute_costs(
 
 
 def compute_parts(cycles: Cycles) -> dict[str, np.ndarray]:
-    """Return the processor time of each part of the judged cycles, (n,), in us.
+    """Return a dictionary from each part of a cycle to its processor times, (n,), in us.
 
-    Cycles of the start-up and stalled cycles are not judged. The first cycle is left out.
+    The first cycle, cycles of the start-up and stalled cycles are left out.
     """
     rows = cycles.rows
     rest_ns = (rows["processor_ns"] - cycles.used_ns)[1:]

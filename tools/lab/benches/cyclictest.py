@@ -56,7 +56,7 @@ def find_missing_cyclictest() -> tuple[Absent, ...]:
 
 
 def is_fifo_permitted() -> bool:
-    """Return True if this process may take a real-time priority."""
+    """Return True if this process may use a real-time priority."""
     return set_priority(1) and set_priority(0)
 
 
@@ -100,7 +100,7 @@ def compute_late_share(runs: Sequence[np.ndarray], period_ns: int) -> float | No
         period_ns: Distance of the grid points, ns.
 
     Returns:
-        The fraction. None without any run.
+        The fraction. None if there are no runs.
     """
     if not runs:
         return None

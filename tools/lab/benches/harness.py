@@ -192,8 +192,8 @@ class Comparison:
         name: Name of the bench in the command, one word.
         title: Description of the measured quantity.
         samples: Samples of all cases and contestants.
-        baselines: Contestant of each case with which the others are compared. A case without a
-            baseline has no ratios.
+        baselines: Dictionary from cases to the contestants with which the others are compared. A
+            case without a baseline has no ratios.
         absent: Contestants that are not available.
         conclusion: Conclusion from the figures, in one line. Empty if there is none.
     """
@@ -226,7 +226,7 @@ class Comparison:
 
     @cached_property
     def _samples(self) -> dict[tuple[str, str], Sample]:
-        """Samples by case and contestant."""
+        """Dictionary from case and contestant to their sample."""
         return {(sample.case, sample.who): sample for sample in self.samples}
 
     def to_document(self) -> dict[str, Any]:
@@ -302,13 +302,13 @@ def call_interleaved(
     The order changes from round to round, but is the same in every run of the bench.
 
     Args:
-        contestants: Function of each contestant, by name.
+        contestants: Dictionary from the name of each contestant to its function.
         rounds: Number of rounds.
         progress: Shows each call. None for no progress.
         each_s: Expected time of a call, s.
 
     Returns:
-        The results of each contestant, oldest first.
+        Dictionary from the name of each contestant to its results, oldest first.
     """
     results: dict[_Name, list[_Result]] = {name: [] for name in contestants}
     random = Random(rounds)

@@ -46,8 +46,8 @@ def measure_launches(
 
     Args:
         name: Config of the rack, by name or path.
-        rounds: Rounds of launches and commands.
-        kills: Kills of the board that drives the arm.
+        rounds: Number of rounds of launches and commands.
+        kills: Number of kills of the board that drives the arm.
         against: Another checkout, launched alternately. None if there is none.
         share: Whether to run racks even on cores that another one uses.
         progress: Shows both parts.
@@ -93,7 +93,7 @@ def _measure_commands(
     for case, arguments in commands.items():
         contestants[case, this_tree.name] = partial(_measure_command_s, this_tree, arguments)
         contestants[case, INTERPRETER] = partial(_measure_command_s, python, ())
-    # The boards of this rack wait for its clock. It gives `list` and `status` a rack to show, and
+    # This rack gives `list` and `status` a rack to show. Its boards only wait for its clock, so it
     # uses no core.
     with Rack(idle):
         times = call_interleaved(contestants, rounds)
@@ -119,7 +119,7 @@ def measure_launch_s(rack: RackCommand, config: str, folder: Path, share: bool) 
 
 
 def make_brief_run(rack: RackCommand, config: str, out: Path, share: bool) -> Path:
-    """Record a short run of which only the launch is used, and return its folder.
+    """Record a short run and return its folder. Only its launch is evaluated.
 
     Args:
         rack: Command to run.
@@ -141,7 +141,7 @@ def find_fastest_board(config: RackConfig) -> str:
 
 
 def find_first_cycle_ns(run: Path, task: str) -> int:
-    """Return when the first recorded cycle of a task started, in ns of CLOCK_MONOTONIC.
+    """Return the start of a task's first recorded cycle, in ns of CLOCK_MONOTONIC.
 
     The file is read directly, because another checkout may write other columns.
 
@@ -171,7 +171,7 @@ def measure_kills(name: str, count: int, share: bool = True) -> list[Sample]:
         share: Whether to run even on cores that another rack uses.
 
     Returns:
-        Times to detection and to engaged brakes, ms.
+        Times from each kill to its detection, and to the engagement of the brakes, ms.
 
     Raises:
         Failure: If the rack has no arm, or did not react to any kill.

@@ -89,7 +89,7 @@ def measure_lockstep(
 
 
 def build_comparison(samples: Sequence[Sample], baseline: str) -> Comparison:
-    """Compare samples with one contestant. The conclusion gives simulated seconds per second."""
+    """Compare samples with those of `baseline`. The conclusion states the simulation speeds."""
     speeds = [f"{one.case} {format_value(1e3 / one.median)} ({one.who})" for one in samples]
     return Comparison(
         name="lockstep",
@@ -164,7 +164,8 @@ def _check_bare_run(rack: str, options: Sequence[object], folder: Path) -> int:
 def find_differences(recording: Recording, bare: BareRun) -> Iterator[str]:
     """Yield every mailbox or message field in which a recorded run and its levels alone differ.
 
-    The newest message that was visible before the end is compared. Later ones may not be recorded.
+    Of each mailbox, the newest message that was visible before the end is compared. Later messages
+    may not be recorded.
     """
     for name in sorted({*recording.mailboxes, *bare.serials}):
         visible_rows = np.flatnonzero(recording.read_signal(name, "visible_at") < bare.ticks)

@@ -101,8 +101,8 @@ def change_rate(config: RackConfig, rate_hz: float) -> RackConfig:
 class RateFigures:
     """Results of all runs at one rate.
 
-    The rate is held if no run failed, and if neither the late wakes of the machine nor the further
-    missed cycles of the rack exceed `MAX_LATE_SHARE`.
+    The rate is held if no run failed, and if neither the late wakes of the machine nor the
+    additional missed cycles of the rack exceed `MAX_LATE_SHARE`.
 
     Attributes:
         rate_hz: The rate.
@@ -148,7 +148,7 @@ class MachineComparison(Comparison):
 
     @property
     def highest_hz(self) -> float | None:
-        """Highest rate that is held together with all lower ones, or None if the lowest is not."""
+        """Highest rate up to which every rate is held. None if the lowest rate is not held."""
         held_rates = takewhile(lambda rate: not rate.reason, self.rates)
         return max((rate.rate_hz for rate in held_rates), default=None)
 
@@ -306,7 +306,7 @@ class RackRun(NamedTuple):
 
 
 def _run_rack(rack: RackConfig, board: str, seconds: float, share: bool, awake: bool) -> RackRun:
-    """Run a rack once, and return the lateness of a board with its counts."""
+    """Run a rack once, and return a board's lateness and cycle counts and the failure, if any."""
     with (
         TemporaryDirectory(prefix="rack-bench-") as folder,
         keep_cores_awake() if awake else nullcontext(),
@@ -317,16 +317,17 @@ def _run_rack(rack: RackConfig, board: str, seconds: float, share: bool, awake: 
 
 
 def _run_cyclictest(grid: WakeGrid) -> RackRun:
+    """Run `cyclictest` once. Only the lateness of the result is filled."""
     return RackRun(run_cyclictest(grid))
 
 
 def compare_idle_cores(samples: Sequence[Sample], who: str) -> str:
-    """Return which value of `clock.idle_cores` suits this machine, with the figures.
+    """Recommend a value of `clock.idle_cores` for this machine, with the figures for both values.
 
     A wake-up is lost if it is late by a period or more. The setting with fewer lost wake-ups wins
-    if the difference exceeds two standard deviations of chance. Otherwise the setting with the
-    smaller worst lateness wins, because the worst lateness is the first sign that a host takes the
-    core away.
+    if the counts differ by more than two standard deviations. Otherwise the setting with the
+    smaller worst lateness wins, because a host that takes the core away first shows in the worst
+    lateness.
 
     Args:
         samples: Lateness of all contestants.

@@ -72,7 +72,7 @@ class Case(NamedTuple):
 
     @property
     def lengths(self) -> dict[str, int]:
-        """Lengths of the arrays that give the message its size."""
+        """Lengths of the message's arrays, chosen to give the message its size."""
         numbers = SIZE_BYTES[self.size] // 8 - 1
         return {"joints": numbers // 3, "rest": numbers - 2 * (numbers // 3)}
 
@@ -187,7 +187,7 @@ def _open_mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
         (box,) = layout.mailboxes
         writer = open_writer(segment, box.name)
         readers = [_build_reader(segment, box, task) for task in box.readers]
-    # An open segment needs no name. Nothing is left even if this process is killed.
+    # An open segment needs no name, and without a name nothing remains if this process is killed.
     send = WriteTable([(writer, ())]).write if can_write(writer) else writer.write
     yield Transport(writer.message, send, readers)
 
@@ -195,7 +195,7 @@ def _open_mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
 def _build_reader(segment: Segment, box: MailboxSpec, task: str) -> Callable[[int], AnyMessage]:
     """Build a function that reads a mailbox as a board does.
 
-    Where no machine code exists, the checks on the writer are left out.
+    Without machine code, the checks on the writer are left out.
     """
     inbox = open_inbox(segment, task)
     watched_reader = open_watched(segment, box.name, AlarmWriter(segment, task), ReadingTask(inbox))
@@ -207,12 +207,14 @@ def _build_reader(segment: Segment, box: MailboxSpec, task: str) -> Callable[[in
         read_table = ReadTable([line]).read
 
         def read_by_table(tick: int) -> AnyMessage:
+            """Read the mailbox through a `ReadTable`."""
             read_table(tick + delay)
             return message
 
         return read_by_table
 
     def read_message(tick: int) -> AnyMessage:
+        """Read the mailbox directly, without checks on its writer."""
         return read(tick + delay).message
 
     return read_message

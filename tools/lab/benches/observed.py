@@ -71,7 +71,7 @@ def add_commands(config: RackConfig, commands: Sequence[CommandConfig]) -> RackC
 
 
 def compute_lateness_us(recording: Recording, task: str) -> np.ndarray:
-    """Return the lateness of each cycle, (n,), in us, without the start of the run.
+    """Return the lateness of each cycle after the start-up of the run, (n,), in us.
 
     After skipped releases the lateness counts from the first skipped one, as for any program that
     oversleeps grid points.

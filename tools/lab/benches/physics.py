@@ -77,7 +77,7 @@ def replay_physics(folder: Path, ticks: int) -> list[float]:
 def _find_longest_stretch(recording: Recording) -> tuple[int, int]:
     """Return the first and last tick of the longest stretch without brakes.
 
-    The states of the arm at both ticks are recorded.
+    Both are ticks at which the state of the arm was recorded.
     """
     status = f"{SERVO_BOARD}.status"
     ticks = recording.read_signal(status, "tick")[recording.read_signal(status, "braked") == 0]

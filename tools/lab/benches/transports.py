@@ -58,7 +58,7 @@ class Peer(NamedTuple):
 
 @contextmanager
 def open_iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Update an entry of an iceoryx2 blackboard. Every reader copies its newest value."""
+    """Open a transport that updates an iceoryx2 blackboard entry, which every reader copies."""
     message = AnyMessage(dtype)
     with _open_iceoryx2_node() as (iceoryx2, node):
         payload = _build_structure(dtype)
@@ -73,6 +73,7 @@ def open_iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transpor
         entries = [service.reader_builder().create().entry(key, payload) for _ in range(readers)]
 
     def build_fetch(reader: Any) -> Callable[[memoryview], None]:
+        """Build a function that copies a reader's newest value into a buffer."""
         get = reader.get
 
         def fetch(raw: memoryview) -> None:
@@ -86,7 +87,7 @@ def open_iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transpor
 
 @contextmanager
 def open_multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Send the bytes through a pipe to each reader."""
+    """Open a transport that sends the bytes through a pipe to each reader."""
     message = AnyMessage(dtype)
     pipes = [multiprocessing.Pipe(duplex=False) for _ in range(readers)]
 
@@ -105,7 +106,7 @@ def open_multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transpo
 
 @contextmanager
 def open_horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
-    """Send the bytes as a grey image of one row through a HORUS topic.
+    """Open a transport that sends the bytes as a grey one-row image through a HORUS topic.
 
     No other HORUS message carries an arbitrary number of bytes.
     """
@@ -126,6 +127,8 @@ def open_horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
         topic.send(image)
 
     def build_fetch(receive: Callable[[], Any]) -> Callable[[memoryview], None]:
+        """Build a function that copies the next received image into a buffer."""
+
         def fetch(raw: memoryview) -> None:
             raw[:] = np.asarray(receive()).reshape(-1).data
 
@@ -161,7 +164,7 @@ def _build_reader(
 def _open_iceoryx2_node() -> Iterator[tuple[Any, Any]]:
     """Open an iceoryx2 node for services.
 
-    Its files and shared memory have names only while the context lasts.
+    The names of its files and shared memory are removed when the context ends.
     """
     import iceoryx2
 
@@ -172,7 +175,7 @@ def _open_iceoryx2_node() -> Iterator[tuple[Any, Any]]:
         config.global_cfg.root_path = iceoryx2.Path.new(folder)
         config.global_cfg.prefix = iceoryx2.FileName.new(prefix)
         builder = iceoryx2.NodeBuilder.new().config(config)
-        # The process handles signals itself.
+        # This process handles signals itself.
         builder = builder.signal_handling_mode(iceoryx2.SignalHandlingMode.Disabled)
         try:
             yield iceoryx2, builder.create(iceoryx2.ServiceType.Ipc)

@@ -57,9 +57,9 @@ def _build_equation_claim(
         number: Number of the equation.
         form: The equation.
         quote: Sentence of the paper.
-        config: Config of a rack that violates it.
+        config: Config of a rack that violates the equation.
         settings: Changes to this config, as for `--set`.
-        judge: Rule of the claim. None for the common rule.
+        judge: Rule of the claim. None for `rules.judge_equation`.
     """
     return PaperClaim(
         f"equation-{number}",

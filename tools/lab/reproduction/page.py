@@ -84,10 +84,11 @@ class PaperClaim:
     predict: Callable[[], tuple[Evidence, ...]] = lambda: ()
 
     def judge_results(self, results: Mapping[str, StoredResult | str]) -> JudgedClaim:
-        """Judge the claim by the results of its experiments.
+        """Apply the rule of the claim to the results of its experiments.
 
         Args:
-            results: Result of each experiment by name, or a text that tells why it has none.
+            results: Dictionary from the name of each experiment to its result, or to the reason why
+                it has none.
         """
         unruled = JudgedClaim(self.name, self.title, self.quote, self.predict())
         records = []

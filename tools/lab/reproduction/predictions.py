@@ -24,7 +24,7 @@ def predict_equation(number: str, config: str, settings: tuple[str, ...]) -> tup
 
 
 def _predict_for_config(number: str, config: str, settings: tuple[str, ...]) -> Evidence:
-    """Return both sides of an equation from the budgets of a config, or why it is refused."""
+    """Return both sides of an equation from the budgets of a config, or the error in the config."""
     source = " ".join(("rack check", config, *(f"--set {setting}" for setting in settings)))
     try:
         rack = load(config, settings)
@@ -48,6 +48,6 @@ def predict_sweep() -> tuple[Evidence, ...]:
 
 
 def predict_figure_5() -> tuple[Evidence, ...]:
-    """Return the place of NASREM's levels in figure 5."""
+    """Return figure 5 as text, with the levels of NASREM in their regions."""
     text = "\n".join(figure5.format_figure(load(NAME)))
     return (Evidence(f"rack gantt {NAME} --figure 5", text=text),)

@@ -97,7 +97,7 @@ def judge_determinism(runs: Sequence[ComparedRun]) -> ClaimVerdict:
 
 
 def judge_speedup(on_one: FigureRun, on_two: FigureRun) -> ClaimVerdict:
-    """Compare the number of plans of a level on one processor and on two."""
+    """Check that a level makes more plans on two processors than on one."""
     plans_on_one, plans_on_two = (run.tasks[PLANNER].jobs for run in (on_one, on_two))
     needs = [compare_value("plans_on_one_processor", plans_on_one, ">=", 1)]
     return rule_on(
@@ -106,19 +106,19 @@ def judge_speedup(on_one: FigureRun, on_two: FigureRun) -> ClaimVerdict:
 
 
 def judge_growth(chains: Chains) -> ClaimVerdict:
-    """Count the missed cycles of a chain of boards after more boards were added."""
+    """Check that a chain of boards misses no cycles after more boards were added."""
     grown = chains.grown
     on_time = compare_value("messages_on_time", grown.took.get(grown.boards, 0), ">=", 1)
     return rule_on_strays("cycles_missed", grown.missed, grown.due, on_time)
 
 
 def judge_locks(chains: Chains) -> ClaimVerdict:
-    """Count missed cycles of boards that lock, read and unlock as the paper's do."""
+    """Check that boards that lock, read and unlock, as the paper's do, miss no cycles."""
     return rule_on_strays("cycles_missed", chains.locked.missed, chains.locked.due)
 
 
 def judge_pipeline(chains: Chains) -> ClaimVerdict:
-    """Compare the cycles that messages took with the number of levels."""
+    """Check that every message takes exactly as many cycles as there are levels."""
     lockstep_counts, realtime_counts = chains.lockstep.took, chains.realtime.took
     sent, arrived = sum(lockstep_counts.values()), sum(realtime_counts.values())
     early = sum(count for took, count in realtime_counts.items() if took < LEVELS)
@@ -142,7 +142,7 @@ def judge_replication() -> ClaimVerdict:
 
 
 def judge_communication(run: NasremRun, partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
-    """Compare the processor time of communication with the time that a second processor saves.
+    """Check that communication takes less processor time than a second processor saves.
 
     Both are in ms per second.
     """
@@ -154,7 +154,7 @@ def judge_communication(run: NasremRun, partitions: Sequence[PartitionFigures]) 
 
 
 def judge_flow(run: NasremRun) -> ClaimVerdict:
-    """Compare the number of commands and statuses with the number of their writers' cycles."""
+    """Check that every cycle of a writer sends its command and its status."""
     ways = [[box for box in run.due if box.endswith(way)] for way in (".command", ".status")]
     boxes = [box for way in ways for box in way]
     # A run may end before the last message is written.
@@ -167,14 +167,14 @@ def judge_flow(run: NasremRun) -> ClaimVerdict:
 
 
 def judge_loop(run: NasremRun) -> ClaimVerdict:
-    """Compare the number of missed cycles with the number of all cycles."""
+    """Check that no cycle was missed."""
     tasks = run.executors.values()
     bad = sum(task.missed for task in tasks)
     return rule_on_strays("cycles_missed", bad, sum(task.cycles for task in tasks))
 
 
 def judge_losses(*runs: LossesRun) -> ClaimVerdict:
-    """Compare the times of detection and recovery of each loss with their bounds."""
+    """Check that every loss is detected and recovered within its bounds and all tasks are done."""
     faults = [fault for run in runs for fault in run.faults]
     failures = check_none(
         not_detected_in_bound=sum(not fault.is_within for fault in faults),
@@ -186,7 +186,7 @@ def judge_losses(*runs: LossesRun) -> ClaimVerdict:
 
 
 def judge_goto(runs: GotoRuns) -> ClaimVerdict:
-    """Check that A is done by its deadline, and that too early a deadline moves nothing."""
+    """Check that A is done by its deadline, and that an impossible deadline starts no motion."""
     early, met = runs.early, runs.met
     begun = early.moved + (early.done_s is not None)
     done_s = inf if met.done_s is None else met.done_s
@@ -207,7 +207,7 @@ def check_equations(verdicts: Iterable[EquationVerdict]) -> list[Check]:
 
 
 def judge_equation(number: str, run: NasremRun) -> ClaimVerdict:
-    """Compare both sides of an equation in the worst cycle of every subject.
+    """Check that an equation holds in the worst cycle of every subject.
 
     The claim holds within bounds if the equation holds in 99 of 100 cycles.
     """
@@ -220,7 +220,7 @@ def judge_equation(number: str, run: NasremRun) -> ClaimVerdict:
 
 
 def judge_sum(run: NasremRun) -> ClaimVerdict:
-    """Compare the longest responses with the sum of equation 3.3, in ms.
+    """Check that the longest responses do not exceed the sum of equation 3.3, in ms.
 
     The claim holds within bounds if every response beyond the grid's bound was delayed by a missed
     cycle.
@@ -241,7 +241,7 @@ def judge_sum(run: NasremRun) -> ClaimVerdict:
 
 
 def judge_background(background: FigureRun, in_cycle: FigureRun) -> ClaimVerdict:
-    """Compare the late cycles while a level stores data in the background and in its cycle."""
+    """Check that a level is late if it stores data in its cycle, but not if in the background."""
     return rule_on(
         compare_value("blocks_stored", background.tasks[PLANNER].jobs, ">=", 1),
         compare_value(
@@ -257,7 +257,7 @@ def judge_background(background: FigureRun, in_cycle: FigureRun) -> ClaimVerdict
 
 
 def judge_loose_coupling(normal: NetworkRun, slower: NetworkRun) -> ClaimVerdict:
-    """Compare the servo rack's cycles and response on a network and on a slower one."""
+    """Check that a slower network delays the response as expected without missed servo cycles."""
     later_ms = 0.0
     if normal.response_ms is not None and slower.response_ms is not None:
         later_ms = slower.response_ms - normal.response_ms
@@ -276,19 +276,19 @@ def judge_loose_coupling(normal: NetworkRun, slower: NetworkRun) -> ClaimVerdict
 
 
 def judge_waits(waits: Waits) -> ClaimVerdict:
-    """Compare the lateness, in us, of cycles after polling and after blocking."""
+    """Check that the median lateness, in us, is smaller with polling than with blocking."""
     return rule_on(
         compare_value("polling_late_median_us", waits.polling_us, "<", waits.blocking_us)
     )
 
 
 def judge_update(run: FigureRun) -> ClaimVerdict:
-    """Count the preempted plan updates among those during which the executor was released."""
+    """Check that no plan update is preempted, even if the executor is released during it."""
     return rule_on_strays("updates_preempted", run.preempted, run.met)
 
 
 def judge_concurrency(*runs: FigureRun) -> ClaimVerdict:
-    """Compare the executors' late cycles with all cycles of runs in which planners made plans."""
+    """Check that executors are never late in runs in which planners make plans."""
     late = sum(run.tasks[LEVEL].late for run in runs)
     due = sum(run.tasks[LEVEL].jobs for run in runs)
     plans = min(run.tasks[PLANNER].jobs for run in runs)
@@ -319,13 +319,13 @@ def _check_undisturbed(run: FigureRun) -> list[Check]:
 
 
 def judge_working(run: FigureRun) -> ClaimVerdict:
-    """Judge a figure that works according to the paper."""
+    """Check that no job is late in a figure that works according to the paper."""
     late = check_none(late=sum(count.late for count in run.tasks.values()))
     return rule_on(ideal=late, here=[_compare_late_share(run, "<=")], needs=_check_undisturbed(run))
 
 
 def judge_failing(paper_run: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
-    """Judge a figure that fails according to the paper.
+    """Check that many jobs are late in a figure that fails according to the paper.
 
     Args:
         paper_run: Run of the figure.
@@ -370,7 +370,7 @@ def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
 
 
 def judge_tables(runs: TableRuns) -> ClaimVerdict:
-    """Compare the state transitions of runs with and without a disturbance."""
+    """Check that a disturbance causes state transitions that do not occur without it."""
     answering_rows = {*runs.disturbed.rows} - {*runs.undisturbed.rows}
     return rule_on(
         *check_done(runs.disturbed, runs.undisturbed),
@@ -379,10 +379,10 @@ def judge_tables(runs: TableRuns) -> ClaimVerdict:
 
 
 def judge_levels(run: NasremRun) -> ClaimVerdict:
-    """Compare the rates of the levels and the gaps between their cycles with nominal values.
+    """Check that every level has its nominal rate and leaves out no cycle.
 
-    The nominal rate is the paper's, or else the config's. A gap of two periods or more means that a
-    cycle was left out.
+    The nominal rate is the paper's, or else the config's. A gap of two periods or more between
+    cycles means that one was left out.
     """
     config = load(NAME)
     rates = check_done(run)
@@ -401,7 +401,7 @@ def judge_levels(run: NasremRun) -> ClaimVerdict:
 
 
 def judge_switch(run: SwitchRun) -> ClaimVerdict:
-    """Compare the context switch time with the paper's and with the config's, in us."""
+    """Check that the median switch time is at most the paper's and the p99 at most the config's."""
     return rule_on(
         compare_value("switch_median_us", run.switch_us["p50"], "<=", PAPER_US),
         compare_value("switch_p99_us", run.switch_us["p99"], "<=", run.assumed_us),
@@ -410,9 +410,10 @@ def judge_switch(run: SwitchRun) -> ClaimVerdict:
 
 
 def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
-    """Compare the missed cycles of levels by partition.
+    """Check that slow levels miss few cycles, and that fast ones miss more if coupled tightly.
 
-    Slow levels should manage with multitasking, and fast ones should need separate processors.
+    According to the figure, multitasking is enough for slow levels, but fast levels need separate
+    processors.
     """
     is_slow = {
         one.level: figure5.find_region(one.cycle_s).name == "multitasking"
@@ -440,7 +441,7 @@ def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
 
 
 def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimVerdict:
-    """Compare the responses in whole tasks of some systems with their bounds, in ms.
+    """Check that the responses of some systems in whole tasks are within their bounds, in ms.
 
     The claim holds within bounds if every longer response was delayed by a missed cycle.
 
@@ -467,7 +468,7 @@ def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimV
 
 
 def judge_layers(names: Iterable[str]) -> ClaimVerdict:
-    """Count levels in configs, and systems in which a level is faster than one below it."""
+    """Check that each system has at least two levels, none of them faster than a level below it."""
     configs = {name: load(name) for name in names}
     paths = {
         name: build_rack_timing(one, resolve_layout(one)).hierarchy for name, one in configs.items()
@@ -482,7 +483,7 @@ def judge_layers(names: Iterable[str]) -> ClaimVerdict:
 def judge_links(
     rates_hz: Mapping[str, int], run: TaskRun, ideal: Sequence[Check] = ()
 ) -> ClaimVerdict:
-    """Compare the messages between the parts of a system with the number that the rates imply.
+    """Check that the parts of a system exchange as many messages as the rates imply.
 
     Args:
         rates_hz: Rate of each mailbox, Hz. 1 requires at least one message.
@@ -505,7 +506,7 @@ def judge_links(
 
 
 def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
-    """Judge RCCL's links. For the claim to hold, every joint also needs a processor."""
+    """Apply `judge_links` to RCCL. The claim holds in full only if every joint has a processor."""
     joints = [
         task.core for task in resolve_layout(load("rccl")).tasks if task.board.startswith("joint")
     ]
@@ -514,7 +515,7 @@ def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
 
 
 def judge_predictable(run: ResponseRun) -> ClaimVerdict:
-    """Compare responses with the predicted tick and with equations 3.2 and 3.3.
+    """Check that responses occur at the predicted ticks and within equations 3.2 and 3.3.
 
     The claim holds within bounds if only the sum of equation 3.3 is exceeded.
     """

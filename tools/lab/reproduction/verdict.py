@@ -34,13 +34,13 @@ class Ruling(StrEnum):
 
 @dataclass(frozen=True)
 class Check:
-    """One comparison of a measured with a demanded value.
+    """Comparison of a measured value with a required one.
 
     Attributes:
         compared: Name of the quantity, with its unit if it has one.
         measured: Measured value.
         sign: Key of `COMPARISONS`.
-        demanded: Value on the right of the sign.
+        demanded: Required value, on the right of the sign.
         met: Whether the comparison is true.
     """
 

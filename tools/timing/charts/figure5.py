@@ -115,7 +115,7 @@ def place_levels(config: RackConfig) -> list[PlacedLevel]:
 
 
 def merge_levels(levels: Sequence[PlacedLevel]) -> list[PlacedLevel]:
-    """Merge levels at the same place in the figure, such as boards of joints, into one line."""
+    """Merge levels that differ only in their names, such as boards of joints, into one line."""
     return [PlacedLevel(**row) for row in merge_rows(map(vars, levels), "level")]
 
 
@@ -137,7 +137,7 @@ def format_figure(config: RackConfig) -> Iterator[str]:
 
 
 def build_document(config: RackConfig) -> Document:
-    """Return the figure as plain data. The last region has no end."""
+    """Return the figure as plain data. `to_s` of the last region is None."""
     regions = [
         {"name": r.words, "to_s": None if r.to_s == float("inf") else r.to_s} for r in REGIONS
     ]

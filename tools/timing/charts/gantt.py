@@ -109,7 +109,8 @@ def build_gantt(
     Args:
         subject: Config or run.
         options: Window that the user asked for.
-        process_ns: Times of X in the schedule by board, ns, cycle by cycle.
+        process_ns: Dictionary from boards to their times of X in successive cycles of the schedule,
+            ns.
         progress: Receives the fraction of a run that has been read.
 
     Raises:

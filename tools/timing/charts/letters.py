@@ -66,7 +66,8 @@ def format_panel(panel: Panel, column_ns: int) -> Iterator[str]:
 def choose_column_ns(window_ns: int, shortest_ns: int | None) -> int:
     """Return the width of a column, in ns: 1, 2 or 5 times a power of ten.
 
-    If `shortest_ns` is given and long enough, a column is no longer than that.
+    A column is as wide as `shortest_ns` permits, if it is given, but at least so wide that the
+    window fits into `MAX_COLUMNS`.
     """
     steps: list[int] = [digit * 10**power for power in range(3, 12) for digit in (1, 2, 5)]
     fits = next((step for step in steps if window_ns <= MAX_COLUMNS * step), steps[-1])
@@ -93,7 +94,10 @@ def _format_lane(chart: Chart, lane: Lane, column_ns: int) -> str:
 
 
 def _format_marks(panel: Panel, lane: Lane, column_ns: int) -> str:
-    """Return a row with "|" at starts of cycles and "!" at missed deadlines. Empty without any."""
+    """Return a row with "|" at starts of cycles and "!" at missed deadlines.
+
+    The row is empty if there are none.
+    """
     chart = panel.chart
     row = [" "] * (-(-(chart.end_ns - chart.start_ns) // column_ns) + 1)
     if lane.cycle_ns >= MIN_CYCLE_COLUMNS * column_ns:
@@ -195,7 +199,7 @@ def _shorten_pattern(pattern: str) -> str:
 
 
 def _format_late_jobs(panel: Panel) -> Iterator[str]:
-    """Yield the number of late jobs of each task, with the first ones of the window."""
+    """Yield the number of late jobs of each task, followed by its first late jobs in the window."""
     for lane in panel.lanes:
         for task in lane.tasks:
             count = panel.counts.get(task)

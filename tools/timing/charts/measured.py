@@ -58,7 +58,10 @@ class TracedRun:
 
     @property
     def is_lockstep(self) -> bool:
-        """Whether time stood still while tasks computed. Such a run has no chart."""
+        """Whether the run was in lockstep.
+
+        Such a run has no chart, because simulated time does not advance during cycles.
+        """
         return self.config.clock.mode == "lockstep"
 
     def build_panel(self, start_ns: int, end_ns: int, progress: Callable[[float], None]) -> Panel:
@@ -100,9 +103,9 @@ class TracedRun:
         return medians_ns
 
     def find_middle_ns(self, task: TimedTask) -> int:
-        """Return the first release, in ns, of a task or its plans in the second half of the run.
+        """Return the time, in ns, of a task's first release in the second half of the run.
 
-        0 if there is none.
+        Of a planner, only the releases of plans count. Returns 0 if there is no release.
         """
         ticks = self._records[task.name][0]["tick"]
         index = int(np.searchsorted(ticks, self.end_ns // self.config.tick_ns // 2))
@@ -141,7 +144,7 @@ class TracedRun:
     def _select_rows(self, task: TimedTask, start_ns: int, end_ns: int) -> np.ndarray:
         """Return the trace records of a task that overlap a stretch of time."""
         rows, longest_ns = self._records[task.name]
-        # A skipped release is noted in the record of the next one.
+        # A skipped release is recorded with the next one.
         bounds = (
             (start_ns - longest_ns) // self.config.tick_ns,
             (end_ns + task.every_ns) // self.config.tick_ns + 1,
@@ -152,7 +155,7 @@ class TracedRun:
 
     @cached_property
     def _records(self) -> dict[str, tuple[np.ndarray, int]]:
-        """Trace records of every task, and its longest response in ns.
+        """Dictionary from each task to its trace records and its longest response in ns.
 
         Of a planner, only the records of plans are included.
         """
@@ -198,7 +201,7 @@ class _TaskTrace:
                     yield release, unit, (start, end)
 
     def list_wake_ups(self) -> Iterator[Stretch]:
-        """Yield the stretches before cycles in which the task had the processor to wake up."""
+        """Yield, for each cycle, the stretch directly before it in which the task was waking up."""
         took = compute_waking_ns(self.rows).tolist()
         yield from (
             (start - ns, start)
@@ -216,7 +219,7 @@ class _TaskTrace:
 
 
 def _list_spans(traced: Sequence[_TaskTrace]) -> Iterator[Span]:
-    """Yield the spans of one core by descending priority.
+    """Yield the spans of one core, sorted by descending priority.
 
     Time that tasks of higher priority took is cut out.
     """

@@ -58,8 +58,8 @@ class Panel:
         kind: "schedule" or "measured".
         chart: Spans and jobs in the window.
         lanes: Rows of the chart.
-        patterns: Patterns by lane, over the whole run or a longer schedule.
-        counts: Jobs by task, over the same time.
+        patterns: Dictionary from lane names to patterns, over the whole run or a longer schedule.
+        counts: Dictionary from task names to numbers of jobs, over the same time.
         frame_ns: Minor frame of a static schedule, ns. 0 if there is none.
     """
 
@@ -72,7 +72,10 @@ class Panel:
 
     @property
     def frames(self) -> dict[int, int]:
-        """Start, in ns, of each minor frame that begins in the window, by its number in the run."""
+        """Dictionary from the numbers of minor frames that begin in the window to their starts.
+
+        Frames are numbered from the start of the run. Starts are in ns.
+        """
         if not self.frame_ns:
             return {}
         numbers = range(
@@ -138,7 +141,7 @@ class Panel:
 
 
 def _convert_to_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
-    """Return the times of an entry that have these names, in ms."""
+    """Return the named times of an entry in ms. Each key is the name with the suffix "_ms"."""
     times = {name: getattr(entry, f"{name}_ns") for name in names}
     return {
         f"{name}_ms": None if time_ns is None else time_ns / NS_PER_MS

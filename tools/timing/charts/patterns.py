@@ -130,11 +130,11 @@ class Patterns(NamedTuple):
 
 @dataclass(frozen=True)
 class PatternDetail:
-    """Longest stretches that patterns leave out, in ns.
+    """Limits, in ns, up to which stretches are left out of patterns.
 
     Attributes:
-        short_ns: Stretches of each unit function.
-        gap_ns: Stretches in which the core is idle.
+        short_ns: Limit for each unit function.
+        gap_ns: Limit for stretches in which the core is idle.
     """
 
     short_ns: Mapping[Unit, int] = field(default_factory=dict)
@@ -163,7 +163,7 @@ def count_patterns(chart: Chart, lane: Lane, within: Stretch, detail: PatternDet
         chart: Chart that extends beyond the stretch by a slice.
         lane: Lane whose patterns are counted.
         within: Start and end of the stretch, ns.
-        detail: Longest stretches that patterns leave out.
+        detail: Limits up to which stretches are left out.
     """
     counted = Patterns.build_empty()
     spans = [span for span in chart.spans if span.core == lane.core]
@@ -208,7 +208,7 @@ def _format_order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Pa
         spans: Spans in the stretch, in chronological order.
         lane: Lane of the pattern.
         within: Start and end of the stretch, ns.
-        detail: Longest stretches that are left out.
+        detail: Limits up to which stretches are left out.
     """
     stretches: list[tuple[Unit | None, int]] = []
     busy_until = within[0]
@@ -222,7 +222,7 @@ def _format_order(spans: Sequence[Span], lane: Lane, within: Stretch, detail: Pa
         busy_until = max(busy_until, end)
     if within[1] - busy_until > detail.gap_ns:
         stretches.append((None, within[1] - busy_until))
-    # Pieces of a unit function between which other boards ran count as one.
+    # A unit function that was interrupted by other boards counts once.
     wholes = [
         (unit, sum(ns for _, ns in pieces))
         for unit, pieces in groupby(stretches, key=itemgetter(0))

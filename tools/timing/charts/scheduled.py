@@ -33,7 +33,8 @@ class Schedule:
     Attributes:
         tasks: Tasks with their cores and priorities.
         frame_ns: Minor frame of a static schedule, ns. 0 if there is none.
-        default_length_ns: Default length of a chart of a static schedule, ns. None without one.
+        default_length_ns: Default length of a chart of a static schedule, ns. None if the schedule
+            is not static.
         switch_ns: Time of a context switch, ns.
     """
 

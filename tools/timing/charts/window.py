@@ -86,7 +86,7 @@ def parse_process_times(process: Sequence[str]) -> dict[str, list[int]]:
     """Parse times of X from texts such as "level=3,2", in ms.
 
     Returns:
-        Times by level, ns.
+        Dictionary from levels to times, ns.
 
     Raises:
         Failure: If a text has another form, or a negative time.

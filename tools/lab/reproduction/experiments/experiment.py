@@ -171,7 +171,7 @@ class Experiment(Generic[Found]):
 
 
 def describe_dependencies() -> Document:
-    """Describe everything on which a result that is made now depends."""
+    """Return the properties of the program and the machine on which results depend."""
     return {"program": compute_program_checksum(), "machine": describe_machine()}
 
 
@@ -215,7 +215,7 @@ def run_and_store(experiment: Experiment[Any], workshop: Workshop) -> StoredResu
     except RequirementMissing as reason:
         missing = str(reason)
     if INTERRUPT.number:
-        # A signal ends the run in good order, but too early for a result.
+        # The signal ended the run cleanly, but too early for a valid result.
         INTERRUPT.end_process()
     took_s = round(time.monotonic() - start_s, 1)
     result = StoredResult(data, took_s, time.strftime("%Y-%m-%d %H:%M:%S"), missing, dependencies)

@@ -57,7 +57,7 @@ class FigureRack:
 
     @cached_property
     def schedule(self) -> Schedule:
-        """Schedule that follows from the budget."""
+        """Schedule computed from the budget."""
         return Schedule(self.rack, resolve_layout(self.rack), {})
 
     @property
@@ -74,7 +74,7 @@ class FigureRack:
 
     @property
     def window_ns(self) -> int:
-        """Length of the charts, in ns."""
+        """Duration that the charts show, in ns."""
         return self.cycles * self.rack.find_period(LEVEL) * self.rack.clock_ns
 
     def build_panel(self) -> Panel:
@@ -88,7 +88,7 @@ class FigureRack:
 
 
 def build_settings(name: str, process_ms: float) -> tuple[str, ...]:
-    """Return the settings that give the executor of a figure a certain X.
+    """Return the settings that change X of a figure's executor.
 
     They change both the budget and the parameters of the board.
 
@@ -148,7 +148,7 @@ class FigureRun(ChartedRecord):
     """A run of a figure.
 
     Attributes:
-        tasks: Number of jobs and late jobs by task.
+        tasks: Dictionary from tasks to their numbers of jobs and late jobs.
         met: Number of updates of the plan during which the executor was released.
         preempted: Number of updates of the plan during which the executor began.
     """
@@ -179,7 +179,7 @@ def _measure_figure(figure: FigureRack, workshop: Workshop) -> FigureRun:
 
 
 def _count_updates_around(updates: np.ndarray, times_ns: np.ndarray) -> int:
-    """Return the number of updates of a plan that contain one of these times."""
+    """Return the number of plan updates during which at least one of `times_ns` occurred."""
     first, last = (np.searchsorted(times_ns, updates[field]) for field in ("process_ns", "end_ns"))
     return int(np.count_nonzero(last > first))
 

@@ -154,7 +154,7 @@ class ComparedRun:
 
 
 def _compare_modes(workshop: Workshop) -> tuple[ComparedRun, ...]:
-    """Run the rack twice in lockstep, then in real time until no deadline is missed."""
+    """Run the rack twice in lockstep, then in real time until a run misses no deadline."""
     first, second = (_record_run(workshop, f"{NAME}-lockstep-{k}", "lockstep") for k in (1, 2))
     runs = [_compare_run(first, None), _compare_run(second, first.recording)]
     for attempt in range(1, MAX_ATTEMPTS + 1):

@@ -62,7 +62,7 @@ class ResponseRun(ChartedRecord):
 
 
 def _measure_response(workshop: Workshop) -> ResponseRun:
-    """Run the rack in both clock modes and once without the hold of a moving arm."""
+    """Run the rack in both clock modes, and in lockstep without the hold of the moving arm."""
     run, lockstep = run_with_commands(workshop, "lockstep")
     _, realtime = run_with_commands(workshop, "realtime")
     predicted = next((c.predicted for c in lockstep.commands if c.given == MOVING_HOLD_TICK), None)

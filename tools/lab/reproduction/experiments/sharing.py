@@ -35,7 +35,7 @@ class ChainRun:
         boards: Number of boards.
         due: Number of due cycles.
         missed: Number of missed or skipped cycles.
-        took: Number of messages by the number of cycles that they took.
+        took: Dictionary from a number of cycles to the number of messages that took it.
     """
 
     boards: int
@@ -65,7 +65,7 @@ def _measure_chains(workshop: Workshop) -> Chains:
 
 
 def _measure_chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> ChainRun:
-    """Run a chain of boards, and count the cycles that its messages took."""
+    """Run a chain of boards. Count its messages for each number of cycles that they took."""
     run = _run_chain(label, workshop, chain, protocol)
     missed, due = count_cycles(run.result.tasks[name] for name in chain.names)
     last = f"{chain.names[-1]}.status"
@@ -101,12 +101,12 @@ class Waits:
 
 
 def _measure_waits(workshop: Workshop) -> Waits:
-    """Measure an empty board that blocks, and one that polls."""
+    """Measure the lateness of an empty board that blocks and of one that polls."""
     return Waits(_measure_median_us(workshop, "signal"), _measure_median_us(workshop, "poll"))
 
 
 def _measure_median_us(workshop: Workshop, wake: Wake) -> float:
-    """Return the median lateness, in us, of an empty board that waits as `wake` says."""
+    """Return the median lateness, in us, of an empty board with the given method of waiting."""
     chain = Chain(1, RATE_HZ, wake=wake)
     late_us = compute_lateness_us(
         _run_chain(f"waits-{wake}", workshop, chain).recording, chain.names[0]

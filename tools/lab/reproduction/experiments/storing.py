@@ -43,7 +43,7 @@ class StoringPlanner(FigurePlanner):
 
 
 class StoringExecutor(FigureExecutor):
-    """Executor that stores a block in every cycle, as no executor should."""
+    """Executor that stores a block in every cycle, and therefore delays its own cycles."""
 
     storage = Storage()
 

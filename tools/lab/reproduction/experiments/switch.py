@@ -130,7 +130,7 @@ def _start_loop(
 
 
 def _run_executor(semaphore: Semaphore, shared: _Shared) -> None:
-    """Run the executor, which wakes up, notes the time and waits again."""
+    """Run the executor, which repeatedly waits, wakes up and records the time."""
     awake = shared.awake
     for number in range(shared.wakes):
         semaphore.acquire()

@@ -67,7 +67,7 @@ class WayResponse:
     """Response in one direction, ms of simulated time.
 
     Attributes:
-        longest_ms: Longest measured response. None if no message went all the way.
+        longest_ms: Longest measured response. None if no response was measured.
         bound_ms: Longest response on the grid.
         unexplained: Number of responses beyond the bound that no missed cycle delayed.
     """
@@ -79,7 +79,10 @@ class WayResponse:
 
 @dataclass(frozen=True)
 class SystemResponse:
-    """Response of a rack by direction, "command" and "status", and the sum of equation 3.3, ms."""
+    """Response of a rack in each direction, and the sum of equation 3.3, ms.
+
+    The directions are "command" and "status".
+    """
 
     sum_eq_3_3_ms: float
     ways: dict[str, WayResponse]
@@ -97,7 +100,7 @@ def parse_response(report: Mapping[str, Any] | None) -> SystemResponse | None:
 
 
 def _parse_way_response(direction: Mapping[str, Any]) -> WayResponse:
-    """Return the response in one direction, from its part of a report."""
+    """Return the response in one direction from its entry in a report."""
     delays = [beyond["delayed_by"] for beyond in direction["beyond"]]
     times = direction["measured_ms"]
     return WayResponse(
@@ -115,7 +118,7 @@ class TaskRun:
         ended: Reason for its end.
         lasted_s: Simulated time, s.
         missed: Fraction of all cycles that were missed or skipped.
-        messages: Number of messages by mailbox.
+        messages: Dictionary from mailboxes to numbers of messages.
         response: Response of the system. None if it has no bounded response.
     """
 
@@ -221,8 +224,8 @@ def _compute_missed_share(*recordings: Recording) -> float:
 def _measure_two_racks(later_ms: int, workshop: Workshop) -> NetworkRun:
     """Run Brown's racks with a network that is slower by `later_ms`.
 
-    Two recorders share two cores with eight boards and may lose records. The run is then repeated,
-    up to `MAX_ATTEMPTS` runs in total.
+    Two recorders share two cores with eight boards and may lose records. A run with lost records is
+    repeated, up to `MAX_ATTEMPTS` runs in total.
     """
     lost: list[str] = []
     for attempt in range(1, MAX_ATTEMPTS + 1):
@@ -312,9 +315,9 @@ def _compute_response_ms(general: Recording, servo: Recording) -> float | None:
 
 
 def _find_first_ns(recording: Recording, box: str, field: str) -> int | None:
-    """Return when the first message that names the modification became visible, in ns.
+    """Return the time, in ns, at which a message that names the modification first became visible.
 
-    It is CLOCK_MONOTONIC time, or simulated time in lockstep.
+    It is CLOCK_MONOTONIC time, or simulated time in lockstep. None if there is no such message.
     """
     is_named = [MODIFICATION in str(text) for text in recording.read_signal(box, field)]
     ticks = recording.read_signal(box, "visible_at")[is_named]
