@@ -225,7 +225,7 @@ class Divergence:
             yield ValueDifference("basis", int(here["basis"]), int(there["basis"]))
 
     def _find_event_clues(self, box: MailboxSpec, message: DivergentMessage) -> Iterator[Clue]:
-        """Yield events of only one run that concern the message's writer or the whole rack."""
+        """Yield clues for events that only one run has and that concern the writer or the rack."""
         boards = {name.partition(".")[0] for name in (box.writer, box.name)}
         about = {CLOCK, box.writer, box.name, *boards}
         event_clues = [list(self._list_event_clues(run)) for run in self.runs]
@@ -233,8 +233,8 @@ class Divergence:
             event_clues, reversed(event_clues), self.runs, strict=True
         ):
             row = find_row(run, box, message.serial)
-            # A death is reported some time after the first message is missing, and the run may
-            # end without a later message. Accept a death up to the next written message.
+            # A death is reported some time after the first message is missing. Accept deaths until
+            # the run wrote a message with this serial, or until its end if it wrote none.
             written = NEVER if row is None else int(row["tick"])
             unmatched = Counter(event.key for event in other_run)
             for event in this_run:
@@ -247,7 +247,7 @@ class Divergence:
                     yield event.clue
 
     def _list_event_clues(self, run: Recording) -> Iterator[EventClue]:
-        """Yield the deaths, faults, commands and demands among a run's events."""
+        """Yield a clue for each death, fault, command or demand among the events of a run."""
         for event in run.events:
             kind = CLUES_BY_EVENT.get(event.get("code")) or CLUES_BY_EVENT.get(event["kind"])
             if kind is not None and event["tick"] >= self._begin:
@@ -258,7 +258,7 @@ class Divergence:
                 yield EventClue((kind, *about, text), about, clue)
 
     def _find_miss_clues(self, task: TaskSpec, tick: int) -> Iterator[Clue]:
-        """Yield the task's deadline miss or skipped cycle at `tick`, if only one run has it."""
+        """Yield a clue if the task missed or skipped its cycle at `tick` in only one run."""
         miss_clues = [
             Clue(miss["what"], MISS_TEXTS[miss["what"]].format(task.name), str(run.folder), tick)
             for run in self.runs
@@ -270,9 +270,9 @@ class Divergence:
             yield from miss_clues
 
     def _find_config_clues(self, task: str) -> Iterator[Clue]:
-        """Yield the differing settings of the task's board.
+        """Yield a clue for each setting of the task's board that differs between the runs.
 
-        If no setting of the board differs, yield the differing settings of the rest of the config.
+        If all settings of the board are equal, the rest of the config is compared instead.
         """
         tables = (load_toml(run.config) for run in self.runs)
         differences = [
@@ -286,7 +286,7 @@ class Divergence:
             yield Clue("config", f"{difference.name} differs", values=difference)
 
     def _find_unrecorded_inputs(self, task: str) -> Iterator[Clue]:
-        """Yield the inputs of a task that no recording contains."""
+        """Yield a clue for each input of a task that is not recorded, such as network messages."""
         layout = self.runs[0].layout
         hosts = {host.name for host in layout.hosts}
         for box in layout.mailboxes:
@@ -300,7 +300,7 @@ class Divergence:
 def _compare_signal(
     signal: Signal, here: np.ndarray, there: np.ndarray
 ) -> Iterator[ValueDifference]:
-    """Yield the difference of one field between two messages, or nothing if it is equal.
+    """Yield the two values of a field in two messages, or nothing if they are equal.
 
     For an array field only the first differing element is yielded.
 
@@ -314,8 +314,8 @@ def _compare_signal(
         return
     plain = [signal.extract_plain(message)[0] for message in (here, there)]
     index = ""
-    # 0.0 and -0.0 compare as equal but have different bytes. In that case no element is found
-    # here, and the whole array is shown.
+    # 0.0 and -0.0 compare as equal but have different bytes. In that case the loop
+    # finds no element, and the whole array is reported.
     for place in np.argwhere(values[0] != values[1])[:1].tolist():
         index = "".join(f"[{number}]" for number in place)
         plain = [np.array(value, "O")[tuple(place)] for value in plain]
@@ -323,7 +323,7 @@ def _compare_signal(
 
 
 def compare_values(here: Mapping[str, Any], there: Mapping[str, Any]) -> Iterator[ValueDifference]:
-    """Yield the values that differ between two nested tables, with dotted names."""
+    """Compare two nested tables. Yield differing values with their paths, as in `clock.mode`."""
     here_values = dict(_flatten_table(here))
     there_values = dict(_flatten_table(there))
     for name in dict.fromkeys((*here_values, *there_values)):
@@ -332,9 +332,9 @@ def compare_values(here: Mapping[str, Any], there: Mapping[str, Any]) -> Iterato
 
 
 def _flatten_table(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested tables, with dotted names.
+    """Yield the path and the value of each entry of a nested table.
 
-    Tables in a list get an index, as in `fault[0].kind`.
+    The keys of a path are separated by dots. Tables in a list get an index, as in `fault[0].kind`.
     """
     for name, value in table.items():
         is_tables = isinstance(value, list) and value and isinstance(value[0], dict)

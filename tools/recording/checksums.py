@@ -39,7 +39,7 @@ class Checksums:
     """The checksums of a run's files, as stored in `checksums.xxh128`.
 
     Attributes:
-        stored: Checksum of each file, by path relative to the folder of the run.
+        stored: Dictionary from the path of each file, relative to the folder, to its checksum.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -115,6 +115,6 @@ def parse_checked_line(line: str) -> Document:
 def is_cut_off(line: str) -> bool:
     """Return True if a line lacks its checksum, because the run was killed while writing it.
 
-    Call this only for a last line without a newline.
+    Call this only for the last line of a file, and only if it does not end with a newline.
     """
     return not _WHOLE.search(line)

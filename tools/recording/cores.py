@@ -69,7 +69,7 @@ class CoreRecord:
         return TypeAdapter(cls).validate_json(text)
 
     def sum_stolen_ms(self) -> dict[int, int]:
-        """Return the stolen time in ms, by core. Cores without steal are left out."""
+        """Return a dictionary from core to stolen time in ms. Cores without steal are left out."""
         spans = self.stolen or ()
         return {
             core: sum(s.ms for s in spans if s.core == core)
@@ -92,7 +92,7 @@ class CoreMeter:
         self._frequency_at = 0.0
 
     def read_counters(self) -> None:
-        """Read the counters, and add the increase of steal since the last reading."""
+        """Read the counters, and update stolen times and lowest and highest frequencies."""
         counts = _read_steal()
         now = time.monotonic_ns()
         if counts != self._counts:
@@ -111,7 +111,7 @@ class CoreMeter:
                 self._mhz[core] = min(low, mhz), max(high, mhz)
 
     def build_record(self) -> CoreRecord:
-        """Return a record of everything measured up to the last reading."""
+        """Return all measurements from the start to the last reading as a record."""
         mhz = tuple((core, low, high) for core, (low, high) in sorted(self._mhz.items()))
         return CoreRecord(
             self._looked_ns - self._began_ns, tuple(self._stolen) if self._counts else None, mhz

@@ -1,4 +1,4 @@
-"""The measured cycles of a run, split into unit functions, and the budgets that they need."""
+"""The measured cycles of a run, split into unit functions, and budgets for these functions."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import analyze_stalls
 
 START_UP_S = 0.1
-"""Simulated time after the start of a process in which its cycles are not judged.
+"""Simulated time after the start of a process during which its cycles are not evaluated.
 
 A new process touches its memory for the first time and fills its caches. The first cycle of each
 level of the default rack takes 2 to 8 times as long as usual; the sixth takes the usual time.
 """
 WORST_PERCENTILE = 100.0
-"""Percentile that eq. 3.6 demands: the longest of all cycles."""
+"""Percentile required by eq. 3.6: the longest of all cycles."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class Cycles:
         read_ns: R, time to read commands and statuses.
         process_ns: X of an executor, P of a planner.
         write_ns: W of an executor, U of a planner.
-        is_judged: False for cycles that are left out of all verdicts: those of a process's
-            start-up, and those in which the core may have been taken away.
-        stalled_count: Number of cycles in which the core may have been taken away, see
+        is_judged: False for cycles that are excluded from all verdicts, because a process was
+            starting or the core may have been unavailable.
+        stalled_count: Number of cycles in which the core may have been unavailable, see
             `analyze_stalls`.
         overhead_ns: Time per cycle outside these functions, for waking up and closing the cycle.
-        stretches: Number of the recorded stretch that contains each cycle, see `find_stretches`.
+        stretches: Index of the recorded stretch that contains each cycle, see `find_stretches`.
     """
 
     task: TaskSpec
@@ -77,7 +77,7 @@ class Cycles:
 
 
 def read_cycles(recording: Recording) -> dict[str, Cycles]:
-    """Return the cycles of a run by task. Tasks without recorded cycles are left out."""
+    """Return a dictionary from task to its cycles. Tasks without recorded cycles are left out."""
     tasks = [task for task in recording.layout.tasks if len(recording.cycles.get(task.name, ()))]
     places = {task.name: recording.find_core_and_priority(task) for task in tasks}
     _, absent = analyze_stalls(recording)
@@ -135,7 +135,7 @@ def _find_settled_cycles(recording: Recording, task: str, ticks: np.ndarray) -> 
 
 
 def list_restarts(recording: Recording) -> dict[str, list[int]]:
-    """Return the ticks at which restarted processes rejoined the rack, by task."""
+    """Return a dictionary from task to the ticks at which its restarted process rejoined."""
     rejoin_ticks: dict[str, list[int]] = {}
     for event in recording.events:
         if event.get("code") == "rejoined":
@@ -146,24 +146,24 @@ def list_restarts(recording: Recording) -> dict[str, list[int]]:
 def measure_budgets(
     recording: Recording, percentile: float = WORST_PERCENTILE
 ) -> dict[str, Budget]:
-    """Return the processor time that each level of a run needed, by board.
+    """Measure the processor time that each level of a run needs in a cycle.
 
-    Each unit function gets its longest time of all cycles (eq. 3.6), and these may come from
-    different cycles. Cycles of a process's start-up (`START_UP_S`) are excluded. So are stalled
-    cycles, because a virtual machine counts the time of a stall as processor time.
+    Each unit function is measured separately (eq. 3.6), so their longest times may come from
+    different cycles. Cycles during a start-up (`START_UP_S`) are excluded. So are stalled cycles,
+    because a virtual machine counts the time of a stall as processor time.
 
     Args:
         recording: The run.
         percentile: Percentage of the cycles that must fit into the budget.
 
     Returns:
-        Budgets by board. Levels that never ran are left out.
+        Dictionary from board to budget. Levels that never ran are left out.
     """
     return compute_budgets(read_cycles(recording), percentile)
 
 
 def compute_budgets(cycles_by_task: Mapping[str, Cycles], percentile: float) -> dict[str, Budget]:
-    """Return the budgets that the cycles from `read_cycles` need, by board."""
+    """Return a dictionary from board to the budget that covers its cycles from `read_cycles`."""
     executors = {
         name: cycles for name, cycles in cycles_by_task.items() if cycles.task.role == "executor"
     }
@@ -176,10 +176,10 @@ def compute_budgets(cycles_by_task: Mapping[str, Cycles], percentile: float) -> 
 
 
 def _compute_budget(executor: Cycles, planner: Cycles | None, percentile: float) -> Budget:
-    """Return the budget that one level needs."""
+    """Return the budget that covers the cycles of one level."""
 
     def worst_time(cycles: Cycles, times_ns: np.ndarray) -> int:
-        """Return the percentile of these times, over the judged cycles."""
+        """Return the percentile of a unit function's times. Excluded cycles are left out."""
         return compute_percentile(times_ns[cycles.is_judged], percentile)
 
     planner_parts = {}
@@ -197,11 +197,11 @@ def _compute_budget(executor: Cycles, planner: Cycles | None, percentile: float)
 
 
 def compute_percentile(times_ns: np.ndarray, percentile: float = WORST_PERCENTILE) -> int:
-    """Return the smallest measured time that at least `percentile` percent do not exceed.
+    """Return a percentile of measured times, rounded up to the next measured time.
 
     Args:
         times_ns: The times, shape (n,).
-        percentile: The percentage.
+        percentile: The percentile, 0 to 100.
 
     Returns:
         The time, or 0 if there are no times.

@@ -40,7 +40,7 @@ class Difference:
 class DivergentMessage:
     """The first message of a mailbox that differs between two runs.
 
-    If the ticks differ, or one run lacks the message, the earlier tick counts.
+    If a serial or tick differs between the runs, the smaller value is stored.
 
     Attributes:
         mailbox: The mailbox.
@@ -56,16 +56,16 @@ class DivergentMessage:
 
 
 def find_other_run(run: Path, named: Path, asked: str = "") -> Path:
-    """Return the folder of the run with which `run` is to be compared.
+    """Return the folder of the run to compare `run` with.
 
     Args:
         run: Folder of the run.
         named: Folder of the other run, or "origin" for the run that `run` continues. The origin is
-            searched at its recorded path, then next to `run`.
-        asked: The command line option or request, which begins the message of a `Failure`.
+            looked for at its recorded path, then next to `run`.
+        asked: Command line option or request with which the message of a `Failure` begins.
 
     Raises:
-        Failure: The run continues no other run, or that run no longer exists.
+        Failure: The origin was requested, but `run` has none, or it no longer exists.
     """
     if str(named) != "origin":
         return named
@@ -162,8 +162,9 @@ def _find_divergent_message(
 ) -> DivergentMessage | None:
     """Return the first differing message of a mailbox, or None if no message differs.
 
-    A damaged message is not recorded, so a missing message shows as a gap in the serials. A
-    difference in the content of a message shows in the chain of the message after it.
+    Serials and chains are compared. Damaged messages are not recorded, so they leave gaps in the
+    serials. A chain covers only earlier messages, so a message whose content differs is the one
+    before the first differing chain.
 
     Args:
         first_run: One run.
@@ -194,15 +195,14 @@ def _find_divergent_message(
     if not positions:
         return None
     serial, tick, visible_at = (min(numbers) for numbers in zip(*positions, strict=True))
-    # A message that only one run has is no difference if the other run ended before it became
-    # visible.
+    # If the other run ended before the message became visible, the message is not expected there.
     if len(positions) == 1 and visible_at >= end:
         return None
     return DivergentMessage(box.name, serial, tick, visible_at)
 
 
 def _read_heads(run: Recording, mailbox: str, begin: int) -> Heads:
-    """Return the compared columns of the messages written from tick `begin` on."""
+    """Return `COMPARED_COLUMNS` of all messages written at or after tick `begin`."""
     columns = {name: run.read_signal(mailbox, name) for name in COMPARED_COLUMNS}
     is_later = columns["tick"] >= begin
     return {name: values[is_later] for name, values in columns.items()}
@@ -211,9 +211,9 @@ def _read_heads(run: Recording, mailbox: str, begin: int) -> Heads:
 def _is_last_equal(
     first_run: Recording, second_run: Recording, box: MailboxSpec, heads: list[Heads]
 ) -> bool:
-    """Return True if the last message that both runs have is equal.
+    """Return True if the last message that both runs contain is equal in both.
 
-    No later message has a chain that covers it, so its content is compared.
+    Its content is compared, because no later message has a chain that covers it.
     """
     last = min(len(head["serial"]) for head in heads) - 1
     if any(heads[0][name][last] != heads[1][name][last] for name in COMPARED_COLUMNS):

@@ -29,10 +29,10 @@ def load_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Re
     Args:
         config: Config of the rack that will be run with these messages.
         run: Folder of the recorded run.
-        asked: The command line option or request, which begins the message of a `Failure`.
+        asked: Command line option or request with which the message of a `Failure` begins.
 
     Returns:
-        The messages, by adapter and port.
+        Dictionary from adapter to the messages of its ports.
 
     Raises:
         ConfigError: The config has mistakes.
@@ -164,13 +164,13 @@ def _check_complete(box: MailboxSpec, recording: Recording, asked: str) -> None:
 
 
 def _load_rows(recording: Recording, box: MailboxSpec, is_sent: bool) -> MessageRows:
-    """Load the messages of a mailbox in the form of `rack.boards.wiring`.
+    """Return tick, basis and bytes of each recorded message of a mailbox, oldest first.
 
     Args:
         recording: The recording.
         box: The mailbox.
-        is_sent: True if the adapter wrote a message only when one arrived. If it is False, the
-            adapter wrote its newest message again in every cycle, and these repeats are left out.
+        is_sent: Whether the adapter wrote only newly arrived messages. If False, the adapter
+            repeated its newest message in every cycle, and the repetitions are left out.
     """
     if box.name not in recording.mailboxes:
         return []

@@ -8,7 +8,7 @@ from pathlib import Path
 from rack.tools.recording.file_names import CODE
 
 RECORDED_ENDINGS = (".toml", ".jsonl", ".spool", ".parquet", ".rrd", "published.json", CODE)
-"""Endings of the names of recorded files. Reports and pictures have other endings."""
+"""Endings of recorded files. Reports and pictures, which do not count, have other endings."""
 
 
 def measure_size(folder: Path) -> int:
@@ -34,7 +34,7 @@ def format_size(size: int, lasted_s: float) -> str:
 
 
 def format_recorded_line(folder: Path, lasted_s: float) -> str:
-    """Return a line that says where a run is recorded and how large the recording is."""
+    """Return a line with the folder and the size of a recording."""
     return f"recorded into {folder}: {format_size(measure_size(folder), lasted_s)}"
 
 

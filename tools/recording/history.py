@@ -30,9 +30,9 @@ BY_LEVEL = "holding"
 def list_misses(recording: Recording) -> list[Document]:
     """List every missed cycle of the trace, earliest first.
 
-    A skipped release leaves no record: the next record of the task holds the number of releases
-    skipped before it. Releases skipped after the last record follow from the counts at the end of
-    the run.
+    A skipped release leaves no record: the next record of the task contains the number of
+    releases skipped before it. Releases skipped after the last record follow from the counts at
+    the end of the run.
 
     Returns:
         Entries with task, tick, `what` ("late" or "skipped") and count. Entries of late cycles
@@ -43,7 +43,7 @@ def list_misses(recording: Recording) -> list[Document]:
         entries += _list_task_misses(task, recording.read_trace(task.name))
         done = recording.find_task_counts(task.name).get("done")
         if done is None:
-            # The end of the run was not recorded, or the recording is of an earlier version.
+            # The end of the run was not recorded, or an earlier version recorded the run.
             continue
         if count := task.count_unfinished(done, recording.end_counts["outcome"]["ticks"]):
             entries.append(_build_skip_entry(task, task.grid.find_tick(done + 1), count))
@@ -80,7 +80,7 @@ def _build_skip_entry(task: TaskSpec, tick: int, count: int) -> Document:
 
 
 def count_misses(entries: Sequence[Document]) -> tuple[int, int]:
-    """Return the numbers of late and of skipped cycles in a list from `list_misses`."""
+    """Return the number of late and the number of skipped cycles in entries of `list_misses`."""
     late, left_out = (
         sum(miss["count"] for miss in entries if miss["what"] == kind)
         for kind in ("late", "skipped")
@@ -92,8 +92,8 @@ def summarize_steal(recording: Recording) -> Document:
     """Return the time that the hypervisor stole from each core.
 
     Returns:
-        `ms` and `percent` of the run, by core, and `measured`. The latter is False for a run in
-        lockstep, and if the kernel does not count steal.
+        `ms` and `percent` (of the run), which are dictionaries keyed by core, and `measured`, which
+        is False if the run was in lockstep or the kernel does not count steal.
     """
     record = recording.cores
     stolen_ms = {str(core): ms for core, ms in record.sum_stolen_ms().items()}
@@ -110,9 +110,10 @@ def list_holds(recording: Recording) -> list[Document]:
     """List every hold of every level, earliest first.
 
     Returns:
-        Entries with the level, times in seconds, `by` and `why`. If `by` is "operator", `why` is
-        the command. If `by` is "holding", the level itself held, and `why` is the last reason in
-        its status. `until_s` is None for a hold that lasted to the end of the run.
+        Entries with level, times in seconds, `by` and `why`. `by` is "operator" for a hold that an
+        operator commanded, and `why` is the command. `by` is "holding" for a hold by the level
+        itself, and `why` is the last reason in its status. `until_s` is None if the hold lasted
+        until the end of the run.
     """
     levels = [
         mailbox.removesuffix(".status")
@@ -124,11 +125,12 @@ def list_holds(recording: Recording) -> list[Document]:
 
 
 def list_fired_rows(recording: Recording) -> dict[str, list[Document]]:
-    """List the rows of state tables that fired, by level.
+    """List the rows of state tables that fired at least once.
 
     Returns:
-        The rows of each level, in the order in which they first fired. Each has table, row, name,
-        number of cycles in which it fired, and simulated time of the first firing.
+        Dictionary from level to its rows, in the order in which they first fired. Each entry has
+        table, row, name, number of cycles in which the row fired, and simulated time at which it
+        first fired.
     """
     by_level = {}
     for mailbox in recording.mailboxes:
@@ -156,7 +158,7 @@ def list_fired_rows(recording: Recording) -> dict[str, list[Document]]:
 
 
 def _list_level_holds(recording: Recording, level: str) -> Iterator[Document]:
-    """Yield the holds of one level, found in its recorded statuses."""
+    """Yield the holds of one level, as derived from its recorded statuses."""
     mailbox = f"{level}.status"
     tick_s = recording.layout.clock_ns * 1e-9
     fields = recording.list_fields(mailbox)
@@ -190,10 +192,10 @@ def _list_level_holds(recording: Recording, level: str) -> Iterator[Document]:
 
 
 def _find_equal_runs(numbers: np.ndarray) -> list[tuple[int, int]]:
-    """Find the runs of equal consecutive numbers in an array. Runs of 0 are left out.
+    """Find the runs of equal, consecutive, nonzero numbers in an array.
 
     Returns:
-        For each run its first index and the index after its last element.
+        For each run, the index of its first element and the index after its last element.
     """
     borders = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
     return [(first, end) for first, end in pairwise(borders) if first < end and numbers[first]]

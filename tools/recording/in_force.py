@@ -9,7 +9,7 @@ from rack.tools.recording.signal import Trigger
 
 
 class VisibleMessages:
-    """Looks up the messages of a run by the tick at which they are visible to readers.
+    """Finds the message that readers of a mailbox see at a given tick of a run.
 
     A mailbox is loaded when it is first used.
     """
@@ -38,7 +38,7 @@ class VisibleMessages:
         return ticks
 
     def _load_rows(self, mailbox: str) -> np.ndarray:
-        """Return all rows of a mailbox. They are read from the files once, then kept in memory."""
+        """Return all rows of a mailbox. They are read from the files only once."""
         if mailbox not in self._rows:
             self._rows[mailbox] = self._recording.read_rows(mailbox)
         return self._rows[mailbox]

@@ -1,7 +1,7 @@
 """Decides which ticks of a run a flight recorder keeps.
 
-An occasion is anything that is worth keeping the recording around it: an alarm, a missed or skipped
-cycle, and the begin or end of a hold.
+An occasion is an event around which the recording is kept: an alarm, a missed or skipped cycle, or
+the beginning or end of a hold.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rack.boards.config.record import RecordConfig
 from rack.boards.timing.trace_times import count_skipped_releases, find_missed_cycles
 
 ORDINARY_ALARMS = (Alarm.COMMANDED,)
-"""Alarms that are not occasions. All others are: faults, detections, brakes, restarts."""
+"""Alarms that are not occasions. All other alarms are, for example faults and detections."""
 
 
 class TickRange(NamedTuple):
@@ -34,9 +34,9 @@ class Retention(NamedTuple):
     """The settings of a flight recorder in `[record]`, converted to ticks.
 
     Attributes:
-        keep: Length of the newest part of the run, which is always kept.
+        keep: Number of newest ticks, which are always kept.
         before: Number of ticks that are kept before each occasion: an alarm, a missed or skipped
-            cycle, or the begin or end of a hold.
+            cycle, or the beginning or end of a hold.
         after: Number of ticks that are kept after each occasion.
     """
 
@@ -60,7 +60,7 @@ class Retention(NamedTuple):
     def find_missing_windows(
         self, segment: Segment, kept: Sequence[tuple[int, int]], ticks: int
     ) -> list[TickRange]:
-        """Find the ranges of ticks that should have been kept but were not kept completely.
+        """Find the ranges of ticks that should have been kept but are missing or incomplete.
 
         Args:
             segment: Segment of the rack, whose alarm rings still contain the last alarms.
@@ -81,9 +81,9 @@ class Retention(NamedTuple):
 
 
 class Occasions:
-    """Finds the ticks of occasions, around which a flight recorder keeps the recording.
+    """Finds occasions, the ticks around which a flight recorder keeps the recording.
 
-    Occasions are alarms, missed or skipped cycles, and begins and ends of holds.
+    Occasions are alarms, missed or skipped cycles, and the beginning and end of each hold.
     """
 
     def __init__(self, segment: Segment) -> None:
@@ -98,7 +98,7 @@ class Occasions:
         }
 
     def find_alarm_ticks(self) -> Iterator[int]:
-        """Yield the ticks of alarms that are occasions and were raised since the last call.
+        """Yield the ticks of the occasions among the alarms since the last call.
 
         The first call yields all alarms that the alarm rings still contain.
         """

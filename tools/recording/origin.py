@@ -33,10 +33,10 @@ PACKAGES_FOLDER = Path(__file__).resolve().parents[2]
 
 
 def write_code_state(config: RackConfig, folder: Path) -> None:
-    """Write code.json into the folder of a run.
+    """Write code.json, which identifies the code that produces a run, into the run's folder.
 
-    Call this only when the levels have been loaded, because loaded modules show the code of the
-    user's levels.
+    Call this after the levels have been loaded, because the code of the user's levels is found
+    through the loaded modules.
 
     Raises:
         OSError: The file cannot be written.
@@ -51,12 +51,12 @@ def write_code_state(config: RackConfig, folder: Path) -> None:
 
 
 def check_code_state(recording: Recording, asked: str, anyway: bool) -> None:
-    """Check that the code and files of a run are unchanged before it is repeated.
+    """Check that the code and files that produced a run have not changed since.
 
     Args:
         recording: The run.
-        asked: The command line option or request, which begins the message.
-        anyway: Whether to only print a note on stderr if something has changed.
+        asked: Command line option or request with which the message begins.
+        anyway: Whether to print a warning on stderr instead of raising `Failure`.
 
     Raises:
         Failure: Code or files have changed, or code.json is missing, and `anyway` is False.
@@ -78,7 +78,7 @@ def check_code_state(recording: Recording, asked: str, anyway: bool) -> None:
 
 
 def _compute_state(name: str) -> str:
-    """Return the current state of an entry of code.json.
+    """Return the current value of an entry of code.json.
 
     Args:
         name: "version", "python", `PROGRAM`, or the path of a file or folder.
@@ -105,7 +105,7 @@ def _compute_state(name: str) -> str:
 
 @dataclass(frozen=True)
 class Origin:
-    """The original run that another run, the continuation, continues.
+    """Reference to the original run of a continuation, a run that begins at a tick of another.
 
     Attributes:
         folder: Folder of the original run, as the user named it.
@@ -119,7 +119,7 @@ class Origin:
 
     @classmethod
     def from_run(cls, run: Recording, tick: int) -> Self:
-        """Return the origin of a run that continues `run` from `tick` on."""
+        """Return the origin for a continuation of `run` from `tick` on."""
         return cls(str(run.folder), tick, run.launch.created_ns)
 
     @classmethod

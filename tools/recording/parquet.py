@@ -30,11 +30,11 @@ TRACE_FIELDS = (pa.field("task", pa.string()), *(pa.field(name, pa.int64()) for 
 HEAD_COLUMNS = ("serial", "tick", "visible_at", "basis", "stamp_ns", "chain")
 """Columns of every mailbox's messages. In a table they follow `TIME_COLUMN`."""
 TIME_COLUMN = "time_s"
-"""Column with the tick as simulated time, s."""
+"""Column with the simulated time of the tick in s."""
 TRACE_ROWS = 1 << 16
 MESSAGE_ROWS = 8192
 MESSAGE_BYTES = 16 << 20
-"""Amounts of waiting rows at which they are written as one block.
+"""Amounts of buffered rows at which they are written as one block.
 
 Blocks are large because a file's footer has an entry for every column of every block.
 """
@@ -51,7 +51,7 @@ An open part holds 0.7 kB of memory for each entry.
 class CyclesFile:
     """Writer of cycles.parquet, the trace of all tasks.
 
-    Trace records wait in memory until there are enough of them for a block.
+    Trace records are buffered in memory and written in large blocks.
     """
 
     def __init__(self, path: Path, layout: Layout, launch: Launch) -> None:
@@ -79,7 +79,7 @@ class CyclesFile:
             self._write_block()
 
     def _write_block(self) -> None:
-        """Write the waiting records to the file as one block."""
+        """Write the buffered records to the file as one block."""
         if not self._waiting:
             return
         # Sort by task, so that the rows of each task are contiguous.
@@ -100,10 +100,10 @@ class CyclesFile:
         gaps: Sequence[tuple[str, int, int]],
         kept: Sequence[tuple[int, int]],
     ) -> None:
-        """Finish the file, with these data of the recording as its metadata.
+        """Finish the file. The arguments are stored in its metadata.
 
         Args:
-            lost: Number of lost rows, by task and by mailbox.
+            lost: Number of lost rows of each task and mailbox.
             cores: Stolen time and frequency of the cores.
             gaps: Name of the ring, first and last tick of each gap.
             kept: Ticks that a flight recorder kept, as ranges [first, end).
@@ -120,9 +120,9 @@ class CyclesFile:
 
 
 def create_signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]:
-    """Create the tables in signals/, and return them by mailbox.
+    """Create the tables in signals/. Returns a dictionary from mailbox to table.
 
-    An existing folder, which a killed recorder left, is deleted first.
+    A folder that a killed recorder left behind is deleted first.
     """
     if folder.exists():
         rmtree(folder)
@@ -135,7 +135,7 @@ def create_signal_tables(folder: Path, layout: Layout) -> dict[str, SignalTable]
 class SignalTable:
     """Writer of the table of a mailbox, which is a folder of parquet files called parts.
 
-    Rows wait in memory until there are enough of them for a block.
+    Rows are buffered in memory and written in large blocks.
     """
 
     def __init__(self, folder: Path, mailbox: MailboxSpec, layout: Layout) -> None:
@@ -178,7 +178,7 @@ class SignalTable:
             self._write_block()
 
     def _write_block(self) -> None:
-        """Write the waiting rows as one block, and begin a new part if the footer is large."""
+        """Write the buffered rows as one block, and begin a new part if the footer is large."""
         if not self._waiting:
             return
         rows = np.concatenate(self._waiting)
@@ -196,7 +196,7 @@ class SignalTable:
             self._begin_part()
 
     def close(self) -> None:
-        """Write the waiting rows and finish the last part."""
+        """Write the buffered rows and finish the last part."""
         self._write_block()
         self._writer.close()
 

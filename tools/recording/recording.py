@@ -64,7 +64,7 @@ class Gap(NamedTuple):
 MAX_SHOWN_STRETCHES = 20
 """Largest number of kept stretches that a text lists."""
 READ_ERRORS = (pa.ArrowException, OSError, ValueError, KeyError, TypeError)
-"""Errors that are raised while a damaged file, or a file of another kind, is read."""
+"""Errors that reading a damaged file, or a file of another format, may raise."""
 
 
 class Recording:
@@ -207,14 +207,14 @@ class Recording:
 
     @property
     def lost_rows(self) -> dict[str, int]:
-        """Number of rows that were written but are not in the files, by task and by mailbox."""
+        """Number of rows of each task and mailbox that were written but are not in the files."""
         return dict(self.end_counts.get("rows_lost", self._lost_before_end))
 
     def find_stretches(self, ticks: np.ndarray) -> np.ndarray:
-        """Return the number of the kept stretch that contains each tick, shape (n,).
+        """Return the index of the kept stretch that contains each tick, shape (n,).
 
-        Use the numbers to leave out differences between rows of different stretches, because
-        nothing is recorded between them. If everything was kept, all numbers are 0.
+        Do not compute differences between rows of different stretches, because nothing is recorded
+        between them. If everything was kept, all indices are 0.
         """
         # Rows may lie slightly outside their stretch. Each border between two stretches is
         # therefore halfway between them, but at most one second after the earlier one.
@@ -240,14 +240,14 @@ class Recording:
     def find_gaps(
         self, lost: Mapping[str, int] | None = None, ticks: int | None = None
     ) -> list[Gap]:
-        """Find the ranges of ticks in which rows are missing, in order. Merges overlapping ranges.
+        """Find the ranges of ticks in which rows are missing. Merges overlapping ranges.
 
         Args:
-            lost: Number of lost rows, by task and by mailbox. Defaults to the counts at the end of
+            lost: Number of lost rows of each task and mailbox. Defaults to the counts at the end of
                 the run.
             ticks: Length of the run in ticks. Defaults to its recorded length. If `lost` counts
-                more rows of a ring than the files report, these are missing between the last
-                recorded row of the ring and this tick.
+                more rows of a ring than the files report, the additional rows are missing between
+                the last recorded row of the ring and this tick.
         """
         lost = self.lost_rows if lost is None else lost
         ticks = self.end_counts.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
@@ -275,7 +275,7 @@ class Recording:
         return int(self.read_signal(name, "tick")[-1]) if name in self.mailboxes else -1
 
     def count_untraced(self) -> dict[str, tuple[int, int]]:
-        """Return recorded and total number of cycles, for each task with missing trace records."""
+        """Return recorded and total number of cycles of each task that lacks trace records."""
         traced = {task.name: len(self.read_trace(task.name)) for task in self.layout.tasks}
         return {
             name: (rows, rows + self.lost_rows[name])
@@ -292,7 +292,7 @@ class Recording:
             segment: Segment of the rack.
 
         Returns:
-            The missing rows by task and by mailbox.
+            Dictionary from task or mailbox to its missing rows. Complete rings are left out.
         """
         taken = {}
         lost = dict(self.lost_rows)
@@ -325,7 +325,7 @@ class Recording:
     def find_core_and_priority(self, task: TaskSpec) -> tuple[int, int]:
         """Return the core and the priority with which a task ran.
 
-        If the end of the run was not recorded, the settings of the config are returned.
+        If the end of the run was not recorded, these are the settings of the config.
         """
         counted = self.find_task_counts(task.name)
         return counted.get("core", task.core), counted.get("priority", task.priority)
@@ -401,8 +401,8 @@ def _parse_event(line: str, place: str) -> Document:
     """Parse a line of events.jsonl.
 
     Raises:
-        Failure: The line is damaged or not an event. The message begins with `place`, which says
-            where the line was read.
+        Failure: The line is damaged or not an event. The message begins with `place`, the file
+            and line that are parsed.
     """
     try:
         event = parse_checked_line(line)

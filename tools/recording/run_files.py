@@ -66,10 +66,10 @@ def find_missing(
     Args:
         segment: Segment of the rack.
         taken: Number of the last record that the recorder read from each ring.
-        lost: Number of earlier records that are not in the recording, by ring.
+        lost: Number of earlier records of each ring that are not in the recording.
 
     Returns:
-        The missing rows by task and by mailbox. Complete rings are left out.
+        Dictionary from task or mailbox to its missing rows. Complete rings are left out.
     """
     missing = {}
     for name, ring in open_rings(segment).items():
@@ -89,9 +89,9 @@ class Tally:
 
     Attributes:
         tasks: Names of the tasks, whose rings are traces.
-        lost: Number of rows that were overwritten before they were read, by ring.
-        taken: Number of the last record read, by ring. Starts at `before`.
-        rows: Number of rows read, by ring.
+        lost: Number of rows of each ring that were overwritten before they were read.
+        taken: Number of the last record read from each ring. Starts at `before`.
+        rows: Number of rows read from each ring.
         kept: Ranges of ticks [first, end) that were not deleted. Consecutive stretches are one
             range.
         stretch_number: Number of the newest stretch.
@@ -108,7 +108,7 @@ class Tally:
         self._newest = -1
 
     def count_part(self, part: Part) -> None:
-        """Add the rows or the stretch border in one part of a spool to the counts."""
+        """Update the counts with one part of a spool: rows, or the head or end of a stretch."""
         match part:
             case StretchHead():
                 self.begin_stretch(part)
@@ -119,7 +119,7 @@ class Tally:
                     self.add_rows(*block)
 
     def begin_stretch(self, stretch: StretchHead) -> None:
-        """Continue with the counts at the head of a stretch. Earlier stretches may be deleted."""
+        """Adopt the counts at the head of a stretch. Earlier stretches may have been deleted."""
         follows = stretch.number == self.stretch_number + 1
         if follows:
             # Rows are missing here only if the file of the previous stretch is damaged.
@@ -165,8 +165,8 @@ class Tally:
         """End the last stretch.
 
         Args:
-            tick: Tick at which it ends. Defaults to the tick after its newest row, as for the
-                stretch of a killed recorder.
+            tick: Tick at which it ends. By default, the tick after its newest row, because a
+                killed recorder writes no end.
         """
         if self.kept and self.kept[-1][1] == OPEN_END:
             first = self.kept[-1][0]
@@ -232,8 +232,7 @@ def rebuild_files(folder: Path) -> bool:
     """Build the files of a run from the spool of a killed recorder or of a flight recorder.
 
     Returns:
-        True if the files were built. False if the folder contains no spool, so that nothing has to
-        be built.
+        True if the files were built, False if the folder contains no spool.
 
     Raises:
         Failure: The recorder is still running, or its spool cannot be read.

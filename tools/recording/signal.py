@@ -50,7 +50,7 @@ class Signal(Column):
 
     @classmethod
     def build_by_name(cls, boxes: Sequence[MailboxSpec]) -> dict[str, Signal]:
-        """Return a signal for every field of these mailboxes, by name."""
+        """Return a dictionary from name to signal, with every field of these mailboxes."""
         return {column.name: cls(**vars(column)) for box in boxes for column in list_columns(box)}
 
     @classmethod
@@ -116,7 +116,7 @@ class Signal(Column):
         return decode_text(value) if isinstance(value, bytes) else value
 
     def replace_numbers(self, values: np.ndarray) -> np.ndarray:
-        """Replace numbers that stand for names, such as states, by the names.
+        """Replace numbers that stand for names, such as states, with the names.
 
         Values of other signals are returned unchanged.
         """
@@ -163,8 +163,8 @@ def _build_failure(
     Args:
         what: Kind of the name, "signal" or "mailbox".
         name: The unknown name.
-        known: The known names, of which the message lists similar ones.
-        boxes: Mailboxes, which the message lists if no known name is similar.
+        known: The valid names. The message lists those that are similar to `name`.
+        boxes: Mailboxes. The message lists them if no valid name is similar.
     """
     near = get_close_matches(name.partition("[")[0], known, MAX_SUGGESTIONS)
     offered = "nearest" if near else "mailboxes"

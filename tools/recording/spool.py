@@ -99,8 +99,8 @@ class StretchHead(NamedTuple):
         number: Number of the stretch, counted from 1.
         begin: First tick of the range. The stretch contains rows of cycles that ended at or after
             this tick.
-        taken: Number of the last record read before the stretch, by ring.
-        rows: Number of rows read before the stretch, by ring.
+        taken: Number of the last record that was read from each ring before the stretch.
+        rows: Number of rows that were read from each ring before the stretch.
     """
 
     number: int
@@ -219,7 +219,7 @@ class Spool:
             now: Whether to write even if that time has not passed.
 
         Returns:
-            True if the queue was written, so that it is empty now.
+            True if the queue was written and is now empty.
 
         Raises:
             OSError: The disk is full.
@@ -278,7 +278,7 @@ def _read_parts(file: IO[bytes], path: Path) -> Iterator[Any]:
 
 
 def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
-    """Read the head of a spool, and leave the file position after it.
+    """Read the head of a spool, and leave the file positioned after it.
 
     Returns:
         Layout and launch of the rack.
@@ -294,7 +294,7 @@ def read_head(file: IO[bytes], path: Path) -> tuple[Layout, Launch]:
 
 
 def read_spool(file: IO[bytes], folder: Path) -> Iterator[Part]:
-    """Yield the parts of a spool whose head was read, then the parts of all its stretches."""
+    """Yield the parts after the head of a spool, then the parts of all its stretches."""
     yield from _read_parts(file, folder / SPOOL)
     yield from _read_stretches(list_stretch_files(folder))
 
@@ -313,7 +313,7 @@ def list_stretch_files(folder: Path) -> list[Path]:
 
 
 def open_rings(segment: Segment) -> dict[str, Ring]:
-    """Open every ring of a rack: first the traces by task, then the messages by mailbox."""
+    """Open every ring of a rack, keyed by task or mailbox. The tasks come first."""
     traces = {task.name: open_trace_ring(segment, task.name) for task in segment.layout.tasks}
     return traces | {
         mailbox.name: MailboxRing(segment, mailbox.name) for mailbox in segment.layout.timed
@@ -321,7 +321,7 @@ def open_rings(segment: Segment) -> dict[str, Ring]:
 
 
 def list_ring_dtypes(layout: Layout) -> dict[str, np.dtype]:
-    """Return the row type of every ring of a rack, by task and by mailbox, as `open_rings`."""
+    """Return a dictionary from task or mailbox to the row type of its ring."""
     traces = {task.name: RECORD for task in layout.tasks}
     return traces | {mailbox.name: build_row_dtype(mailbox) for mailbox in layout.timed}
 

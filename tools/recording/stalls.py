@@ -1,12 +1,12 @@
-"""Finds out when cores were taken away from a rack that ran in real time, and by what.
+"""Finds the times at which cores were unavailable to a rack in real time, and the causes.
 
-Cores are taken away by the hypervisor, or by a CPU quota of the host. In either case the kernel may
-count the time as steal, but need not. Without steal, an absence shows as a time at which the rack
-was due but recorded no time stamp. On the clock's core, the clock, which preempts everything else,
-woke late (event `CLOCK_LATE`). On any other core, a task was due and no task recorded a stamp. Both
-are considered only for real-time priorities, because without one a task waits for any other
-program. Alternative considered: a trace of the clock board, which would show nothing more but need
-another ring.
+A core is unavailable, or absent, while the hypervisor or a CPU quota of the host withholds it. The
+kernel may or may not count that time as steal. Without steal, an absence is inferred from missing
+time stamps. On the clock's core, the clock, which preempts everything else, woke late (event
+`CLOCK_LATE`). On any other core, a task was due but no task recorded a time stamp. Both are
+considered only for real-time priorities, because a task without one may wait for other programs.
+Alternative considered: a trace of the clock board, which would show nothing more but need another
+ring.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
 
 QUOTA_NS = 100_000_000
-"""Period of CPU quotas: the default of Linux (cpu.max), so of libvirt, Docker and Kubernetes."""
+"""Period of CPU quotas: default of Linux (cpu.max), used by libvirt, Docker and Kubernetes."""
 MIN_STALLS = 5
 CLUSTERED_PART = 0.75
 WINDOW_PART = 0.02
@@ -37,14 +37,14 @@ WINDOW_PART = 0.02
 
 The width is a fraction of the quota period. If the phases are independent of the period, four of
 five stalls end within 2 % of it in one of 6,300 runs, and more rarely with more stalls. A share of
-three quarters is enough to exclude most levels that are late for their own reasons: a level whose
-cycle is half the period ends its stalls at two phases.
+three quarters is enough to exclude most levels that are late for other reasons: the stalls of a
+level whose cycle is half the period end at two phases.
 """
 
 
 @dataclass(frozen=True)
 class Absence:
-    """Summary of the times at which a core was away, although no steal was counted.
+    """Summary of the times at which a core was unavailable although no steal was counted.
 
     Attributes:
         core: Number of the core.
@@ -82,7 +82,7 @@ class Stalls:
     Attributes:
         lost: Number of all lost cycles.
         during_steal: Number of lost cycles that were due while the steal of their core increased.
-        absences: Absences without steal, by core.
+        absences: One summary for each core that was absent without steal.
         quota: The suspected quota, or None.
     """
 
@@ -95,11 +95,11 @@ class Stalls:
 def analyze_stalls(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
     """Find the absences of cores in a run, and the late or skipped cycles that they caused.
 
-    While the clock's core is away without steal, the whole machine may be away, so that time counts
-    as an absence of every core.
+    While the clock's core is absent without steal, the whole machine may be stopped, so that time
+    counts as an absence of every core.
 
     Returns:
-        The summary, and the times at which each core was away.
+        The summary, and a dictionary from core to the times at which it was absent.
     """
     clock = recording.rack_config.clock
     clock_core = find_core(clock.core)
@@ -117,7 +117,7 @@ def analyze_stalls(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]
         is_home = core == clock_core
         stolen = Occupation(*spans[spans[:, 2] == core, :2].T)
         since, until = late_clock if is_home else cycles.find_idle_spans(on_core, is_shown)
-        # While the clock is away no task is released, which explains idle time on other cores.
+        # While the clock's core is absent, no task is released, so other cores are idle as well.
         explained = stolen if is_home else Occupation.merge([stolen, without_clock])
         is_away = until - since > cycles.grid_ns // LATE_DIVISOR
         is_away &= explained.compute_overlap(since, until) == 0
@@ -137,7 +137,7 @@ def analyze_stalls(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]
 
 
 class _CycleTable:
-    """All cycles of a run, task by task, with the data to find the cause of lost cycles.
+    """The cycles of all tasks of a run, with the data to find the cause of lost cycles.
 
     A cycle is lost if it was late or skipped. All arrays have shape (n,).
 
@@ -167,32 +167,32 @@ class _CycleTable:
         self.lost = count_skipped_releases(rows) + find_missed_cycles(rows)
 
     def count_lost_during(self, occupied: Occupation, among: np.ndarray) -> int:
-        """Count the cycles that were lost while their core was occupied.
+        """Count the lost cycles whose delay overlaps a time at which their core was unavailable.
 
         Args:
-            occupied: Times at which the core was occupied.
-            among: Mask of the cycles that are counted.
+            occupied: Times at which the core was unavailable.
+            among: Mask of the cycles to consider.
         """
         is_hit = occupied.compute_overlap(self.due_ns, self.resumed_ns) > 0
         return int(self.lost[among & is_hit].sum())
 
     def find_stall_ends(self) -> np.ndarray:
-        """Return the end times of the stalls, in which executors lost cycles.
+        """Return the end times of all stalls, the times during which executors lost cycles.
 
-        Overlapping spans of lost cycles are one stall.
+        Delays that overlap, on any core, count as one stall.
         """
         # Planners are left out, because their time slice may be longer than a stall.
         counted = (self.lost > 0) & (self.rows["flags"] & Flag.PLANNED == 0)
         return Occupation(self.due_ns[counted], self.resumed_ns[counted]).ends
 
     def find_clock_absences(self, events: list[Document]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the begin and end of each time at which the clock board woke late.
+        """Return the times between the due and the actual wake-ups of a late clock board.
 
         Args:
-            events: Events of the run, of which those with code "clock_late" count.
+            events: Events of the run. Only events with code "clock_late" are used.
 
         Returns:
-            Begin and end times, in ns of CLOCK_MONOTONIC.
+            Due and actual times, in ns of CLOCK_MONOTONIC.
         """
         late = [
             (e["since"], e["value"])
@@ -206,31 +206,30 @@ class _CycleTable:
         return due_ns, due_ns + late_ns
 
     def find_idle_spans(self, on_core: np.ndarray, is_shown: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return, for each cycle on a core, the span before it in which the core ran no due task.
+        """Return the span before each cycle on a core in which the cycle was due but no task ran.
 
         Args:
             on_core: Mask of the cycles on that core.
-            is_shown: False if due times are unknown, as in lockstep. All spans are then empty.
+            is_shown: False if due times are unknown, as in lockstep. All spans are empty then.
 
         Returns:
-            Begin and end of each span, in ns of CLOCK_MONOTONIC.
+            Start and end time of each span, in ns of CLOCK_MONOTONIC.
         """
         rows = self.rows[on_core]
         starts = rows["start_ns"]
         due_ns = np.where(is_shown & self.is_urgent, self.due_ns, self.rows["start_ns"])[on_core]
         stamps = np.sort(np.concatenate([rows[name] for name in STAMPS]))
-        # A span begins no earlier than the last stamp on the core before the cycle. The first
-        # cycle has none; its index -1 selects the last stamp of the run, so its span is empty.
+        # A span begins no earlier than the last stamp on the core before the cycle. For the
+        # first cycle, index -1 selects the last stamp of the run, so its span is empty.
         return np.maximum(due_ns, stamps[np.searchsorted(stamps, starts) - 1]), starts
 
 
 def _detect_quota(ends: np.ndarray, periods_ns: dict[str, int]) -> Quota | None:
-    """Return the CPU quota that stalls suggest, or None if they do not end at the same phase.
+    """Return the CPU quota that stalls indicate, or None if too few end at the same phase.
 
     Args:
-        ends: Times at which stalls ended. Lost cycles that overlap, on any core, are one stall,
-            which ends when the last of the tasks runs again.
-        periods_ns: Period of each level, by name.
+        ends: Times at which stalls ended, from `find_stall_ends`.
+        periods_ns: Dictionary from level to its period.
     """
     if len(ends) < MIN_STALLS or (
         at_one_phase := _count_at_one_phase(ends, QUOTA_NS)
@@ -245,9 +244,9 @@ def _detect_quota(ends: np.ndarray, periods_ns: dict[str, int]) -> Quota | None:
 
 
 def _count_at_one_phase(ends: np.ndarray, period_ns: int) -> int:
-    """Return the largest number of end times whose phases lie in one window of the period.
+    """Return the largest number of end times that fall into one window of the period.
 
-    The width of the window is `WINDOW_PART` of the quota period.
+    The window has the same phase in every period. Its width is `WINDOW_PART` of `QUOTA_NS`.
     """
     phases = np.sort(ends % period_ns)
     around = np.append(phases, phases + period_ns)

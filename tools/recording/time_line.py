@@ -1,9 +1,9 @@
-"""Places the recordings of several racks on one time line, which is the first rack's.
+"""Aligns the recordings of several racks on one time line, the simulated time of the first rack.
 
 In real time each machine has its own CLOCK_MONOTONIC, and each rack its own grid on it. Racks that
-work together over a network record the offset of the other rack's clock (`rack.levels.peer`). These
-offsets convert times from rack to rack until they are times of the first one. In lockstep all racks
-share one simulated time, and nothing has to be converted.
+work together over a network record the offset of the other rack's clock (`rack.levels.peer`). With
+these offsets, times are converted to the first rack, through other racks if necessary. In lockstep
+all racks share one simulated time, and no conversion is needed.
 
 Recordings of different launches have no common time line, and are rejected. In real time, tick 0
 differs between launches, so the offset that a rack recorded and the peer's own recording must agree
@@ -73,7 +73,7 @@ class RackGrid:
 
         Args:
             ticks: The ticks, shape (n,).
-            within_ns: Simulated time since each tick, which is added.
+            within_ns: Simulated time to add to each tick.
         """
         within: Ints = np.asarray(within_ns) * self.period_ns // self.clock_ns
         return self.epoch_ns + ticks * self.period_ns + within
@@ -108,7 +108,7 @@ class TimeShift:
         return np.asarray(stamps_ns - first - np.rint(by_ns).astype(np.int64))
 
     def swap_machines(self) -> TimeShift:
-        """Return the offset for conversions in the other direction, with the machines exchanged."""
+        """Return the offset for the opposite direction, from the second machine to the first."""
         return TimeShift(self.at_ns - self.by_ns, -self.by_ns, self.uncertainty_ns)
 
 
@@ -121,7 +121,7 @@ class TimeLineNote(NamedTuple):
 
 @dataclass(frozen=True)
 class RackPlace:
-    """Conversion of a recorded rack's times to the time line, which is the first rack's time.
+    """Conversion of a recorded rack's times to the time line, the first rack's simulated time.
 
     Attributes:
         grid: Grid of the rack.
@@ -130,7 +130,7 @@ class RackPlace:
             first rack's machine. Empty if both racks have the same ticks, as in lockstep, and for
             the first rack itself.
         is_tick_aligned: True if two runs of the same rack are aligned tick by tick.
-        marks: Notes to the user. Empty for the first rack.
+        marks: Notes to show to the user on the time line. Empty for the first rack.
     """
 
     grid: RackGrid
@@ -146,7 +146,7 @@ class RackPlace:
 
     @property
     def note(self) -> str:
-        """Sentence that says at which time of the time line the rack begins, and how exactly."""
+        """Sentence with the time at which the rack begins on the time line, and its uncertainty."""
         text = f"rack '{self.grid.rack}' is on the time line of '{self.reference_grid.rack}'"
         if self.grid.is_lockstep:
             return f"{text}: both ran in lockstep, tick by tick"
@@ -177,7 +177,7 @@ class RackPlace:
 
         Args:
             ticks: The ticks, shape (n,).
-            within_ns: Simulated time of the rack since each tick, which is added.
+            within_ns: Simulated time of the rack to add to each tick.
         """
         if not self.offsets:
             return ticks * self.grid.clock_ns + within_ns
@@ -195,10 +195,10 @@ class RackPlace:
 
 
 def place_on_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
-    """Place the racks of these recordings on the time line of the first one.
+    """Return the conversion of each recorded rack's times to the time line of the first rack.
 
     Raises:
-        Failure: The racks did not run together, or no recorded comparison of clocks connects them.
+        Failure: The racks did not run together, or no recorded clock offsets connect them.
     """
     grids = [RackGrid(recording) for recording in recordings]
     for index, grid in enumerate(grids):
@@ -229,7 +229,7 @@ def place_on_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
 def place_side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
     """Align two runs of the same rack tick by tick, for example a branch and its origin.
 
-    Both runs are of a rack with the same name, so each is shown under the name of its folder.
+    Each run is shown under the name of its folder, because the rack has the same name in both.
 
     Raises:
         Failure: The recordings are not two runs of the same rack, or one of them lacks rows.
@@ -283,8 +283,8 @@ def _find_offsets(grid: RackGrid, other: RackGrid) -> tuple[TimeShift, ...] | No
     """Return the clock offsets that convert times of `grid` to times of `other`.
 
     Returns:
-        One offset, or none for racks in lockstep, which share their ticks. None if neither rack
-        communicated with the other.
+        A tuple with one offset, or () for racks in lockstep, which share their ticks. None if
+        neither rack communicated with the other.
     """
     if grid.is_lockstep:
         have_met = [
@@ -316,10 +316,10 @@ def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
     """Return the offset of the peer's clock that `observer` measured and recorded.
 
     Returns:
-        The offset, with the peer's machine as the first. None if `observer` never measured it.
+        The offset, with the peer's machine as the first one. None if it was never measured.
 
     Raises:
-        Failure: `observer` measured the clocks of other launches of the peer only.
+        Failure: `observer` measured only the clocks of other launches of the peer.
     """
     if (mailbox := _find_peer_mailbox(observer, peer)) is None:
         return None
@@ -359,7 +359,7 @@ def _has_met(observer: RackGrid, peer: RackGrid) -> bool:
     """Return True if `observer`, in lockstep, communicated with `peer`.
 
     Raises:
-        Failure: It communicated with a different launch of the peer.
+        Failure: `observer` communicated with a different launch of the peer.
     """
     mailbox = _find_peer_mailbox(observer, peer)
     if (
@@ -395,8 +395,8 @@ def _check_import(
     at_ns = sent["tick"] * peer.clock_ns
     content = [row.tobytes() for row in sent["message"]]
     for row in imported:
-        # The sender's tick is recorded only in ticks of the importer, which may be longer, so
-        # several messages of the sender are candidates.
+        # `basis` is the time of sending in ticks of the importer. These may be longer than the
+        # sender's ticks, so the imported message may be any of several sent ones.
         since_ns = int(row["basis"]) * importer.clock_ns
         first, end = np.searchsorted(at_ns, (since_ns, since_ns + importer.clock_ns))
         if first < end and row["message"].tobytes() not in content[first:end]:

@@ -27,7 +27,7 @@ def compare_runs(recording: Recording, other_run: OtherRun) -> Document:
 
     Args:
         recording: The run.
-        other_run: The other run, and what is to be explained.
+        other_run: The other run, and options of the comparison.
 
     Returns:
         The entry "against" of report.json.
@@ -91,7 +91,7 @@ def _repeat_if_unexplained(
 
 
 def _format_cycle(cycle: DivergentCycle, other: str) -> Iterator[str]:
-    """Yield sentences about a cycle: what differs in its message, its inputs, possible causes."""
+    """Yield sentences on how a cycle's message differs, on its inputs, and on possible causes."""
     yield (
         f"at tick {cycle.tick}: "
         f"{_join_clauses(_format_field(cycle, field, other) for field in cycle.fields)}"
@@ -114,7 +114,7 @@ def _format_cycle(cycle: DivergentCycle, other: str) -> Iterator[str]:
 
 
 def _format_field(cycle: DivergentCycle, field: ValueDifference, other_folder: str) -> str:
-    """Return a clause that describes a differing field, or a message that one run lacks."""
+    """Return a clause that says how a field differs, or which run lacks the message."""
     box = cycle.mailbox
     values = field.here, field.there
     match field.name, *values:
@@ -147,24 +147,24 @@ def _format_difference(difference: ValueDifference, other_folder: str, absent: s
 
 
 def _format_value(value: object, absent: str) -> str:
-    """Format a value for the text. None is shown as `absent`."""
+    """Format a value as text. None is shown as `absent`."""
     return absent if value is None else format_value(value) or '""'
 
 
 def _join_clauses(texts: Iterator[str]) -> str:
-    """Join the first `MAX_SHOWN` clauses, and append the number of any further ones."""
+    """Join the first `MAX_SHOWN` clauses, and append the number of omitted clauses, if any."""
     clauses = [*texts]
     more = [f"{len(clauses) - MAX_SHOWN} more"] if len(clauses) > MAX_SHOWN else []
     return "; ".join([*clauses[:MAX_SHOWN], *more])
 
 
 def _format_clue(clue: Clue) -> str:
-    """Return a sentence about a clue, with the run and tick in which it occurred, if any."""
+    """Return a sentence about a clue, with its run and tick unless it applies to whole runs."""
     return f"in {clue.run} only, at tick {clue.tick}: {clue.text}" if clue.run else clue.text
 
 
 def _format_repetition(repetition: Repetition, cycle: DivergentCycle, other: str) -> Iterator[str]:
-    """Yield sentences about the result of repeating a cycle: attributes that differed, and why."""
+    """Yield sentences on the result of repeating a cycle: differing attributes, and the cause."""
     task = cycle.writer
     runs = " and ".join(repetition.runs)
     if repetition.attributes:

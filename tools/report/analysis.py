@@ -1,4 +1,4 @@
-"""Compares a run with the timing model, by predicting and measuring every equation."""
+"""Compares a run with the timing model: evaluates each equation for budgets and measurements."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from rack.tools.recording.recording import Recording
 from rack.tools.timing.measured_response import measure_system_response
 
 MOST_CYCLES_PERCENTILE = 99.0
-"""Percentile of the second verdicts, which show what fails in more than 1 % of the cycles."""
+"""Percentile of the second verdicts. They show failures in more than 1 % of the cycles."""
 OBSERVED_EQUATIONS = ("3.2", "3.3", "3.7", RESPONSE_TIME, LOAD)
-"""Equations that are judged by times observed in the run.
+"""Equations that are evaluated with times observed in the run.
 
 The other equations are computed from the measured processor times of the levels.
 """
@@ -38,7 +38,7 @@ The other equations are computed from the measured processor times of the levels
 
 @dataclass(frozen=True)
 class EquationPair:
-    """Predicted and measured verdict on one equation and one subject.
+    """Predicted and measured verdict on one equation for one subject.
 
     Attributes:
         equation: Number or name of the equation.
@@ -54,10 +54,11 @@ class EquationPair:
 
     @property
     def is_contradicted(self) -> bool:
-        """True if the equation held in the run against the prediction, or failed against it."""
+        """True if prediction and measurement disagree on whether the equation holds."""
         if self.predicted is None or self.measured is None:
             return False
-        # The measured load of an overloaded core stays below 1, so it contradicts nothing.
+        # An overloaded core may have a measured load below 1, which does not contradict a predicted
+        # overload.
         is_full = self.equation == LOAD and not self.predicted.holds
         return self.predicted.holds != self.measured.holds and not is_full
 
@@ -71,15 +72,15 @@ class EquationPair:
 class Analysis:
     """Comparison of a run with the timing model.
 
-    The equations are judged at two percentiles. A level whose times do not fit into its period
+    The equations are evaluated at two percentiles. A level whose times do not fit into its period
     fails in most of its cycles, while occasional stalls of the machine make a level fail in a
     few cycles.
 
     Attributes:
         recording: The run.
         percentile: Percentage of a level's cycles that must fulfil an equation.
-        cycles: Measured cycles, by task.
-        loads: Used fraction of each core's time, by core.
+        cycles: Dictionary from task to its measured cycles.
+        loads: Dictionary from core to the used fraction of its time.
         predicted: Timing of the rack with the budgets of its config.
         measured: Timing of the rack with the measured budgets.
         pairs: Verdicts on all equations at `percentile`.
@@ -172,9 +173,9 @@ def _pair_verdicts(
 
 
 def _build_pair_key(verdict: EquationVerdict) -> tuple[str, str, str]:
-    """Return a key that is equal for predicted and measured verdicts that belong together."""
-    # Equations 3.2 and 3.3 are judged in two directions, and eq. 3.7 means something else for a
-    # config than for a run. For these, the meanings must be equal as well.
+    """Return the key with which a measured verdict is matched to the predicted one."""
+    # Equations 3.2 and 3.3 are evaluated in two directions, and eq. 3.7 has different meanings for
+    # a config and for a run. For these, the meanings must be equal as well.
     meaning = verdict.meaning if verdict.equation in ("3.2", "3.3", "3.7") else ""
     return verdict.equation, verdict.subject, meaning
 
@@ -184,11 +185,11 @@ def _judge_response(
 ) -> Iterator[EquationVerdict]:
     """Yield verdicts on eqs. 3.2 and 3.3 for the longest measured response in each direction.
 
-    Each chain of levels is judged downward (command) and upward (status). The bound of eq. 3.3 is
-    the sum of the levels' cycles and of the waits for the next cycle of each level.
+    Each chain of levels is evaluated downward (command) and upward (status). The bound of eq. 3.3
+    is the sum of the levels' cycles and of the waits for the next cycle of each level.
 
     Args:
-        response: Result of `measure_system_response`. None yields nothing.
+        response: Result of `measure_system_response`. If it is None, nothing is yielded.
         rack: Timing of the rack.
     """
     if response is None:
@@ -216,7 +217,7 @@ def _judge_tasks(
 ) -> Iterator[EquationVerdict]:
     """Yield verdicts on eq. 3.7 for executors, and on the response times of all tasks.
 
-    Response times are judged for runs in real time only.
+    Response times are evaluated only for runs in real time.
     """
     for name, cycles in cycles_by_task.items():
         rows = cycles.rows
@@ -229,7 +230,7 @@ def _judge_tasks(
             yield EquationVerdict("3.7", name, step_ns, "=", every_ns, "t_(k+1) - t_k = R_i")
         if not rack.is_lockstep:
             deadline_ns = compute_slice_ns(rack, cycles.task)
-            # A cycle marked as missed in the trace counts as beyond its deadline, even if its
+            # A cycle that the trace marks as missed counts as later than its deadline, even if its
             # measured response is shorter.
             least_ns = np.where(trace_times.find_missed_cycles(rows), deadline_ns + 1, 0)
             response_ns = np.maximum(trace_times.compute_response_ns(rows), least_ns)
@@ -241,7 +242,7 @@ def _judge_tasks(
 def compute_core_loads(
     recording: Recording, cycles_by_task: Mapping[str, Cycles], rack: RackTiming
 ) -> dict[int, float]:
-    """Return the fraction of each core's time that its tasks used, without the clock board.
+    """Return the fraction of each core's time that its tasks, except the clock board, used.
 
     An executor is counted as if it ran at every release, including skipped ones, so the load of an
     overloaded core exceeds 1.
@@ -252,7 +253,7 @@ def compute_core_loads(
         rack: Timing of the rack.
 
     Returns:
-        Loads by core. 1 means that the core was always busy.
+        Dictionary from core to load. A load of 1 means that the core was always busy.
     """
     first = min(int(rows["tick"][0]) for rows in recording.cycles.values())
     last = max(int(rows["tick"][-1]) for rows in recording.cycles.values())

@@ -18,12 +18,12 @@ DRIVING = ("servo_status", "arm_status")
 HAND_STATUS = "hand_status"
 WRENCH = "wrench"
 FORCE_STATUS = "force_status"
-"""Message types by name, as recordings contain them.
+"""Names of message types.
 
-A report must not import levels that only other racks have.
+The types are given by name, because a report must not import levels that only other racks have.
 """
 FALLING_M_S = 0.05
-"""Speed above which an object counts as falling. It slips or is lowered more slowly."""
+"""Speed above which an object counts as falling. Slipping and lowered objects are slower."""
 BOUNCE_SAMPLES = 2
 """Largest number of samples between two parts of the same fall."""
 SETTLE_SAMPLES = 20
@@ -39,7 +39,7 @@ Tasks release objects up to 2 mm above the support, and opening pads can drag an
 
 
 Signals = Callable[[str], np.ndarray]
-"""Function that returns a field of all messages of a mailbox, by the field's name."""
+"""Function from the name of a field to its values in all messages of a mailbox."""
 
 
 def summarize_task(recording: Recording) -> Document | None:
@@ -56,14 +56,14 @@ def summarize_task(recording: Recording) -> Document | None:
 
 
 def summarize_objects(recording: Recording, config: RackConfig) -> Iterator[Document]:
-    """Yield the final distance from its goal, and the falls, of each object that has a goal."""
+    """Yield an entry for each object with a goal: its distance from the goal, and its falls."""
     for end in recording.end_counts.get("outcome", {}).get("objects", ()):
         row = config.scene.objects.index(end["object"])
         yield {**end, "drops": list(_find_drops(recording, row))}
 
 
 def _find_drops(recording: Recording, row: int) -> Iterator[Document]:
-    """Yield the tick and the height in mm of each fall of an object.
+    """Yield tick and height (in mm) of each fall of an object.
 
     An object falls while it moves down quickly and its distance from the tool changes.
 
@@ -89,10 +89,10 @@ def _find_drops(recording: Recording, row: int) -> Iterator[Document]:
 
 
 def summarize_motion(recording: Recording) -> Document | None:
-    """Return the tracking error of an arm in mrad, and its counts.
+    """Return the tracking error and the event counts of an arm.
 
     Returns:
-        RMS and peak error, which are None if no status contains the error, and the numbers of
+        RMS and peak error in mrad, or None if no status contains the error, and the numbers of
         touches, exceeded limits, and refused or clipped commands. None without an arm.
     """
     status = find_signals(recording, *DRIVING)
@@ -142,7 +142,7 @@ def round_figure(value: float) -> float:
 
 
 def summarize_hand(recording: Recording, config: RackConfig) -> Document | None:
-    """Return tensions, tension errors and fingertip forces of a hand, all in N, and its counts.
+    """Return tensions, tension errors and fingertip forces of a hand in N, and event counts.
 
     Returns:
         The results, or None without a hand.
@@ -166,7 +166,7 @@ def summarize_hand(recording: Recording, config: RackConfig) -> Document | None:
 
 
 def summarize_force(recording: Recording) -> Document | None:
-    """Return the largest contact force and torque at the wrist, and the force error.
+    """Return the largest contact force and torque at the wrist, and the RMS force error.
 
     Returns:
         Forces in N and torques in N m. None without a wrist sensor.
@@ -192,11 +192,11 @@ def summarize_force(recording: Recording) -> Document | None:
 
 
 def find_signals(recording: Recording, *messages: str) -> Signals | None:
-    """Return access to the first mailbox that carries one of these message types.
+    """Return a function that reads the first mailbox with one of these message types.
 
     Returns:
-        A function that returns a field of all messages, by name. None if there is no such mailbox,
-        or if no message was recorded.
+        A function from the name of a field to its values in all messages. None if there is no such
+        mailbox, or if none of its messages was recorded.
     """
     name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
     return partial(recording.read_signal, name) if name in recording.mailboxes else None

@@ -1,6 +1,6 @@
 """Repeats a cycle of two recorded runs, to find out why its message differed.
 
-The inputs of the cycle were equal in both runs, see `rack.tools.recording.causes`. The cycle is
+The inputs of the cycle were equal in both runs (see `rack.tools.recording.causes`). The cycle is
 repeated several times in each run, with three possible results. If all repetitions write the
 recorded message, the state or the parameters of the level differed between the runs. If they write
 another message, but always the same, the level's code has changed since the run. If they write
@@ -36,8 +36,8 @@ class Repetition:
             that the state or the parameters differed; "code" if the level's code has changed since
             one of the runs; "chance" if repetitions of the same run differed.
         runs: Folders of the runs that did not repeat their recorded message.
-        strays: Mailboxes of other levels that differed from the recording, by run. If there are
-            any, the result is uncertain.
+        strays: For each run, the mailboxes of other levels that differed from the recording. If
+            there are any, the result is uncertain.
     """
 
     attributes: tuple[ValueDifference, ...]

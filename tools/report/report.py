@@ -49,7 +49,7 @@ It is given by name, because it imports code that a report on one run does not n
 
 @dataclass(frozen=True)
 class OtherRun:
-    """Another run with which the report on a run compares that run.
+    """Another run to compare the reported run with, and options of the comparison.
 
     Attributes:
         folder: Folder of the other run.
@@ -200,9 +200,9 @@ def _build_task_entry(recording: Recording, config: RackConfig, task: TaskSpec) 
 
 
 def compute_plan_ages_ms(recording: Recording, board: str) -> np.ndarray:
-    """Return the ages in ms of simulated time of the plans that an executor could read.
+    """Return the age of the visible plan in each cycle of an executor, in ms of simulated time.
 
-    One age per cycle for which `compute_plan_ages` finds a visible plan, shape (n,).
+    Cycles for which `compute_plan_ages` finds no visible plan are left out. Shape (n,).
     """
     plan = f"{board}.plan"
     plan_ticks = recording.read_signal(plan, "tick")
@@ -227,7 +227,7 @@ def _describe_task(task: TaskSpec, layout: Layout) -> Document:
 
 
 def _summarize_entries(recording: Recording) -> list[Document]:
-    """Return counts and message ages (in ms) of every entry that a bus adapter passes on."""
+    """Return counts and message ages (in ms) for every entry that a bus adapter forwards."""
     entries = []
     tick_ms = recording.layout.clock_ns * 1e-6
     for mailbox, entry, source in list_entries(recording.layout, recording.config):
@@ -244,7 +244,7 @@ def _summarize_entries(recording: Recording) -> list[Document]:
 
 
 def summarize_network(recording: Recording) -> Document | None:
-    """Return the traffic with other racks, and how often these racks were lost.
+    """Return the traffic with other racks, and how often contact with them was lost.
 
     Returns:
         Imports with counts and ages in ms, exports with counts, and the states of the other racks.
@@ -276,7 +276,7 @@ def summarize_network(recording: Recording) -> Document | None:
 
 
 def _summarize_peer(recording: Recording, rack: str) -> Document:
-    """Return the final state of another rack, and how often and how long contact to it was lost."""
+    """Return the final state of another rack, and number and duration of losses of contact."""
     mailbox = f"{ADAPTER}.{format_peer_port(rack)}"
     presence = recording.read_signal(mailbox, "presence")
     cycle_s = recording.layout.find_task(ADAPTER).every * recording.layout.clock_ns * 1e-9

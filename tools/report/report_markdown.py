@@ -114,7 +114,7 @@ def _format_selection(rows: Sequence[Any], which: str) -> str:
 
 
 def _format_holds(rack: str, holds: Sequence[Document]) -> Blocks:
-    """Yield the section with the longest holds, and commands to release holds by an operator."""
+    """Yield the section on holds, with commands to release holds that an operator did not end."""
     yield from ("", f"## Holds: {len(holds)}{_format_selection(holds, 'longest')}", "")
     rows = [
         {
@@ -140,7 +140,7 @@ def _format_holds(rack: str, holds: Sequence[Document]) -> Blocks:
 
 
 def _build_state_tables(levels: dict[str, list[Document]]) -> TextTable:
-    """Return a table with one line per level: its state table, most frequent and newest row."""
+    """Return a table of levels, each with its most frequent row and its last new row."""
     rows = []
     for level, fired in levels.items():
         most_frequent = max(fired, key=lambda row: row["cycles"])
@@ -191,7 +191,7 @@ def _format_machine(report: RunReport) -> Iterator[str]:
 
 
 def _format_comparison(against: Document) -> Iterator[str]:
-    """Yield where and why the run diverges from another run."""
+    """Yield lines on where and why the run diverges from another run."""
     difference = against["first_difference"]
     if difference is None:
         yield f"- no message differs from {against['folder']}"
@@ -350,7 +350,7 @@ def _build_traffic_table(rows: Sequence[Document], dropped: Sequence[str]) -> Te
 
 
 def _format_network(network: Document | None) -> Blocks:
-    """Yield the section on traffic with other racks, and how often these were lost."""
+    """Yield the section on traffic with other racks, and on losses of contact with them."""
     if network is None:
         return
     yield from ("", "## Network, ages in ms of simulated time", "")

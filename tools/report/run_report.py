@@ -17,9 +17,9 @@ class RunReport:
 
     Attributes:
         worked: The verdict: True if the run succeeded.
-        failures: Reasons of a negative verdict.
+        failures: Reasons why the run failed. Empty if it succeeded.
         unjudged: Aspects that the verdict does not cover.
-        tasks: Times by task, from `compute_task_times`.
+        tasks: Dictionary from task to its times, from `compute_task_times`.
         system_response: Result of `measure_system_response`.
         against: Comparison with another run.
     """

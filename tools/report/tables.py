@@ -72,7 +72,7 @@ def build_document(analysis: Analysis) -> Document:
 
 
 def _build_sides(predicted: _Side, measured: _Side) -> Document:
-    """Return predicted and measured timing or verdict side by side as plain data."""
+    """Return a predicted and a measured timing or verdict as plain data. None remains None."""
     sides = {"predicted": predicted, "measured": measured}
     return {
         side: None if side_timing is None else side_timing.to_document()
@@ -83,8 +83,8 @@ def _build_sides(predicted: _Side, measured: _Side) -> Document:
 def build_task_document(cycles: Cycles, rack: RackTiming) -> Document:
     """Return counts and times in ms of a task's cycles, without start-up and stalled cycles.
 
-    The entries of `compute_task_times` are included, with execution and communication in processor
-    time.
+    The result includes the entries of `compute_task_times`, in which execution and communication
+    are processor times.
     """
     judged = cycles.is_judged
     rows = cycles.rows[judged]
@@ -155,7 +155,7 @@ def _format_percentile(percentile: float) -> str:
 
 
 def _format_summary(analysis: Analysis) -> Iterator[str]:
-    """Yield the summary: how the run ended, failed equations, advice, and what was not judged."""
+    """Yield the summary: how the run ended, failed equations, advice, and what was excluded."""
     config = analysis.recording.rack_config
     pairs = [pair for pair in analysis.pairs if pair.measured is not None]
     failing = [pair for pair in pairs if pair.is_failed]

@@ -1,4 +1,4 @@
-"""Blueprints: the views that the viewer shows at first, their layout, and the eye position."""
+"""Blueprints: the initial views of the viewer, their layout, and the eye position."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def build_common_view(racks: Mapping[str, RackViews]) -> rrb.Container:
     The first tab shows all racks above a common log. Each further tab shows one rack.
 
     Args:
-        racks: Views of the racks, by name.
+        racks: Dictionary from the name of each rack to its views.
     """
     return _build_tabs(racks, "all racks", _build_common_log(racks, "racks"), [4, 1])
 
@@ -92,11 +92,11 @@ def build_common_view(racks: Mapping[str, RackViews]) -> rrb.Container:
 def build_comparison_view(runs: Mapping[str, RackViews]) -> rrb.Container:
     """Return the view that compares two runs of the same rack.
 
-    The first tab shows both runs, and plots with the curves of both, those of the first run in
-    grey. Each further tab shows one run.
+    The first tab shows both runs, and plots with the curves of both. The curves of the first run
+    are grey. Each further tab shows one run.
 
     Args:
-        runs: Views of the two runs, by name.
+        runs: Dictionary from the name of each run to its views.
     """
     first, other = runs.values()
     names = "{} in grey, {} in colour".format(*runs)
@@ -117,7 +117,7 @@ def _build_tabs(
     """Return a tab with all racks side by side, and further tabs with one rack each.
 
     Args:
-        racks: Views of the racks, by name.
+        racks: Dictionary from the name of each rack to its views.
         name: Title of the first tab.
         below: View below the racks in the first tab.
         shares: Relative heights of the racks and of the view below them.
@@ -133,7 +133,7 @@ def _build_common_log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
     """Return a view with the log lines of all racks.
 
     Args:
-        racks: Views of the racks, by name.
+        racks: Dictionary from the name of each rack to its views.
         what: What the racks are called in the title, "racks" or "runs".
     """
     logs = [f"{build_path(LOG)}/**", *(views.build_query(LOG) for views in racks.values())]
@@ -171,7 +171,7 @@ class RackViews:
         return f"{self.build_path(*entity)}/**"
 
     def build_all_views(self, name: str | None = None) -> rrb.Container:
-        """Return a container with all views of the rack, which has the title `name`."""
+        """Return a container with the title `name` that contains all views of the rack."""
         level_lanes = build_lanes_view(
             "levels and events, whole run", [self.build_query(EVENTS), self.build_query(LEVELS)]
         )
@@ -201,10 +201,10 @@ class RackViews:
         return rrb.Horizontal(left, right, column_shares=[2, 3], name=name)
 
     def list_main_curves(self) -> dict[str, list[str]]:
-        """Return the entities whose curves are compared between runs, by title of the plot.
+        """Return a dictionary from plot title to the entities whose curves two runs compare.
 
-        These are tracking error, position, velocity and torque of the arm or, without an arm, all
-        fields of all messages.
+        The plots show tracking error, position, velocity and torque of the arm or, without an arm,
+        all fields of all messages.
         """
         if not self._joints:
             boxes = self._layout.mailboxes
@@ -226,7 +226,7 @@ class RackViews:
         return rrb.Vertical(self._build_scene(self._cell, name), levels, row_shares=[5, 4])
 
     def _build_scene(self, cell: Cell, name: str) -> rrb.View:
-        """Return the 3D view of the cell, without collision shapes, with the title `name`."""
+        """Return the 3D view of the cell with the title `name`. Collision shapes are hidden."""
         return rrb.Spatial3DView(
             origin=self.build_path(CELL),
             contents=[
@@ -428,7 +428,7 @@ def _build_plot(
         name: Title of the plot.
         contents: Queries for its entities.
         legend: Whether to show a legend.
-        overrides: Styles that replace those in the recording, by entity.
+        overrides: Dictionary from entity to the style that replaces the recorded one.
     """
     axis = rrb.TimeAxis(link="LinkToGlobal")
     legend_style = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)

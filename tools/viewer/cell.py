@@ -85,7 +85,8 @@ def find_moving_bodies(model: mujoco.MjModel) -> Ints:
     These are bodies with joints or mocap poses, and all bodies attached to them.
     """
     moves = np.zeros(model.nbody, dtype=bool)
-    for body in range(1, model.nbody):  # parents precede their children
+    # Parents precede their children, so one pass reaches all attached bodies.
+    for body in range(1, model.nbody):
         has_motion = model.body_jntnum[body] > 0 or model.body_mocapid[body] >= 0
         moves[body] = has_motion or moves[model.body_parentid[body]]
     return np.flatnonzero(moves)
@@ -130,7 +131,7 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
 
 
 class PoseWriter:
-    """Writes the mailbox of an `ArmState` as poses of all moving bodies, and as points of the tool.
+    """Writes the poses of all moving bodies, and points of the tool, from `ArmState` messages.
 
     The poses are computed by MuJoCo's kinematics. With `has_pushes`, the forces with which the
     scene pushes objects are written as arrows.
@@ -253,7 +254,7 @@ class MarkWriter:
         Args:
             when: Time from which they are shown.
             group: Parent entity of the marks, `BRAKES` or `FAULTS`.
-            texts: Label of each marked joint, by name. "" means a mark without a label.
+            texts: Dictionary from each marked joint to its label, "" for a mark without a label.
         """
         for name, place in self._joints.items():
             text = texts.get(name)
@@ -316,13 +317,13 @@ def build_path_part(stream: Stream, cell: Cell) -> ViewPart:
 
 
 def subdivide_path(corners: Array) -> Array:
-    """Add points to a joint path, so that no joint moves further than `STEP_RAD` between two.
+    """Add points to a joint path, so that no joint moves more than `STEP_RAD` between neighbours.
 
     Args:
         corners: Joint positions in rad, shape (points, joints).
 
     Returns:
-        The path with the additional points, in the same form.
+        The path with the additional points, shape (more points, joints).
     """
     longest = np.abs(np.diff(corners, axis=0)).max(axis=1)
     counts = np.maximum(np.ceil(longest / STEP_RAD), 1)
@@ -332,7 +333,7 @@ def subdivide_path(corners: Array) -> Array:
 
 
 class GoalWriter:
-    """Writes the points where a `TaskPlan` releases objects, and the goal of the current move."""
+    """Writes the points at which a `TaskPlan` releases objects, and the current move's goal."""
 
     def __init__(self, stream: Stream, objects: Sequence[str]) -> None:
         self._stream = stream

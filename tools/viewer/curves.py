@@ -38,7 +38,7 @@ FIELDS = {
     "velocity": {"commanded": "target_velocity", "measured": "velocity"},
     "torque": {"applied": "torque"},
 }
-"""Fields of the status for the curves of a joint, by quantity and name of the curve."""
+"""For each quantity of a joint, a dictionary from curve to field of the status."""
 
 
 def build_joint_curves(
@@ -46,8 +46,8 @@ def build_joint_curves(
 ) -> Iterator[ViewPart]:
     """Yield the view parts that show the status of the board that drives the arm.
 
-    These are curves of each joint, measured and commanded, with their limits, of the tracking
-    errors, and of the gripper.
+    These are curves of the measured and commanded values of each joint with their limits, of the
+    tracking errors, and of the gripper.
 
     Args:
         stream: Stream to write to.

@@ -39,7 +39,7 @@ LOG_LEVELS = {
 
 
 class EventWriter:
-    """Writes the events in events.jsonl to the view while the launcher adds them.
+    """Follows events.jsonl during a run, and writes each new event to the view.
 
     Lost boards are also shown in the graph of the hierarchy, and with `marks` faults are also shown
     in 3D.
@@ -72,7 +72,7 @@ class EventWriter:
                 self._write(Event(**event))
 
     def _write(self, event: Event) -> None:
-        """Write an event to the log, to its lane and, if it is a fault or loss, to other views."""
+        """Write an event to the log and its lane, and a fault or lost board to other views too."""
         board = event.board or RACK_LANE
         when = Moment(max(0, event.tick), self._stream.times.to_monotonic(event.time_ns))
         text = f"{event.kind}: {board}: {event.text}"
@@ -105,8 +105,8 @@ class EventWriter:
 def build_loss_writer(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:
     """Return a function that writes the total number of lost rows, and logs every new loss.
 
-    Its arguments are the tick, and the number of rows, by ring, that were overwritten before the
-    recorder read them.
+    Its arguments are the tick, and a dictionary from ring to the number of rows that were
+    overwritten before the recorder read them.
     """
     entity = (RECORDER, "rows_lost")
     style_curves(stream, entity, ["rows lost"], [LOST])
@@ -126,10 +126,10 @@ def build_loss_writer(stream: Stream) -> Callable[[int, Mapping[str, int]], None
 
 
 def build_load_writer(stream: Stream) -> Callable[[int], None]:
-    """Return a function that writes the recorder's processor load since the function's last call.
+    """Return a function that writes the recorder's mean processor load since the previous call.
 
-    The load is the load of the calling process, so call the function in the recorder. Its argument
-    is the tick for which the load is written.
+    Call the function in the recorder, because it measures the calling process. Its argument is the
+    tick for which the load is written.
     """
     entity = (RECORDER, "load")
     style_curves(stream, entity, ["recorder, % of a core"])

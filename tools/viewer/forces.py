@@ -41,11 +41,11 @@ AXES = dict(zip(AXIS_NAMES, UNITS, strict=True))
 
 
 class ContactPlace(NamedTuple):
-    """A place where forces are sensed.
+    """A point on the tool or hand at which forces are sensed.
 
     Attributes:
-        name: Name of the place.
-        site: Index of the MuJoCo site at the place.
+        name: Name of the point.
+        site: Index of the MuJoCo site at the point.
         orientation_site: Index of the site in whose axes the forces are given, or None if they are
             given in the axes of the world.
     """
@@ -56,7 +56,7 @@ class ContactPlace(NamedTuple):
 
     @property
     def frame(self) -> str:
-        """Name of the coordinate frame at the place, in which the arrow is drawn."""
+        """Name of the coordinate frame at the point, in which the arrow is drawn."""
         return f"contact/{self.name}"
 
     def compute_pose(self, data: mujoco.MjData) -> tuple[Array, Array]:
@@ -68,7 +68,7 @@ class ContactPlace(NamedTuple):
 
 
 def list_contacts(cell: Cell) -> list[ContactPlace]:
-    """Return the places where the forces on a cell's tool or hand are sensed.
+    """Return the points at which the forces on a cell's tool or hand are sensed.
 
     These are the tool of an arm with a wrist sensor, or the fingertips of a hand.
     """
@@ -86,7 +86,8 @@ def build_contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
     Args:
         stream: Stream to write to.
         cell: The cell.
-        field: Field of the message that begins with three numbers for each place, its force in N.
+        field: Field of the message. It begins with the force in N at each point of
+            `list_contacts`, three numbers per point.
     """
     scale, shaft = TIP_M, TIP_SHAFT_M
     if cell.wrist is not None:
@@ -98,7 +99,7 @@ def build_contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:
     sampled_rows = build_row_sampler(stream.times.clock_ns)
 
     def write(block: RowBlock) -> None:
-        """Write the arrows for one row of each drawing interval."""
+        """Write the arrows for the first row of each drawing interval."""
         chosen = sampled_rows(block.ticks)
         if not len(chosen):
             return

@@ -1,4 +1,4 @@
-"""Curves of a hand: joints, tensions and tip forces by finger."""
+"""Curves of a hand: joints, tensions and tip force of each finger."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ FIRED = ["table", "row", "fired", "in_state"]
 def build_value_lane(
     stream: Stream, lane: tuple[str, str], fields: str | list[str], name: Callable[[Any], str]
 ) -> ViewPart:
-    """Return the view part that shows how a value in a level's messages changes, as a lane.
+    """Return the view part that shows a value in a level's messages as a lane.
 
     Args:
         stream: Stream to write to.
@@ -60,12 +60,12 @@ def format_serial(serial: int) -> str:
 
 
 def format_step(step: tuple[int, int]) -> str:
-    """Format a step of a grasp, which is given as number of earlier steps and kind."""
+    """Format a step of a grasp. `step` contains the number of earlier steps and the kind."""
     return f"{step[0] + 1} {format_enum(GraspKind, step[1])}"
 
 
 def format_move(move: tuple[int, int]) -> str:
-    """Format the verb of a move, which is given as serial and verb. "" for serial 0: no move."""
+    """Format a move, given as serial and verb. Returns "" for serial 0, which means no move."""
     return format_enum(Verb, move[1]) if move[0] else ""
 
 
@@ -96,7 +96,7 @@ def build_state_lane(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]
 
 
 def build_fired_lane(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
-    """Return the view part that shows the firing rows of a state table, as lane and log lines."""
+    """Return the view part that shows which row of a state table fires, in a lane and the log."""
     board = mailbox.name.partition(".")[0]
     changed_rows = build_change_finder()
 
@@ -187,7 +187,7 @@ def _name_states(rows: np.ndarray) -> np.ndarray:
 
 
 def compute_positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:
-    """Return the positions of the tasks in the graph, by name.
+    """Return a dictionary from task to its position in the graph.
 
     Each rank of the hierarchy is one row, or several rows if it has many boards. Planners are to
     the right of their boards, and boards outside the hierarchy are in a column on the left.

@@ -1,4 +1,4 @@
-"""Recorded runs of several racks as one recording for the viewer, on one time line."""
+"""Writes recorded runs of several racks as one recording for the viewer, on one time line."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _split_blocks(
         block: Number of ticks in a block.
 
     Yields:
-        The tick at which the block ends, and the rows of the block by task and by mailbox.
+        The tick at which the block ends, and a dictionary from task or mailbox to its rows.
     """
     layout = recording.layout
     names = [*(task.name for task in layout.tasks), *(box.name for box in layout.timed)]

@@ -19,7 +19,7 @@ def list_part_names(file: Path) -> Iterator[Path]:
 def find_next_file(folder: Path) -> Path:
     """Return the next unused name of a part in the folder of a run.
 
-    A restarted recorder thus overwrites nothing.
+    Thus a restarted recorder does not overwrite the parts of its predecessor.
     """
     return next(path for path in list_part_names(folder / FILE) if not path.is_file())
 

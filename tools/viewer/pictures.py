@@ -55,7 +55,7 @@ class NoViewerError(Failure):
 
 
 class Picture(NamedTuple):
-    """A picture, and the complaints of the viewer that drew it.
+    """A picture, and the problems that the viewer reported while it drew the picture.
 
     Attributes:
         png: The picture in PNG format.
@@ -74,11 +74,11 @@ class Screen:
 
     @property
     def views(self) -> dict[str, str]:
-        """Ids of the views that the viewer shows, by name."""
+        """Dictionary from the name of each view that the viewer shows to its id."""
         return {view.name: view.view_id for view in self._client.get_state().views}
 
     def take_picture(self, at_s: float, view: str | None = None) -> Picture:
-        """Show a simulated time, wait until the picture no longer changes, and return it.
+        """Go to a simulated time, wait until the picture no longer changes, and return it.
 
         Args:
             at_s: The simulated time in s.
@@ -172,10 +172,10 @@ def describe_missing_packages() -> str:
 
 
 def main() -> int:
-    """Save one picture, and print the viewer's complaints.
+    """Save one picture, and print the problems that the viewer reported.
 
     Returns:
-        The exit status: 0, 1 if the viewer complained, or the status of a failure.
+        The exit status: 0, 1 if the viewer reported problems, or the status of a failure.
     """
     parser = argparse.ArgumentParser(
         prog="python -m rack.tools.viewer.pictures", description=__doc__

@@ -187,9 +187,9 @@ class RackWriter:
         """Write a block of rows.
 
         Args:
-            rows_by_ring: Rows of each ring, shape (rows,), by task or mailbox.
+            rows_by_ring: Dictionary from task or mailbox to its rows, shape (rows,).
             tick: Tick at which the block ends. The rows include everything before this tick.
-            lost: Number of lost rows since the start, by ring.
+            lost: Number of rows of each ring that were lost since the start.
         """
         if (fastest := rows_by_ring.get(self._fastest)) is not None:
             self._times.add_stamps(fastest["tick"], fastest["start_ns"])
@@ -212,8 +212,8 @@ class RackWriter:
 class ViewSink:
     """The recorder's sink that writes run.rrd of a rack into `folder`, in parts if the run is long.
 
-    With a port, the recording is also served to a viewer. It then has only one part, because a
-    recording that is served cannot change its file. A rack with a flight recorder gets no file.
+    With a port, the recording is also served to a viewer, and has only one part, because a served
+    recording cannot continue in another file. A rack with a flight recorder gets no file.
     """
 
     def __init__(self, segment: Segment, folder: Path, port: int | None) -> None:
@@ -246,7 +246,7 @@ class ViewSink:
 
         Args:
             tick: Tick before which all rows have been added.
-            lost: Number of lost rows, by ring.
+            lost: Number of lost rows of each ring.
 
         Raises:
             RuntimeError: The file cannot be written.
@@ -263,7 +263,7 @@ class ViewSink:
 
         Args:
             tick: Tick at which the run ended.
-            lost: Number of lost rows, by ring.
+            lost: Number of lost rows of each ring.
 
         Raises:
             RuntimeError: The file cannot be written.

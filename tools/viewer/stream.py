@@ -25,9 +25,9 @@ SIM_TIME = "sim_time"
 TICK = "tick"
 WALL = "wall"
 REMEMBERED_TICKS = 4096
-"""Number of remembered pairs of tick and time stamp.
+"""Number of stored pairs of tick and time stamp.
 
-From these the times of ticks without a time stamp are interpolated.
+The times of ticks without a time stamp are interpolated from them.
 """
 APPLICATION = "rack"
 LOG = "log"
@@ -58,8 +58,8 @@ class RowTimes(NamedTuple):
 class Timelines:
     """Converts ticks and CLOCK_MONOTONIC stamps to times on the timelines of the recording.
 
-    The timelines are simulated time, tick and wall clock. If `placed` is given, they are the
-    timelines of another rack, to which the times are converted. All times are integers, in ns.
+    The timelines are simulated time, tick and wall clock. If `placed` is given, times are converted
+    to the timelines of another rack. All times are integers, in ns.
     """
 
     def __init__(self, clock_ns: int, launch: Launch, placed: RackPlace | None = None) -> None:
@@ -75,7 +75,7 @@ class Timelines:
         Args:
             ticks: Release ticks, shape (rows,).
             stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
-            within_ns: Simulated time since the release, which is added.
+            within_ns: Simulated time to add to each release.
         """
         if (placed := self._placed) is None:
             return RowTimes(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
@@ -94,7 +94,7 @@ class Timelines:
         Args:
             ticks: Release ticks, shape (rows,).
             stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
-            within_ns: Simulated time since the release, which is added.
+            within_ns: Simulated time to add to each release.
         """
         times = self.compute_times(ticks, stamps_ns, within_ns)
         return [
@@ -104,7 +104,7 @@ class Timelines:
         ]
 
     def add_stamps(self, ticks: Ints, stamps_ns: Ints) -> None:
-        """Remember the time stamps of ticks, from which other times are estimated.
+        """Store time stamps of ticks, from which the times of other ticks are estimated.
 
         Args:
             ticks: The ticks in ascending order, shape (n,).
@@ -188,7 +188,7 @@ def build_change_finder() -> Callable[[np.ndarray], Ints]:
     last: np.ndarray | None = None
 
     def changed_rows(values: np.ndarray) -> Ints:
-        """Return the indices of rows that differ from the row before, across blocks."""
+        """Return the indices of rows that differ from the previous row, even across blocks."""
         nonlocal last
         changed = values != np.concatenate((values[:1] if last is None else last, values[:-1]))
         changed[0] |= last is None
@@ -212,7 +212,7 @@ def build_row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
     last = -1
 
     def sampled_rows(ticks: Ints) -> Ints:
-        """Return the index of the first row of each drawing interval, across blocks."""
+        """Return the index of the first row of each interval, which may span several blocks."""
         nonlocal last
         slots, first = np.unique(ticks // every, return_index=True)
         chosen = first[slots > last]
@@ -254,7 +254,7 @@ def open_recording(
 class Stream:
     """Writes the data of one rack to a recording.
 
-    An entity is given as the parts of its path, which may contain any character. All entities of
+    An entity is given as the parts of its path. A part may contain any character. All entities of
     the rack are below the path `root`.
     """
 
@@ -325,7 +325,7 @@ class Stream:
         self._recording.log(self._build_path(entity), archetype)
 
     def log_line(self, when: Moment, source: str, text: str, level: str) -> None:
-        """Write a line to the log. If the recording has several racks, the rack's name precedes it.
+        """Write a line to the log. If the recording has several racks, the rack's name is prefixed.
 
         Args:
             when: Time of the line.

@@ -116,8 +116,8 @@ def style_lane(
     Args:
         stream: Stream to write to.
         entity: The lane.
-        colours: Colours, by state.
-        labels: Labels, by state. Defaults to the names of the states.
+        colours: Dictionary from state to colour.
+        labels: Dictionary from state to label. By default, names of states are the labels.
     """
     shades = pack_colours(colours.values())
     shown_labels = list(colours)
@@ -207,7 +207,7 @@ def write_spans(
     Args:
         stream: Stream to write to.
         entity: The lane.
-        times: Time columns with the begins of the states.
+        times: Time columns with the start times of the states.
         states: The states. "" means no state.
     """
     stream.send_columns(entity, times, rr.StateChange.columns(state=states))

@@ -82,7 +82,7 @@ def list_boards(layout: Layout) -> list[str]:
 
 
 def choose_task_colours(layout: Layout) -> dict[str, Colour]:
-    """Return the colour of each task, by name. A planner gets the dimmed colour of its board."""
+    """Return a dictionary from task to colour. A planner has the dimmed colour of its board."""
     boards = list_boards(layout)
     by_task = {task.name: choose_joint_colour(boards.index(task.board)) for task in layout.tasks}
     return {name: dim_colour(colour) if "." in name else colour for name, colour in by_task.items()}

@@ -54,10 +54,10 @@ class ViewerWindow:
         self._is_reported = False
 
     def read_news(self) -> list[str]:
-        """Return a message about the end of the viewer.
+        """Return a message about the end of the viewer, once it has ended.
 
         Returns:
-            The message, once. [] while the viewer runs, and after the message was returned.
+            A list with the message, or [] if the viewer runs or the message was already returned.
         """
         if self._is_reported or self.is_open:
             return []

@@ -66,8 +66,9 @@ def main() -> None:
                 # No board needs the core any more. Only root may lower the niceness again.
                 with suppress(PermissionError):
                     os.nice(-NICENESS)
-            # If the launcher was killed, nobody waits for the viewer's file, whose libraries alone
-            # may take a minute to load on a busy machine. `rack replay` can make it later.
+            # If the launcher was killed, do not wait for the viewer's file. Loading the viewer's
+            # libraries may take a minute on a busy machine, and `rack replay` can make the file
+            # later.
             is_hurried = sys.stdin.readline() or os.getppid() != launcher
             if is_hurried and view is not None:
                 view.hurry()

@@ -1,6 +1,6 @@
 """The flight recorder, which deletes old parts of a recording that are not near an occasion.
 
-Occasions are alarms, missed or skipped cycles, and begins and ends of holds.
+Occasions are alarms, missed or skipped cycles, and the beginning and end of each hold.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class FlightRecorder:
     """Divides the spool of a recorder into stretches, and deletes stretches that are not needed.
 
     A stretch is a file with the rows of about one second. It is needed if it is near an occasion:
-    an alarm, a missed or skipped cycle, or the begin or end of a hold. Stretches of an earlier,
-    killed recorder are all kept, because its occasions are unknown. A rack restarts its recorder at
-    most three times, so these are few.
+    an alarm, a missed or skipped cycle, or the beginning or end of a hold. All stretches of an
+    earlier, killed recorder are kept, because its occasions are unknown. They are few, because a
+    rack restarts its recorder at most three times.
     """
 
     def __init__(self, segment: Segment, retention: Retention, spool: Spool, tally: Tally) -> None:
@@ -103,7 +103,7 @@ class FlightRecorder:
             end: Tick at which the current stretch ends.
 
         Returns:
-            File of the new stretch.
+            Path of the new stretch.
         """
         tally = self._tally
         stretch = StretchHead(tally.stretch_number + 1, begin, dict(tally.taken), dict(tally.rows))

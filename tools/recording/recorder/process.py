@@ -29,7 +29,7 @@ ATTACH_S = 30.0
 """Longest time to wait for the recorder to attach."""
 MAX_IDLE_CHECKS = 100
 MAX_STOPPED_CHECKS = 5
-"""Number of idle checks in a row after which a recorder is killed.
+"""Number of consecutive idle checks after which a recorder is killed.
 
 A check finds the recorder idle if it has used no processor time since the previous check, 0.2 s to
 1 s earlier. On a busy machine a recorder is slow but never idle. The smaller number applies to a
@@ -91,8 +91,8 @@ class RecorderProcess:
     The recorder process starts at once and imports its libraries while the rack is being launched.
     `attach` makes it record. A recorder that dies is restarted in the same folder, up to
     `MAX_RESTARTS` times, and a recorder that hangs is killed and restarted. In lockstep the clock
-    waits for the recorder. If its files cannot be written, `read_news` and `finish` raise
-    `Failure`.
+    waits for the recorder. If its files cannot be written, `read_notices` and `finish`
+    raise `Failure`.
 
     Attributes:
         folder: Folder of the run.
@@ -147,7 +147,7 @@ class RecorderProcess:
         return self.wait_until_attached(ATTACH_S)
 
     def wait_until_attached(self, bound_s: float = inf) -> bool:
-        """Wait until the recorder has attached, has died or hangs, but at most `bound_s`.
+        """Wait up to `bound_s` for the recorder to attach. Returns early if it dies.
 
         Returns:
             True if the recorder has attached.
@@ -161,15 +161,15 @@ class RecorderProcess:
     def _send_request(self) -> None:
         """Send the name of the rack, the folder and the viewer's port to the recorder."""
         assert self._process.stdin is not None, "it is a pipe"
-        # From now on the clock waits for the recorder. Until the recorder reads the rings, they
-        # hold all rows.
+        # Make the clock wait for the recorder before it attaches, so that no row in the rings is
+        # overwritten before the recorder reads it.
         self._set_follower(self.pid)
         with suppress(BrokenPipeError):
             self._process.stdin.write(self._request)
             self._process.stdin.flush()
 
     def read_news(self) -> list[str]:
-        """Return the messages to the user since the last call. Restarts the recorder if it died.
+        """Return new messages to the user since the last call. Restarts the recorder if it died.
 
         Raises:
             Failure: The files of the recording cannot be written.
@@ -188,7 +188,7 @@ class RecorderProcess:
         return lines
 
     def _kill_hung(self) -> None:
-        """Kill the recorder if it has been idle for too many checks."""
+        """Kill the recorder if it has been idle for too many consecutive checks."""
         bound = MAX_STOPPED_CHECKS if read_state(self.pid) in STOPPED_STATES else MAX_IDLE_CHECKS
         if self._idle.count_idle_checks() > bound and not self._is_killed:
             self._is_killed = True
@@ -240,8 +240,7 @@ class RecorderProcess:
         Only the first call has an effect. Later calls return the same result.
 
         Args:
-            in_a_hurry: Whether the recorder should leave out the viewer's file if that file is not
-                open yet.
+            in_a_hurry: Whether to omit the viewer's file if the recorder has not opened it yet.
 
         Returns:
             A description of how the recorder ended.

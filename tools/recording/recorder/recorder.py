@@ -77,7 +77,7 @@ class Sink(Protocol):
 
         Args:
             tick: The tick.
-            lost: Number of lost rows, by ring.
+            lost: Number of lost rows of each ring.
         """
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
@@ -85,17 +85,17 @@ class Sink(Protocol):
 
         Args:
             tick: Tick at which the run ended.
-            lost: Number of lost rows, by ring.
+            lost: Number of lost rows of each ring.
         """
 
 
 class SafeSink:
-    """A sink that protects the recorder from errors and delays of another sink, the viewer's file.
+    """Shields the recorder from errors and delays of another sink, which writes the viewer's file.
 
     After its first error, which is reported through `tell`, the other sink is dropped and the
-    recorder continues without it. Calls are queued and passed on in `advance`, when the rows are
+    recorder continues without it. Calls are queued, and passed on in `advance` when the rows are
     already in the spool. With `in_background` a thread opens the other sink, because its imports
-    may take as long as a launch. Calls then wait until it is open.
+    may take as long as a launch. Calls remain in the queue until the sink is open.
     """
 
     def __init__(
@@ -153,7 +153,7 @@ class SafeSink:
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
         """Pass on the queued calls if the sink is open.
 
-        A sink that was opened late gets the older calls over several passes.
+        If the sink was opened late, the older calls are spread over several passes.
         """
         counted = dict(lost)
         self._waiting.append(lambda sink: sink.advance(tick, counted))
@@ -164,7 +164,7 @@ class SafeSink:
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
         """Wait for the sink to open, pass on all queued calls and finish it.
 
-        If the sink does not open in time, a message says that the viewer's file is missing.
+        If the sink does not open in time, the user is told that the viewer's file is missing.
         """
         self._waiting.append(lambda sink: sink.close(tick, lost))
         until = time.monotonic() + self._patience_s
@@ -187,8 +187,8 @@ class SafeSink:
     def _make_waiting_calls(self, until: float = 0.0) -> None:
         """Pass queued calls on to the sink, oldest first.
 
-        As many calls are passed on as were queued since the last pass, and further ones until the
-        time `until`. Calls to a failed sink are dropped.
+        At least as many calls are passed on as were queued since the last pass, so that the queue
+        never grows, and more until the time `until`. Calls to a failed sink are dropped.
         """
         while len(self._waiting) > self._late or (self._waiting and time.monotonic() < until):
             call = self._waiting.popleft()
@@ -205,9 +205,9 @@ class SafeSink:
 
 
 RISKED_DIVISOR = 4
-"""Divisor of the rings' length that limits the rows not yet in the spool's file.
+"""Limit on the rows that are not yet in the spool's file, as a divisor of the rings' length.
 
-A rack in lockstep may run ahead of the file by at most this fraction of the rings.
+A rack in lockstep may be ahead of the file by at most this fraction of the rings.
 """
 
 
@@ -297,9 +297,9 @@ class Recorder:
         self._report_progress()
 
     def _report_progress(self) -> None:
-        """Tell the clock of a rack in lockstep up to which tick the recording is safe.
+        """Tell the clock of a rack in lockstep up to which tick all rows are in the spool's file.
 
-        This also makes the recorder the follower again, if the clock gave up waiting for it.
+        The recorder also becomes the follower again if the clock had stopped waiting for it.
         """
         if self._is_follower:
             self._words[System.FOLLOWER_TICK] = self._safe_tick
@@ -315,7 +315,7 @@ class Recorder:
         self.drain_rings()
 
     def close(self) -> None:
-        """Finish the files. The rack continues without a follower."""
+        """Finish the files. The clock no longer waits for this recorder."""
         if self._is_follower:
             self._words[System.FOLLOWER_PID] = 0
         if self._flight is not None:
