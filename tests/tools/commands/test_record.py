@@ -208,7 +208,7 @@ def test_a_signal_ends_recordings_at_once_and_leaves_their_merging_to_the_user(
         send(recorder.pid, number)
         out, said = recorder.communicate(timeout=WATCHDOG_S)
     assert recorder.returncode == 128 + number, said
-    notes = [f"{folder}/run.rrd is missing; 'rack replay {folder}' makes it"] if count > 1 else []
+    notes = [f"{folder}/run.rrd is missing; 'rack replay {folder}' creates it"] if count > 1 else []
     assert json.loads(out)["notes"] == notes
     assert (folder / "run.rrd").exists() == (count == 1)
     for each in folders:
