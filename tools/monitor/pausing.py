@@ -73,7 +73,7 @@ class Stepper:
         self._await_hold_at(tick)
 
     def find_end_tick(self, at: int, cycles: int, level: str | None) -> int:
-        """Return the tick right after the one at which the last of the next `cycles` begins.
+        """Return the tick after the one at which the last of `cycles` cycles is released.
 
         Args:
             at: The current tick.
