@@ -25,9 +25,9 @@ def guarded_line(motions: Motions, goal: Sequence[float], seconds: float) -> boo
     """Move the tool along a line until the arm touches something.
 
     Args:
-        motions: The verbs.
+        motions: Motion commands of the arm.
         goal: End of the line, (3,), in m.
-        seconds: Duration of the whole line.
+        seconds: Duration of the motion along the whole line.
 
     Returns:
         True if the arm touched something.

@@ -45,12 +45,13 @@ def wipe(y, seconds, end, what):
         what: Name of the step, for the error.
 
     Raises:
-        RuntimeError: The force was wrong on more than a fifth of the way, or the end differs.
+        RuntimeError: The force was outside its tolerance on more than a fifth of the path, or the
+            request ended differently.
     """
     pressed = {}
 
     def check_force():
-        """Note whether the force is right at this point of the way. Never ends the motion."""
+        """Record whether the force is within tolerance at this position. Never ends the motion."""
         position_step = round(where()[1] / STEP)
         pressed[position_step] = abs(wrench()["z"] - PRESS) < 0.3 * PRESS
         return False

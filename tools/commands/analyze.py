@@ -33,14 +33,14 @@ def analyze(
 ) -> None:
     r"""Compare a run with the timing model, equation by equation.
 
-    Each equation that `rack check` predicts is shown with its measurement. Times of levels are
-    processor time, without waiting and preemption. A virtual machine stalled by its host counts the
-    stall as processor time. Cycles with a detected stall are not judged. Some stalls go undetected:
-    --percentile 99 leaves out whatever happens less than once in 100 cycles.
+    Each equation that `rack check` predicts is shown with its measurement. Level times are
+    processor times, which exclude waiting and preemption. If the host stalls a virtual machine, the
+    stall counts as processor time. Cycles with a detected stall are excluded. To exclude undetected
+    stalls as well, --percentile 99 ignores the longest cycle in 100.
 
-    The output tells how the run ended, which equations held, which was tightest, and what to do.
-    --verbose adds every level, task and equation. The command writes analysis.json. `rack gantt
-    RUN` shows which tasks had a core.
+    The output shows how the run ended, which equations held, which one had the smallest margin, and
+    what to do. --verbose adds all levels, tasks and equations. The command writes analysis.json.
+    `rack gantt RUN` shows when each task had its core.
 
     Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.
 

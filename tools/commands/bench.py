@@ -60,15 +60,15 @@ def machine(
 ) -> None:
     r"""Is this machine fit for real time, and up to which rate?
 
-    The fastest board of a rack runs at each rate in turn. The other levels keep their rates.
-    Between these runs `cyclictest` of rt-tests sleeps to the same grid on the same core; no board
-    can wake earlier than it. A rate is held if `cyclictest` is late by a cycle in at most 0.1 % of
-    its wakes, and the board misses at most 0.1 % of its cycles in addition. Without SCHED_FIFO (see
-    `ulimit -r`) no machine is fit.
+    The fastest board of a rack runs at each rate in turn. The other levels keep their rates. For
+    comparison, `cyclictest` of rt-tests runs on the same core with the same period, because no
+    board can wake up earlier. The machine is fit for a rate if `cyclictest` is late by a whole
+    cycle in at most 0.1 % of its wake-ups, and the board misses at most 0.1 % more of its cycles.
+    Without SCHED_FIFO (see `ulimit -r`) no machine is fit.
 
-    Lateness is the time from grid point to start. As root the rack also runs with idle cores held
-    awake, and the last line recommends a value of `clock.idle_cores` for this machine. The bench
-    takes about four minutes. Run nothing else during this time.
+    Lateness is the time from a release to the start of its cycle. As root, the rack also runs with
+    idle cores kept awake, and the last line recommends a value of `clock.idle_cores` for this
+    machine. The bench takes about four minutes. Run nothing else during this time.
 
     Exit status: 0 fit at least at the lowest rate; 1 not fit, or a run failed; 2 a bad config.
 
@@ -94,8 +94,9 @@ def mailbox(
 ) -> None:
     """Measure the cost of a message, next to iceoryx2, HORUS and pipes.
 
-    Messages of 64 B to 16 kB are sent to one reader and to four, by every protocol, alternately
-    with iceoryx2, HORUS and pipes of multiprocessing. The ratio is to the best of these peers.
+    Messages of 64 B to 16 kB are sent to one and to four readers with every protocol, alternating
+    with iceoryx2, HORUS and multiprocessing pipes. The ratio compares each protocol with the best
+    of these three.
     """
     from rack.tools.lab.benches.mailbox import CASES, measure_mailboxes
 
@@ -113,9 +114,9 @@ def cycle(
     """Measure the cost of a board's cycle, part by part.
 
     The bench runs boards that compute nothing, and each board of nasrem, in real time and in
-    lockstep, alternately with another checkout. Without a checkout, the servo board in lockstep is
-    compared with bare mj_step calls that replay the physics of its recorded run. TREE runs in its
-    environment TREE/.venv.
+    lockstep. With --against TREE, runs of this program alternate with runs of the checkout TREE in
+    its environment TREE/.venv. Otherwise the servo board in lockstep is compared with bare mj_step
+    calls that replay the physics of its recorded run.
     """
     from rack.tools.lab.benches.cycle import measure_cycles
 
@@ -135,9 +136,10 @@ def lockstep(
 ) -> None:
     """Measure the speed of nasrem, k1607 and fig4 in lockstep.
 
-    They run alternately with the lower bound: the same plans and cycles of the same levels in one
-    process without a rack, whose messages must equal the rack's bit for bit. Ratios are to TREE if
-    it is given, and to this bound otherwise. TREE runs in its environment TREE/.venv.
+    The runs alternate with a lower bound: the same levels execute the same plans and cycles in one
+    process without a rack. Their messages must equal the rack's bit for bit. Ratios refer to the
+    checkout TREE if --against names one, otherwise to this bound. TREE runs in its environment
+    TREE/.venv.
     """
     from rack.tools.lab.benches.lockstep import RACKS, measure_lockstep
 
@@ -159,11 +161,11 @@ def launch(
 ) -> None:
     """Measure the duration of launches, commands and reactions.
 
-    A launch is the time from `rack run` to the first cycle of the fastest level; its ratio is to
-    the checkout given by --against. The ratio of a short command is to a Python that only imports
-    numpy. `rack report` shows a report that the run has made. Then the board that drives the arm of
-    a running rack is killed repeatedly: the output shows the time to detection, and the time until
-    the brakes of the arm are engaged.
+    A launch lasts from `rack run` to the first cycle of the fastest level, and is compared with the
+    checkout given by --against. Short commands are compared with a Python process that only imports
+    numpy. `rack report` shows a report that already exists. Finally the board that drives the arm
+    of a running rack is killed repeatedly, to measure the time to detection and the time until the
+    brakes of the arm are engaged.
     """
     from rack.tools.lab.benches.launch import measure_launches
 

@@ -72,12 +72,13 @@ def campaign(
 ) -> None:
     r"""Inject random faults of all kinds into runs of a rack, and judge each of them.
 
-    Each trial has as many faults as fit. Trials in lockstep run on all cores in parallel, others
-    one after the other. Up to its first fault a trial equals the faultless run. In lockstep it
-    therefore continues from a snapshot of that run, and ends when the verdict on each of its faults
-    is certain; --json lists the trials that could not, with reasons. --whole runs each to the end
-    of its task. There are also runs without faults in real time, alone and under load. The same
-    --out continues an interrupted campaign.
+    Each trial has as many faults as fit into a run. Lockstep trials run in parallel on all cores,
+    real-time trials one after the other. Up to its first fault a trial equals the faultless run. In
+    lockstep it therefore continues from a snapshot of that run, and ends as soon as the verdict on
+    each of its faults is certain. --json lists the trials for which this was not possible, with
+    reasons. --whole runs each trial from its beginning to the end of its task. The campaign also
+    includes runs without faults in real time, alone and under load. To continue an interrupted
+    campaign, give the same --out.
 
     Exit status: 0 the campaign passed; 1 a fault had no effect, or was not detected, handled and
     recovered from in time; a limit was violated; a process or segment was left behind; a task was

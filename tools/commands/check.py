@@ -53,28 +53,29 @@ def check(
 ) -> None:
     r"""Validate a config, and predict whether its levels meet their cycles.
 
-    The command prints every mistake, one per line. A valid config gets five lines: whether the rack
-    fits, where it is tightest, how soon it responds, reach and payload of its arm, and what to do.
-    --verbose adds slots, cores, rates, mailboxes with their bus addresses, and every equation. On a
-    terminal the tables show as many columns as fit; --json has all.
+    The command prints every mistake in the config, one per line. For a valid config it prints five
+    lines: whether the rack fits, its smallest margin, its response time, reach and payload of its
+    arm, and what to do. --verbose adds slots, cores, rates, mailboxes with their bus addresses, and
+    every equation. On a terminal the tables show as many columns as fit; --json has all.
 
     The prediction uses budgets: the longest processor time of each part of a level's cycle. They
-    are in the config, in [board.<name>.budget], or measured, with --from RUN. [timing] has the
-    context switch, the time of the clock itself, the limit of eq. 3.10, and a goal for the response
-    of the system. `rack schema board.budget` and `rack schema timing` show the keys.
+    are read from [board.<name>.budget] in the config, or measured in a run with --from RUN.
+    [timing] contains the context switch time, the processor time of the clock, the limit of eq.
+    3.10, and a goal for the system response. `rack schema board.budget` and `rack schema timing`
+    show the keys.
 
-    Equations 3.1 to 3.10 of the paper are applied to every level with a budget: both sides, the
-    margin, and ok or FAILS. Beyond the paper, it computes the worst-case response time of every
-    task, and the load of every core.
+    Equations 3.1 to 3.10 of the paper are evaluated for every level with a budget. The output shows
+    both sides, the margin, and ok or FAILS. The command also computes the worst-case response time
+    of every task and the load of every core, which the paper does not.
 
-    If an equation fails, the command lists changes that help, cheapest first, each tried on the
-    whole rack: another priority or core, a board for the planner, older plans, or a longer cycle,
-    for that board or for one that shares its core. Changes that need more cores than this machine
-    has come last. --fix prints the config with the first change.
+    If an equation fails, the command lists changes that help, cheapest first. Each has been tried
+    on the whole rack: another priority or core, a separate board for the planner, a larger plan
+    age, or a longer cycle, for the failing board or for one that shares its core. Changes that need
+    more cores than this machine has come last. --fix prints the config with the first change.
 
-    The verdict names every board, planner and host board that was not counted. "fits" without names
-    means that all were counted, except the recorder. In --json timing.fits is true, false, or null
-    for a rack that fits without the boards in timing.uncounted.
+    The verdict names every board, planner and host board that was not counted. If it names none,
+    all were counted except the recorder. With --json, timing.fits is true, false, or null if the
+    rack fits when the boards in timing.uncounted are ignored.
 
     Exit status: 0 all equations hold for the counted boards; 1 an equation fails, or no change
     helps; 2 a bad config.
@@ -163,11 +164,11 @@ def _use_measured_budgets(config: RackConfig, run: Path, percentile: float) -> R
 
 
 def _compute_abilities(config: RackConfig) -> Abilities | None:
-    """Compute reach and payload of a rack's arm at rest. None for a hand, or without an arm."""
+    """Compute reach and payload of a rack's arm at rest. None if it has a hand or no arm."""
     robot = config.robot
     if robot is None or robot.hand is not None:
         return None
-    # Importing MuJoCo takes 0.5 s: only racks with an arm pay for it.
+    # Import late: MuJoCo takes 0.5 s to import, and only racks with an arm need it.
     from rack.levels.robot.abilities import compute_abilities
 
     return compute_abilities(build_rack_cell(config))

@@ -10,7 +10,7 @@ from rack.tools.console.parameters import Json
 def clean(as_json: Json = False) -> None:
     r"""Remove the shared memory that killed racks left behind.
 
-    A rack in use is never touched, nor is a directory or symbolic link with the name of a rack.
+    Racks in use are not touched, and neither are directories or symbolic links named like a rack.
 
     \b
     Examples:

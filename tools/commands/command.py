@@ -63,7 +63,7 @@ def command(
     goto      move the arm to a goal, and keep it there
     setpoint  the same, at the servo level: a straight line in joint space,
               without checking for collisions
-    resume    let the level continue its own work
+    resume    return the level to automatic mode
     modify    switch a control modification of the servo level on or off,
               between two samples and without a step in the torque
     table     switch to another state table
@@ -72,14 +72,14 @@ def command(
     enable    ask the arm's drives for torque; the arm continues from its position
     disable   brake the arm, and take the torque from its drives
     reset     clear a fault of the arm's drives, which are then disabled
-    release   end the bring-up of an arm: full speed from now on
+    release   end the bring-up of an arm, and permit full speed
 
-    `hold`, `setpoint`, `goto` and `do` stay in force until `resume`. Until then the mode of the
-    level in 'rack status' is "operator" instead of "automatic". They survive a restart of the
-    level's board. With --lease they stay in force as long as this program runs: Ctrl-C, a closed
-    terminal or SIGKILL make the level hold. --wait only watches: if it is interrupted, the command
-    stays in force. An emergency stop takes precedence. On a rack that is held between two ticks,
-    this program returns at once and the command takes effect at the next step.
+    `hold`, `setpoint`, `goto` and `do` stay in force until `resume`. While one is in force, the
+    mode of the level in 'rack status' is "operator" instead of "automatic". They survive a restart
+    of the level's board. With --lease they stay in force as long as this program runs: Ctrl-C, a
+    closed terminal or SIGKILL make the level hold. --wait only watches: if it is interrupted, the
+    command stays in force. An emergency stop takes precedence. On a rack that is held between two
+    ticks, this program returns at once and the command takes effect at the next step.
 
     Exit status: 0 the level accepted the command, or with --wait completed it; 1 it refused or did
     not answer in time; 2 usage.

@@ -21,7 +21,7 @@ from rack.tools.console.parameters import (
 )
 
 MAX_RESPONSE_S = 2.0
-"""Maximum time that the clock, which reads the latch every tick, may take to obey it."""
+"""Maximum time within which the clock, which reads the latch every tick, must apply it."""
 
 
 def estop(
@@ -50,10 +50,11 @@ def estop(
 
     The run continues with the arm braked. The reset is refused while a board is lost, or SYSFAIL or
     ACFAIL is asserted. A rack on another machine, HOST/RACK, can be stopped by the operators whom
-    its config names in adapter.lan.estop_from. It must be reset on its own machine. Strangers who
-    reach the port of a rack can delay new connections; --ready therefore connects in advance, and
-    reports on stderr whenever the connection is lost or restored. Enter, or any line on stdin, sets
-    the stop at once, or as soon as the rack can be reached. Ctrl-C ends without a stop.
+    its config names in adapter.lan.estop_from. It must be reset on its own machine. Anyone who can
+    reach the network port of a rack can delay new connections. --ready therefore connects in
+    advance, and reports on stderr whenever the connection is lost or restored. Pressing Enter (any
+    line on stdin) then sets the stop at once, or as soon as the rack can be reached. Ctrl-C exits
+    without a stop.
 
     The arm of a rack that is held between two ticks brakes when the rack continues.
 
@@ -150,11 +151,11 @@ def _wait_for_enter(wait_s: float) -> bool:
 
 
 def _set_latch(rack: str, reset: bool) -> tuple[int, str]:
-    """Set or clear the latch of a rack on this machine, and wait until the clock has obeyed.
+    """Set or clear the latch of a rack on this machine, and wait until the clock has applied it.
 
     Returns:
-        The current tick, and the reason if the arm obeys only later. The reason is empty unless the
-        rack is held.
+        The current tick, and a text that tells why the arm reacts only later if the rack is held.
+        Otherwise the text is empty.
     """
     segment = Segment.attach(rack)
     words = segment.words

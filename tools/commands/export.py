@@ -20,9 +20,9 @@ def export(
 ) -> None:
     r"""Write a recorded run as an MCAP file, which Foxglove and others read.
 
-    Each mailbox is a channel of JSON messages, whose schema has units and meanings. Events are a
-    channel, too. Log time is simulated time, publish time the wall clock. The command needs mcap:
-    pip install 'nasrem-rack[export]'.
+    Each mailbox becomes a channel of JSON messages, with units and meanings in its schema. Events
+    become another channel. The log time is simulated time, the publish time is wall-clock time. The
+    command needs mcap: pip install 'nasrem-rack[export]'.
 
     Exit status: 0 written; 1 FILE cannot be written, or mcap is missing; 2 RUN is not a run, or
     FILE exists.

@@ -44,11 +44,11 @@ def gantt(
     r"""Draw a Gantt chart of the schedule of a config, or of the trace of a run.
 
     The schedule of a config follows from its budgets. The letters are unit functions: C reads the
-    plan, R reads command and status, X executes, W writes, P plans, U updates the plan. "-" is an
-    idle core, "." a core that another board uses. A run is drawn above the schedule of its config.
-    The chart is printed as text, and drawn as PNG and SVG.
+    plan, R reads command and status, X executes, W writes, P plans, U updates the plan. "-" marks
+    an idle core, "." a core that another board uses. For a run, its trace is drawn above the
+    schedule of its config. The chart is printed as text, and drawn as PNG and SVG.
 
-    Figures 2 to 4 of the paper are racks of that name.
+    Figures 2 to 4 of the paper are the racks fig2, fig3 and fig4.
 
     \b
     Examples:

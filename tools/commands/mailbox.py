@@ -28,7 +28,7 @@ def mailbox(
 ) -> None:
     r"""Show the newest message in a mailbox of a running rack, or list its mailboxes.
 
-    The message is shown field by field with units. Reading costs the boards nothing. With --watch
+    The message is shown field by field with units. Reading does not delay the boards. With --watch
     and --json each message is one line.
 
     Exit status: 0 shown; 1 there is no such rack, or no message yet; 2 usage.
@@ -64,8 +64,8 @@ def _watch_mailbox(
 ) -> None:
     """Show the newest message of a mailbox, then each new one until the run is over.
 
-    JSON output contains every message. Text output skips all but the newest message of each
-    reading.
+    JSON output contains every message. If several messages arrive between two readings, text output
+    shows only the newest.
     """
     from rich.live import Live
     from rich.text import Text

@@ -35,7 +35,7 @@ def new(
 
     A level reads and writes messages, and declares a live parameter and an event. A servo law is
     one method: torques from set points and sensed motion. A planner works in the background of a
-    level that reads its plans. Each runs, and passes its test, without changes.
+    level that reads its plans. The files run and pass their test without changes.
 
     Exit status: 0 written; 2 NAME cannot be a module, or the folder exists already, and nothing is
     written.
@@ -91,6 +91,6 @@ def _class_name(name: str) -> str:
 
 
 def _fill_template(text: str, kind: str, name: str) -> str:
-    """Replace the names in a file of a template by the user's name."""
+    """Replace the module and class names of a template in a text by the user's."""
     template_name = f"my_{kind}"
     return text.replace(template_name, name).replace(_class_name(template_name), _class_name(name))

@@ -19,8 +19,9 @@ def pause(rack: RackName, as_json: Json = False) -> None:
     r"""Pause a rack until 'rack resume'.
 
     In lockstep the rack is held before its next tick, as by 'rack step'. In real time the clock
-    keeps running: an operator's hold of the highest level brings the arm to rest on its path. A
-    level that executes another command of an operator keeps it, and the level below is held.
+    keeps running. The highest level gets an operator's hold, which brings the arm to rest on its
+    path. If that level is executing a different command of an operator, the level below is held
+    instead.
 
     Exit status: 0 the rack is held, or the arm at rest; 1 there is no such rack, its run ended, or
     none of its levels can hold.

@@ -35,11 +35,12 @@ def prompt(
 ) -> None:
     r"""Open a Python prompt, or run a script, on the host side of a running rack.
 
-    The prompt runs as the program of a host board with `external = true`, one process at a time.
-    `program` is the board's program, whose ports read and send messages. It may define more names.
-    `bus` has the time, and waits for messages. Nothing that happens at the prompt delays the
-    real-time side. The prompt can be closed and opened again while the rack runs. Because its
-    program is a class that the config of the rack names, the rack must belong to you.
+    The prompt runs as the process of a host board with `external = true`. A board can have only one
+    such process at a time. The name `program` is the board's program, whose ports read and send
+    messages, and `bus` gives the time and waits for messages. The program may define more names.
+    Nothing that happens at the prompt delays the real-time side. The prompt can be closed and
+    opened again while the rack runs. The rack must belong to you, because the prompt runs a class
+    that the rack's config names.
 
     Exit status: 0 prompt closed; 1 there is no such rack, it belongs to another user, the board is
     in use, or the script failed; 2 usage.
@@ -73,7 +74,7 @@ def prompt(
 def _find_wiring(segment: Segment, board: str | None) -> HostWiring:
     """Return the wiring of the external host board.
 
-    Raises `Failure` if none fits, or several do.
+    If `board` is None, the rack must have exactly one. Raises `Failure`.
     """
     wirings = {
         host.board: host for host in resolve(load_text(segment.config)).hosts if host.is_external

@@ -49,9 +49,9 @@ def record(
 ) -> None:
     r"""Record a running rack until its run is over, or until Ctrl-C.
 
-    The recording begins with the two seconds that the rack's rings still hold. `rack report`, `rack
-    analyze` and `rack replay` read it. Recording costs the rack no deadline, and ending it does not
-    end the run.
+    The recording begins with the last two seconds, which are still in the rack's rings. `rack
+    report`, `rack analyze` and `rack replay` read it. Recording causes no missed deadlines, and the
+    run continues when it ends.
 
     With --with, each rack is recorded into a separate folder DIR/<rack>. When all runs are over,
     DIR/run.rrd shows them on the time line of the first rack. Record a rack of another machine on
@@ -120,11 +120,11 @@ def _save_recording(segment: Segment, folder: Path) -> tuple[Document, str]:
 
 
 def save_run(folder: Path, into: Path) -> None:
-    """Copy what `folder` contains of a recording to the run folder `into`, while it continues."""
+    """Copy an unfinished recording from `folder` to the run folder `into`, while it continues."""
     stretches = (f"{STRETCHES}/{path.name}" for path in list_stretch_files(folder))
     for name in (CONFIG, PUBLISHED, ORIGIN, CODE, EVENTS, CHECKSUMS, SPOOL, *stretches):
         (into / name).parent.mkdir(parents=True, exist_ok=True)
-        # The flight recorder may have removed a listed file by now, and few runs have an origin.
+        # Some files may be missing: the flight recorder removes old ones, few runs have an origin.
         with suppress(FileNotFoundError):
             copyfile(folder / name, into / name)
     rebuild_files(into)

@@ -41,7 +41,7 @@ def replay(
     also be a run.rrd.
 
     For several racks that ran together, give the folder of each. They are shown side by side under
-    their names, on the time line of the first. Their clocks are compared by the messages that the
+    their names, on the time line of the first. Times are converted with the clock offsets that the
     racks recorded of each other, and the log states the uncertainty. Racks that did not run
     together are refused.
 
@@ -97,7 +97,7 @@ def _find_viewer_files(run: Path) -> list[Path]:
 
 
 def _list_runs(run: Path) -> list[Path]:
-    """List the runs in a folder made by `rack record --with`. A run folder lists only itself."""
+    """List the runs in a folder of `rack record --with`. For a run, return its folder."""
     parts = (
         [] if (run / CONFIG).exists() else sorted(path.parent for path in run.glob(f"*/{CONFIG}"))
     )
@@ -131,7 +131,8 @@ def merge_runs(runs: Sequence[Path], out: Path, place: Places = place_on_time_li
     Args:
         runs: Run folders.
         out: The file.
-        place: Puts the runs on one time line, by default as racks that ran together.
+        place: Function that puts the runs on one time line. By default they are treated as racks
+            that ran together.
 
     Returns:
         Notes for the user about the times of the runs.

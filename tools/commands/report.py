@@ -31,16 +31,16 @@ def report(
 ) -> None:
     r"""Report on a run from its recording.
 
-    The command writes report.json and report.md, unless those of the run are newer than its
-    recording and this program. On a terminal the tables show as many columns as fit; report.md has
-    all.
+    The command writes report.json and report.md if they are missing or older than the recording or
+    this program. On a terminal the tables show as many columns as fit; report.md has all.
 
-    With --against it names the first message that differs, its fields, and whether its writer had
-    read the same inputs in both runs. If not, it follows the differing inputs back to a cycle with
-    equal inputs, and names the cause: a fault, a loss, a command, a miss or a setting. If only the
-    state and code of the level remain, --repeat runs both racks in lockstep again up to that cycle.
-    It reports which attributes of the level differed before it, and whether the code repeats what
-    it wrote. No other report runs code of a run.
+    With --against the report names the first message that differs, its fields, and whether its
+    writer had read the same inputs in both runs. If not, the command follows the differing inputs
+    back to a cycle with equal inputs, and names the cause: a fault, a loss, a command, a miss or a
+    setting. If only the state or the code of the level can be the cause, --repeat runs both racks
+    again in lockstep up to that cycle. It reports which attributes of the level differed before the
+    cycle, and whether running the cycle again gives the same output. Only --repeat executes code of
+    a run; other reports just read recordings.
 
     Exit status: 0 the report was printed; 1 with --against: the runs diverge before any miss; 2 RUN
     is not a run, or the two cannot be compared: they are of different racks, or one lacks rows.

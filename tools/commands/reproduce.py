@@ -41,19 +41,20 @@ def reproduce(
     holds here, within bounds; the paper contradicts itself; it is not testable here; or it does not
     hold here.
 
-    The page is DIR/index.html and, as Markdown, DIR/README.md. Figures are drawn in letters.
+    The page is DIR/index.html and, as Markdown, DIR/README.md. Figures are drawn as text.
     DIR/paper.json has everything as data. DIR/runs has the recordings, for `rack report`, `rack
     gantt` and `rack analyze`.
 
-    Every ruling results from comparisons of measured values, which the page lists. A run that does
-    not show a claim does not judge it, such as a run in which a level made no plan.
+    Every ruling results from comparisons of measured values, which the page lists. A run in which a
+    claim cannot be observed, such as one in which a level made no plan, counts neither for nor
+    against it.
 
     The experiments take fifteen minutes on two cores. Do not use the machine during this time,
-    because real-time figures suffer. Finished experiments are kept, even if the command is
-    interrupted or killed; the same command continues. After a change of configs, program or machine
-    the experiments that depend on it are repeated.
+    because other load distorts the real-time figures. Finished experiments are kept, even if the
+    command is interrupted or killed; the same command continues. After a change of configs, program
+    or machine the experiments that depend on it are repeated.
 
-    Exit status: 0 all experiments were made, and no claim failed; 1 otherwise; 2 usage error.
+    Exit status: 0 all experiments were completed, and no claim failed; 1 otherwise; 2 usage error.
 
     \b
     Examples:

@@ -38,7 +38,7 @@ MAX_SECONDS = 1e9
 def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> None:
     r"""Go to any tick of a recorded run, inspect messages and levels, and branch off.
 
-    The command opens a prompt. Commands can also come from stdin, one a line. With --json each
+    The command opens a prompt. Commands can also come from stdin, one per line. With --json each
     answer is a document on one line, and the answer of a failed command has the key 'error'.
 
     \b
@@ -50,9 +50,10 @@ def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> Non
       branch [--set KEY=VALUE]... [--faults FILE] [--seconds S] [--out DIR]
       help [COMMAND], quit
 
-    A tick is shown before its tasks begin, with the messages that they are about to read. Messages
-    and events come from the recording. For the objects of levels, and for branches, the rack runs
-    again unchanged, from the beginning or from an earlier snapshot. RUN is only read.
+    Each tick is shown in the state before its tasks begin, with the messages that they are about to
+    read. Messages and events come from the recording. For the objects of levels, and for branches,
+    the rack runs again unchanged, from the beginning or from an earlier snapshot. RUN itself is not
+    changed.
 
     Exit status: 0 the prompt was left, and all commands from stdin or with --json worked; 2 one of
     them failed, or RUN is not a run.
@@ -142,7 +143,7 @@ class RewindPrompt(cmd.Cmd):
     def do_goto(self, line: str) -> None:
         """Go to a simulated time in s, or to the next tick at which a condition begins to hold.
 
-        That is the tick of the first message that meets the condition after one that does not.
+        A condition begins to hold at the first message that meets it after one that does not.
         Comparisons: == != <= >= < >; a state may be named, as in "primitive.status.state ==
         holding".
         """
@@ -190,7 +191,8 @@ class RewindPrompt(cmd.Cmd):
         """Run the rack from this tick with other settings or faults, and record it as a new run.
 
         The answer states where the branch first differs. --seconds counts from the beginning of the
-        run. By default the branch ends with its task, or after as long a time as the run.
+        run. By default the branch lasts as long as the run if that had a time limit, and otherwise
+        ends with its task.
         """
         arguments = _parse_arguments("branch", line)
         with open_display(silent=self._as_json) as display:

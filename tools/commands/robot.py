@@ -49,12 +49,13 @@ def new(
 ) -> None:
     r"""Write a folder with a config, a scene and a task for the arm of a model file.
 
-    The config takes from the model: the joints along the chain, their limits, the torques of
-    actuators or a URDF's efforts, and a keyframe. The rest is found (the tool, a home free of
-    contact, the drive of the gripper and the joints or jaw that go with it, bodies that always
-    overlap) or guessed. Each guess is named here, in the file, and in [robot] guessed. The task
-    moves two blocks on a table, or tours poses if no gripper can grasp blocks. The planner has
-    rehearsed it. On a terminal the command asks for values that no option gives.
+    The config takes the following from the model: the joints along the chain, their limits, torque
+    limits from actuators or URDF efforts, and a keyframe. The rest is computed (the tool, a home
+    pose free of contact, the drive of the gripper and the joints or jaw that belong to it, bodies
+    that always overlap) or guessed. Each guess is listed in the output, in the file, and in [robot]
+    guessed. The task moves two blocks on a table, or visits several poses if no gripper can grasp
+    blocks. It has been planned successfully. On a terminal the command asks for values that no
+    option gives.
 
     Exit status: 0 written; 2 the model cannot be used, and nothing is written.
 
@@ -94,10 +95,10 @@ def check(
 ) -> None:
     r"""Examine an arm before it moves, and draw it.
 
-    The arm belongs to a config, or is drafted from a model file as by `rack robot new`. The
+    The arm is that of a config, or is drafted from a model file as `rack robot new` does. The
     report shows axes, limits, reach, payload at the edge of the reach, contacts at home, unattached
     bodies, actuators by kind, the coupling of the gripper, its fingers, the natural frequency, and
-    objects that fall without end.
+    objects that never stop falling.
 
     Exit status: 0 all checks pass; 1 a check fails; 2 the model cannot be used.
 
@@ -158,9 +159,9 @@ def _format_examination(document: Document) -> Iterator[str]:
 
 
 def _ask(text: str, default: str = "") -> str:
-    """Ask the user for a value, and return the answer or else the default.
+    """Ask the user for a value, and return the answer, or the default if it is empty.
 
-    An empty result leaves the choice of the value to the draft.
+    If the result is empty, the draft chooses the value.
     """
     question = text if default else f"{text} [found]"
     return str(typer.prompt(question, default, show_default=bool(default))).strip()

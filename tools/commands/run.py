@@ -82,21 +82,21 @@ def run(
     r"""Run a rack until its task ends, and report on the run.
 
     A rack that names others in adapter.lan.launch also launches them, each by a separate 'rack
-    run'. If one fails, all end. On a terminal a live table shows every task and what holds the
-    rack; elsewhere one line a second is printed. --json prints the report as one document. With
+    run'. If one fails, all are stopped. On a terminal a live table shows every task and what holds
+    the rack; elsewhere one line a second is printed. --json prints the report as one document. With
     --no-record it has the same keys; those that need a recording are null.
 
     With --from, the rack first runs again, unchanged, from the beginning to TIME. Commands of
-    operators in that run, before TIME and after it, are repeated. Stops and faults by hand are not.
-    Host boards and other racks are not started. What they sent is replayed at the same ticks.
-    --seconds counts from the beginning of the run that is continued.
+    operators in that run, before TIME and after it, are repeated. Emergency stops and faults given
+    by hand are not. Host boards and other racks are not started. What they sent is replayed at the
+    same ticks. --seconds counts from the beginning of the run that is continued.
 
     Exit status: 0 the task was done, with its objects at their goals, or --seconds have passed; no
     fault is latched, and the recording is complete. 1 otherwise, also if brakes or a level held the
     rack for over 5 s, or brakes for half of the run, without a known cause; if a level missed or
     skipped more of its cycles than supervision.max_missed_fraction permits; or if the system
     response exceeded its bound without a lost cycle. 2 usage or config error. A full disk ends the
-    run. Ctrl-C ends it in order, with a report and exit status 130.
+    run. Ctrl-C ends it cleanly, with a report and exit status 130.
 
     \b
     Examples:
@@ -171,7 +171,10 @@ def run(
 
 
 def _preload_levels(crate: CrateLine | None, tables: Tables) -> CrateLine | None:
-    """Let the crate import a config's levels while this process checks the config."""
+    """Ask the crate to import a config's levels while this process checks the config.
+
+    Returns `crate`, which is None if no crate was started early.
+    """
     if crate is not None:
         python_path = tables.get("python_path")
         crate.send_request(
@@ -186,7 +189,7 @@ def _preload_levels(crate: CrateLine | None, tables: Tables) -> CrateLine | None
 def _report_run(
     config: RackConfig, folder: Path | None, result: RunResult, as_json: bool
 ) -> Document:
-    """Write, print and return the report. A run whose report cannot be written has failed."""
+    """Write, print and return the report. If it cannot be written, the run has failed."""
     from rack.tools.recording.folder_size import format_recorded_line
     from rack.tools.report.report import build_unrecorded_report, write_report
     from rack.tools.report.report_markdown import format_summary

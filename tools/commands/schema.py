@@ -32,7 +32,7 @@ def schema(
     r"""Show the keys of a config: type, unit, permitted values, default and meaning.
 
     Without TABLE the command lists the tables. [task] and [board.<name>.params] depend on the
-    levels of CONFIG. The beginning of a name shows all tables that begin with it.
+    levels of CONFIG. The beginning of a name selects all tables whose names begin with it.
 
     \b
     Examples:

@@ -20,10 +20,9 @@ def set_param(
 ) -> None:
     r"""Set a live parameter of a running rack, between two cycles of its level.
 
-    'rack schema' marks the parameters that a level declares as live. All others are read only at
-    the launch. The command counts as an operator's: it is given again when the board of the level
-    is restarted. To repeat the run in lockstep, put the same command, what = "set", into the
-    config.
+    'rack schema' marks the parameters that a level declares as live. All others take effect only at
+    launch. The setting is an operator's command: it is given again when the board of the level is
+    restarted. To repeat the run in lockstep, put the same command, what = "set", into the config.
 
     Exit status: 0 the parameter is set; 1 the level refused it, or did not answer in time; 2 the
     parameter is not live, or the value is invalid.

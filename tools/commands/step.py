@@ -25,9 +25,10 @@ def step(
 ) -> None:
     r"""Advance a rack in lockstep by single cycles, and show the state of each level.
 
-    Start the rack with 'rack run CONFIG --lockstep --step': it holds before tick 0. A rack that
-    already runs in lockstep is held by its first step. Without options the rack advances until
-    every level has completed one more cycle. For a level with a state table, its row is shown.
+    Start the rack with 'rack run CONFIG --lockstep --step': it is then held before tick 0. A rack
+    that already runs in lockstep is held by its first step. Without options the rack advances until
+    every level has completed one more cycle. For a level with a state table, the current row is
+    shown as well.
 
     Exit status: 0 the steps are done; 1 there is no such rack, it is not in lockstep, or its run
     ended; 2 usage.

@@ -19,7 +19,7 @@ def stop(
 ) -> None:
     r"""End a run, and wait until its launcher has ended.
 
-    The run ends in order at its next tick, and writes its report.
+    The run ends cleanly at its next tick, and writes its report.
 
     Exit status: 0 the run has ended; 1 there is no such rack, or it is still running after --wait.
 

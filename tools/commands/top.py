@@ -19,7 +19,7 @@ def top(rack: OnlyRack = None) -> None:
 
     On a terminal the view fills the screen, if textual is installed (pip install
     'nasrem-rack[live]'), and keys command the rack. Elsewhere one line a second is printed.
-    Watching costs the rack no deadline. When the view is closed, the run continues, and commands
+    Watching causes no missed deadlines. When the view is closed, the run continues, and commands
     given from it stay in force.
 
     To watch a rack on another machine: ssh -t HOST rack top.
@@ -31,7 +31,7 @@ def top(rack: OnlyRack = None) -> None:
     c        type a command, as in: task goto home
     i        choose a fault, change it, inject it
     e E      set the emergency stop, reset it
-    w q      forget the worst times, quit
+    w q      reset the longest times, quit
 
     \b
     Examples:

@@ -57,7 +57,7 @@ def watch(
     Otherwise each line has the time in s and the values; with --json each line is a document.
 
     With --when the command waits until a condition holds, and saves every message in a window
-    around that tick. Watching reads the same rings as the recorder, and costs the rack no deadline.
+    around that tick. Watching reads the same rings as the recorder, and causes no missed deadlines.
 
     Exit status: 0 shown, or saved without a gap; 1 there is no such rack, messages were lost, or
     the run ended before the condition held; 2 usage.
@@ -113,7 +113,7 @@ def _parse_seconds(option: str, text: str) -> float:
 def _check_writable(path: Path) -> None:
     """Raise `OSError` if a file cannot be written.
 
-    This is checked before the capture, because its messages would otherwise be lost.
+    Call this before the capture. Otherwise the captured messages could be lost.
     """
     is_new = not path.exists()
     with path.open("a"):
@@ -177,7 +177,7 @@ def _await_trigger(segment: Segment, history: SignalHistory, trigger: Trigger, a
 
 
 def _save_csv(path: Path, history: SignalHistory, rows: SignalRows) -> None:
-    """Write the captured values as CSV. Raises `Failure` if messages were lost on the way."""
+    """Write the captured values as CSV. Raises `Failure` if messages were lost."""
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)

@@ -51,7 +51,7 @@ class Operator(NamedTuple):
 class RackAddress(NamedTuple):
     """Address of a rack on another machine: host, port and name.
 
-    The host keeps the brackets of an IPv6 address.
+    An IPv6 address as host includes its brackets.
     """
 
     host: str

@@ -13,14 +13,14 @@ from rack.boards.errors import Failure as Failure
 from rack.boards.errors import to_one_line
 
 Document = dict[str, Any]
-"""Plain data, as `--json` prints it and as the files of a run hold it."""
+"""Plain data, as `--json` prints it and as the files of a run store it."""
 MAX_LINE = 1300
 """Maximum number of characters in one line of an error message."""
 
 
 @contextmanager
 def convert_errors() -> Iterator[None]:
-    """Convert the errors of backplane and levels to `Failure`, with its exit status."""
+    """Convert errors of the backplane and the levels to `Failure`."""
     try:
         yield
     except Exception as error:

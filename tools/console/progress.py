@@ -19,7 +19,7 @@ LINE_INTERVAL_S = 2.0
 class Progress:
     """Progress of a series of runs, weighted by their expected durations.
 
-    Shows a `bar`, or prints lines, or neither.
+    It is shown as a bar, as printed lines, or not at all.
     """
 
     def __init__(self, bar: RichProgress | None = None, prints_lines: bool = False) -> None:
@@ -78,7 +78,7 @@ def open_progress(silent: bool) -> Iterator[Progress]:
 def create_reading_progress(
     silent: bool, activity: str = "reading the run"
 ) -> Callable[[float], None]:
-    """Return a function that prints the progress of reading on stderr from time to time.
+    """Return a function that prints progress on stderr, at most once per `LINE_INTERVAL_S`.
 
     The function takes the fraction of the work that is done, 0 to 1.
     """

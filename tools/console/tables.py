@@ -119,7 +119,7 @@ def build_grid(
 
 
 def is_number(cell: str) -> bool:
-    """Return whether a cell holds a number or is empty."""
+    """Return whether a cell contains a number or is empty."""
     return not cell.strip("0123456789.-+e")
 
 
@@ -143,7 +143,7 @@ class TextTable:
     """A table as data.
 
     Attributes:
-        records: Cells of each row, by column.
+        records: For each row, a dictionary from column to cell.
         dropped: Columns that a narrow terminal leaves out, in this order.
     """
 
@@ -201,7 +201,7 @@ def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
 
 
 def print_blocks(blocks: Iterable[str | TextTable]) -> None:
-    """Print text and tables on stdout, fitted to a terminal or complete in a pipe."""
+    """Print text and tables on stdout. Tables are fitted to a terminal, but complete in a pipe."""
     terminal = create_console()
     if terminal.is_terminal:
         show_blocks(blocks, terminal)
@@ -215,7 +215,7 @@ def format_decimal(value: float | None, digits: int = 3) -> str:
 
 
 def format_figure(distribution: Mapping[str, Any] | None, key: str) -> str:
-    """Format one figure of a distribution, or "-" if the distribution is None."""
+    """Format the value of one key of a distribution, or "-" if the distribution is None."""
     return "-" if distribution is None else format_decimal(distribution[key])
 
 

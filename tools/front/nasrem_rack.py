@@ -13,7 +13,7 @@ from pathlib import Path
 
 
 def main() -> None:
-    """Run the command line of `rack`, or exit with one line that names the wrong package."""
+    """Run the command line, or exit with one line if another package `rack` takes precedence."""
     place = _find_package()
     if "nasrem-rack" not in place.read_text():
         sys.exit(f"rack: {place} is not nasrem-rack's package `rack`: {_describe_remedy()}")
@@ -31,7 +31,7 @@ def _find_package() -> Path:
 
 
 def _describe_remedy() -> str:
-    """Tell how to remove the other package, which overwrites ours or precedes it on the path."""
+    """Return how to remove the other package, which overwrites ours or precedes it on the path."""
     try:
         version("rack")
     except PackageNotFoundError:

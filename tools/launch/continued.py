@@ -1,9 +1,9 @@
-"""Runs a recorded run again in lockstep, up to any tick, with snapshots on the way.
+"""Repeats a recorded run in lockstep up to any tick, and takes snapshots.
 
 `rack run --from RUN@TIME` and `rack rewind` use it. Lockstep is deterministic, so the rack reaches
 each tick in the same state as in the recorded run. Commands of operators are repeated, and messages
-of host boards and other racks are replayed. Up to the tick nothing is changed: a branch may differ
-only from there.
+of host boards and other racks are replayed. Up to that tick nothing is changed. A branch may differ
+only from that tick on.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ DIFFERENCE_CAUSES = (
 class RepeatedRun:
     """The rack of a recorded run, which can be repeated up to any tick.
 
-    Each tick reached leaves a snapshot, from which later ticks take less time. If the run continues
-    another run, that one is repeated first. Use it as a context, at whose end the snapshots and the
-    `crate` end.
+    A snapshot is taken at each tick reached, so that later ticks are reached faster. If the run
+    continues another run, that one is repeated first. Use it as a context: on exit the `crate` and
+    its snapshots end.
 
     Args:
         recording: The run.
@@ -118,9 +118,10 @@ class RepeatedRun:
         )
 
     def reach_tick(self, tick: int) -> None:
-        """Make a snapshot before `tick`. Differences from the recording are reported on stderr.
+        """Repeat the run up to `tick`, and take a snapshot before it.
 
-        Raises `Failure` if a board is lost at that tick, because no snapshot is possible then.
+        Differences from the recording are reported on stderr. Raises `Failure` if no snapshot can
+        be taken, as when a board is lost at that tick.
         """
         if not self._has_begun and self._branched_at not in (None, tick):
             # First reach the branching tick, so that all later snapshots belong to this run.
@@ -180,7 +181,7 @@ class RepeatedRun:
         return replace(self._find_beginning(tick), origin=Origin.from_run(self.recording, tick))
 
     def read_levels(self, tick: int) -> dict[str, Document]:
-        """Return the attributes of each level's object before `tick`, by task."""
+        """Return a dictionary from task to the attributes of its level's object before `tick`."""
         self.reach_tick(tick)
         tasks = [task.name for task in self.recording.layout.tasks]
         texts = {task: self.crate.read_attributes(tick, task).attributes for task in tasks}
@@ -204,14 +205,15 @@ class RepeatedRun:
     def _find_continuation(self, tick: int) -> Continuation:
         """Return how a rack continues from the newest snapshot up to `tick`.
 
-        The result counts the faults and commands of the config that the snapshot already contains.
+        The result includes the numbers of faults and commands of the config, which the snapshot
+        already contains.
         """
         ran = self.recording.rack_config
         return Continuation(tick, len(ran.fault), len(ran.command), self._losses)
 
     @cached_property
     def _losses(self) -> tuple[tuple[str, int], ...]:
-        """Boards that died in this run or in one that it continues, each with the tick."""
+        """Boards that died in this run or in a run that it continues, each with its tick."""
         died = (event for event in self.recording.events if event["kind"] == "died")
         earlier = () if self._parent is None else self._parent._losses
         before = (loss for loss in earlier if loss[1] < (self._branched_at or 0))
@@ -270,7 +272,7 @@ def find_run_config(origin: str) -> Path:
 def open_beginning(
     config: RackConfig, origin: str, crate: WarmCrate | None = None, anyway: bool = False
 ) -> Iterator[Beginning]:
-    """Yield the state of a recorded run from which a rack can continue, valid inside the context.
+    """Yield a state of a recorded run from which a rack can continue. Valid inside the context.
 
     Args:
         config: Config of the rack, which may be a branch of the run.

@@ -71,7 +71,7 @@ class EventLog:
     def write_outcome(self, outcome: Document) -> None:
         """Write the outcome, close the file, and sort its events.
 
-        Before that, events are in the order in which they became known.
+        During the run, events are written in the order in which they are reported.
         """
         self._write_entry({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
         self.close()
@@ -101,7 +101,7 @@ class EventLog:
         self._write_text(format_checked_line(entry))
 
     def _write_text(self, text: str) -> None:
-        """Write a text. The first failure is shown as an event."""
+        """Write a text. The first failed write is shown as an event; later texts are dropped."""
         try:
             if not self.has_failed:
                 self._file.write(text)

@@ -1,4 +1,4 @@
-"""Launches a rack, watches and records it, and ends it in order."""
+"""Launches a rack, watches and records it, and ends it cleanly."""
 
 from __future__ import annotations
 
@@ -80,13 +80,15 @@ FROM_START = Beginning()
 
 @dataclass(frozen=True)
 class RunResult:
-    """A finished run: its outcome, the counts of every task's control block, and its faults.
+    """A finished run: its outcome, its faults, and the counts from every task's control block.
 
     Attributes:
         recording: "complete", "none" if no recording was wanted, or a text about what is missing.
-        rows_lost: Number of missing rows, by task and by mailbox.
-        clock_offset_ns: Converts CLOCK_MONOTONIC, the clock of boards, to the time of the events.
-        refused: Messages that full queues refused, by queue.
+        rows_lost: Dictionary from task or mailbox to its number of missing rows.
+        clock_offset_ns: Time to add to CLOCK_MONOTONIC, which boards use, to get the wall-clock
+            time of events.
+        refused: Dictionary from queue to the number of messages that it refused because it was
+            full.
         others: Racks that were launched with this one.
         failed: Which of these other racks failed, and why. Empty if none did.
     """
@@ -106,9 +108,9 @@ class RunResult:
 
     @property
     def worked(self) -> bool:
-        """True if nothing at the end of the run shows a failure.
+        """True if no failure is known at the end of the run.
 
-        The response of the system is judged separately, in the report.
+        The system response is evaluated later, in the report.
         """
         return not self.describe_failure()
 
@@ -222,7 +224,7 @@ def create_run_folder(
     Args:
         folder: The folder.
         config: Config of the rack.
-        log: Event log, which from now on writes to the folder.
+        log: Event log, which starts to write to the folder.
         origin: The run that is continued, or None.
 
     Raises:
@@ -283,7 +285,11 @@ def build_result(
 
 
 def _open_viewer(port: int) -> News:
-    """Open the viewer on the recorder. The returned function also reports a missing viewer."""
+    """Open the viewer on the recorder's port.
+
+    The returned function returns new messages of the viewer. If the viewer is missing, its only
+    message is the reason.
+    """
     window = import_module(VIEWER)
     try:
         opened: News = window.ViewerWindow(window.format_url(port)).read_news
@@ -334,7 +340,8 @@ def compare_recording(
         ticks: Ticks of the run.
 
     Returns:
-        "complete" or a text about what is missing, and the missing rows by task and by mailbox.
+        "complete" or a text about what is missing, and a dictionary from task or mailbox to its
+        number of missing rows.
     """
     # Import late, because these libraries would delay the launch.
     from rack.tools.recording.occasions import Retention

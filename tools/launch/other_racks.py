@@ -43,7 +43,7 @@ class LaunchedProcess(NamedTuple):
 
 
 class OtherRacks:
-    """The other racks of a run. Leaving the context ends them all."""
+    """Other racks that are launched with this one. Leaving the context ends them all."""
 
     def __init__(
         self, configs: Sequence[str], config: RackConfig, seconds: float | None, is_recorded: bool

@@ -1,4 +1,4 @@
-"""The verdict on a run: why it failed, and what was not judged.
+"""The verdict on a run: why it failed, and which checks were not made.
 
 Exit status, first line, report.json, report.md and `--json` all use this verdict.
 """
@@ -16,15 +16,15 @@ ACROSS_RACKS = "the system response: there are no bounds yet for a response acro
 
 
 def judge_run(ended: Mapping[str, Any], response: Document | None) -> Document:
-    """Judge a run by its end and by the response of the system.
+    """Decide whether a run worked, from its end and its system response.
 
     Args:
-        ended: End of the run, a `RunResult` as plain data. Empty if it was not recorded.
-        response: Response of the system. None if the rack has none, or nothing was recorded.
+        ended: A `RunResult` as plain data. Empty if the end of the run was not recorded.
+        response: System response. None if the rack has none, or nothing was recorded.
 
     Returns:
-        `worked`, `failures` with one line for each reason, and `unjudged` with each check that was
-        not made and the reason.
+        A document with `worked`, `failures` (one line for each reason), and `unjudged` (one line
+        for each check that was not made, with the reason).
     """
     unjudged: list[str] = []
     failures = ["the end of the run is not recorded"]
@@ -40,7 +40,7 @@ def judge_run(ended: Mapping[str, Any], response: Document | None) -> Document:
 
 
 def list_failures(outcome: Outcome, recording: str, others: str) -> list[str]:
-    """List the reasons why a run failed that are known at its end, without the response.
+    """List the reasons why a run failed, except a late system response.
 
     Args:
         outcome: Outcome of the run.

@@ -72,7 +72,7 @@ class LevelCommander:
         Levels below another level of the result are left out.
 
         Args:
-            in_force: Names of operator's commands. "" stands for no command.
+            in_force: Names of operator commands. "" stands for no command.
         """
         levels = [
             name
@@ -291,7 +291,7 @@ def parse_goal(what: str, words: Sequence[str]) -> Document:
 
 
 def _parse_number(text: str, word: str) -> float:
-    """Parse a number of a goal. Raises `Failure`, which quotes the whole word."""
+    """Parse a number of a goal. Raises `Failure` with `word`, which contains the number."""
     try:
         return float(text)
     except ValueError:

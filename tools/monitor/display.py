@@ -42,7 +42,7 @@ COLUMNS: dict[str, Callable[[TaskRow], str]] = {
     "late ms": lambda row: format_decimal(row.lateness_ms, 2),
     "state": lambda row: row.state + " (operator)" * (row.mode == "operator"),
 }
-"""Text of each column by its heading."""
+"""Functions that format the cells of each column, keyed by its heading."""
 DROPPED = (
     "tick",
     "sched",
@@ -92,7 +92,7 @@ class Display:
         """Show the state of the rack in a snapshot."""
 
     def show_event(self, event: Event) -> None:
-        """Show an event, unless the table shows it already."""
+        """Show an event if `is_worth_showing` returns True for it."""
         if is_worth_showing(event):
             self.print_event(format_event(event))
 
@@ -245,7 +245,7 @@ def _format_head(snapshot: Snapshot) -> Text:
 
 
 def _list_active_demand(snapshot: Snapshot) -> list[str]:
-    """Return the safety demand on the arm as a list of one text. Empty without a stop or brake."""
+    """Return a list with the demand on the arm (stop or brake) as text. Empty if there is none."""
     return [f"arm: {snapshot.demand}"] if snapshot.demand != NO_DEMAND else []
 
 
@@ -269,14 +269,18 @@ def _format_exchange(board: str, ports: Mapping[str, PortAge]) -> str:
 
 
 def _choose_style(column: str, text: str) -> str:
-    """Return the colour of a cell, which depends on a state or marks a count above 0."""
+    """Return the style of a cell: for a state, or for a count above 0. Empty for other cells."""
     if column == "state":
         return STATE_STYLES.get(text.partition(" (")[0], "")
     return COUNT_STYLES.get(column, "") if text != "0" else ""
 
 
 def is_worth_showing(event: Event) -> bool:
-    """Return whether an event tells the user more than the table does."""
+    """Return whether to show an event in addition to the table.
+
+    Events whose kind is in `HIDDEN_EVENTS` are not shown, nor is braking for lack of torque if it
+    was shorter than `BRIEF_TICKS`.
+    """
     is_brief = event.subject == NO_TORQUE and event.value < BRIEF_TICKS
     return event.kind not in HIDDEN_EVENTS and not is_brief
 

@@ -151,11 +151,11 @@ class RackScreen(App[None]):
         return build_grid(("late us", level), rows, self.size.width)
 
     def action_pane(self, number: int) -> None:
-        """Show the pane with a number."""
+        """Show the pane with the given number, counted from 1."""
         self.query_one(TabbedContent).active = [*self._panes][number - 1]
 
     def action_level(self) -> None:
-        """Select the next level. Keys then command this one."""
+        """Select the next level. Keys that give commands apply to it."""
         self._levels.rotate(-1)
 
     def action_worst(self) -> None:
@@ -164,11 +164,11 @@ class RackScreen(App[None]):
         self._late.clear()
 
     def action_interrupt(self) -> None:
-        """End the program in the way in which Ctrl-C ends every command."""
+        """End the program as Ctrl-C does."""
         signal.raise_signal(signal.SIGINT)
 
     def action_stop(self) -> None:
-        """Set the emergency stop, which the head line then shows."""
+        """Set the emergency stop. The head line shows it."""
         self._lines.latch_emergency_stop()
 
     def action_give(self, what: str) -> None:

@@ -26,7 +26,7 @@ RELAYED_PREFIX = re.compile(r"(?:holding|waiting for \w+): ")
 COMPARED_CHARACTERS = 60
 """Number of characters that identify a reason. Levels that relay a long reason cut off its end."""
 NEEDED_COMMANDS = {Error.DISABLED: "enable", Error.DRIVES: "reset"}
-"""Command that an arm needs, by the error in its status."""
+"""Dictionary from the error in an arm's status to the command that the arm needs."""
 OPERATOR_FIELDS = frozenset({"standing", "order", "answer"})
 """Fields in the status of a level that takes commands of an operator."""
 
@@ -59,9 +59,9 @@ def format_resume_command(rack: str, level: str) -> str:
 
 
 def is_new_reason(reason: str, shown: list[str]) -> bool:
-    """Return whether a reason is not among those shown, and if so add it to `shown`.
+    """Return True if a reason has not been shown yet, and add it to `shown`.
 
-    A reason that a level only repeats from the level below is not new.
+    A reason that a level has only relayed from the level below is not new.
     """
     origin = RELAYED_PREFIX.split(reason)[-1][:COMPARED_CHARACTERS]
     if any(origin in other for other in shown):
@@ -143,7 +143,7 @@ def _find_command_in_force(
 
 
 class StandstillDetector:
-    """Reports, once each, the holds during which nothing moves and that only a user can end."""
+    """Reports, once, each hold that only a user can end and during which nothing moves."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -152,7 +152,7 @@ class StandstillDetector:
         self._reported: set[tuple[str, int]] = set()
 
     def list_events(self) -> Iterator[Event]:
-        """Yield an event for each hold that is to be reported now."""
+        """Yield an event for each unreported hold that has stopped the arm for `STANDSTILL_S`."""
         # Import late: this imports the kinds of faults, which would slow down `rack status`.
         from rack.tools.faults.ending import read_arm
 

@@ -85,7 +85,7 @@ def _list_heads(segment: Segment, writer: str) -> list[memoryview]:
 
 
 def list_entry_rows(newest: NewestMessages) -> tuple[EntryRow, ...]:
-    """Return the entries of all bus adapters that have reported a status."""
+    """Return the state of each entry of the bus adapters that have reported a status."""
     rows: list[EntryRow] = []
     segment = newest.segment
     tick_ms = segment.layout.clock_ns * 1e-6

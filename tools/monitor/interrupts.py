@@ -28,7 +28,7 @@ class InboxFill:
 
     Attributes:
         served: Number of messages that interrupted the board.
-        lost: Number of messages that found the inbox full.
+        lost: Number of messages lost because the inbox was full.
         waiting: Largest number of messages that waited at once.
         depth: Capacity of the inbox.
     """
@@ -50,7 +50,7 @@ class InboxFill:
 
 
 def find_inbox_depths(layout: Layout) -> dict[int, int]:
-    """Return the inbox depth of every board that messages interrupt, by slot."""
+    """Return a dictionary from slot to inbox depth, for each board that messages interrupt."""
     slots = dict.fromkeys(task.slot for task in layout.tasks)
     boxes = {slot: layout.list_interrupting_mailboxes(slot) for slot in slots}
     return {
@@ -77,7 +77,7 @@ class Arrivals(NamedTuple):
     Times are in ns of simulated time since tick 0.
     """
 
-    mailbox: np.ndarray  # number of the mailbox, as `Layout.interrupting` counts
+    mailbox: np.ndarray  # index in `Layout.list_interrupting_mailboxes`
     sent_ns: np.ndarray
     end_ns: np.ndarray  # end of service; `NEVER_SERVED` if the inbox was full
     most_waiting: int
@@ -90,7 +90,7 @@ def replay_inbox(recording: Recording, slot: int) -> Arrivals:
     sent = []
     for box in boxes:
         visible_at = recording.read_signal(box.name, "visible_at").astype(np.int64)
-        # A message that overtakes an earlier one of its mailbox waits for it.
+        # No message is delivered before an earlier one of the same mailbox.
         newest = np.maximum.accumulate(visible_at * layout.clock_ns)
         sent.append(newest + compute_send_offset_ns(box, layout.clock_ns))
     times = np.concatenate(sent)
@@ -108,8 +108,8 @@ def replay_inbox(recording: Recording, slot: int) -> Arrivals:
 def summarize_interrupts(recording: Recording) -> list[Document]:
     """Describe the interrupts of every board in a run, as plain data.
 
-    Latencies in us are measured from the sending of a message to the end of its service. Only then
-    can a level see it.
+    Latencies, in us, are measured from the sending of a message to the end of its service, when a
+    level can read it.
     """
     layout = recording.layout
     documents = []

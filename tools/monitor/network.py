@@ -78,7 +78,7 @@ class ExportRow:
 
 
 class ExchangedEntries(NamedTuple):
-    """Exports and imports of a rack, with the source by port, and its partner racks."""
+    """Exports and imports of a rack, as dictionaries from port to source, and its partner racks."""
 
     exports: dict[str, str]
     imports: dict[str, str]
@@ -149,7 +149,7 @@ def _list_counts(
     Args:
         newest: Reads the status of the adapter.
         kind: "import" or "export".
-        sources: Source by port.
+        sources: Dictionary from port to source.
     """
     if (status := newest.read_message(STATUS)) is not None:
         for port, source in sources.items():

@@ -36,7 +36,7 @@ class NewestMessages:
     def list_messages(
         self, is_wanted: Callable[[MailboxSpec], bool]
     ) -> Iterator[tuple[str, AnyMessage]]:
-        """Yield the writer and the newest message of every wanted mailbox that has one."""
+        """Yield writer and newest message of each non-empty mailbox that `is_wanted` accepts."""
         for box in self.segment.layout.mailboxes:
             if is_wanted(box) and (message := self.read_message(box.name)) is not None:
                 yield box.writer, message

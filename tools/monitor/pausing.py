@@ -58,7 +58,7 @@ class Stepper:
             raise Failure(f"rack '{segment.rack}' runs in real time, which cannot be held; {hint}")
 
     def release(self) -> None:
-        """Let the rack run on without being held again."""
+        """Let the rack continue without holding it again."""
         self._words[System.HOLD_AT] = 0
 
     def hold_rack(self) -> int:
@@ -73,7 +73,7 @@ class Stepper:
         self._await_hold_at(tick)
 
     def find_end_tick(self, at: int, cycles: int, level: str | None) -> int:
-        """Return the tick after the release of the last of the next `cycles` cycles.
+        """Return the tick after the one at which the last of `cycles` cycles is released.
 
         Args:
             at: The current tick.

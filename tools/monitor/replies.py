@@ -29,16 +29,17 @@ Fate = Literal["waiting", "given", "taken", "done", "refused", "superseded"]
 
 @dataclass(frozen=True)
 class Reply:
-    """A command to a level, and what has become of it.
+    """A command to a level, and the level's reaction to it.
 
-    `given`, `taken_up` and `done` are the ticks of these events, or -1 if they have not occurred.
+    `given`, `taken_up` and `done` are the ticks at which the command was given, accepted and
+    completed, or -1 if this has not happened.
 
     Attributes:
-        serial: Serial number of the command. 0 while it waits.
-        fate: "waiting" for a command to a rack that is held. It stays "given" if the status of the
-            level does not answer operators.
+        serial: Serial number of the command. 0 while the command waits.
+        fate: "waiting" if the rack is held, "given" until the level answers. It stays "given" if
+            the level's status has no fields for answers.
         objection: Why the command was refused.
-        waits: How long a waiting command must wait.
+        waits: Text that tells what a waiting command waits for. Empty for other commands.
     """
 
     serial: int
@@ -91,9 +92,8 @@ def find_answering_status(segment: Segment, level: str) -> MailboxSpec | None:
 class ReplyReader:
     """Reads the statuses of a level for its reply to one command.
 
-    As soon as the level has accepted a newer command, the newer one supersedes this one. There are
-    two exceptions: settings supersede nothing, and commands to the drives supersede only each
-    other.
+    A newer command supersedes this one as soon as the level has accepted it. There are two
+    exceptions: settings supersede nothing, and commands to the drives supersede only each other.
 
     Attributes:
         reply: The reply according to the statuses read so far.
@@ -103,7 +103,7 @@ class ReplyReader:
         self._ring = MailboxRing(segment, status.name)
         self._given = MailboxRing(segment, f"{reply.level}.operator")
         self._kinds: dict[int, int] = {}
-        """Kind of each command given to the level, by serial."""
+        """Kind of each command given to the level, keyed by serial number."""
         self.reply = reply
 
     def read_statuses(self) -> Reply:
@@ -159,7 +159,7 @@ class ReplyDeadline:
         self._silent = max(REPLY_CYCLES * status.every, shortest)
 
     def explain_silence(self, tick: int) -> str:
-        """Return why no answer will come. Empty while an answer is still possible."""
+        """Return why the answer is overdue. Empty before the deadline."""
         cycles = self._block[Block.CYCLES]
         if cycles != self._cycles:
             self._cycles = cycles

@@ -46,7 +46,7 @@ class SignalReader:
     def read_new(self) -> Iterator[WrittenMessages]:
         """Yield the messages since the last call.
 
-        The first call yields the messages that the rings still hold, up to 2 s.
+        The first call yields the messages that are still in the rings, up to 2 s.
         """
         for name, ring in self._rings.items():
             rows, lost = ring.read_new_rows()
@@ -58,7 +58,7 @@ class SignalHistory:
     """Recent values of some signals by tick. A signal keeps its value until its next message.
 
     Attributes:
-        settling_ticks: Number of ticks after which everything released at a tick has been written.
+        settling_ticks: Number of ticks within which all messages released at a tick are written.
         lost: Number of messages that were overwritten before they were read.
 
     Args:
@@ -75,16 +75,16 @@ class SignalHistory:
         span: int,
         followed: Sequence[Signal] = (),
     ) -> None:
-        """Store the messages that the rings hold now."""
+        """Store the messages that are in the rings now."""
         specs = [segment.layout.find_mailbox(signal.mailbox) for signal in signals]
         self.signals = signals
         self.tick_s = segment.layout.clock_ns * 1e-9
         # A message is written, and becomes visible, before its writer's next period.
         self.settling_ticks = max(spec.every + spec.delay for spec in specs)
-        # One reading may return as much as a ring holds.
+        # One reading may return all messages of a ring.
         self._span = span + self.settling_ticks + max(spec.every * spec.depth for spec in specs)
         self._changes: dict[str, deque[tuple[int, dict[str, Any]]]] = defaultdict(deque)
-        """By mailbox: ticks, and the values of its signals by name."""
+        """For each mailbox, ticks with the values of its signals, keyed by name."""
         self._tap = SignalReader(segment, [*signals, *followed])
         self.lost = 0
         self.read_new()
@@ -113,7 +113,7 @@ class SignalHistory:
         return all_written
 
     def list_rows(self, first: int, last: int) -> SignalRows:
-        """Return a row for each tick from `first` to `last` at which a signal was released."""
+        """Return a row of values for each tick from `first` to `last` that has a new message."""
         changes = [
             change
             for mailbox_changes in self._changes.values()
@@ -146,9 +146,9 @@ class SignalPrinter:
     """Prints signals as lines of text or JSON.
 
     Args:
-        strip: History of the signals.
+        history: History of the signals.
         first: Tick of the first line.
-        every: Number of ticks between two lines. 0 for a line at each tick with a release.
+        every: Number of ticks between two lines. 0 for a line at each tick with a new message.
         as_json: True to print JSON documents.
     """
 
@@ -180,9 +180,9 @@ class SignalPlot:
     """Draws signals as curves on the terminal. Raises `ImportError` without plotext.
 
     Args:
-        strip: History of the signals.
+        history: History of the signals.
         span: Number of ticks that the plot covers.
-        terminal: Where it is drawn.
+        terminal: Console on which the plot is drawn.
     """
 
     def __init__(self, history: SignalHistory, span: int, terminal: Console) -> None:
@@ -219,7 +219,7 @@ class SignalPlot:
         self._live.update(Text.from_ansi(plot.build()), refresh=True)
 
     def _list_curves(self, rows: SignalRows) -> dict[str, list[tuple[float, float]]]:
-        """Return the points of each curve by its name, as simulated time in s and value.
+        """Return a dictionary from the name of a curve to its points, (time in s, value).
 
         A signal with several numbers has a curve for each.
         """
@@ -232,7 +232,7 @@ class SignalPlot:
 
 
 def _list_numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
-    """Yield each number of a value, under the name with its index in front."""
+    """Yield each number of a value with its name, which begins with the index of the number."""
     if isinstance(value, list):
         for index, element in enumerate(value):
             yield from _list_numbers(f"[{index}] {name}", element)

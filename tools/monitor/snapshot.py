@@ -139,8 +139,8 @@ class RackMonitor:
 
     Args:
         segment: The rack.
-        keeps_longest: True for the longest times since the first snapshot, or since `forget_times`.
-            By default each snapshot covers the cycles since the previous one.
+        keeps_longest: True to report the longest times since the first snapshot, or since
+            `forget_times`. By default each snapshot covers the cycles since the previous one.
 
     Attributes:
         cycles: Trace records of each task since the previous snapshot.
@@ -275,8 +275,7 @@ class RackMonitor:
     def _longest_times_ms(self, task: str) -> list[float | None]:
         """Return the longest execution time and lateness of a task in ms.
 
-        Without a new cycle the times of the previous snapshot are returned, or None before the
-        first.
+        Without a new cycle the previous times are returned, or None before the first cycle.
         """
         self.cycles[task] = cycles = self._traces[task].read_new_rows().rows
         longest = self._longest_ns.get(task)

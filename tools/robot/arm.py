@@ -57,7 +57,8 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
 
     Args:
         model: The compiled model.
-        tip: Body or site at the end of the arm. Empty to choose by joints or by length.
+        tip: Body or site at the end of the arm. Empty to choose the arm by its joints, or else the
+            longest one.
         joints: Joints of the arm, base to tool. Empty to take all between base and tip.
 
     Raises:
@@ -127,10 +128,10 @@ def find_driven_joints(model: mujoco.MjModel) -> set[int]:
 
 
 def fix_joints(path: Path, moving_joints: Iterable[str]) -> list[str]:
-    """Fix all joints of an MJCF file except those to keep, and remove free bodies.
+    """Fix all joints of an MJCF file except `moving_joints`, and remove free bodies.
 
-    Bodies moved from outside (mocap) and everything that refers to a removed element are removed
-    as well.
+    Bodies moved from outside (mocap) and everything that refers to a removed element are removed as
+    well.
 
     Args:
         path: The file, as MuJoCo writes it. It is overwritten.

@@ -1,6 +1,6 @@
 """Finds a task for a drafted arm: a table with two blocks to move, or a tour of poses.
 
-Either is rehearsed in the way in which the task level will plan it.
+Either is planned in advance, exactly as the task level will plan it.
 """
 
 from __future__ import annotations
@@ -70,14 +70,14 @@ DENSITY = 400.0  # kg/m3
 TABLE_CLEARANCE_M = 0.008
 """Clearance between fingers and table when a block is taken."""
 EXTRA_CLEARANCE_M = 0.004
-"""Additional clearance where it is a guess how the fingers follow.
+"""Additional clearance if the motion of following fingers is a guess.
 
 With less, Robotiq's 140 touches the table.
 """
 
 
 class TableSpot(NamedTuple):
-    """A place for a table, with two starts and two ends for blocks."""
+    """Position of a table, with start and goal positions for two blocks."""
 
     top: float  # m
     direction: float  # rad
@@ -103,7 +103,7 @@ class Assignment:
 def find_assignment(draft: Draft) -> Assignment:
     """Find a task for an arm: blocks to move if possible, otherwise a tour of poses.
 
-    The draft's home is changed to suit the task, and its model gets table and blocks. Raises
+    The draft's home is changed to suit the task. Table and blocks are added to its model. Raises
     `RobotError` if not even a tour is possible.
     """
     if draft.gripper is not None:
@@ -115,7 +115,7 @@ def find_assignment(draft: Draft) -> Assignment:
 
 
 def _find_transfers(draft: Draft, gripper: FittedGripper) -> Assignment | str:
-    """Find a table on which the arm can move two blocks, or return why there is none."""
+    """Find a table on which the arm can move two blocks, or return why this failed."""
     cell = draft.cell()
     fingertips = gripper.fingertips
     width = min(fingertips.block_width, MAX_BLOCK_M)
@@ -185,7 +185,7 @@ def _locate_base(cell: Cell) -> Array:
 
 
 def _list_table_spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
-    """Yield places to try for a table, for at most `SEARCH_S` of processor time."""
+    """Yield positions to try for a table, for at most `SEARCH_S` of processor time."""
     base = _locate_base(cell)
     end = time.process_time() + SEARCH_S
     for height, distance, front in itertools.product(
@@ -201,20 +201,20 @@ def _list_table_spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
 
 
 def _can_reach_places(cell: Cell, spot: TableSpot, half_height: float, lift: float) -> bool:
-    """Return whether the tool can come down from above to every place.
+    """Return whether the tool can be lowered to every block position.
 
     Args:
         cell: The arm.
-        spot: The table and its places for blocks.
+        spot: The table and the positions of its blocks.
         half_height: Half the height of a block in m.
-        lift: Height in m above each place from which the tool comes down.
+        lift: Height in m above each position from which the tool is lowered.
     """
     ik = InverseKinematics(cell, SEED)
     # An arm with fewer joints has fewer solutions, so search longer for one.
     restarts = MAX_RESTARTS if len(cell.qpos) >= FULL_ORIENTATION else LEANING_RESTARTS
 
     def is_reached(place: Array) -> bool:
-        """Return whether the tool can come down to a place, with the fingers in some direction."""
+        """Return whether the tool can be lowered to a position, for some finger direction."""
         for quarter in QUARTER_TURNS:
             orientation = build_pointing_quaternion(DOWN, -(spot.direction + 0.5 * np.pi * quarter))
             placed = make_pose([*place, spot.top + half_height], orientation)
@@ -234,7 +234,7 @@ def _add_furniture(
     Args:
         spec: The model, which is changed.
         scene: Names of table and blocks.
-        spot: Place of the table.
+        spot: Positions of table and blocks.
         half: Half the size of a block, (3,), in m.
         reach: Reach of the arm in m, which determines the size of the table.
 
@@ -259,8 +259,8 @@ def _add_furniture(
         geom.group = spec.compiler.inertiagrouprange[0]
         geom.condim = 4
         geom.friction[:] = [1.0, 0.02, 0.001]
-        # Impose this stiffness on every contact: averaged with MuJoCo's default of 20 ms, a carried
-        # block would drift.
+        # Give this stiffness priority in every contact. If it were averaged with MuJoCo's default
+        # of 20 ms, a carried block would drift.
         geom.priority = 1
         geom.solref[:] = [0.002, 1.0]
         geom.solimp[:3] = [0.95, 0.99, 0.001]
@@ -275,14 +275,14 @@ def _add_furniture(
 
 
 class _TimedMotionPlanner(MotionPlanner):
-    """A motion planner that refuses to plan once `REHEARSAL_S` is used up."""
+    """Motion planner that may use at most `REHEARSAL_S` of processor time."""
 
     def __init__(self, cell: Cell, scene: SceneConfig, seed: int) -> None:
         super().__init__(cell, scene, seed)
         self._end = time.process_time() + REHEARSAL_S
 
     def plan(self, *args: Any, **options: Any) -> Path:
-        """Plan as the task level does. Raises `Refused` also when the time is used up."""
+        """Plan as `MotionPlanner` does. Also raises `Refused` once the time is used up."""
         if time.process_time() > self._end:
             raise Refused(Error.NO_PATH, f"no way found in {REHEARSAL_S:g} s of processor time")
         return super().plan(*args, **options)

@@ -43,7 +43,7 @@ from rack.tools.robot.source import Source, copy_model
 CLOCK_NS = 2_500_000
 """Clock period of `nasrem`, whose levels and boards the arm gets."""
 GUESSED_SPEED = {mujoco.mjtJoint.mjJNT_HINGE: 1.5, mujoco.mjtJoint.mjJNT_SLIDE: 0.25}
-"""Guessed velocity limits by joint type, in rad/s and m/s."""
+"""Guessed velocity limits of each joint type, in rad/s and m/s."""
 SPEED_UP_S = 0.5
 """Time to full speed of planned motion, if the motors permit.
 
@@ -329,7 +329,7 @@ def _find_mount(model: mujoco.MjModel, tip: str) -> str:
 
 
 def _fit_gripper(draft: Draft) -> FittedGripper:
-    """Give the gripper of the arm one drive in the draft's model, and measure its fingers.
+    """Equip the gripper in the draft's model with a single drive, and measure its fingers.
 
     Raises `RobotError` if the gripper cannot be used.
     """
@@ -398,7 +398,7 @@ def find_touching_bodies(
 
     Args:
         cell: The arm and its surroundings.
-        data: Simulation data of the cell. It is left at the pose.
+        data: Simulation data of the cell, which this function sets to the pose.
         q: Positions of the joints, (joints,), in rad.
         skin_m: Distance in m below which bodies count as touching. The geoms must have at least
             half of it as margin.
@@ -492,7 +492,7 @@ def find_home(
     low, high = cell.limits.position.T
 
     def compute_spare_torque(q: Array) -> float:
-        """Return the least fraction of torque that gravity leaves to a joint, minus the minimum.
+        """Return the smallest fraction of torque left to a joint at rest, minus the minimum.
 
         Returns -1 for a pose out of range or in contact.
         """
@@ -516,7 +516,7 @@ def find_home(
     set_margins(cell.model, 0.5 * PREFERRED_CLEARANCE_M)
 
     def rate_pose(q: Array) -> float:
-        """Rate a pose by spare torque, downward tool and clearance. More is better."""
+        """Return a score from spare torque, tool direction (best downward) and clearance."""
         # Forward kinematics at `q` is a side effect of `find_touching_bodies`.
         is_near = bool(find_touching_bodies(cell, data, q, PREFERRED_CLEARANCE_M))
         downward = -float(data.site_xmat[cell.tool, 8])

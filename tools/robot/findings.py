@@ -151,7 +151,7 @@ def _describe_fingers(cell: Cell, scene: SceneConfig) -> str:
 
 
 def _find_coupling_error(cell: Cell, config: GripperConfig) -> str:
-    """Return why the fingers do not settle where planning poses them. Empty if they do."""
+    """Return why the fingers do not settle where planning assumes them. Empty if they do."""
     try:
         check_fingers(cell, config)
     except RobotError as error:
@@ -160,10 +160,10 @@ def _find_coupling_error(cell: Cell, config: GripperConfig) -> str:
 
 
 def _find_fastest_vibration(cell: Cell) -> tuple[float, float]:
-    """Find the fastest natural vibration of the joints, with their springs and the gripper's loop.
+    """Find the fastest natural vibration of the joints with their springs and gripper control.
 
     Returns:
-        Phase angle of the vibration in one step in rad, and its frequency in Hz.
+        Phase advance of the vibration per simulation step in rad, and its frequency in Hz.
     """
     model = cell.model
     data = cell.build_start_data()

@@ -33,7 +33,7 @@ A finger that turns faces its jaw only when it is nearly closed.
 MIN_GAP_M = 0.012
 """Minimum opening of a gripper that can grasp a block."""
 NEARLY_CLOSED, NEARLY_CLOSED_ON_JAW = 0.6, 0.85
-"""Fractions of the way to closed at which the meeting point is measured: two fingers, one finger.
+"""Closed fractions at which the meeting point is measured: for two fingers, and for one finger.
 
 The tip of a single turning finger is near its jaw only when it is nearly closed.
 """
@@ -63,13 +63,12 @@ class Fingertips(NamedTuple):
 
 
 def measure_fingertips(cell: Cell, tip: str, has_one_finger: bool = False) -> Fingertips:
-    """Measure what a gripper can grasp, and place the tool between its fingers.
+    """Measure opening and reach of a gripper, and define a tool frame between its fingers.
 
     Args:
         cell: The arm with its gripper.
         tip: Body that carries the gripper.
-        has_one_finger: True if the gripper is known to have one finger, because its meshes have
-            been cut.
+        has_one_finger: True if one finger and a fixed jaw were found before the meshes were cut.
 
     Raises:
         RobotError: The fingers do not close on each other or on a jaw, or open too little.
@@ -250,12 +249,12 @@ def _snap_to_axis(direction: Array, axes: Array, min_cosine: float = ALIGNED_COS
 def _to_body_frame(
     data: mujoco.MjData, body: int, origin: Array, across: Array, out: Array
 ) -> ToolConfig:
-    """Convert a tool frame in the world to one on a body.
+    """Convert a tool frame from world to body coordinates.
 
     Args:
         data: Simulation data with the pose of the body.
         body: Id of the body.
-        origin: Origin of the frame, (3,), in m.
+        origin: Origin of the tool frame, (3,), in m.
         across: Its y axis, (3,).
         out: Its z axis, (3,).
     """

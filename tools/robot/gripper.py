@@ -30,8 +30,7 @@ MAX_FORCE_N = 40.0
 MIN_LEVER_M = 0.02
 """Lower bound for the lever arm of a finger that turns."""
 MIN_CLOSING_COSINE = 0.5
-"""A finger does not close if the cosine between its motion and the way to the others is below this.
-"""
+"""Minimum cosine between the motion of a closing finger and the direction to the others."""
 
 
 class _Finger(NamedTuple):
@@ -46,7 +45,7 @@ class _Finger(NamedTuple):
 def fit_gripper(
     spec: mujoco.MjSpec, model: mujoco.MjModel, arm: ArmParts, wanted: str
 ) -> tuple[GripperConfig, str]:
-    """Give a gripper one drive, and make the joints that are not coupled to it followers.
+    """Equip a gripper with a single drive. Joints that are not coupled to it become followers.
 
     Args:
         spec: The model. Surplus actuators are removed, and a missing one is added.
@@ -55,7 +54,7 @@ def fit_gripper(
         wanted: Joint to be driven. Empty to prefer one with an actuator that closes the fingers.
 
     Returns:
-        The gripper's table, and a text that names what in it is guessed.
+        The gripper's table, and a text that lists the guesses in it.
 
     Raises:
         RobotError: A joint of the gripper has no range.
@@ -166,7 +165,7 @@ def _compute_centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Ar
 
 
 def _group_coupled_joints(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:
-    """Group the joints of the gripper by the equalities that couple them."""
+    """Group the joints of the gripper. Joints that equalities couple are in one group."""
     groups = [{name} for name in arm.fingers]
     for equality in range(model.neq):
         tied = {model.joint(joint).name for joint in find_tied_joints(model, equality)} & {
@@ -182,7 +181,7 @@ def _group_coupled_joints(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]
 def _compute_ratio(
     model: mujoco.MjModel, leader: tuple[str, _Finger], follower: tuple[str, _Finger]
 ) -> float:
-    """Compute how far a follower moves per motion of the driven joint.
+    """Compute the motion of a follower per unit of motion of the driven joint.
 
     Joints of the same kind move equally far. Otherwise the full range of the one corresponds to the
     full range of the other. The ratio is 0 for a follower that does not close the fingers.

@@ -88,13 +88,13 @@ def _slice_mesh(corners: Array, faces: NDArray[np.int32], out: Array) -> list[Ar
     Args:
         corners: Vertices of the mesh, (n, 3), in m.
         faces: Vertex numbers of the triangles, (m, 3).
-        out: Direction along which slices follow each other, (3,).
+        out: Direction perpendicular to the cuts, (3,).
     """
     along = corners @ out
     edges = np.vstack((faces[:, :2], faces[:, 1:], faces[:, ::2]))
 
     def find_crossings(place: float) -> Array:
-        """Return where edges cross the plane at position `place` along `out`."""
+        """Return the points at which edges cross the plane at position `place` along `out`."""
         start, end = edges[np.prod(along[edges] - place, axis=1) < 0.0].T
         fraction = (place - along[start]) / (along[end] - along[start])
         return np.asarray(corners[start] + fraction[:, None] * (corners[end] - corners[start]))

@@ -131,7 +131,7 @@ def _check_tree(path: Path, root: ElementTree.Element) -> None:
 
 
 def _find_shapes(path: Path, root: ElementTree.Element) -> list[str]:
-    """Make sure that the links of a URDF have collision shapes.
+    """Prepare the collision shapes of a URDF. Links without them use their visible shapes.
 
     Returns notes for the user. Raises `RobotError` if no link has a shape that can be read.
     """

@@ -1,6 +1,6 @@
 """A running rack for a Python program, which can read, command, disturb and record it.
 
-Each method does the same as the command of its name, by the same library.
+Each method does the same as the command of its name, and uses the same library.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def attach(rack: str) -> AttachedRack:
 class AttachedRack:
     """A running rack. Use it as a context, or call `close` at the end.
 
-    Every error is a `Failure` with the text that the command would print.
+    Every error is raised as a `Failure`, with the text that the command would print.
     """
 
     @convert_errors()
@@ -183,10 +183,10 @@ class AttachedRack:
 
     @convert_errors()
     def wait_for(self, event: str, timeout_s: float) -> Event:
-        """Wait for an event, and return it. Events since the rack was attached count.
+        """Wait for an event, and return it. Events since `attach` are included.
 
-        Each event is returned once. Events of a rack that misses many cycles are overwritten unless
-        they are read within seconds. `Rack.events` has all of them.
+        Each event is returned once. If a rack misses many cycles, events that are not read within
+        seconds are overwritten. `Rack.events` contains all of them.
 
         Args:
             event: Kind or code, as in `detection` or `rejoined`.
@@ -218,7 +218,7 @@ class AttachedRack:
 
     @convert_errors()
     def record(self, folder: str | Path | None = None) -> Path:
-        """Record the rack until `close`, beginning with the two seconds that its rings still hold.
+        """Record the rack until `close`, beginning with the last two seconds, still in its rings.
 
         Args:
             folder: Folder of the recording. None for runs/<rack>-<time>.

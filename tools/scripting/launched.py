@@ -145,7 +145,7 @@ class RunRecord:
         self._began_s = time.monotonic()
 
     def log_news(self) -> None:
-        """Log new messages of the recorder, and holds that have become standstills.
+        """Log new messages of the recorder, and the events of the standstill detector.
 
         Raises `Failure` if the recorder cannot write.
         """

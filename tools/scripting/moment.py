@@ -16,8 +16,8 @@ from rack.tools.recording.signal import Signal, find_mailbox
 class RecordedMoment:
     """State of a recorded run just before the tasks released at `tick` begin.
 
-    Every error is a `Failure`. Messages come from the recording. To read the objects of levels, or
-    to continue the rack from this tick, the run is repeated up to it.
+    Every error is raised as a `Failure`. Messages come from the recording. To read the objects of
+    levels, or to continue the rack from this tick, the run is repeated up to it.
     """
 
     def __init__(self, recording: Recording, in_force: VisibleMessages, tick: int) -> None:
@@ -55,7 +55,7 @@ class RecordedMoment:
 
     @property
     def mailboxes(self) -> dict[str, AnyMessage]:
-        """The messages that tasks released at this tick would read, by mailbox."""
+        """Dictionary from mailbox to the message that a task released at this tick would read."""
         names = (box.name for box in self._recording.layout.timed)
         return {
             name: self.read(name)
@@ -64,7 +64,7 @@ class RecordedMoment:
         }
 
     def levels(self, anyway: bool = False) -> dict[str, Document]:
-        """Return the attributes of each level's object as plain data, by task.
+        """Return a dictionary from task to the attributes of its level's object, as plain data.
 
         Args:
             anyway: True to repeat the run even if its code or files have changed since.
@@ -82,9 +82,9 @@ class RecordedMoment:
         """Continue the run in the background, in lockstep. Close the rack, or use it as a context.
 
         Args:
-            settings: Changed values, as in "board.servo.params.bandwidth=80", which make it a
-                branch.
-            faults: A fault script by name or path, which makes it a branch as well.
+            settings: Changed values, as in "board.servo.params.bandwidth=80". Any change makes the
+                run a branch.
+            faults: A fault script by name or path. It also makes the run a branch.
             seconds: Simulated time from the beginning of the recorded run. None to run to the end.
             anyway: True to repeat the run even if its code or files have changed since.
         """

@@ -37,8 +37,8 @@ class RecordedRun:
 
     Attributes:
         folder: Folder of the run.
-        signals: Every field of every mailbox, by name. One number of a field can be looked up as
-            well, as in `servo.status.position[2]`.
+        signals: Mapping from name to signal, with every field of every mailbox. One number of a
+            field can be looked up as well, as in `servo.status.position[2]`.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -64,7 +64,7 @@ class RecordedRun:
 
     @cached_property
     def report(self) -> Document:
-        """The content of report.json, which is updated if it is missing or older than the run."""
+        """The content of report.json, which is updated first if missing or older than the run."""
         return load_report(self.folder)[0]
 
     def to_pandas(self, mailbox: str) -> DataFrame:
@@ -74,7 +74,7 @@ class RecordedRun:
 
 
 class RecordedSignals(dict[str, "RecordedSignal"]):
-    """The signals of a run by name. An unknown name raises `Failure` with the nearest names."""
+    """Signals of a run, keyed by name. An unknown name raises `Failure` with the nearest names."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
@@ -114,7 +114,7 @@ class RecordedSignal:
 
     @cached_property
     def values(self) -> np.ndarray:
-        """Values in all messages, (messages, *shape), in `unit`. States are numbers."""
+        """Values in all messages, (messages, *shape), in `unit`. States are given as numbers."""
         signal = self.signal
         return signal.select_part(self._recording.read_signal(signal.mailbox, signal.label))
 
@@ -173,9 +173,9 @@ class RecordedSignal:
         return axes
 
     def _list_marks(self) -> dict[int, str]:
-        """Return the texts that a plot marks, by tick.
+        """Return a dictionary from tick to the text that marks it in a plot.
 
-        If a process died at the tick at which a fault begins, the later event is marked.
+        If a process died at the tick at which a fault begins, only the later event is marked.
         """
         marks: dict[int, str] = {}
         for event in _list_events(self._recording):

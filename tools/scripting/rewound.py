@@ -1,8 +1,8 @@
 """Navigation through a recorded run, tick by tick, with branches.
 
 `rack rewind` is its prompt. A tick is shown in the state that the tasks released at it are about to
-read. Messages come from the recording. Objects of levels are read in copies of their processes, the
-snapshots that a repeated run of the rack leaves.
+read. Messages come from the recording. Objects of levels are read from snapshots, which are copies
+of their processes that a repeated run makes.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class RewindAnswer:
 class RewoundRun:
     """A recorded run and the current `tick`.
 
-    Use it as a context, in which the run is repeated in the background and leaves snapshots.
+    Use it as a context. Inside it the run can be repeated in the background, with snapshots.
     """
 
     def __init__(self, folder: Path, anyway: bool = False) -> None:
@@ -61,7 +61,7 @@ class RewoundRun:
 
     def __enter__(self) -> Self:
         # Start the crate early, so that it imports while the user types. If the run cannot be
-        # repeated, the user is told when a command needs that.
+        # repeated, the first command that needs this reports the reason.
         with suppress(Failure):
             self._prepare_repeated_run()
         return self
@@ -71,7 +71,7 @@ class RewoundRun:
             self._again.crate.end_crate()
 
     def _prepare_repeated_run(self) -> RepeatedRun:
-        """Return the repeated run. It is started again if its crate was lost."""
+        """Return the repeated run. If its crate has ended, start it again."""
         if self._again is None or self._again.crate.is_over:
             self._again = RepeatedRun(self.recording, anyway=self._anyway)
         return self._again

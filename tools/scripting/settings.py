@@ -33,7 +33,7 @@ def list_settings(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
 
 
 def _format_inline(value: Any) -> str:
-    """Format a Python value as TOML on one line. Numpy arrays become lists, and paths texts."""
+    """Format a Python value as TOML on one line. Arrays become lists, paths become strings."""
     if isinstance(value, Mapping):
         items = (
             f"{_format_inline(str(key))} = {_format_inline(item)}" for key, item in value.items()

@@ -43,12 +43,12 @@ class Cable:
         return self._kind if monotonic() < self._until_s else Disturbance.NONE
 
     def send(self, kind: int, data: bytes) -> None:
-        """Send a frame of the drive."""
+        """Send a frame from the drive. A disturbance may drop or double it."""
         for _ in range(self._count_copies()):
             send(self._bus, kind, self._node, data)
 
     def receive(self, take: Callable[[Frame], None]) -> None:
-        """Pass frames that have arrived to `take`, in order, with CLOCK_MONOTONIC time stamps."""
+        """Call `take` with each frame that has arrived, in order. Times are CLOCK_MONOTONIC."""
         late_s = self._size if self.disturbance is Disturbance.LATE else 0.0
         # The kernel stamps frames at arrival, so it does not matter when this process reads them.
         epoch_s = time() - monotonic() - late_s
@@ -63,7 +63,7 @@ class Cable:
             take(self._coming.popleft())
 
     def _disturb(self, kind: int, seconds: float, size: float) -> None:
-        """Start a disturbance in place of the current one."""
+        """Start a disturbance that replaces the current one and ends after `seconds`."""
         self._kind = next((known for known in Disturbance if known == kind), Disturbance.NONE)
         self._size = size
         self._until_s = monotonic() + seconds

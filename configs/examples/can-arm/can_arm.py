@@ -23,15 +23,15 @@ UP: dict[int, Control] = {
     Power.SWITCH_ON_DISABLED: Control.SHUT_DOWN,
     **dict.fromkeys((Power.READY_TO_SWITCH_ON, *ON), Control.SWITCH_ON),
 }
-"""Control word that brings a drive closer to SWITCHED_ON, by its state. The brake stays engaged."""
+"""Control words that move a drive towards SWITCHED_ON, keyed by state. The brake stays engaged."""
 
 
 class CanArm(Arm):
     """Sends a SYNC and a command in every cycle, and reads the reports that have arrived.
 
     No method blocks. A sample is complete when all drives have answered the same SYNC. The arm is
-    enabled while all drives are switched on. If a drive leaves this state, reports a fault or is
-    silent, the arm has a fault, and all other drives are switched off.
+    enabled while all drives are switched on. If a drive leaves this state, reports a fault or stops
+    sending, the arm has a fault, and all other drives are switched off.
     """
 
     def __init__(
@@ -99,25 +99,26 @@ class CanArm(Arm):
         self.brake()
 
     def reset(self) -> None:
-        """Let the drives leave their fault states."""
+        """Clear the fault of the arm and its drives. The arm is disabled afterwards."""
         if self.state is DriveState.FAULT:
             self.fault = ""
             self.state = DriveState.DISABLED
             self._reset_until = self.tick + wire.SILENT_S * self._rate_hz
 
     def restore(self, state: ArmState) -> None:
-        """Continue after a restart of the board.
+        """Continue after a restart of the board. Enable the drives again unless they were disabled.
 
-        Meanwhile the drives have kept their states, or have braked by their watchdogs.
+        During the restart the drives kept their states, or their watchdogs engaged the brakes.
         """
         super().restore(state)
         if self.state is not DriveState.DISABLED:
             self._request_power()
 
     def _request_power(self) -> None:
-        """Note that the drives are to be enabled, and give them time to answer."""
+        """Request that the drives be enabled, and allow extra time for their first answers."""
         self._wanted = True
-        self._newest.clear()  # silent drives have old reports
+        # Discard old reports of drives that no longer answer.
+        self._newest.clear()
         self._heard = [self.tick + ANSWER_S * self._rate_hz] * self._joints
 
     def _send_command(self, control: list[Control]) -> None:
@@ -125,9 +126,9 @@ class CanArm(Arm):
         wire.send(self._bus, wire.COMMAND, 0, wire.command(self.tick, control, self.torque))
 
     def _next_control(self, joint: int) -> Control:
-        """Return the control word that brings a braked drive closer to the wanted state."""
+        """Return the control word that moves a braked drive towards the requested state."""
         if self._wanted and joint not in self._newest:
-            # The drive may be on after a restart of the board. SWITCH_ON then only removes torque.
+            # The drive may still be on after a restart. SWITCH_ON then only removes its torque.
             return Control.SWITCH_ON
         power = self._newest[joint].power if joint in self._newest else Power.FAULT
         if power == Power.FAULT and self.tick < self._reset_until:
@@ -135,7 +136,10 @@ class CanArm(Arm):
         return UP.get(power, Control.DISABLE_VOLTAGE) if self._wanted else Control.DISABLE_VOLTAGE
 
     def _take_frame(self, joint: int, frame: wire.Frame) -> None:
-        """Process a frame from the drive of a joint. The last missing report completes a sample."""
+        """Process a frame from the drive of a joint.
+
+        The sample is updated once the reports of all drives for the same tick have arrived.
+        """
         self._heard[joint] = self.tick
         if frame.kind != wire.STATUS:
             return

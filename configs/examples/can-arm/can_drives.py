@@ -27,7 +27,8 @@ class Drives(HostProgram):
     def run(self, bus: Bus) -> None:
         """Start the drives and restart those that died."""
         context = self.context
-        open_bus().shutdown()  # raises once, with the reason, if there is no bus
+        # Without a bus, raise the error once here instead of in every drive.
+        open_bus().shutdown()
         cell = build_cell(context.robot, context.scene, context.clock_ns)
         mechanics = Mechanics(cell, monotonic())
         times_s = context.tick_s, cell.patience.ticks(1, context.tick_s) * context.tick_s

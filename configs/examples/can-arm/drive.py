@@ -34,7 +34,7 @@ DEFECTS = {Disturbance.BUS_OFF: wire.BUS_OFF, Disturbance.TOO_HOT: wire.TOO_HOT}
 
 
 def next_power(power: Power, control: int) -> Power:
-    """Return the state of a drive after a control word."""
+    """Return the state of a drive after it has received a control word."""
     if power is Power.FAULT:
         return Power.SWITCH_ON_DISABLED if control == Control.RESET_FAULT else power
     reachable = POWERS[: POWERS.index(power) + 2]
@@ -52,9 +52,9 @@ class TickClock:
         self._start_s = 0.0
 
     def at(self, tick: int, came_s: float) -> float:
-        """Return the time in s of a tick whose SYNC arrived at `came_s`."""
+        """Estimate the time of a tick in s, given that its SYNC arrived at `came_s`."""
         start_s = came_s - tick * self._tick_s
-        # A very late SYNC, or one of another run, is accepted; the next timely one corrects it.
+        # Accept a very late SYNC, or one of another run: the next timely one corrects the estimate.
         if not self._start_s < start_s < self._start_s + WINDOW_S:
             self._start_s = start_s
         self._start_s += DRIFT_S
@@ -94,7 +94,7 @@ class Drive:
         send(wire.HEARTBEAT, wire.BOOTED)
 
     def take(self, frame: Frame) -> None:
-        """Process a received frame."""
+        """Process a received frame: a SYNC, a command or a heartbeat of the rack."""
         kind, node, data, came_s = frame
         identifier = kind + node
         if identifier == wire.SYNC:
@@ -110,7 +110,7 @@ class Drive:
             self._heard_s = came_s
 
     def _obey(self, orders: wire.Orders, came_s: float) -> None:
-        """Execute the order for this drive in a command."""
+        """Execute this drive's entry in a command that arrived at `came_s`."""
         control = int(orders["control"][self._node - 1])
         power = next_power(self.power, control)
         if power is not self.power:

@@ -65,8 +65,8 @@ class Joint:
         """Release the brake and apply a torque.
 
         Args:
-            torque: Torques of all joints from the same command, (joints,), in N m. Torques of
-                different cycles would disturb a joint strongly if axes are nearly parallel.
+            torque: Torques of all joints, (joints,), in N m. They must belong to the same command:
+                torques of different cycles would disturb joints with nearly parallel axes.
         """
         self._torque = torque
         self._all.braked[self._number] = 0.0
@@ -95,7 +95,7 @@ class Joint:
         shared.time[own] = until_s
 
     def _acceleration(self, position: Array, velocity: Array, step_s: float) -> Array:
-        """Return the accelerations in rad/s2. Braked joints come to rest whatever the load."""
+        """Return the accelerations in rad/s2. Braked joints decelerate regardless of the load."""
         inertia, bias = self._dynamics.terms(position, velocity)
         braked = self._all.braked > 0.0
         stopping = np.clip(-velocity / step_s, -self._braking, self._braking) * braked

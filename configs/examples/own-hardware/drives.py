@@ -42,7 +42,7 @@ class Drives:
         self._waited_ticks = 0  # ticks since `enable`
 
     def enable(self) -> None:
-        """Find the reference if it is not known, and become ready for torques."""
+        """Start to enable the drives. If their reference is not known, homing comes first."""
         self.state = DriveState.ENABLING
         self._waited_ticks = -HOMING_TICKS if self.zero.any() else 0
 

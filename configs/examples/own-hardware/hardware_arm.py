@@ -42,7 +42,7 @@ class HardwareArm(Arm):
         self.drives.leave(DriveState.DISABLED)
 
     def weaken(self, most: Array | None) -> None:
-        """Simulate an injected fault: the drive of a motor without torque reports a fault."""
+        """Simulate a motor fault: if a torque limit in `most` is 0, its drive reports a fault."""
         if most is not None and not most.all():
             self.drives.leave(DriveState.FAULT, f"drive {most.argmin() + 1}: motor phase open")
 

@@ -96,8 +96,8 @@ class TrapezoidPlanner(Planner):
 
         Args:
             path: Path of the segment.
-            first: Path parameter at the beginning of the part in rad.
-            last: Path parameter at the end of the part in rad.
+            first: Path parameter at the beginning of the section in rad.
+            last: Path parameter at the end of the section in rad.
 
         Returns:
             Largest speed in rad/s and acceleration in rad/s2.

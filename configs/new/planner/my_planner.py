@@ -55,7 +55,7 @@ class MyPlanner(Planner):
         self.rest = np.zeros(len(cell.home))  # (joints,), rad/s
 
     def wanted(self, tick: int) -> bool:
-        """Return whether there is new input to plan from. By default this asks the port `above`."""
+        """Return whether there is new input for a plan. The base class checks the port `above`."""
         return self.servo.is_new
 
     def plan(self, tick: int) -> None:
