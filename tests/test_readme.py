@@ -169,10 +169,9 @@ def test_the_script_of_the_readme_plots_a_killed_board(tmp_path: Path) -> None:
     ended = python(tmp_path, "script.py")
     assert ended.returncode == 0, ended.stderr
     printed = ended.stdout.splitlines()
+    assert len(printed) == 2
     assert printed[0].startswith("'primitive' rejoined after ")
-    assert printed[1].startswith("'primitive' rejoined after ")
-    assert printed[2] == "time over"
-    assert printed[3] == f"<run run of rack '{OWN_NAME}': time over, 216 signals>"
+    assert printed[1] == "time over"
     assert (tmp_path / "velocity.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -68,6 +68,14 @@ def test_an_infinite_or_negative_duration_of_a_run_is_refused(seconds: str) -> N
 
 
 @pytest.mark.parametrize("command", NAMES)
+def test_help_keeps_its_lines_and_shows_no_escapes(command: str, tmp_path: Path) -> None:
+    text = rack(command, "--help", folder=tmp_path).stdout
+    assert "\\" not in text
+    _, _, examples = text.partition("Examples:\n")
+    assert not examples or examples.lstrip().startswith("rack ")
+
+
+@pytest.mark.parametrize("command", NAMES)
 def test_a_usage_error_of_any_command_is_a_document_under_json(command: str) -> None:
     done = rack(command, "--bogus", "--json")
     assert done.returncode == 2

@@ -31,7 +31,7 @@ def analyze(
     verbose: bool = option("--verbose", "add the tables of levels, tasks and equations", False),
     as_json: Json = False,
 ) -> None:
-    r"""Compare a run with the timing model, equation by equation.
+    """Compare a run with the timing model, equation by equation.
 
     Each equation that `rack check` predicts is shown with its measurement. Level times are
     processor times, which exclude waiting and preemption. If the host stalls a virtual machine, the

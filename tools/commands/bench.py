@@ -58,7 +58,7 @@ def machine(
     share: Share = False,
     as_json: Json = False,
 ) -> None:
-    r"""Is this machine fit for real time, and up to which rate?
+    """Is this machine fit for real time, and up to which rate?
 
     The fastest board of a rack runs at each rate in turn. The other levels keep their rates. For
     comparison, `cyclictest` of rt-tests runs on the same core with the same period, because no

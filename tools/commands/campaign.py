@@ -70,7 +70,7 @@ def campaign(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Inject random faults of all kinds into runs of a rack, and judge each of them.
+    """Inject random faults of all kinds into runs of a rack, and judge each of them.
 
     Each trial has as many faults as fit into a run. Lockstep trials run in parallel on all cores,
     real-time trials one after the other. Up to its first fault a trial equals the faultless run. In

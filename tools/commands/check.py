@@ -51,7 +51,7 @@ def check(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Validate a config, and predict whether its levels meet their cycles.
+    """Validate a config, and predict whether its levels meet their cycles.
 
     The command prints every mistake in the config, one per line. For a valid config it prints five
     lines: whether the rack fits, its smallest margin, its response time, reach and payload of its

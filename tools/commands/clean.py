@@ -8,7 +8,7 @@ from rack.tools.console.parameters import Json
 
 
 def clean(as_json: Json = False) -> None:
-    r"""Remove the shared memory that killed racks left behind.
+    """Remove the shared memory that killed racks left behind.
 
     Racks in use are not touched, and neither are directories or symbolic links named like a rack.
 

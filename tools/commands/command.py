@@ -56,7 +56,7 @@ def command(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Command one level of a running rack, overriding the level above it.
+    """Command one level of a running rack, overriding the level above it.
 
     \b
     hold      bring the arm to rest on its path, and keep it there

@@ -46,7 +46,7 @@ def estop(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Engage the brakes of the arm at once, and keep them engaged until --reset.
+    """Engage the brakes of the arm at once, and keep them engaged until --reset.
 
     The run continues with the arm braked. The reset is refused while a board is lost, or SYSFAIL or
     ACFAIL is asserted. A rack on another machine, HOST/RACK, can be stopped by the operators whom

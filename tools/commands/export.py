@@ -18,7 +18,7 @@ def export(
     out: Path | None = option("--out FILE", "file to write; default: RUN/run.mcap"),
     as_json: Json = False,
 ) -> None:
-    r"""Write a recorded run as an MCAP file, which Foxglove and others read.
+    """Write a recorded run as an MCAP file, which Foxglove and others read.
 
     Each mailbox becomes a channel of JSON messages, with units and meanings in its schema. Events
     become another channel. The log time is simulated time, the publish time is wall-clock time. The

@@ -41,7 +41,7 @@ def gantt(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Draw a Gantt chart of the schedule of a config, or of the trace of a run.
+    """Draw a Gantt chart of the schedule of a config, or of the trace of a run.
 
     The schedule of a config follows from its budgets. The letters are unit functions: C reads the
     plan, R reads command and status, X executes, W writes, P plans, U updates the plan. "-" marks

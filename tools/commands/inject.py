@@ -52,7 +52,7 @@ def inject(
     is_list: bool = option("--list", "list the kinds; with RACK, the faults of that rack", False),
     as_json: Json = False,
 ) -> None:
-    r"""Inject a fault into a running rack.
+    """Inject a fault into a running rack.
 
     The fault begins at the next tick and lasts to the end of the run, unless --tick, --when, --for
     or --cycles say otherwise. With --tick or --when, or on a rack that is held, the command arms

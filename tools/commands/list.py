@@ -16,7 +16,7 @@ from rack.tools.console.tables import format_fitted_table
 
 
 def list_racks(as_json: Json = False) -> None:
-    r"""List the racks on this machine, running or left behind by a killed launcher.
+    """List the racks on this machine, running or left behind by a killed launcher.
 
     The states are starting, running and stopped. A rack is dead if its launcher has ended, and
     foreign if its shared memory belongs to another version or user. `rack clean` removes dead

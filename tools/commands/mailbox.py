@@ -26,7 +26,7 @@ def mailbox(
     watch: bool = option("--watch", "show each message, until Ctrl-C or the end of the run", False),
     as_json: Json = False,
 ) -> None:
-    r"""Show the newest message in a mailbox of a running rack, or list its mailboxes.
+    """Show the newest message in a mailbox of a running rack, or list its mailboxes.
 
     The message is shown field by field with units. Reading does not delay the boards. With --watch
     and --json each message is one line.

@@ -31,7 +31,7 @@ def new(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    r"""Write a folder with a class, a config that adds it to nasrem, and a test.
+    """Write a folder with a class, a config that adds it to nasrem, and a test.
 
     A level reads and writes messages, and declares a live parameter and an event. A servo law is
     one method: torques from set points and sensed motion. A planner works in the background of a

@@ -16,7 +16,7 @@ from rack.tools.monitor import pausing
 
 
 def pause(rack: RackName, as_json: Json = False) -> None:
-    r"""Pause a rack until 'rack resume'.
+    """Pause a rack until 'rack resume'.
 
     In lockstep the rack is held before its next tick, as by 'rack step'. In real time the clock
     keeps running. The highest level gets an operator's hold, which brings the arm to rest on its
@@ -41,7 +41,7 @@ def pause(rack: RackName, as_json: Json = False) -> None:
 
 
 def resume(rack: RackName, as_json: Json = False) -> None:
-    r"""Let a paused rack continue.
+    """Let a paused rack continue.
 
     In lockstep this releases the clock, in real time the highest level that an operator holds.
 

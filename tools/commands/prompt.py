@@ -33,7 +33,7 @@ def prompt(
         "SCRIPT", "Python script to run, in place of a prompt", None, dir_okay=False
     ),
 ) -> None:
-    r"""Open a Python prompt, or run a script, on the host side of a running rack.
+    """Open a Python prompt, or run a script, on the host side of a running rack.
 
     The prompt runs as the process of a host board with `external = true`. A board can have only one
     such process at a time. The name `program` is the board's program, whose ports read and send

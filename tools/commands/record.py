@@ -47,7 +47,7 @@ def record(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Record a running rack until its run is over, or until Ctrl-C.
+    """Record a running rack until its run is over, or until Ctrl-C.
 
     The recording begins with the last two seconds, which are still in the rack's rings. `rack
     report`, `rack analyze` and `rack replay` read it. Recording causes no missed deadlines, and the

@@ -35,7 +35,7 @@ def replay(
         "also show another run of the same rack, or 'origin' for the run that RUN continues",
     ),
 ) -> None:
-    r"""Open the recording of a run in the viewer, and wait until it is closed.
+    """Open the recording of a run in the viewer, and wait until it is closed.
 
     The viewer shows the arm in 3D, its curves, a Gantt lane for each task, and the log. RUN may
     also be a run.rrd.

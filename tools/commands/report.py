@@ -29,7 +29,7 @@ def report(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Report on a run from its recording.
+    """Report on a run from its recording.
 
     The command writes report.json and report.md if they are missing or older than the recording or
     this program. On a terminal the tables show as many columns as fit; report.md has all.

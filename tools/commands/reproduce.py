@@ -34,7 +34,7 @@ def reproduce(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Reproduce the paper on this machine, and write a page that goes through it claim by claim.
+    """Reproduce the paper on this machine, and write a page that goes through it claim by claim.
 
     The paper is NISTIR 90-4251 (1990). Each claim, equation and figure is quoted, with the
     prediction of the timing model, the measurement with real processes, and a ruling: it holds; it

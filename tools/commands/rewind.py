@@ -36,7 +36,7 @@ MAX_SECONDS = 1e9
 
 
 def rewind(run: RunFolder, anyway: Anyway = False, as_json: Json = False) -> None:
-    r"""Go to any tick of a recorded run, inspect messages and levels, and branch off.
+    """Go to any tick of a recorded run, inspect messages and levels, and branch off.
 
     The command opens a prompt. Commands can also come from stdin, one per line. With --json each
     answer is a document on one line, and the answer of a failed command has the key 'error'.

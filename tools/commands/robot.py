@@ -47,7 +47,7 @@ def new(
     out: Path | None = option("--out DIR", "new folder; default: NAME"),
     as_json: Json = False,
 ) -> None:
-    r"""Write a folder with a config, a scene and a task for the arm of a model file.
+    """Write a folder with a config, a scene and a task for the arm of a model file.
 
     The config takes the following from the model: the joints along the chain, their limits, torque
     limits from actuators or URDF efforts, and a keyframe. The rest is computed (the tool, a home
@@ -93,7 +93,7 @@ def check(
     out: Path | None = option("--out PNG", "file of the picture; default: NAME.png"),
     as_json: Json = False,
 ) -> None:
-    r"""Examine an arm before it moves, and draw it.
+    """Examine an arm before it moves, and draw it.
 
     The arm is that of a config, or is drafted from a model file as `rack robot new` does. The
     report shows axes, limits, reach, payload at the edge of the reach, contacts at home, unattached

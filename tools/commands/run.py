@@ -79,7 +79,7 @@ def run(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Run a rack until its task ends, and report on the run.
+    """Run a rack until its task ends, and report on the run.
 
     A rack that names others in adapter.lan.launch also launches them, each by a separate 'rack
     run'. If one fails, all are stopped. On a terminal a live table shows every task and what holds

@@ -29,7 +29,7 @@ def schema(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Show the keys of a config: type, unit, permitted values, default and meaning.
+    """Show the keys of a config: type, unit, permitted values, default and meaning.
 
     Without TABLE the command lists the tables. [task] and [board.<name>.params] depend on the
     levels of CONFIG. The beginning of a name selects all tables whose names begin with it.

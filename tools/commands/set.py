@@ -18,7 +18,7 @@ def set_param(
     at: At = None,
     as_json: Json = False,
 ) -> None:
-    r"""Set a live parameter of a running rack, between two cycles of its level.
+    """Set a live parameter of a running rack, between two cycles of its level.
 
     'rack schema' marks the parameters that a level declares as live. All others take effect only at
     launch. The setting is an operator's command: it is given again when the board of the level is

@@ -31,7 +31,7 @@ OnlyRack = Annotated[
 
 
 def status(rack: OnlyRack = None, as_json: Json = False) -> None:
-    r"""Show a running rack once: every task, its faults, what holds it, and its progress.
+    """Show a running rack once: every task, its faults, what holds it, and its progress.
 
     Each task has a line with its cycles, misses, longest times and state. A hold is shown with its
     time, its reason, and the command that releases it.

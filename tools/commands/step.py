@@ -23,7 +23,7 @@ def step(
     run: bool = option("--run", "let the rack run without holding", False),
     as_json: Json = False,
 ) -> None:
-    r"""Advance a rack in lockstep by single cycles, and show the state of each level.
+    """Advance a rack in lockstep by single cycles, and show the state of each level.
 
     Start the rack with 'rack run CONFIG --lockstep --step': it is then held before tick 0. A rack
     that already runs in lockstep is held by its first step. Without options the rack advances until

@@ -17,7 +17,7 @@ def stop(
     wait: float = option("--wait S", "seconds to wait for the run's end", 10.0, min=0.0, max=1e9),
     as_json: Json = False,
 ) -> None:
-    r"""End a run, and wait until its launcher has ended.
+    """End a run, and wait until its launcher has ended.
 
     The run ends cleanly at its next tick, and writes its report.
 

@@ -15,7 +15,7 @@ SNAPSHOT_INTERVAL_S = 0.2
 
 
 def top(rack: OnlyRack = None) -> None:
-    r"""Watch a running rack until its run is over, or until Ctrl-C.
+    """Watch a running rack until its run is over, or until Ctrl-C.
 
     On a terminal the view fills the screen, if textual is installed (pip install
     'nasrem-rack[live]'), and keys command the rack. Elsewhere one line a second is printed.

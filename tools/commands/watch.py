@@ -50,7 +50,7 @@ def watch(
     ),
     as_json: Json = False,
 ) -> None:
-    r"""Show signals of a running rack until its run is over, or until Ctrl-C.
+    """Show signals of a running rack until its run is over, or until Ctrl-C.
 
     A signal is a field of a mailbox ('rack mailbox RACK' lists the mailboxes), or one number of a
     field. On a terminal it is plotted, if plotext is installed (pip install 'nasrem-rack[live]').

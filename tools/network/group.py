@@ -30,7 +30,7 @@ def certificates(
     days: int = option("--days N", "validity, days", YEAR, min=1, max=3650),
     as_json: Json = False,
 ) -> None:
-    r"""Make a set of certificates for tests: an authority, and a pair for each name.
+    """Make a set of certificates for tests: an authority, and a pair for each name.
 
     The common name of a certificate is the name of the rack. It determines what the rack may send
     and read. For a rack that listens, give the addresses or host names that other racks use in

@@ -153,7 +153,7 @@ def test_boards_killed_from_outside_are_detected_and_restarted(small: Path, tmp_
         (["--lockstep", "--realtime"], "--lockstep and --realtime exclude each other"),
         (
             ["--kills", "3", "--kinds", "kill"],
-            "--kills 3 and --kinds kill exclude each other: kills from outside are not a kind of fault",
+            "--kills 3 and --kinds kill exclude each other: kills from outside are not",
         ),
         (
             ["--set", "board.upper.ends_run=false"],
