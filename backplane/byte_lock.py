@@ -108,7 +108,7 @@ def _close_inherited() -> None:
 os.register_at_fork(after_in_child=_close_inherited)
 
 
-def close_all() -> None:
+def close_all_files() -> None:
     """Close the descriptors of all locks in a forked process. `reopen_all` opens them again."""
     for lock in _OPEN:
         lock.close_file()

@@ -89,7 +89,7 @@ def detach_segment(segment: Segment) -> None:
 
     The process must not use the segment again before it calls `switch_segment`.
     """
-    byte_lock.close_all()
+    byte_lock.close_all_files()
     _map_memory(segment, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 0, -1)
     file = os.fstat(segment.fd)
     nothing = os.open(os.devnull, os.O_RDONLY)

@@ -61,7 +61,7 @@ _FILES: list[tuple[int, int]] = []
 """Start and end addresses of the parts of mapped files that the crate has used."""
 
 
-def note_used_files() -> None:
+def record_used_files() -> None:
     """Record which pages of mapped files this process has in memory.
 
     A fork does not inherit the page table entries of mapped files, so `touch_memory` uses this

@@ -96,7 +96,7 @@ class RequestEntry:
         """True if the command was issued under a lease that has not been released."""
         return self.client == Client.LEASES and self.stage == RequestStage.GIVEN
 
-    def can_become(self, issued: Request) -> bool:
+    def could_have_produced(self, issued: Request) -> bool:
         """Check whether issuing this request could have produced a command of a recorded run.
 
         Args:
@@ -215,7 +215,7 @@ class OperatorTable:
         waiting = sorted(self.list_waiting(), key=lambda entry: entry.tick)
         missing = []
         for request in requests:
-            entry = next((entry for entry in waiting if entry.can_become(request)), None)
+            entry = next((entry for entry in waiting if entry.could_have_produced(request)), None)
             if entry is None:
                 missing.append(request)
             else:

@@ -91,7 +91,7 @@ def wait_readable(fd: int, timeout_s: float) -> bool:
     return bool(waiting.poll(max(0.0, timeout_s) * 1000))
 
 
-def compute_until(processor_time_ns: int) -> None:
+def busy_wait_until(processor_time_ns: int) -> None:
     """Busy-wait until the processor time of the calling process reaches a value.
 
     Args:

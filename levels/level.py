@@ -316,7 +316,7 @@ class LevelSection:
         self._check_is_free(port)
         return vars(self)
 
-    def place_output(self, port: str, value: object) -> None:
+    def store_output(self, port: str, value: object) -> None:
         """Store a message, or a `Sender`, as the attribute of an output port.
 
         Raises:

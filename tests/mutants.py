@@ -77,7 +77,7 @@ MUTANTS = (
         "claim",
         "masquerade",
         (
-            (MAILBOX, "if not slots.is_lawful(self._signature):", "if False:"),
+            (MAILBOX, "if not slots.is_from_claimant(self._signature):", "if False:"),
             ("boards/run/ports.py", "if writer.intruder:", "if False:"),
         ),
     ),

@@ -82,7 +82,9 @@ class NextCycle:
         self._takes_batches = is_lockstep and spec.role == "executor"
         self._newest = -1
         self._silent_clock = (
-            None if is_lockstep or clock_alarms is None else SilentClock(segment, clock_alarms)
+            None
+            if is_lockstep or clock_alarms is None
+            else StoppedClockDetector(segment, clock_alarms)
         )
         # A restarted task skips the releases before its start. This process may write RELEASED
         # here, because the clock does not until the task has rejoined.
@@ -142,7 +144,7 @@ class NextCycle:
         self._due = release + every
         self._slack = every * (self._spec.within_cycles - 1)
         if self._silent_clock is not None:
-            self._silent_clock.end_silence()
+            self._silent_clock.record_release()
         return release
 
     def _is_before_grid_point(self, release: int) -> bool:
@@ -236,7 +238,7 @@ This is longer than a clock ever waits for its next tick.
 """
 
 
-class SilentClock:
+class StoppedClockDetector:
     """Detects, on behalf of one task, that the clock has stopped.
 
     An alarm is raised once each time the clock stops, and never for a clock that is merely late.
@@ -249,7 +251,7 @@ class SilentClock:
         self._is_reported = False
         self._waited_at = -1
 
-    def end_silence(self) -> None:
+    def record_release(self) -> None:
         """Record that a release was received, so that the next stop of the clock is reported."""
         self._is_reported = False
 

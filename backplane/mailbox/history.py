@@ -118,7 +118,7 @@ def find_chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
         while serial > oldest and not (
             slots.read_visible_tick(serial) < until
             and slots.fetch_message(serial)
-            and slots.is_lawful(0)
+            and slots.is_from_claimant(0)
         ):
             serial -= 1
         chain = slots.chain if serial > oldest else 0

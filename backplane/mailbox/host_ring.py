@@ -112,15 +112,15 @@ class HostReader:
         slots = self._slots
         if (
             slots.fetch_message(serial)
-            and slots.is_lawful(0)
-            and is_proper(slots.message.record, self.spec.fields)
+            and slots.is_from_claimant(0)
+            and has_permitted_values(slots.message.record, self.spec.fields)
         ):
             return slots.message
         self.refused += 1
         return None
 
 
-def is_proper(record: np.ndarray | np.void, fields: Sequence[FieldSpec]) -> bool:
+def has_permitted_values(record: np.ndarray | np.void, fields: Sequence[FieldSpec]) -> bool:
     """Check whether all values of a message are permitted.
 
     Numbers must be finite, norms of vectors within their limits, enum values members of their enum,
@@ -145,7 +145,9 @@ def _is_permitted(values: np.ndarray, field: FieldSpec) -> bool:
     if field.length and not _is_length_within(values, field.length, bool(field.shape)):
         return False
     # In an array of groups, a group of zeros is an unused entry and is not checked.
-    return not field.fields or is_proper(values[values != np.zeros_like(values)], field.fields)
+    return not field.fields or has_permitted_values(
+        values[values != np.zeros_like(values)], field.fields
+    )
 
 
 def _is_length_within(values: np.ndarray, limits: tuple[float, float], is_vector: bool) -> bool:

@@ -146,7 +146,7 @@ class InterruptLine:
     def _accept_writer(self, serial: int) -> bool:
         """Check whether a message's writer held the claim. If so, store the writer's signature."""
         slots = self._slots
-        if not slots.copy_slot(serial) or not slots.is_lawful(self._signature):
+        if not slots.copy_slot(serial) or not slots.is_from_claimant(self._signature):
             return False
         self._signature = slots.signature
         return True

@@ -336,7 +336,7 @@ class Reader:
         if not slots.fetch_message(serial):
             return False
         if slots.signature != self._signature:
-            if not slots.is_lawful(self._signature):
+            if not slots.is_from_claimant(self._signature):
                 return False
             self._unchanged = self._readings[Verdict.OLD]
         self.good[:] = slots.record

@@ -246,7 +246,11 @@ class QueueReader(Reader):
         head = box[Box.HEAD]
         last = min(box[Box.SENT], self.taken + slots.depth)
         slots.fence()
-        if head > last and slots.fetch_message(head) and not slots.is_lawful(self._signature):
+        if (
+            head > last
+            and slots.fetch_message(head)
+            and not slots.is_from_claimant(self._signature)
+        ):
             # The newest message is forged. Count it without taking it, because the writer's next
             # message will overwrite it.
             self.statistics.bad_reads += 1

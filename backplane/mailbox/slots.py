@@ -271,7 +271,7 @@ class Slots:
         Messages whose slots have been reused are left out.
         """
         for serial in range(max(before + 1, newest - self.mask), newest):
-            if self.fetch_message(serial) and self.is_lawful(0):
+            if self.fetch_message(serial) and self.is_from_claimant(0):
                 yield copy_message(self.message)
 
     def copy_slot(self, serial: int) -> bool:
@@ -288,7 +288,7 @@ class Slots:
         """True if the checksum of the message in the local record is correct."""
         return self.chain == xxh3(self.covered, self.words[_CHAIN])
 
-    def is_lawful(self, known: int) -> bool:
+    def is_from_claimant(self, known: int) -> bool:
         """Check whether the writer of the local message held the claim on the mailbox.
 
         Args:

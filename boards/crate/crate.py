@@ -24,7 +24,7 @@ from socket import socket
 
 from rack.backplane.copies import restore_memory
 from rack.backplane.lines import UtilityLines
-from rack.backplane.memory import note_used_files
+from rack.backplane.memory import record_used_files
 from rack.backplane.process import (
     adopt_orphans,
     describe_refusal,
@@ -58,7 +58,7 @@ from rack.boards.crate.requests import (
 )
 from rack.boards.crate.shelf import SnapshotShelf, WaitingCopy
 from rack.boards.errors import MAX_REASON_LENGTH, to_one_line
-from rack.boards.faults.tasks import act_on_core
+from rack.boards.faults.tasks import run_core_fault
 from rack.boards.run.board import run_board, run_clock_board, run_task_board
 from rack.boards.run.compiled_mailbox import load_machine_code
 from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
@@ -161,7 +161,7 @@ class Crate:
                     lambda segment: import_module(HOST_BOARD).run_host_board(segment, host, *lines),
                 )
             case PowerOn(name, HogWiring(entry)):
-                self._fork_board(name, lambda segment: act_on_core(segment, entry))
+                self._fork_board(name, lambda segment: run_core_fault(segment, entry))
             case PowerOff(name):
                 self._kill_boards(name)
             case Leave():
@@ -179,7 +179,7 @@ class Crate:
     def _open_rack(self, opening: Open) -> None:
         """Attach to the segment of a rack. If the rack continues a run, restore its snapshot."""
         self._opened = segment = Segment.attach(opening.rack)
-        note_used_files()
+        record_used_files()
         set_priority(opening.priority)
         snapshot = None if opening.before is None else self._shelf.find_nearest(opening.before)
         if snapshot is not None:
@@ -207,9 +207,9 @@ class Crate:
             self._segment.words[System.STATE] = Run.RUNNING
         self._fork_board(name, lambda segment: run_clock_board(segment, wiring, *lines))
 
-    def _receive_copy_note(self) -> None:
+    def _receive_copy_message(self) -> None:
         """Receive a board's message about its copy, and publish the number of snapshots."""
-        self._shelf.receive_note(self._wirings)
+        self._shelf.receive_copy_message(self._wirings)
         self._publish_snapshots()
 
     def _publish_snapshots(self) -> None:
@@ -357,7 +357,7 @@ class Crate:
             self._reap_ended(None)
         # Receive the messages about copies that boards sent before they ended.
         while wait_readable(self._shelf.line.fileno(), 0):
-            self._receive_copy_note()
+            self._receive_copy_message()
         self._reap_copies()
         for output in self._outputs.values():
             output.close()
@@ -398,7 +398,7 @@ class Crate:
             with suppress(OSError):
                 self._line.send(Ended(name, pid, os.waitstatus_to_exitcode(status), seen_ns, tick))
         if self._shelf.line in ready:
-            self._receive_copy_note()
+            self._receive_copy_message()
         return ready
 
 

@@ -17,9 +17,7 @@ from rack.boards.faults.describe import describe_fault, find_board
 from rack.boards.faults.kind import find_kind
 
 
-def judge_lost_cycles(
-    segment: Segment, config: RackConfig, end: int
-) -> tuple[list[str], list[str]]:
+def find_late_tasks(segment: Segment, config: RackConfig, end: int) -> tuple[list[str], list[str]]:
     """Find the tasks that missed or skipped more cycles than the config permits.
 
     Only totals are known, not which cycles an injected fault cost. Every task may therefore lose

@@ -221,7 +221,7 @@ class PrivateTask:
         self._posts = [posts[name] for name in wiring.outputs.values()]
         for port, name in wiring.outputs.items():
             message = level.outputs[port].message if port in level.outputs else AnyMessage
-            level.place_output(port, message(posts[name].dtype, posts[name].message.raw))
+            level.store_output(port, message(posts[name].dtype, posts[name].message.raw))
         self._busy_until = 0
         self.cycle = self._run_executor if isinstance(level, Executor) else self._run_planner
 

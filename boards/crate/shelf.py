@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 
-from rack.boards.run.copying import ContinueRequest, receive_note
+from rack.boards.run.copying import ContinueRequest, receive_copy_message
 from rack.boards.wiring import ClockWiring, TaskWiring
 
 MOST_SNAPSHOTS = 32
@@ -137,11 +137,11 @@ class SnapshotShelf:
         self._most_bytes = sum(int(kib) << 10 for kib in sizes) // MEMORY_PART
 
     @property
-    def _whole_snapshots(self) -> list[HeldSnapshot]:
+    def _complete_snapshots(self) -> list[HeldSnapshot]:
         """Complete snapshots, in the order in which they were taken."""
         return [snapshot for snapshot in self._snapshots if snapshot.is_complete]
 
-    def receive_note(self, wirings: Mapping[str, Wiring]) -> None:
+    def receive_copy_message(self, wirings: Mapping[str, Wiring]) -> None:
         """Receive a board's message about its copy, and add the copy to its snapshot.
 
         A copy that replaces one that has continued only reports its process id.
@@ -149,9 +149,9 @@ class SnapshotShelf:
         Args:
             wirings: Wirings of all processes that a complete snapshot contains, keyed by name.
         """
-        note, files = receive_note(self.line)
+        note, files = receive_copy_message(self.line)
         if not files:
-            for snapshot in self._whole_snapshots:
+            for snapshot in self._complete_snapshots:
                 if snapshot.tick == note.tick:
                     snapshot.copies[note.name].pid = note.pid
             return
@@ -168,17 +168,17 @@ class SnapshotShelf:
             unfinished.memory = fd
         if unfinished.memory >= 0 and unfinished.copies.keys() == wirings.keys():
             self._snapshots.remove(unfinished)
-            self._add_whole_snapshot(unfinished)
+            self._add_complete_snapshot(unfinished)
 
-    def _add_whole_snapshot(self, snapshot: HeldSnapshot) -> None:
+    def _add_complete_snapshot(self, snapshot: HeldSnapshot) -> None:
         """Add a complete snapshot, which replaces one of the same tick.
 
         Drop other snapshots if there are more than the limits of number and memory permit.
         """
-        for before in self._whole_snapshots:
+        for before in self._complete_snapshots:
             if before.tick == snapshot.tick:
                 self.drop_snapshot(before)
-        for before in self._whole_snapshots[-1:]:
+        for before in self._complete_snapshots[-1:]:
             # The pages that the rack has changed since are now private to the previous snapshot.
             before.measure_memory()
         self._snapshots.append(snapshot)
@@ -194,7 +194,7 @@ class SnapshotShelf:
 
         Neither the newest snapshot nor the one with the first tick is chosen.
         """
-        held = self._whole_snapshots
+        held = self._complete_snapshots
         ticks = sorted(snapshot.tick for snapshot in held)
         older = held[: max(2, len(held) // 2)]
         candidates = [old for old in older if old.tick != ticks[0] and old is not held[-1]]
@@ -207,12 +207,12 @@ class SnapshotShelf:
         return min(candidates, key=gap, default=held[0])
 
     def __len__(self) -> int:
-        return len(self._whole_snapshots)
+        return len(self._complete_snapshots)
 
     @property
     def private_bytes(self) -> int:
         """Total memory in bytes that the snapshots do not share with other processes."""
-        return sum(snapshot.private_bytes for snapshot in self._whole_snapshots)
+        return sum(snapshot.private_bytes for snapshot in self._complete_snapshots)
 
     @property
     def pids(self) -> set[int]:
@@ -224,7 +224,7 @@ class SnapshotShelf:
 
         Snapshots in which a copy has ended are dropped.
         """
-        earlier = [held for held in self._whole_snapshots if held.tick <= tick]
+        earlier = [held for held in self._complete_snapshots if held.tick <= tick]
         for snapshot in sorted(earlier, key=lambda held: held.tick, reverse=True):
             # A readable line means that the copy at its other end has ended.
             if all(copy.pid and not copy.line.poll() for copy in snapshot.copies.values()):

@@ -18,7 +18,7 @@ from rack.backplane.words import Block, Run, System
 from rack.boards.config.resolved import Resolved
 from rack.boards.crate.alarm_events import AlarmReader
 from rack.boards.crate.heartbeat import Heartbeat
-from rack.boards.crate.lateness import judge_lost_cycles
+from rack.boards.crate.lateness import find_late_tasks
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.patience import PeerWaitReporter, ReportedWait
 from rack.boards.crate.recovery import UP_STATES, Recovery, RestartPolicy
@@ -214,7 +214,7 @@ class Supervisor:
         patience = ReportedWait(self._journal, LAST_CYCLES_S)
         while any(map(self._is_cycling, self.pids)) and not patience.is_over:
             self._wait_for_messages(patience.left_s)
-        late, excused = judge_lost_cycles(self.segment, self.plan.config, stop)
+        late, excused = find_late_tasks(self.segment, self.plan.config, stop)
         self.outcome = Outcome(
             cause=cause,
             ticks=stop,

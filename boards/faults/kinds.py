@@ -113,7 +113,7 @@ KINDS.add(
         name="overrun",
         where="load",
         means="the executor computes longer",
-        step=tasks.extend_cycle,
+        step=tasks.compute_cycle_end,
         tasks=("executor",),
         parameters=(
             Parameter(
@@ -145,7 +145,7 @@ KINDS.add(
         name="planner-slow",
         where="load",
         means="the planner exceeds its time slice",
-        step=tasks.extend_time_slice,
+        step=tasks.compute_slice_end,
         tasks=("planner",),
         parameters=(
             Parameter(

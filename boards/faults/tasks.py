@@ -64,7 +64,7 @@ Times are CLOCK_MONOTONIC in ns.
 """
 
 
-def extend_cycle(load: ExtraComputing, tick: int, now_ns: int) -> int:
+def compute_cycle_end(load: ExtraComputing, tick: int, now_ns: int) -> int:
     """Compute when extra computing of `by` cycles, or a random fraction of that, ends.
 
     Args:
@@ -80,7 +80,7 @@ def extend_cycle(load: ExtraComputing, tick: int, now_ns: int) -> int:
     return now_ns + load.cycles_ns(fraction * by)
 
 
-def extend_time_slice(load: ExtraComputing, tick: int, now_ns: int) -> int:
+def compute_slice_end(load: ExtraComputing, tick: int, now_ns: int) -> int:
     """Compute when extra computing that exceeds a planner's time slice by `by` cycles ends.
 
     Args:
@@ -195,7 +195,7 @@ def take_core(segment: Segment, entry: FaultEntry) -> None:
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def act_on_core(segment: Segment, index: int) -> int:
+def run_core_fault(segment: Segment, index: int) -> int:
     """Carry out the fault at `index` of the fault table, which takes a task's core.
 
     Called in a process that the crate has forked, or by `rack inject`. Returns exit status 0.

@@ -16,7 +16,7 @@ from rack.boards.lan.config import LanTable
 from rack.boards.lan.endpoint import has_tls
 from rack.boards.lan.keys import (
     ALL_ALIVE,
-    any_alive,
+    alive_pattern,
     estop_key,
     out_key,
     ping_key,
@@ -94,8 +94,8 @@ def _list_exchange_rules(rack: str, peer: str, table: LanTable) -> list[Rule]:
         (IN, PUT, taken),
         (IN, SUBSCRIBE, [ping_key("*", peer), pong_key("*", peer)]),
         *_list_export_rules([*exports, step_key(rack), ping_key(rack, peer), pong_key(rack, peer)]),
-        (OUT, WATCH_TOKENS, [ALL_ALIVE, any_alive(peer)]),
-        (IN, TOKEN, [any_alive(peer)]),
+        (OUT, WATCH_TOKENS, [ALL_ALIVE, alive_pattern(peer)]),
+        (IN, TOKEN, [alive_pattern(peer)]),
     ]
 
 
@@ -106,7 +106,10 @@ def _list_export_rules(keys: Sequence[str]) -> list[Rule]:
 
 def _list_presence_rules(rack: str) -> list[Rule]:
     """Return the rules that let others see the liveliness tokens of this rack."""
-    return [(IN, WATCH_TOKENS, [ALL_ALIVE, any_alive(rack)]), (OUT, TOKEN, [any_alive(rack)])]
+    return [
+        (IN, WATCH_TOKENS, [ALL_ALIVE, alive_pattern(rack)]),
+        (OUT, TOKEN, [alive_pattern(rack)]),
+    ]
 
 
 def _build_settings(by_subject: dict[str, list[Rule]]) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rack.backplane.mailbox.host_ring import is_proper
+from rack.backplane.mailbox.host_ring import has_permitted_values
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.message import AnyMessage, fill_counts
@@ -321,7 +321,7 @@ class Import:
     def _keep_if_newest(self, head: Envelope, payload: bytes) -> bool:
         """Store a message and return True if it is well formed and newer than all stored before."""
         message = AnyMessage(self._buffer.record.dtype, memoryview(bytearray(payload)))
-        if not is_proper(message.record, self._fields):
+        if not has_permitted_values(message.record, self._fields):
             self.count.refused += 1
             return False
         if not self._order.accept_message(head):

@@ -24,7 +24,7 @@ import numpy as np
 from xxhash import xxh3_64_intdigest as xxh3
 
 from rack.boards.lan.config import MAX_CHAIN_BYTES
-from rack.boards.lan.keys import sender_of
+from rack.boards.lan.keys import parse_sender
 
 if TYPE_CHECKING:
     from rack.boards.lan.credentials import Credentials
@@ -160,7 +160,7 @@ class Sealer:
         identity = self._credentials.identify_sender(chain)
         return (
             identity is not None
-            and identity.name == sender_of(key)
+            and identity.name == parse_sender(key)
             and identity.has_signed(digest, seal)
         )
 

@@ -20,7 +20,7 @@ _ALIVE = re.compile(r"rack/[^/]+/alive/([0-9a-f]{16})(?:-([0-9]{1,18}))?")
 _SENDER = re.compile(r"rack/([^/]+)/")
 
 
-def sender_of(key: str) -> str:
+def parse_sender(key: str) -> str:
     """Return the sender's name in a key expression. Empty if the expression contains none."""
     match = _SENDER.match(key)
     return match[1] if match else ""
@@ -55,7 +55,7 @@ def parse_alive_key(alive: str) -> tuple[int, int] | None:
     return int(launch, 16), int(cycle_ns or 0)
 
 
-def any_alive(rack: str) -> str:
+def alive_pattern(rack: str) -> str:
     """Return the key expression that matches the tokens of all launches of a rack."""
     return f"rack/{rack}/alive/*"
 

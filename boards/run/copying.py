@@ -43,7 +43,7 @@ _THREADS = Path("/proc/self/task")
 
 
 @dataclass(frozen=True)
-class CopyNote:
+class CopyMessage:
     """Message to the crate that a copy of a task or of the clock exists and waits for requests.
 
     The crate's end of the copy's pipe is sent with the message. The clock also sends the file with
@@ -59,7 +59,7 @@ class CopyNote:
     name: str
     pid: int
 
-    def send_note(self, line: socket, *files: int) -> None:
+    def send(self, line: socket, *files: int) -> None:
         """Send the message and the descriptors of open files.
 
         Args:
@@ -72,10 +72,10 @@ class CopyNote:
         send_fds(line, [encode_json(asdict(self)).encode()], files)
 
 
-def receive_note(line: socket) -> tuple[CopyNote, list[int]]:
+def receive_copy_message(line: socket) -> tuple[CopyMessage, list[int]]:
     """Wait for the next `CopyMessage`. Returns it with the descriptors that were sent along."""
     data, files, *_ = recv_fds(line, MAX_NOTE_BYTES, MAX_NOTE_FILES)
-    return CopyNote(**json.loads(data)), files
+    return CopyMessage(**json.loads(data)), files
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ class Copier:
             except OSError as error:
                 raise SnapshotError(f"{self._name}: cannot be copied: {error.strerror}") from None
             if pid:
-                CopyNote(tick, self._name, pid).send_note(self._line, here.fileno(), *memory)
+                CopyMessage(tick, self._name, pid).send(self._line, here.fileno(), *memory)
                 # Reap earlier copies that have ended, because they are children of this process.
                 self._copies = [
                     copy for copy in self._copies if not os.waitpid(copy, os.WNOHANG)[0]
@@ -154,7 +154,7 @@ class Copier:
         die_with_parent(request.crate)
         copies.switch_segment(self._segment, request.rack)
         reclaim_mailboxes()
-        CopyNote(tick, self._name, successor).send_note(self._line)
+        CopyMessage(tick, self._name, successor).send(self._line)
         self._copies = [successor]
         name_process(f"{self._segment.rack}:{self._name}")
         return request

@@ -115,13 +115,13 @@ class InputPorts:
             segment, get_position_mailbox(queue.spec.name), alarms, self.task
         )
 
-        def read_and_note(tick: int) -> Reading[AnyMessage]:
+        def read_position(tick: int) -> Reading[AnyMessage]:
             """Read the position of the queue's reader, and store it in the queue's writer."""
             reading = position_reader.read(tick)
             queue.taken = reading.message.taken
             return reading
 
-        self._rest.append(InputMailbox({}, "", read_and_note, position_reader))
+        self._rest.append(InputMailbox({}, "", read_position, position_reader))
         self._table = ReadTable(self._rest)
         self._readers.append(position_reader.reader)
 
@@ -320,7 +320,7 @@ class OutputPorts:
             sources = [inputs.readers[name] for name in writer.spec.rests_on]
             output = OutputPort(segment, writer, alarms, sources, port in sent)
             self._ports.append(output)
-            level.place_output(port, output.value)
+            level.store_output(port, output.value)
             if isinstance(writer, QueueWriter):
                 inputs.read_queue_position(segment, writer, alarms)
         self._compiled = [port for port in self._ports if can_write(port.writer)][:MAX_PORTS]

@@ -10,7 +10,7 @@ from typing import ParamSpec, TypeVar
 from rack.backplane.clock.system_clock import SystemClock
 from rack.backplane.clock.wake import NextCycle
 from rack.backplane.mailbox.interrupt import BoardInbox, open_inbox
-from rack.backplane.process import compute_until
+from rack.backplane.process import busy_wait_until
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.words import Block, System, TaskState
@@ -190,7 +190,7 @@ class InterruptHandler:
             self._block[Block.INTERRUPTS] += inbox.count - self._served
             self._served = inbox.count
             if self._takes_time:
-                compute_until(begun_ns + inbox.service_ns - self._service_ns)
+                busy_wait_until(begun_ns + inbox.service_ns - self._service_ns)
             self._service_ns = inbox.service_ns
         if inbox.inbox.most_waiting > self._block[Block.INTERRUPTS_WAITING]:
             self._block[Block.INTERRUPTS_WAITING] = inbox.inbox.most_waiting
@@ -233,7 +233,7 @@ def slow_access(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:
         """Make the access, and busy-wait until it has taken its minimum processor time."""
         end = process_time_ns() + time_ns
         result = access(*args, **kwargs)
-        compute_until(end)
+        busy_wait_until(end)
         return result
 
     return access_slowly

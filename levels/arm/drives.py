@@ -84,15 +84,15 @@ class LimitGate:
         passed: Array = np.clip(torque, -self._torque, self._torque)
         lowest_gain = -self._limit_speed(q - self._low, -qd) - qd
         highest_gain = self._limit_speed(self._high - q, qd) - qd
-        gain = np.clip(self._predict_gain(passed, q, qd), lowest_gain, highest_gain)
+        gain = np.clip(self._predict_velocity_change(passed, q, qd), lowest_gain, highest_gain)
         # Light joints change speed so much within a cycle that its end must be predicted from the
         # state in the middle of the cycle.
-        gain = self._predict_gain(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
+        gain = self._predict_velocity_change(passed, q + 0.5 * self._period_s * qd, qd + 0.5 * gain)
         if (gain < lowest_gain).any() or (gain > highest_gain).any():
             passed = self._find_nearest_torque(gain, lowest_gain, highest_gain)
         return passed, not np.array_equal(passed, torque)
 
-    def _predict_gain(self, torque: Array, q: Array, qd: Array) -> Array:
+    def _predict_velocity_change(self, torque: Array, q: Array, qd: Array) -> Array:
         """Predict the change in velocity that torques cause in one cycle, (joints,), in rad/s."""
         self._inertia, bias = self._dynamics.terms(q, qd)
         self._resisting = bias + self._dynamics.friction(qd)

@@ -145,7 +145,7 @@ class Simulation(Plant):
         is_broken = self._check_limits()
         if self.struck:
             self.struck = STRUCK_TICKS if is_broken else self.struck - 1
-        self.fault = self._find_fault()
+        self.fault = self._describe_failure()
         if self.fault:
             restore_state(self._model, self._data, self._steps.states[0])
             self._read_joint_state()
@@ -209,7 +209,7 @@ class Simulation(Plant):
             self.first_violation = f"{quantity} {value:.6g} {unit} of {where}; {permitted}"
         self.report_finding(Finding(Alarm.LIMIT_EXCEEDED, joint, value))
 
-    def _find_fault(self) -> str:
+    def _describe_failure(self) -> str:
         """Return a description of a failure of the simulation, or an empty string."""
         d = self._data
         warned = np.flatnonzero(d.warning.number)

@@ -380,7 +380,7 @@ def _is_within_limits(stop: Trajectory, path: BlendedPath, limits: Limits) -> bo
     # In an interval dds is linear and keeps its sign, so values at the ends bound dds and ds.
     acceleration = np.maximum(np.abs(dds[:-1]), np.abs(dds[1:]))[:, None]
     speed = np.maximum(ds[:-1], ds[1:])[:, None]
-    first, second, third = _find_bounds_over(path, s)
+    first, second, third = _find_bounds_between(path, s)
     # The result of ** 3 on an array differs between processors.
     cubed = speed * speed * speed
     tolerance = 1.0 + LIMIT_ROUNDING
@@ -412,7 +412,7 @@ def _find_check_times(stop: Trajectory) -> Array:
     )
 
 
-def _find_bounds_over(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
+def _find_bounds_between(path: BlendedPath, s: Array) -> tuple[Array, Array, Array]:
     """Return bounds of the path's first three derivatives between consecutive values of `s`.
 
     Each bound is (n - 1, joints).

@@ -70,7 +70,7 @@ class PathMotion:
         """Time until the present trajectory ends, in s. 0 without a trajectory."""
         return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
 
-    def rest_at(self, position: Array) -> float:
+    def reset_to_start(self, position: Array) -> float:
         """Reset the motion to rest at the start of the path, with the set point at the arm.
 
         Args:
@@ -79,9 +79,9 @@ class PathMotion:
         Returns:
             Largest distance of a joint of the arm from the start of the path, rad.
         """
-        return self._place_at_rest(0.0, position)
+        return self._reset_to(0.0, position)
 
-    def rest_near(self, position: Array, progress: float) -> float:
+    def reset_to_nearest(self, position: Array, progress: float) -> float:
         """Reset the motion to rest at the point of the path that is nearest to the arm.
 
         If several points are equally near, because the path returns to an earlier position, take
@@ -106,7 +106,7 @@ class PathMotion:
         # `linspace` returns the exact end. A value beyond it would permit no trajectory.
         places = np.linspace(0.0, self.path.length, len(points))[minima]
         nearest = np.argmin(np.abs(places - progress * self.path.length))
-        return self._place_at_rest(float(places[nearest]), position)
+        return self._reset_to(float(places[nearest]), position)
 
     def follow_trajectory(self, trajectory: Trajectory) -> None:
         """Start to follow a trajectory. It must begin at rest at the present path parameter."""
@@ -154,7 +154,7 @@ class PathMotion:
         if self.time_s >= self.trajectory.duration:
             self._come_to_rest()
 
-    def _place_at_rest(self, s: float, position: Array) -> float:
+    def _reset_to(self, s: float, position: Array) -> float:
         """Reset the motion to rest at path parameter `s`, with the set point at the arm.
 
         Args:

@@ -172,7 +172,7 @@ class PathWork:
             position: Position of the arm, (joints,), rad.
         """
         permitted = self._rules.params.astray
-        distance = self.motion.rest_at(position)
+        distance = self.motion.reset_to_start(position)
         if distance > permitted:
             begins = f"segment {self.segment.id} begins {distance:.4f} rad from where the arm rests"
             self.fault = SegmentFault(Error.LIMIT, f"{begins}; valid: at most {permitted} rad")
@@ -189,7 +189,7 @@ class PathWork:
         self._fresh = False
         self._clear_cycles = 0
         self._quiet = SettlingCounter(self._rules)
-        distance = self.motion.rest_near(position, progress)
+        distance = self.motion.reset_to_nearest(position, progress)
         self.astray = self.blocked = distance > self._rules.params.astray
         self.obstacle = f"the arm is {distance:.3f} rad off its path"
 

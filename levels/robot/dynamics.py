@@ -88,7 +88,7 @@ class Dynamics:
         self._position, self._velocity = current[:STATE_ROWS]
         self._offset = np.zeros(3)
         at = self._model._address, d._address
-        self._evaluating = *at, *find_places(self._model, d, cell), self._evaluations
+        self._evaluating = *at, *find_memory_indices(self._model, d, cell), self._evaluations
         hand = int(cell.model.site_bodyid[cell.tool])
         tool = (d.site_xpos[cell.tool], d.site_xmat[cell.tool])
         gravity = np.array(self._model.opt.gravity)
@@ -124,7 +124,7 @@ class Dynamics:
         return np.asarray(self.dry * apply_elementwise(math.tanh, velocity / FRICTION_SPEED))
 
 
-def find_places(
+def find_memory_indices(
     model: mujoco.MjModel, data: mujoco.MjData, cell: Cell
 ) -> tuple[NDArray[np.int64], Array]:
     """Return the indices of the elements of MuJoCo's memory that an evaluation uses.

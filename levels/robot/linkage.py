@@ -336,7 +336,7 @@ def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: boo
         RobotError: An equality couples a joint of the arm.
     """
     for equality in range(model.neq):
-        tied = [model.joint(joint).name for joint in sorted(find_tied_joints(model, equality))]
+        tied = [model.joint(joint).name for joint in sorted(find_coupled_joints(model, equality))]
         counts = of_bodies or model.eq_type[equality] not in map(int, LOOP_EQUALITIES)
         if counts and model.eq_active0[equality] and {*tied} & {*joints}:
             raise RobotError(
@@ -347,7 +347,7 @@ def check_couplings(model: mujoco.MjModel, joints: Sequence[str], of_bodies: boo
             )
 
 
-def find_tied_joints(model: mujoco.MjModel, equality: int) -> set[int]:
+def find_coupled_joints(model: mujoco.MjModel, equality: int) -> set[int]:
     """Return the ids of the joints that an equality couples.
 
     An equality between two bodies couples the joints that move only one of them.

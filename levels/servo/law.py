@@ -33,7 +33,7 @@ from rack.levels.servo.arm_report import SetPointStatus
 from rack.levels.servo.control import Grip, LawParams, limit_torques
 from rack.levels.servo.curves import Motion, SensedMotion
 from rack.levels.servo.driver import SCENES, ArmDriver
-from rack.levels.servo.modification import find_misfits, list_names
+from rack.levels.servo.modification import find_unsuitable_modifications, list_names
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
@@ -104,7 +104,7 @@ class ServoLaw(ArmDriver):
     ) -> Mismatches:
         """Yield control modifications that do not suit the law, and mismatches of `ArmDriver`."""
         yield from super().find_mismatches(context, above, below)
-        yield from find_misfits(context)
+        yield from find_unsuitable_modifications(context)
         interface = context.robot.interface
         if interface != "torque" and (names := cls.list_names(context.params)):
             why = f'they modify a law of torques; [robot] interface is "{interface}"'

@@ -202,7 +202,7 @@ def list_names(params: Mapping[str, Any]) -> Sequence[str]:
     return tuple(table) if isinstance(table, Mapping) else ()
 
 
-def find_misfits(context: LevelContext) -> Mismatches:
+def find_unsuitable_modifications(context: LevelContext) -> Mismatches:
     """Yield a mismatch for each modification that does not suit the law of its board."""
     params = read_params(
         ModifiableParams, {"modifications": context.params.get("modifications", {})}

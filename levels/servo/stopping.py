@@ -193,7 +193,7 @@ class Stopping:
             self.cause = Error.NONE
             self.reason = ""
             return Reaction.NONE
-        reaction, cause = self._weigh_faults(sensors, tick)
+        reaction, cause = self._select_reaction(sensors, tick)
         if cause is None:
             self._kept = max(self._kept - passed, 0)
         elif not demand:
@@ -221,7 +221,7 @@ class Stopping:
         self.cause = cause.error
         self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
 
-    def _weigh_faults(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
+    def _select_reaction(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
         """Return the strongest reaction to the present faults, and the fault to report or None."""
         reaction = Reaction.NONE
         cause = None if self.refused is None else self._describe_refusal(self.refused)

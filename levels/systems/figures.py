@@ -11,7 +11,7 @@ from typing import Annotated
 from pydantic import Field as Parameter
 
 from rack.backplane.message import Message, State, Status, field
-from rack.backplane.process import compute_until
+from rack.backplane.process import busy_wait_until
 from rack.levels.level import Executor, Input, LevelContext, Output, Planner
 from rack.levels.tables import Table, read_params
 
@@ -71,7 +71,7 @@ class FigureLoop(Executor):
         status.state = State.EXECUTING
         status.cycle = tick
         status.plan = self.plan_in_use
-        compute_until(end)
+        busy_wait_until(end)
 
 
 class FigureExecutor(FigureLoop):
@@ -107,4 +107,4 @@ class FigurePlanner(Planner):
         end_ns = process_time_ns() + self._time_ns
         self.output.made_at = tick
         self.output.cycle = self.status.message.cycle if self.status.has_message else -1
-        compute_until(end_ns)
+        busy_wait_until(end_ns)

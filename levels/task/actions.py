@@ -160,10 +160,10 @@ def rehearse_transfer(
             for group in find_goals(action, situation.object_pose(row), cell)
         ]
 
-    def pair_takes_with_goals() -> Iterator[tuple[list[Spot], list[Pose]]]:
+    def pair_pick_spots_with_goals() -> Iterator[tuple[list[Spot], list[Pose]]]:
         """Yield each pair of a group of pick spots and a group of goals, sorted by pick group."""
         with _label_refusals(k, pick):
-            for takes in planner.find_takes():
+            for takes in planner.find_pick_spots():
                 yield from ((takes, group) for group in standing_goals)
 
     def rehearse_pair(pair: tuple[list[Spot], list[Pose]]) -> Rehearsal:
@@ -179,7 +179,7 @@ def rehearse_transfer(
         with _label_refusals(k, place):
             return planner.rehearse_moves(taken, k, way.put, Verb.RELEASE)
 
-    return _rehearse_first(pair_takes_with_goals(), rehearse_pair)
+    return _rehearse_first(pair_pick_spots_with_goals(), rehearse_pair)
 
 
 class TransferPlanner(NamedTuple):
@@ -192,7 +192,7 @@ class TransferPlanner(NamedTuple):
     row: int  # row of the object in the world model
     lift: float  # height of the straight motions, m
 
-    def find_takes(self) -> Iterator[list[Spot]]:
+    def find_pick_spots(self) -> Iterator[list[Spot]]:
         """Yield the spots at which the object can be taken and held, one list per group of grasps.
 
         The groups are in the order of `find_grasps`. Groups without a spot are left out.

@@ -193,7 +193,7 @@ class TaskExecutor(Executor):
         """Show the program's next moves, or the operator's goto, to the level below."""
         detour = self._detour
         if detour.move and detour.is_known and not self._error:
-            self._window.show_one(detour.to_move(self._count_done_actions(plan)), command)
+            self._window.show_only(detour.to_move(self._count_done_actions(plan)), command)
         else:
             is_stopped = self._error or detour.move
             until = 0 if is_stopped else self._find_first_barred_move(plan)

@@ -71,7 +71,7 @@ class TaskPlanner(Planner):
         """
         self._since = tick if self._since is None else self._since
         followed = self.status.message.echo == self._id
-        if not self._program.action or followed or self._may_be_reported(tick, self._since):
+        if not self._program.action or followed or self._may_be_unacknowledged(tick, self._since):
             return False
         if self._plan is not None:
             return True
@@ -109,7 +109,7 @@ class TaskPlanner(Planner):
         """Number of ticks that the computation of a plan may take."""
         return self.context.within_cycles * self.context.every
 
-    def _may_be_reported(self, tick: int, since: int) -> bool:
+    def _may_be_unacknowledged(self, tick: int, since: int) -> bool:
         """Return True while the executor's status may not acknowledge a published plan yet.
 
         This process or an earlier one may have published the plan. `since` is the tick of the first
@@ -128,13 +128,13 @@ class TaskPlanner(Planner):
         world = self.world.message
         situation = Situation(np.array(world.position), np.array(world.quaternion))
         start = Rehearsal(self._motion, np.array(self.servo.message.target), situation)
-        moves = self._add_times(rehearse(self._program, self.context.scene, start).moves)
+        moves = self._add_deadlines(rehearse(self._program, self.context.scene, start).moves)
         if len(moves) > MOVES:
             raise Refused(
                 Error.LIMIT,
                 f"the program has {len(moves)} elemental moves; at most {MOVES} are valid",
             )
-        self._check_times(moves, self._compute_visible_s(tick))
+        self._check_deadlines(moves, self._compute_visible_s(tick))
         for k, (move, _) in enumerate(moves):
             move.write_to(self.output.moves[k])
         self.output.count = len(moves)
@@ -148,7 +148,7 @@ class TaskPlanner(Planner):
         # a cycle later.
         return (tick + (self.context.within_cycles + 1) * self.context.every) * self.context.tick_s
 
-    def _add_times(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
+    def _add_deadlines(self, moves: Sequence[Rehearsed]) -> list[Rehearsed]:
         """Return the moves, with deadlines for the actions that have one.
 
         The deadline is for the last move of the action. It is one cycle before the action's
@@ -165,7 +165,7 @@ class TaskPlanner(Planner):
                 )
         return timed
 
-    def _check_times(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
+    def _check_deadlines(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
         """Check that every action with a deadline can be completed in time.
 
         Raises:

@@ -98,7 +98,7 @@ class ShownWindow:
         command.moves["id"][:count] = np.arange(count) + (self.first + first)
         self._finish_window(command, count)
 
-    def show_one(self, move: Move, command: TaskCommand) -> None:
+    def show_only(self, move: Move, command: TaskCommand) -> None:
         """Show `move` as the only move of the window."""
         move.write_to(command.moves[0])
         self._finish_window(command, 1)

@@ -19,7 +19,7 @@ from rack.backplane.process import (
     STOPPED_STATES,
     WAITING_STATES,
     Reservation,
-    compute_until,
+    busy_wait_until,
     describe_end,
     describe_refusal,
     die_with_parent,
@@ -98,7 +98,7 @@ def test_the_kernel_says_in_which_state_a_process_is() -> None:
 
 def test_processor_time_excludes_other_processes() -> None:
     target = time.process_time_ns() + 30_000_000
-    compute_until(target)
+    busy_wait_until(target)
     used = time.process_time_ns()
     assert used >= target
     # The kernel counts in steps of 10 ms.

@@ -80,7 +80,7 @@ class Task:
             port: kinds[port](box.dtype) for port, box in outputs.items()
         }
         for port, message in self.written.items():
-            level.place_output(port, message)
+            level.store_output(port, message)
 
     def release(self, tick: int, demand: Demand = Demand.NONE) -> None:
         """Run one cycle, under a demand on the arm."""

@@ -66,7 +66,7 @@ def test_the_public_api_does_not_import_mujoco() -> None:
 def level() -> Answering:
     context = cast(LevelContext, SimpleNamespace(sizes={}, params={"offset": 0.5}))
     made = Answering(context)
-    made.place_output("status", AnswerStatus.zeros({}))
+    made.store_output("status", AnswerStatus.zeros({}))
     return made
 
 

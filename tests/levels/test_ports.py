@@ -84,7 +84,7 @@ def test_a_port_with_the_name_of_another_attribute_is_an_error_of_the_class(
 def test_ports_from_a_config_are_separate_from_attributes() -> None:
     level = Base(CONTEXT)
     level.find_input_table("context")["context"] = 1
-    level.place_output("process", 2)
+    level.store_output("process", 2)
     assert level.ports == {"context": 1, "process": 2}
     assert level.context is CONTEXT
 

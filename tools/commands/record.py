@@ -213,8 +213,8 @@ def _await_runs(
     ended = Event()
     with INTERRUPT.stop_orderly(ended.set, unfinished):
         while not all(rack.run_is_over for rack in racks) and not ended.wait(CHECK_INTERVAL_S):
-            notes += [text for recorder in recorders for text in recorder.read_news()]
+            notes += [text for recorder in recorders for text in recorder.read_notices()]
     for recorder in recorders:
         recorder.finish(in_a_hurry=INTERRUPT.number != 0)
-        notes += recorder.read_news()
+        notes += recorder.read_notices()
     return notes

@@ -15,11 +15,11 @@ from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.divergence import find_other_run
 from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.time_line import RackPlace, place_on_time_line, place_side_by_side
+from rack.tools.recording.time_line import RackAlignment, align_racks, align_runs
 from rack.tools.viewer.parts import FILE, list_parts
 from rack.tools.viewer.window import ViewerWindow, has_screen
 
-Places = Callable[[Sequence[Recording]], list[RackPlace]]
+Places = Callable[[Sequence[Recording]], list[RackAlignment]]
 """Function that puts recordings on one time line."""
 
 
@@ -59,11 +59,11 @@ def replay(
       rack replay runs/slower --against runs/whole
       rack replay runs/slower --against origin
     """
-    place: Places = place_on_time_line
+    place: Places = align_racks
     if against is not None:
         if len(runs) > 1:
             raise Failure("--against: give exactly one RUN", 2)
-        place = place_side_by_side
+        place = align_runs
         runs = [find_other_run(runs[0], against), *runs]
     if out is None and len(runs) == 1 and (recordings := _find_viewer_files(runs[0])):
         _open_viewer(*recordings)
@@ -125,7 +125,7 @@ def _write_file(runs: Sequence[Path], out: Path, place: Places) -> None:
         print(note, file=sys.stderr)
 
 
-def merge_runs(runs: Sequence[Path], out: Path, place: Places = place_on_time_line) -> list[str]:
+def merge_runs(runs: Sequence[Path], out: Path, place: Places = align_racks) -> list[str]:
     """Write runs to one file for the viewer.
 
     Args:

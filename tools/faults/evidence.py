@@ -87,7 +87,7 @@ def can_be_detection(event: Event, strike: Strike) -> bool:
         event.kind in DETECTION_KINDS
         and 0 <= strike.tick <= event.tick + (event.kind == DIED)
         and event.code in strike.record.codes
-        and is_about(event, strike)
+        and concerns_target(event, strike)
     )
 
 
@@ -101,12 +101,12 @@ def can_explain(strike: Strike, event: Event) -> bool:
         return strike.board == event.board and consequence.ends_process
     if event.code in _to_codes(consequence.arm):
         return True
-    return event.code in _to_codes(consequence.own).union(strike.record.codes) and is_about(
+    return event.code in _to_codes(consequence.own).union(strike.record.codes) and concerns_target(
         event, strike
     )
 
 
-def is_about(event: Event, strike: Strike) -> bool:
+def concerns_target(event: Event, strike: Strike) -> bool:
     """Return True if an event concerns the target of a fault: its mailboxes, task or joint."""
     if event.code == DIED:
         return event.board == strike.board
@@ -191,7 +191,7 @@ def find_aftermath(
     lacking = tuple(
         code
         for code in strike.record.consequence.reactions
-        if code not in names and not (code == BRAKES and _are_engaged(strike.tick, events))
+        if code not in names and not (code == BRAKES and _were_brakes_closed(strike.tick, events))
     )
     known_ticks = [tick for tick in undone_ticks if tick is not None]
     is_undone = len(known_ticks) == len(undone_ticks)
@@ -216,7 +216,7 @@ def takes_cycles(strike: Strike) -> bool:
     return strike.record.where in TAKE_CYCLES
 
 
-def _are_engaged(tick: int, events: Sequence[Event]) -> bool:
+def _were_brakes_closed(tick: int, events: Sequence[Event]) -> bool:
     """Return True if the brakes were closed before a tick and opened only after it."""
     brakings = [e for e in events if e.kind == "reaction" and e.code == BRAKES and e.tick < tick]
     undone = (_find_undone_tick(event, events) for event in brakings)

@@ -411,12 +411,12 @@ def _build_row(judgement: Judgement, layout: Layout) -> Report:
         # Convert tuples to lists, so that the row equals itself when read back from JSON.
         "reactions": list(judgement.reactions),
         "lacking": list(judgement.lacking),
-        "delay_cycles": _in_cycles(judgement.delay, judgement.cycle),
-        "bound_cycles": _in_cycles(judgement.bound, judgement.cycle),
+        "delay_cycles": _to_cycles(judgement.delay, judgement.cycle),
+        "bound_cycles": _to_cycles(judgement.bound, judgement.cycle),
         "recovery_ms": recovery_ms,
     }
 
 
-def _in_cycles(ticks: int | None, cycle: int) -> float | None:
+def _to_cycles(ticks: int | None, cycle: int) -> float | None:
     """Convert ticks to cycles of the affected task. None remains None."""
     return None if ticks is None else round(ticks / cycle, 3)

@@ -22,14 +22,14 @@ from rack.boards.errors import ConfigError, Mistake
 from rack.boards.faults.config import FaultConfig, format_condition
 from rack.boards.faults.describe import describe_fault, to_document
 from rack.boards.faults.kind import KINDS
-from rack.boards.faults.tasks import act_on_core
+from rack.boards.faults.tasks import run_core_fault
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.held import describe_wait
 from rack.tools.console.tables import format_fitted_table
 
 BEGIN_S = 5.0
 """Maximum wait in s for a fault to begin at the next tick."""
-LOOK_S = 0.001
+POLL_S = 0.001
 NEXT_TICK = "the next tick"
 SEEDS = 2**31
 
@@ -72,7 +72,7 @@ class LiveRack:
         if KINDS[fault.kind].where == "core":
             # This process itself takes the core.
             self._print_waiting(entry)
-            act_on_core(self._segment, entry.index)
+            run_core_fault(self._segment, entry.index)
         elif fault.tick is None and fault.when is None:
             words = self._segment.words
             if not self._wait_until(
@@ -181,7 +181,7 @@ class LiveRack:
         while not holds() and not self._segment.run_is_over:
             if time.monotonic() > deadline:
                 return False
-            time.sleep(LOOK_S)
+            time.sleep(POLL_S)
         return True
 
     def _await_end(self, entry: FaultEntry, timeout_s: float | None) -> None:

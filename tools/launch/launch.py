@@ -175,7 +175,7 @@ def run_rack(
             segment.words[System.HOLD_AT] = int(step)
             news: list[News] = []
             if recorder is not None:
-                news.append(recorder.read_news)
+                news.append(recorder.read_notices)
                 create_run_folder(recorder.folder, config, log, beginning.origin)
                 port = import_module(VIEWER).find_free_port() if view else None
                 if not recorder.attach(config.name, port, segment.words):
@@ -292,7 +292,7 @@ def _open_viewer(port: int) -> News:
     """
     window = import_module(VIEWER)
     try:
-        opened: News = window.ViewerWindow(window.format_url(port)).read_news
+        opened: News = window.ViewerWindow(window.format_url(port)).read_notices
         return opened
     except Failure as failure:
         news = [f"no viewer: {failure}"]

@@ -15,7 +15,7 @@ UNRECORDED = "the system response: nothing is recorded"
 ACROSS_RACKS = "the system response: there are no bounds yet for a response across racks"
 
 
-def judge_run(ended: Mapping[str, Any], response: Document | None) -> Document:
+def build_verdict(ended: Mapping[str, Any], response: Document | None) -> Document:
     """Decide whether a run worked, from its end and its system response.
 
     Args:

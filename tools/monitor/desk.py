@@ -209,7 +209,7 @@ class LevelCommander:
         about = f"command {reply.serial}"
         awaited = f"waiting for '{reply.level}', which runs every {status.every} ticks"
         for is_over in self._poll_run(about, awaited):
-            late = last.explain_silence(self._segment.words[System.TICK])
+            late = last.explain_missing_reply(self._segment.words[System.TICK])
             reply = replies.read_statuses()
             if reply.fate not in ("given", "taken") or (reply.fate == "taken" and not wait):
                 break

@@ -158,7 +158,7 @@ class ReplyDeadline:
         shortest = round(NO_CYCLE_S * 1e9 / segment.layout.clock_ns)
         self._silent = max(REPLY_CYCLES * status.every, shortest)
 
-    def explain_silence(self, tick: int) -> str:
+    def explain_missing_reply(self, tick: int) -> str:
         """Return why the answer is overdue. Empty before the deadline."""
         cycles = self._block[Block.CYCLES]
         if cycles != self._cycles:

@@ -85,7 +85,7 @@ class SignalHistory:
         self._span = span + self.settling_ticks + max(spec.every * spec.depth for spec in specs)
         self._changes: dict[str, deque[tuple[int, dict[str, Any]]]] = defaultdict(deque)
         """For each mailbox, ticks with the values of its signals, keyed by name."""
-        self._tap = SignalReader(segment, [*signals, *followed])
+        self._reader = SignalReader(segment, [*signals, *followed])
         self.lost = 0
         self.read_new()
         # Messages overwritten before the start do not count.
@@ -93,7 +93,7 @@ class SignalHistory:
 
     def read_new(self) -> list[WrittenMessages]:
         """Read, store and return the messages since the last call."""
-        all_written = [*self._tap.read_new()]
+        all_written = [*self._reader.read_new()]
         for written in all_written:
             self.lost += written.lost
             mailbox_signals = [
@@ -153,23 +153,23 @@ class SignalPrinter:
     """
 
     def __init__(self, history: SignalHistory, first: int, every: int, as_json: bool) -> None:
-        self._strip = history
+        self._history = history
         self._next = first
         self._every = max(every, 1)
         self._as_json = as_json
 
     def show_until(self, last: int) -> None:
         """Print the lines up to the tick `last` that have not been printed yet."""
-        for tick, values in self._strip.list_rows(self._next, last):
+        for tick, values in self._history.list_rows(self._next, last):
             if tick >= self._next:
                 self._print_line(tick, values)
                 self._next = tick + self._every
 
     def _print_line(self, tick: int, values: list[Any]) -> None:
         """Print the values of all signals at a tick."""
-        time_s = self._strip.to_time_s(tick)
+        time_s = self._history.to_time_s(tick)
         if self._as_json:
-            names = [signal.name for signal in self._strip.signals]
+            names = [signal.name for signal in self._history.signals]
             line = {"time_s": time_s, "tick": tick, **dict(zip(names, values, strict=True))}
             print(encode_json(line), flush=True)
         else:
@@ -190,7 +190,7 @@ class SignalPlot:
         from rich.live import Live
 
         self._plotext = plotext
-        self._strip = history
+        self._history = history
         self._span = span
         self._live = Live(console=terminal, auto_refresh=False, vertical_overflow="crop")
 
@@ -205,7 +205,7 @@ class SignalPlot:
         """Redraw the curves over the last `span` ticks up to tick `last`."""
         from rich.text import Text
 
-        rows = self._strip.list_rows(last - self._span, last)
+        rows = self._history.list_rows(last - self._span, last)
         plot = self._plotext
         plot.clear_figure()
         # Use the colours of the terminal.
@@ -225,9 +225,9 @@ class SignalPlot:
         """
         curves = defaultdict(list)
         for tick, values in rows:
-            for signal, value in zip(self._strip.signals, values, strict=True):
+            for signal, value in zip(self._history.signals, values, strict=True):
                 for name, number in _list_numbers(signal.heading, value):
-                    curves[name].append((self._strip.to_time_s(tick), number))
+                    curves[name].append((self._history.to_time_s(tick), number))
         return curves
 
 

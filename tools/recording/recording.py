@@ -274,7 +274,7 @@ class Recording:
             return int(self.cycles[name]["tick"][-1])
         return int(self.read_signal(name, "tick")[-1]) if name in self.mailboxes else -1
 
-    def count_untraced(self) -> dict[str, tuple[int, int]]:
+    def count_traced_cycles(self) -> dict[str, tuple[int, int]]:
         """Return recorded and total number of cycles of each task that lacks trace records."""
         traced = {task.name: len(self.read_trace(task.name)) for task in self.layout.tasks}
         return {

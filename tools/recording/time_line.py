@@ -120,7 +120,7 @@ class TimeLineNote(NamedTuple):
 
 
 @dataclass(frozen=True)
-class RackPlace:
+class RackAlignment:
     """Conversion of a recorded rack's times to the time line, the first rack's simulated time.
 
     Attributes:
@@ -194,7 +194,7 @@ class RackPlace:
         return self.convert_stamps(stamps_ns) + launch.wall_offset_ns
 
 
-def place_on_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
+def align_racks(recordings: Sequence[Recording]) -> list[RackAlignment]:
     """Return the conversion of each recorded rack's times to the time line of the first rack.
 
     Raises:
@@ -203,7 +203,7 @@ def place_on_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
     grids = [RackGrid(recording) for recording in recordings]
     for index, grid in enumerate(grids):
         _check_compatible(grid, grids[:index])
-    placed = {0: RackPlace(grids[0], grids[0])}
+    placed = {0: RackAlignment(grids[0], grids[0])}
     while len(placed) < len(grids):
         connections = (
             (near, far, offsets)
@@ -221,12 +221,12 @@ def place_on_time_line(recordings: Sequence[Recording]) -> list[RackPlace]:
                 2,
             )
         near, far, shifts = connection
-        place = RackPlace(grids[far], grids[0], (*shifts, *placed[near].offsets))
+        place = RackAlignment(grids[far], grids[0], (*shifts, *placed[near].offsets))
         placed[far] = replace(place, marks=(TimeLineNote(0, place.note),))
     return [placed[index] for index in range(len(grids))]
 
 
-def place_side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
+def align_runs(recordings: Sequence[Recording]) -> list[RackAlignment]:
     """Align two runs of the same rack tick by tick, for example a branch and its origin.
 
     Each run is shown under the name of its folder, because the rack has the same name in both.
@@ -256,8 +256,8 @@ def place_side_by_side(recordings: Sequence[Recording]) -> list[RackPlace]:
     marks = marks or [TimeLineNote(0, f"all that {names[0]} and {names[1]} both wrote is equal")]
     line = grids[0]
     return [
-        RackPlace(line, line, is_tick_aligned=True),
-        RackPlace(grids[1], line, is_tick_aligned=True, marks=tuple(marks)),
+        RackAlignment(line, line, is_tick_aligned=True),
+        RackAlignment(grids[1], line, is_tick_aligned=True, marks=tuple(marks)),
     ]
 
 
@@ -288,7 +288,8 @@ def _find_offsets(grid: RackGrid, other: RackGrid) -> tuple[TimeShift, ...] | No
     """
     if grid.is_lockstep:
         have_met = [
-            _has_met(observer, observed) for observer, observed in ((grid, other), (other, grid))
+            _has_communicated(observer, observed)
+            for observer, observed in ((grid, other), (other, grid))
         ]
         return () if any(have_met) else None
     measured = _read_offset(other, grid), _read_offset(grid, other)
@@ -355,7 +356,7 @@ def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
     return TimeShift(at_ns, by_ns, worst_ns + longest_gap_ns * DRIFT_PPM // 1_000_000)
 
 
-def _has_met(observer: RackGrid, peer: RackGrid) -> bool:
+def _has_communicated(observer: RackGrid, peer: RackGrid) -> bool:
     """Return True if `observer`, in lockstep, communicated with `peer`.
 
     Raises:

@@ -16,7 +16,7 @@ from rack.boards.timing.trace_times import compute_distribution, compute_plan_ag
 from rack.levels.peer import Presence, format_peer_port
 from rack.tools.console.answer import Document, write_file, write_json
 from rack.tools.faults.judge import report_faults
-from rack.tools.launch.verdict import UNRECORDED, judge_run
+from rack.tools.launch.verdict import UNRECORDED, build_verdict
 from rack.tools.monitor.host_side import ENTRY_COUNTS, list_entries
 from rack.tools.monitor.interrupts import summarize_interrupts
 from rack.tools.monitor.network import ADAPTER, COUNTS, STATUS, read_entries
@@ -125,7 +125,7 @@ def build_report(recording: Recording) -> Document:
         recording=ended.get("recording", "without the end of the run"),
         rows_lost={name: count for name, count in recording.lost_rows.items() if count},
         gaps=[gap._asdict() for gap in recording.find_gaps()],
-        untraced=recording.count_untraced(),
+        untraced=recording.count_traced_cycles(),
         kept=recording.kept_text or None,
     ).to_document()
 
@@ -170,7 +170,7 @@ def _build_head(
         mode=config.clock.mode,
         speed=config.clock.speed,
         clock_ms=config.clock.period_ms,
-        **judge_run(ended, response),
+        **build_verdict(ended, response),
         outcome=outcome or None,
         digest=outcome.get("digest"),
         objects=outcome.get("objects", []),

@@ -68,7 +68,7 @@ def format_report(document: Document) -> Blocks:
     if report.holds:
         yield from _format_holds(report.rack, report.holds)
     if report.state_tables:
-        yield from ("", "## State tables", "", _build_state_tables(report.state_tables))
+        yield from ("", "## State tables", "", _build_state_table(report.state_tables))
     yield from format_times(report)
     yield from _format_faults(report)
     if report.misses:
@@ -139,7 +139,7 @@ def _format_holds(rack: str, holds: Sequence[Document]) -> Blocks:
             )
 
 
-def _build_state_tables(levels: dict[str, list[Document]]) -> TextTable:
+def _build_state_table(levels: dict[str, list[Document]]) -> TextTable:
     """Return a table of levels, each with its most frequent row and its last new row."""
     rows = []
     for level, fired in levels.items():

@@ -37,7 +37,7 @@ def build_document(analysis: Analysis) -> Document:
         "start_up_s": START_UP_S,
         "rows_lost": {name: count for name, count in recording.lost_rows.items() if count},
         "gaps": [gap._asdict() for gap in recording.find_gaps()],
-        "untraced": recording.count_untraced(),
+        "untraced": recording.count_traced_cycles(),
         "kept": recording.kept_text or None,
         "holds": analysis.is_fulfilled,
         "levels": {
@@ -203,7 +203,7 @@ def _list_unjudged(analysis: Analysis) -> Iterator[str]:
         if cycles.stalled_count
     ):
         yield f"stalled cycles are not judged: {stalled}"
-    for name, (traced, ran) in analysis.recording.count_untraced().items():
+    for name, (traced, ran) in analysis.recording.count_traced_cycles().items():
         yield f"{name}: judged by {traced:,} of {ran:,} cycles"
     yield from (
         f"{count} rows of {name} were lost"

@@ -17,7 +17,7 @@ import numpy as np
 from rack.levels.algebra import Mask
 from rack.levels.errors import RobotError
 from rack.levels.robot.hand import compute_moments
-from rack.levels.robot.linkage import find_tied_joints
+from rack.levels.robot.linkage import find_coupled_joints
 from rack.levels.robot.lookup import find, mark_descendants
 from rack.levels.robot.model import SCALAR_JOINTS, check_joint_count, format_names
 
@@ -124,7 +124,7 @@ def find_driven_joints(model: mujoco.MjModel) -> set[int]:
     every = np.arange(model.njnt)
     drives = compute_moments(model, every, model.qpos0[model.jnt_qposadr]).any(axis=0)
     driven = every[drives | model.jnt_actfrclimited]
-    return set(driven.tolist()).union(*(find_tied_joints(model, k) for k in range(model.neq)))
+    return set(driven.tolist()).union(*(find_coupled_joints(model, k) for k in range(model.neq)))
 
 
 def fix_joints(path: Path, moving_joints: Iterable[str]) -> list[str]:

@@ -128,7 +128,7 @@ def _find_transfers(draft: Draft, gripper: FittedGripper) -> Assignment | str:
     spots = (
         spot
         for spot in _list_table_spots(cell, reach)
-        if _can_reach_places(cell, spot, half[2], lift)
+        if _can_reach_blocks(cell, spot, half[2], lift)
     )
     used_names = {body.name for body in draft.spec.bodies} | {
         geom.name for geom in draft.spec.geoms
@@ -200,7 +200,7 @@ def _list_table_spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
         yield TableSpot(round(base[2] + height * reach, 3), front, places, middle)
 
 
-def _can_reach_places(cell: Cell, spot: TableSpot, half_height: float, lift: float) -> bool:
+def _can_reach_blocks(cell: Cell, spot: TableSpot, half_height: float, lift: float) -> bool:
     """Return whether the tool can be lowered to every block position.
 
     Args:

@@ -9,7 +9,7 @@ import numpy as np
 
 from rack.levels.algebra import Array, norm
 from rack.levels.errors import RobotError
-from rack.levels.robot.linkage import find_tied_joints
+from rack.levels.robot.linkage import find_coupled_joints
 from rack.levels.robot.lookup import list_geoms, mark_descendants
 from rack.levels.robot.model import (
     add_motor,
@@ -168,7 +168,7 @@ def _group_coupled_joints(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]
     """Group the joints of the gripper. Joints that equalities couple are in one group."""
     groups = [{name} for name in arm.fingers]
     for equality in range(model.neq):
-        tied = {model.joint(joint).name for joint in find_tied_joints(model, equality)} & {
+        tied = {model.joint(joint).name for joint in find_coupled_joints(model, equality)} & {
             *arm.fingers
         }
         together = [group for group in groups if group & tied]

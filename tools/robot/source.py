@@ -93,7 +93,7 @@ def read_source(path: Path) -> Source:
 def _convert_urdf(path: Path, root: ElementTree.Element) -> Source:
     """Convert a URDF, fixing its planar joints. Raises `RobotError`."""
     _check_tree(path, root)
-    notes = _find_shapes(path, root)
+    notes = _prepare_shapes(path, root)
     for joint in root.findall("joint[@type='planar']"):
         joint.set("type", "fixed")
         notes.append(f"planar joint '{joint.get('name')}' is fixed: a mobile base does not move")
@@ -130,7 +130,7 @@ def _check_tree(path: Path, root: ElementTree.Element) -> None:
     raise RobotError(f"model '{path}': {why}")
 
 
-def _find_shapes(path: Path, root: ElementTree.Element) -> list[str]:
+def _prepare_shapes(path: Path, root: ElementTree.Element) -> list[str]:
     """Prepare the collision shapes of a URDF. Links without them use their visible shapes.
 
     Returns notes for the user. Raises `RobotError` if no link has a shape that can be read.
@@ -142,7 +142,7 @@ def _find_shapes(path: Path, root: ElementTree.Element) -> list[str]:
     unreadable = {
         name: problem
         for name, link in links.items()
-        if (problem := _find_shape(path, link, folder)) is not None
+        if (problem := _prepare_link_shapes(path, link, folder)) is not None
     }
     if unreadable and root.find("link/collision") is None:
         raise next(iter(unreadable.values()))
@@ -168,7 +168,7 @@ def _is_only_visible(link: ElementTree.Element) -> bool:
     return link.find("collision") is None and link.find("visual") is not None
 
 
-def _find_shape(path: Path, link: ElementTree.Element, folder: str) -> RobotError | None:
+def _prepare_link_shapes(path: Path, link: ElementTree.Element, folder: str) -> RobotError | None:
     """Keep the collision shapes of a link, or else turn its visible shapes into collision shapes.
 
     Args:

@@ -149,7 +149,7 @@ class RunRecord:
 
         Raises `Failure` if the recorder cannot write.
         """
-        for text in self._recorder.read_news():
+        for text in self._recorder.read_notices():
             self._log_text(text)
         for event in () if self._standstill is None else self._standstill.list_events():
             self.log.add_event(event)

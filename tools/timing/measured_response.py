@@ -62,14 +62,14 @@ def _measure_response(recording: Recording, rack: RackTiming, chains: ParallelCh
         "levels": list(chains.levels),
         "bound_eq_3_2_ms": chains.bound * tick_ms,
         "sum_eq_3_3_ms": sum(chains.cycles) * tick_ms,
-        "command": _judge_direction(recording, rack, chains.chains, chains.levels),
-        "status": _judge_direction(
+        "command": _measure_direction(recording, rack, chains.chains, chains.levels),
+        "status": _measure_direction(
             recording, rack, [boards[::-1] for boards in chains.chains], chains.levels[::-1]
         ),
     }
 
 
-def _judge_direction(
+def _measure_direction(
     recording: Recording, rack: RackTiming, chains: Sequence[Sequence[str]], levels: Sequence[str]
 ) -> Document:
     """Compare the responses along chains with their bound.

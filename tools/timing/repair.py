@@ -127,7 +127,7 @@ def find_changes(rack: JudgedConfig, board: str) -> list[Change]:
     if not changes:
         combined = (
             _search_first(rack, board, _list_longer_cycles(rack, board, place))
-            for place in _list_planner_places(rack, board)
+            for place in _list_loose_couplings(rack, board)
         )
         changes = [change for change in combined if change is not None][:1]
     return sorted(changes, key=lambda change: change.cost)
@@ -137,7 +137,7 @@ def _find_own_changes(rack: JudgedConfig, board: str) -> Iterator[Change]:
     """Yield the smallest helpful change of each kind to the board's own settings."""
     older = [{"within_cycles": d} for d in _list_plan_cycles(rack.timing.build_level(board))]
     cores = [{"core": core} for core in _list_other_cores(rack, rack.config.board[board].core)]
-    places = list(_list_planner_places(rack, board))
+    places = list(_list_loose_couplings(rack, board))
     planner = _try_each(rack, board, places)
     if planner is None:
         # Moving the planner is not enough. Try it with more cycles for a plan.
@@ -237,7 +237,7 @@ def _list_longer_cycles(
     return longer_settings
 
 
-def _list_planner_places(rack: JudgedConfig, board: str) -> Iterator[Settings]:
+def _list_loose_couplings(rack: JudgedConfig, board: str) -> Iterator[Settings]:
     """Yield settings that couple the board's planner loosely, one for each core it could use."""
     slot = rack.config.board[board].planner_slot
     if slot is None:

@@ -40,7 +40,7 @@ AXES = dict(zip(AXIS_NAMES, UNITS, strict=True))
 """Unit of each axis of a task frame."""
 
 
-class ContactPlace(NamedTuple):
+class ContactPoint(NamedTuple):
     """A point on the tool or hand at which forces are sensed.
 
     Attributes:
@@ -67,15 +67,15 @@ class ContactPlace(NamedTuple):
         return data.site_xpos[self.site], quaternion
 
 
-def list_contacts(cell: Cell) -> list[ContactPlace]:
+def list_contacts(cell: Cell) -> list[ContactPoint]:
     """Return the points at which the forces on a cell's tool or hand are sensed.
 
     These are the tool of an arm with a wrist sensor, or the fingertips of a hand.
     """
     if cell.hand is not None:
         tips = zip(cell.hand.names, cell.hand.tips, strict=True)
-        return [ContactPlace(name, int(tip), cell.tool) for name, tip in tips]
-    return [] if cell.wrist is None else [ContactPlace("tool", cell.tool, None)]
+        return [ContactPoint(name, int(tip), cell.tool) for name, tip in tips]
+    return [] if cell.wrist is None else [ContactPoint("tool", cell.tool, None)]
 
 
 def build_contact_arrows(stream: Stream, cell: Cell, field: str) -> ViewPart:

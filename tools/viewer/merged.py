@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.time_line import RackPlace
+from rack.tools.recording.time_line import RackAlignment
 from rack.tools.viewer.blueprint import (
     RackViews,
     build_blueprint,
@@ -20,7 +20,7 @@ from rack.tools.viewer.stream import Moment, Stream, Timelines, open_recording
 
 
 def write_merged(
-    placed: Sequence[RackPlace], file: Path, show_progress: Callable[[float], None]
+    placed: Sequence[RackAlignment], file: Path, show_progress: Callable[[float], None]
 ) -> None:
     """Write one viewer recording that shows all of these racks, each under its name.
 

@@ -17,7 +17,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from rack.backplane.segment import Launch
-from rack.tools.recording.time_line import RackPlace
+from rack.tools.recording.time_line import RackAlignment
 
 Ints = NDArray[np.int64]
 
@@ -62,7 +62,7 @@ class Timelines:
     to the timelines of another rack. All times are integers, in ns.
     """
 
-    def __init__(self, clock_ns: int, launch: Launch, placed: RackPlace | None = None) -> None:
+    def __init__(self, clock_ns: int, launch: Launch, placed: RackAlignment | None = None) -> None:
         self.clock_ns = clock_ns
         self._offset_ns = launch.wall_offset_ns
         self._placed = placed

@@ -53,7 +53,7 @@ class ViewerWindow:
         )
         self._is_reported = False
 
-    def read_news(self) -> list[str]:
+    def read_notices(self) -> list[str]:
         """Return a message about the end of the viewer, once it has ended.
 
         Returns:

@@ -105,16 +105,18 @@ class Drive:
         elif identifier == wire.COMMAND and wire.read_tick(data) != self._newest:
             self._newest = wire.read_tick(data)
             self._joint.advance(came_s)
-            self._obey(np.frombuffer(data, wire.ORDER, self._joint.count, wire.TICK.size), came_s)
+            self._execute_entry(
+                np.frombuffer(data, wire.ORDER, self._joint.count, wire.TICK.size), came_s
+            )
         elif identifier == wire.HEARTBEAT + wire.RACK:
             self._heard_s = came_s
 
-    def _obey(self, orders: wire.Orders, came_s: float) -> None:
+    def _execute_entry(self, orders: wire.Orders, came_s: float) -> None:
         """Execute this drive's entry in a command that arrived at `came_s`."""
         control = int(orders["control"][self._node - 1])
         power = next_power(self.power, control)
         if power is not self.power:
-            self._turn(power)
+            self._change_state(power)
         if power is Power.OPERATION_ENABLED and control == Control.ENABLE_OPERATION:
             self._driven_s = came_s
             self._joint.drive(orders["torque"] * wire.UNIT)
@@ -130,17 +132,17 @@ class Drive:
         if now_s - self._heard_s > wire.SILENT_S:
             fault = fault or wire.NO_HEARTBEAT
         if fault and self.power in (Power.SWITCHED_ON, Power.OPERATION_ENABLED):
-            self._turn(Power.FAULT, fault)
+            self._change_state(Power.FAULT, fault)
         if now_s - self._driven_s > self._patience_s:
             if self.power is Power.OPERATION_ENABLED:
-                self._turn(Power.SWITCHED_ON)
+                self._change_state(Power.SWITCHED_ON)
             # Leave out the last `WINDOW_S`, because a SYNC for that time may still arrive.
             self._joint.advance(now_s - WINDOW_S)
         if now_s - self._beat_s > wire.HEARTBEAT_S:
             self._beat_s = now_s
             self._send(wire.HEARTBEAT, wire.OPERATIONAL)
 
-    def _turn(self, power: Power, fault: int = 0) -> None:
+    def _change_state(self, power: Power, fault: int = 0) -> None:
         """Change the state and the fault, and brake unless the new state permits torque."""
         self.power = power
         self.fault = fault

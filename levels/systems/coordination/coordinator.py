@@ -221,7 +221,7 @@ class Coordinator(Executor):
                 self._moves = self.last_progress.message.moves
         self._operated.take_commands(self.operator)
         self._readings = {arm: self.ports[f"report_{arm}"] for arm in self._table.arms}
-        hold_reason = self._reason_to_hold()
+        hold_reason = self._find_reason_to_hold()
         if self._steps:
             agreement = self._agreement
             step = agreement.step
@@ -229,7 +229,7 @@ class Coordinator(Executor):
             agreement.advance_program(self._readings, tick * self.context.tick_s)
             if agreement.step > step:
                 self._moves += moves
-        wait_reason = hold_reason or self._reason_to_wait()
+        wait_reason = hold_reason or self._find_reason_to_wait()
         if self._steps:
             self._check_progress(wait_reason, tick)
         for arm in self._table.arms:
@@ -248,7 +248,7 @@ class Coordinator(Executor):
             report.moves for report in own_reports
         )
 
-    def _reason_to_hold(self) -> str:
+    def _find_reason_to_hold(self) -> str:
         """Return why the arms must stop on their paths, or an empty string."""
         if self._operated.is_holding:
             return self._operated.format_reason(self.context.board)
@@ -259,7 +259,7 @@ class Coordinator(Executor):
                 return f"{arm} is lost: the program waits until it is back"
         return ""
 
-    def _reason_to_wait(self) -> str:
+    def _find_reason_to_wait(self) -> str:
         """Return why the program does not advance, or an empty string."""
         agreement = self._agreement
         if agreement.phase is Phase.ENDING:

@@ -185,7 +185,7 @@ class OrderedTaskExecutor(TaskExecutor):
             elif plan.id == request.id:
                 taken.fail_order(plan.error, plan.reason)
             return
-        self._waits = self._reason_not_to_plan()
+        self._waits = self._find_reason_not_to_plan()
         if self._waits:
             return
         order: CellOrder = self.ports["order"].message
@@ -215,7 +215,7 @@ class OrderedTaskExecutor(TaskExecutor):
         request.revision = self.world.message.revision
         request.start = self.below.message.start
 
-    def _reason_not_to_plan(self) -> str:
+    def _find_reason_not_to_plan(self) -> str:
         """Return why nothing can be planned at present, or an empty string."""
         if self._orders.is_in_force or not self.below.message.resting:
             return "the arm does not rest yet"
@@ -233,7 +233,7 @@ class OrderedTaskExecutor(TaskExecutor):
             self._take_action(request)
         has_strayed = float(np.abs(self.below.message.start - request.start).max()) > MAX_STRAY_RAD
         if request.begin and (has_strayed or self.world.message.revision != request.revision):
-            self._waits = self._reason_not_to_plan()
+            self._waits = self._find_reason_not_to_plan()
             if not self._waits:
                 self._request_plan(request, 0.0)
         elif self.plan.message.id == request.id:
@@ -397,9 +397,9 @@ class OrderedTaskPlanner(TaskPlanner):
         """Return the earliest simulated time in s at which the plan can begin."""
         return max(super()._compute_visible_s(tick), self._begin_s + self.context.period_s)
 
-    def _check_times(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
+    def _check_deadlines(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
         """Check the times, and write the earliest end of the order in the coordinator's time."""
-        super()._check_times(moves, visible_s)
+        super()._check_deadlines(moves, visible_s)
         unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
         self.output.earliest = (
             compute_finish_times(unhurried, visible_s, self.context, self._needs)[-1]

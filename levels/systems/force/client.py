@@ -27,7 +27,12 @@ from rack.levels.algebra import Array, norm
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus, HostReceiver, HostSender, ProgramInput, ProgramOutput
 from rack.levels.level import LevelContext, Mismatches, Program
-from rack.levels.systems.force.contact import AXIS_NAMES, Axis, WantedContact, find_misfit
+from rack.levels.systems.force.contact import (
+    AXIS_NAMES,
+    Axis,
+    WantedContact,
+    check_frame_and_wrenches,
+)
 from rack.levels.systems.force.messages import Mode, ServerRequest, ServerStatus
 from rack.levels.systems.trajectory.commands import CommandEnvironment, Motions
 from rack.levels.systems.trajectory.messages import MotionKind
@@ -50,7 +55,7 @@ class FrameConfig(Table):
     z: Vector
     """its z axis, at a right angle to x"""
 
-    def find_objection(self) -> str:
+    def find_axes_error(self) -> str:
         """Return the reason why the axes do not define a frame, or an empty string if they do."""
         lengths = norm(self.x) * norm(self.z)
         if not lengths > 0.0:
@@ -97,15 +102,17 @@ class ForceProgram(Program):
     def find_mismatches(self, robot: RobotConfig | None, scene: SceneConfig) -> Mismatches:
         """Yield invalid frames, and contacts in unknown frames or beyond the limits of the arm."""
         bent = {
-            name: reason for name, frame in self.frame.items() if (reason := frame.find_objection())
+            name: reason
+            for name, frame in self.frame.items()
+            if (reason := frame.find_axes_error())
         }
         for name, reason in bent.items():
             yield f"frame.{name}", self.frame[name].model_dump(), reason
         for name, contact in self.contact.items():
-            if contact.frame not in bent and (reason := self.find_objection(contact, robot)):
+            if contact.frame not in bent and (reason := self.find_contact_error(contact, robot)):
                 yield f"contact.{name}", contact.model_dump(exclude_defaults=True), reason
 
-    def find_objection(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
+    def find_contact_error(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
         """Return the reason why a contact is invalid, or an empty string if it is valid.
 
         Its frame must be in the program, only axes of force may have a speed, and its wrenches must
@@ -124,7 +131,7 @@ class ForceProgram(Program):
                 f" {', '.join(contact.wrench) or 'none'}"
             )
         wanted = self.build_contact(contact)
-        return find_misfit(
+        return check_frame_and_wrenches(
             wanted.frame,
             (wanted.wrench, wanted.guard),
             (robot.wrist.most_force, robot.wrist.most_torque),
@@ -255,7 +262,7 @@ class ForceMotions(Motions):
             raise LevelError(
                 f"{call}: {key} = {first['input']!r}: {first['msg'].lower()}"
             ) from error
-        if reason := self._program.find_objection(changed, self._robot):
+        if reason := self._program.find_contact_error(changed, self._robot):
             raise LevelError(f"{call}: contact '{name}': {reason}")
         return self._program.build_contact(changed)
 

@@ -80,7 +80,7 @@ class Contact:
             True if the motion must restart from rest.
         """
         selected = wanted.selected
-        is_other_frame = not self._is_frame(wanted.frame)
+        is_other_frame = not self._is_same_frame(wanted.frame)
         must_restart = self.is_compliant and (
             is_other_frame or bool((self.selected != selected).any())
         )
@@ -111,19 +111,19 @@ class Contact:
         self.wrench[:] = 0.0
         self.guard[:] = 0.0
 
-    def find_objection(self, frame: Array, guard: Array) -> str:
+    def find_guard_error(self, frame: Array, guard: Array) -> str:
         """Return the reason why guards cannot be set at present, or an empty string.
 
         While there are axes of force, guards must be given in the same task frame.
         """
-        if self.is_compliant and guard.any() and not self._is_frame(frame):
+        if self.is_compliant and guard.any() and not self._is_same_frame(frame):
             return (
                 "the guard's frame is not that of the axes of force; permitted while complying: the"
                 " same"
             )
         return ""
 
-    def _is_frame(self, frame: Array) -> bool:
+    def _is_same_frame(self, frame: Array) -> bool:
         """Return True if `frame` equals the present task frame. q and -q count as equal."""
         return bool(1.0 - abs(float((frame * self.frame).sum())) / norm(frame) < SAME)
 
@@ -141,7 +141,9 @@ class Contact:
             getattr(self, name)[:] = getattr(compliance, name)
 
 
-def find_misfit(frame: Array, vectors: Sequence[Array], most: tuple[float, float]) -> str:
+def check_frame_and_wrenches(
+    frame: Array, vectors: Sequence[Array], most: tuple[float, float]
+) -> str:
     """Check a task frame and the wrenches given in it. Return what is invalid, or an empty string.
 
     Args:

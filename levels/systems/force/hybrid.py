@@ -99,7 +99,7 @@ class ComplianceWatch:
         self.must_rest = False
         self.reason = ""
         self.sensed = wrench.message.tick if wrench.has_message else -1
-        reason = find_objection(wanted) if wanted.active else ""
+        reason = find_command_error(wanted) if wanted.active else ""
         rotation = (
             compute_rotation(wanted.frame) if wanted.frame.any() and not reason else np.eye(3)
         )
@@ -168,7 +168,7 @@ class ComplianceWatch:
             )
 
 
-def find_objection(compliance: Compliance) -> str:
+def find_command_error(compliance: Compliance) -> str:
     """Return the reason why a command is invalid, or an empty string if it is valid."""
     numbers = np.concatenate(
         (compliance.frame, compliance.wrench, compliance.speed, compliance.guard)

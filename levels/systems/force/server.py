@@ -18,7 +18,7 @@ from rack.levels.systems.force.contact import (
     Contact,
     WantedContact,
     WristLevel,
-    find_misfit,
+    check_frame_and_wrenches,
 )
 from rack.levels.systems.force.messages import (
     AXES,
@@ -177,13 +177,17 @@ class ServerWork(RequestWork):
         wanted = WantedContact.from_record(request.record)
         frame = wanted.frame
         if request.kind == MotionKind.COMPLY:
-            return find_misfit(frame, (wanted.wrench,), self.most) if wanted.selected.any() else ""
+            return (
+                check_frame_and_wrenches(frame, (wanted.wrench,), self.most)
+                if wanted.selected.any()
+                else ""
+            )
         if request.kind == MotionKind.GUARD:
-            reason = find_misfit(frame, (wanted.guard,), self.most)
-            return reason or self.contact.find_objection(frame, wanted.guard)
+            reason = check_frame_and_wrenches(frame, (wanted.guard,), self.most)
+            return reason or self.contact.find_guard_error(frame, wanted.guard)
         return super()._find_request_error(request)
 
-    def _start_at_rest(self, request: MotionRequest) -> None:
+    def _begin_stationary_request(self, request: MotionRequest) -> None:
         """Start a request with the arm at rest: set guards or axes of force, or begin a motion."""
         wanted = WantedContact.from_record(request.record)
         if request.kind == MotionKind.GUARD:
@@ -197,7 +201,7 @@ class ServerWork(RequestWork):
         elif request.kind == MotionKind.COMPLY:
             self.end_compliance()
         else:
-            super()._start_at_rest(request)
+            super()._begin_stationary_request(request)
 
     def _is_done(self, current: MotionRequest) -> bool:
         """Return True if the current request is done. COMPLY requires settled forces and rest."""

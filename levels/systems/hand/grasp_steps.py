@@ -294,7 +294,7 @@ class GrippingWork(StepWork):
         grasp.moved = norm(away)
         grasp.farthest = max(grasp.farthest, grasp.moved)
         grasp.grip.follow_creep(grasp.target.tip, fingers.tip)
-        grasp.grip.recover_position(away)
+        grasp.grip.correct_position(away)
         grasp.grip.adapt_force(grasp.base, fingers.force)
         self.apply_grip()
 

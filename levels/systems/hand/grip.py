@@ -85,7 +85,7 @@ class HandGrip:
         wanted = min(base + self._gains.reserve * borne, self._gains.most_grip)
         self.force = max(wanted, self.force - FALL_N_S * self._period_s)
 
-    def recover_position(self, away: Array) -> None:
+    def correct_position(self, away: Array) -> None:
         """Adjust the load to pull the object back to its anchor (integral control).
 
         Args:

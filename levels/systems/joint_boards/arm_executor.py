@@ -159,7 +159,7 @@ class ArmExecutor(ArmDriver):
         self.rests_on = self.joints.rests_on
         if self.abandoned and self._is_astray():
             return None
-        self._defied = self._must_rest(stops, tick) and self.joints.moves
+        self._defied = self._is_rest_overdue(stops, tick) and self.joints.moves
         if self._defied:
             self._waiting = "braked: the boards above did not bring it to rest"
             return None
@@ -184,7 +184,7 @@ class ArmExecutor(ArmDriver):
         )
         return True
 
-    def _must_rest(self, stops: bool, tick: int) -> bool:
+    def _is_rest_overdue(self, stops: bool, tick: int) -> bool:
         """Return True if the time for the boards above to bring the arm to rest is over.
 
         Args:

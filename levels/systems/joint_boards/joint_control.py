@@ -46,7 +46,7 @@ class JointLoads:
         # (joints,), rad. NaN if the loads come from a reference.
         self._computed_at = np.full(joints, np.nan)
 
-    def find_misfit(self, command: JointReference) -> str:
+    def find_invalid_field(self, command: JointReference) -> str:
         """Return the name of the first field beyond the arm's limits, or an empty string."""
         # Written so that NaN is rejected.
         within = {

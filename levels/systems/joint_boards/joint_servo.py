@@ -19,7 +19,11 @@ from rack.levels.servo import curves, reference
 from rack.levels.servo.arm_report import view_numbers
 from rack.levels.servo.control import Grip, LoopGains
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.modification import ModifiableParams, find_misfits, list_names
+from rack.levels.servo.modification import (
+    ModifiableParams,
+    find_unsuitable_modifications,
+    list_names,
+)
 from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
@@ -125,7 +129,7 @@ class JointServo(Executor):
                 yield "params.joints", joint, "named twice"
         if not named and not params.gripper:
             yield "params.joints", [], "it drives no joint, and not the gripper"
-        yield from find_misfits(context)
+        yield from find_unsuitable_modifications(context)
 
     def process(self, tick: int) -> None:
         """Run one cycle: compute the torques that act from the next cycle on."""
@@ -245,7 +249,7 @@ class JointServo(Executor):
             self._command = command.id
             self._rests_on = command.operator
             self._refused = ""
-            if misfit := self.loads.find_misfit(command):
+            if misfit := self.loads.find_invalid_field(command):
                 # Before the first set point all fields are zero, which is not an error.
                 if command.due:
                     self._refused = f"rejected: a reference whose {misfit} is out of range"

@@ -18,7 +18,7 @@ from rack.levels.systems.state_table.table import (
     RowConfig,
     StateTable,
     Vocabulary,
-    find_objection,
+    find_phrase_error,
 )
 from rack.levels.tables import describe_keys
 
@@ -65,7 +65,7 @@ def _find_row_flaws(
     """Yield a line for each unknown word in a row and each required key that is missing."""
     yield from _find_condition_flaws(row, vocabulary)
     for phrase in row.do:
-        if lexicon is not None and (why := find_objection(phrase, vocabulary.actions, lexicon)):
+        if lexicon is not None and (why := find_phrase_error(phrase, vocabulary.actions, lexicon)):
             yield f"do: {why}"
     for key in ("next", "do", "status"):
         if key not in row.model_fields_set:

@@ -47,7 +47,7 @@ from rack.levels.systems.state_table.table import (
     TableError,
     Values,
     Vocabulary,
-    find_objection,
+    find_phrase_error,
     list_phrases,
     read_table,
 )
@@ -365,17 +365,17 @@ class StateTableExecutor(Executor):
         if command.id == self._done_serial:
             self._newest = self._taken
         elif self._newest[:2] != (False, command.id):
-            words = UNKNOWN if self._find_objection(command.words) else command.words
+            words = UNKNOWN if self._find_command_error(command.words) else command.words
             self._newest = WordCommand(False, command.id, words)
         if above.is_lost:
             self._hold_reason = ABOVE_LOST
         elif command.hold:
             self._hold_reason = HELD_FROM_ABOVE
 
-    def _find_objection(self, words: str) -> str:
+    def _find_command_error(self, words: str) -> str:
         """Return why a command is invalid, or an empty string if it is valid."""
         lexicon = self.build_lexicon(self.context.scene, self.table.plan)
-        return find_objection(words, self.vocabulary.commands, lexicon)
+        return find_phrase_error(words, self.vocabulary.commands, lexicon)
 
     def _accept_operator_command(self, order: OperatorCommand) -> None:
         """Execute or refuse a TABLE or DO command of an operator."""
@@ -387,7 +387,7 @@ class StateTableExecutor(Executor):
             elif order.id > self._answered_before_restart:
                 self.use_table(order.name)
         elif order.what == Operation.DO:
-            if why := self._find_objection(order.name):
+            if why := self._find_command_error(order.name):
                 self.orders.refuse_newest(why)
             else:
                 self._newest = WordCommand(True, order.id, order.name)

@@ -99,7 +99,7 @@ def _list_words(parameter: str | Values, lexicon: Lexicon) -> Sequence[str]:
     return lexicon[parameter] if isinstance(parameter, str) else parameter
 
 
-def find_objection(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
+def find_phrase_error(phrase: str, verbs: Phrases, lexicon: Lexicon) -> str:
     """Return why a phrase is not a valid command or action, or an empty string if it is.
 
     Args:

@@ -93,7 +93,7 @@ class TrajectoryExecutor(Executor):
     def max_messages(self, port: str) -> int:
         """Return how many requests to take from the queue in this cycle. The others stay queued."""
         # Take none before the requests of an earlier process are restored.
-        return 0 if self._last_tick is None else self._agenda.free_places
+        return 0 if self._last_tick is None else self._agenda.remaining_capacity
 
     def process(self, tick: int) -> None:
         """Take requests, advance the motion, and write the set point that is due in two cycles."""

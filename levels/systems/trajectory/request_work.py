@@ -239,7 +239,7 @@ class RequestWork:
         elif request.kind in MOVING_KINDS:
             self._begin_leg(request, half_s, request.segment)
         else:
-            self._start_at_rest(request)
+            self._begin_stationary_request(request)
 
     def _find_request_error(self, request: MotionRequest) -> str:
         """Return why a request cannot be executed, or an empty string if no reason is found."""
@@ -248,7 +248,7 @@ class RequestWork:
             request.body
         )
 
-    def _start_at_rest(self, request: MotionRequest) -> None:
+    def _begin_stationary_request(self, request: MotionRequest) -> None:
         """Begin a request that does not move the arm. A GRIP sets the command of the gripper."""
         if request.kind == MotionKind.GRIP:
             self.grip = request.opening, request.force

@@ -114,7 +114,7 @@ class Agenda:
         return self._ended[0][0] if self._ended else 0
 
     @property
-    def free_places(self) -> int:
+    def remaining_capacity(self) -> int:
         """Number of requests that may be taken now."""
         return MAX_HELD_REQUESTS - len(self.held)
 

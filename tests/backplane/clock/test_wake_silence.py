@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from rack.backplane.clock import wake
-from rack.backplane.clock.wake import CLOCK_PATIENCE_TICKS, SilentClock
+from rack.backplane.clock.wake import CLOCK_PATIENCE_TICKS, StoppedClockDetector
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.backplane.words import Run, System
@@ -36,7 +36,7 @@ class Silence:
         for module in ("wake", "system_clock"):
             monkeypatch.setattr(f"rack.backplane.clock.{module}.monotonic_ns", lambda: self.now_ns)
         monkeypatch.setattr(wake, "read_state", self._state_of)
-        self.clock = SilentClock(segment, AlarmWriter(segment, "reader"))
+        self.clock = StoppedClockDetector(segment, AlarmWriter(segment, "reader"))
         self._ring = open_alarm_ring(segment, "reader")
 
     def _state_of(self, pid: int) -> str:
@@ -83,7 +83,7 @@ def test_a_silence_is_reported_once_and_the_next_one_again(watched: Silence) -> 
     watched.tick(7)
     assert [len(watched.check(now)) for now in (9, 10, 40)] == [1, 0, 0]
     watched.tick(40)
-    watched.clock.end_silence()
+    watched.clock.record_release()
     assert [len(watched.check(now)) for now in (42, 43)] == [1, 0]
     # The clock has caught up, as a check sees it.
     watched.tick(43)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rack.backplane.mailbox.host_ring import HostReader, HostWriter, is_proper
+from rack.backplane.mailbox.host_ring import HostReader, HostWriter, has_permitted_values
 from rack.backplane.message import AnyMessage
 from rack.backplane.message_type import Field, MessageType
 from rack.backplane.segment import Segment
@@ -97,7 +97,7 @@ def test_undeclared_lengths_and_non_ascii_texts_are_improper_but_empty_groups_ar
     fields, message = build_field_specs(Number.message_type, {}), Number.zeros({})
     for value, colour, permitted in ((0.0, 0, True), (0.0, 2, False), (np.nan, 1, False)):
         message.value, message.colour = value, colour
-        assert is_proper(message.record, fields) is permitted
+        assert has_permitted_values(message.record, fields) is permitted
     turn = Field("turn", "f8", "1", "unit", (2,), (0.9, 1.1))
     one = MessageType("one", 1, (Field("name", "S4", "ASCII", "its name"), turn))
     kind = MessageType(
@@ -106,13 +106,13 @@ def test_undeclared_lengths_and_non_ascii_texts_are_improper_but_empty_groups_ar
         (Field("ones", one, "1", "them", (3,)), Field("far", "f4", "m", "", (), (0.0, 5.0))),
     )
     fields, message = build_field_specs(kind, {}), AnyMessage(kind.build_dtype({}))
-    assert is_proper(message.record, fields)
+    assert has_permitted_values(message.record, fields)
     for far, permitted in ((5.0, True), (-5.0, True), (5.1, False), (-5.1, False), (0.0, True)):
         message.far = far
-        assert is_proper(message.record, fields) is permitted
+        assert has_permitted_values(message.record, fields) is permitted
     first = message.ones[0]
     first["name"] = b"a"
-    assert not is_proper(message.record, fields)
+    assert not has_permitted_values(message.record, fields)
     big = np.finfo(float).max
     for turned, permitted in (
         ((0.6, 0.8), True),
@@ -121,6 +121,6 @@ def test_undeclared_lengths_and_non_ascii_texts_are_improper_but_empty_groups_ar
         ((0.0, -1.0), True),
     ):
         first["turn"] = turned
-        assert is_proper(message.record, fields) is permitted
+        assert has_permitted_values(message.record, fields) is permitted
     first["name"] = b"\xff"
-    assert not is_proper(message.record, fields)
+    assert not has_permitted_values(message.record, fields)

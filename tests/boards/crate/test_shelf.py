@@ -31,11 +31,11 @@ def hold(shelf: SnapshotShelf, tick: int) -> None:
     """Hold a snapshot of a rack without processes."""
     memory = os.memfd_create("test")
     os.ftruncate(memory, SIZE)
-    shelf._add_whole_snapshot(HeldSnapshot(tick, memory=memory))
+    shelf._add_complete_snapshot(HeldSnapshot(tick, memory=memory))
 
 
 def ticks(shelf: SnapshotShelf) -> list[int]:
-    return sorted(snapshot.tick for snapshot in shelf._whole_snapshots)
+    return sorted(snapshot.tick for snapshot in shelf._complete_snapshots)
 
 
 def test_the_nearest_snapshot_before_a_tick_is_found(shelf: SnapshotShelf) -> None:

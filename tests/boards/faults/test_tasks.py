@@ -20,8 +20,8 @@ from rack.boards.faults.tasks import (
     ExtraComputing,
     LoadStep,
     TaskFaults,
-    extend_cycle,
-    extend_time_slice,
+    compute_cycle_end,
+    compute_slice_end,
     take_core,
 )
 from rack.levels.fault_steps import Fault
@@ -81,18 +81,19 @@ def test_an_executor_overruns_by_cycles_and_a_planner_beyond_its_slice(make_bus:
     segment.words[System.PERIOD_NS] = period = 2_500_000
     segment.words[System.EPOCH_NS] = epoch = 1_000_000_000
     assert (
-        extend_cycle(load(segment, "overrun", extend_cycle, 2.0, 0.0), 4, 77) == 77 + 2 * 3 * period
+        compute_cycle_end(load(segment, "overrun", compute_cycle_end, 2.0, 0.0), 4, 77)
+        == 77 + 2 * 3 * period
     )
-    random = load(segment, "overrun", extend_cycle, 2.0, 1.0)
-    drawn = [extend_cycle(random, tick, 0) for tick in range(50)]
-    assert drawn == [extend_cycle(random, tick, 0) for tick in range(50)]
+    random = load(segment, "overrun", compute_cycle_end, 2.0, 1.0)
+    drawn = [compute_cycle_end(random, tick, 0) for tick in range(50)]
+    assert drawn == [compute_cycle_end(random, tick, 0) for tick in range(50)]
     assert 0 <= min(drawn) < max(drawn) <= 2 * 3 * period
     assert len(set(drawn)) == 50
-    late = load(segment, "planner-slow", extend_time_slice, 2.0)
+    late = load(segment, "planner-slow", compute_slice_end, 2.0)
     slice_end = epoch + (4 + 3 * 2) * period
-    assert extend_time_slice(late, 4, 0) == slice_end + 2 * 3 * period
+    assert compute_slice_end(late, 4, 0) == slice_end + 2 * 3 * period
     # One that is beyond its slice already has them added.
-    assert extend_time_slice(late, 4, slice_end + 5) == slice_end + 5 + 2 * 3 * period
+    assert compute_slice_end(late, 4, slice_end + 5) == slice_end + 5 + 2 * 3 * period
 
 
 class Level:

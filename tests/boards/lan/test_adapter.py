@@ -166,8 +166,8 @@ def test_in_real_time_the_status_counts_messages_with_flaws(make: MakeAdapter) -
 
     Link.sealer.resume_counts([3] * len(Flaw))
     out = build_status_class(adapter._table.exports, adapter._table.imports).zeros({})
-    adapter.place_output("status", out)
-    adapter.place_output("peer_b", PeerPresence.zeros({}))
+    adapter.store_output("status", out)
+    adapter.store_output("peer_b", PeerPresence.zeros({}))
     adapter._write_status(8)
     assert out.flaws.tolist() == (0,) * len(Flaw)
     assert (out.state, out.reason) == (State.HOLDING, "rack 'b' is not there yet")

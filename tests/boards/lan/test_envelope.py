@@ -20,8 +20,8 @@ from rack.boards.lan.keys import (
     estop_answer_key,
     estop_key,
     out_key,
+    parse_sender,
     ping_key,
-    sender_of,
     step_key,
 )
 from rack.tools.network.certificates import make_credentials
@@ -142,11 +142,11 @@ def test_a_spoilt_certificate_names_nobody_else(folder: Path) -> None:
 
 
 def test_each_key_is_sealed_by_the_sender_that_it_names() -> None:
-    assert sender_of(estop_key("operator", "cell")) == "operator"
+    assert parse_sender(estop_key("operator", "cell")) == "operator"
     answer = estop_answer_key("cell", "operator")
     for key in (KEY, out_key("cell", "ask.a"), step_key("cell"), ping_key("cell", "puma"), answer):
-        assert sender_of(key) == "cell"
-    assert [sender_of(key) for key in ("", "rack", "rack/", "rack//out/a", "other/cell/x")] == [
+        assert parse_sender(key) == "cell"
+    assert [parse_sender(key) for key in ("", "rack", "rack/", "rack//out/a", "other/cell/x")] == [
         ""
     ] * 5
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from rack.backplane.process import compute_until
+from rack.backplane.process import busy_wait_until
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.run.snapshots import ClockCopies
@@ -27,7 +27,7 @@ class StubCopier:
 
     def fork_copy(self, tick: int, memory: int) -> None:
         """Take time."""
-        compute_until(process_time_ns() + COST_NS)
+        busy_wait_until(process_time_ns() + COST_NS)
         self.ticks.append(tick)
 
 

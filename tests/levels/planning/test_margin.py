@@ -58,7 +58,7 @@ def lowest_grasp(folder: Path, length: float) -> float:
     poses = made.build_start_data().qpos[made.object_qpos[:, None] + np.arange(7)]
     situation = Situation(poses[:, :3].copy(), poses[:, 3:].copy())
     rehearsal = Rehearsal(MotionPlanner(made, scene, 1), made.home, situation)
-    takes = next(TransferPlanner(rehearsal, 0, 0.1).find_takes())
+    takes = next(TransferPlanner(rehearsal, 0, 0.1).find_pick_spots())
     return float(takes[0].tool.position[2] - situation.positions[0, 2])
 
 

@@ -124,7 +124,7 @@ def test_a_motion_that_resumes_at_the_end_of_its_path_is_finished() -> None:
     for length in np.random.default_rng(4).uniform(0.1, 9.0, 200):
         line = BlendedPath([[0.0], [length]], [0.0, 0.0])
         motion = PathMotion(line, Limits(*np.ones((4, 1))), bridging_s=0.5)
-        motion.rest_near(np.array([length]), progress=1.0)
+        motion.reset_to_nearest(np.array([length]), progress=1.0)
         assert motion.is_finished
 
 

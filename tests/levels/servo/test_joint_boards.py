@@ -93,9 +93,9 @@ def test_a_reference_that_asks_for_more_than_the_arm_can_do_is_named(
     loads = JointLoads(puma)
     message = reference(20, 1.0, 1.0)
     message.position = puma.home
-    assert loads.find_misfit(message) == ""
+    assert loads.find_invalid_field(message) == ""
     setattr(message, field, value)
-    assert loads.find_misfit(message) == field
+    assert loads.find_invalid_field(message) == field
 
 
 def test_torques_of_all_boards_are_added_up() -> None:

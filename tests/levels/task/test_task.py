@@ -158,4 +158,4 @@ def test_a_deadline_on_another_racks_clock_is_not_refused_because_of_rounding() 
     )
     for offset in np.random.default_rng(1).uniform(-20.0, 0.0, 200):
         planner._ahead_s = float(offset)  # the move is slowed down to end just in time
-        planner._check_times(planner._add_times([Rehearsed(home, 1.0)]), 0.0)
+        planner._check_deadlines(planner._add_deadlines([Rehearsed(home, 1.0)]), 0.0)

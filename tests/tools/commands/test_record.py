@@ -24,7 +24,7 @@ from rack.tools.commands.replay import replay
 from rack.tools.console.answer import Failure
 from rack.tools.recording.checksums import CHECKSUMS
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.time_line import place_on_time_line
+from rack.tools.recording.time_line import align_racks
 from rack.tools.report.report import write_report
 from rack.tools.viewer.reading import read_component
 from rack.tools.viewer.window import ViewerWindow
@@ -154,7 +154,7 @@ def test_racks_that_work_together_are_recorded_on_one_time_line(
         report, _ = write_report(folder / name)
         assert report["tasks"]["pulse"]["traced"] > 0
     recordings = [Recording(folder / name) for name in names[::-1]]
-    place = place_on_time_line(recordings)[1]
+    place = align_racks(recordings)[1]
     assert place.note == note
     # The two were on one clock: what that showed is the truth.
     true_ns = place.reference_grid.convert_stamps(np.array([place.grid.epoch_ns]))[0]

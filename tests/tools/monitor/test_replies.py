@@ -20,13 +20,13 @@ def test_the_wait_for_a_level_is_bounded_by_its_cycles(tmp_path: Path, rack_name
         last = ReplyDeadline(segment, layout.find_mailbox("lower.status"))
         # It skipped ticks, but did few cycles.
         block[Block.CYCLES] = REPLY_CYCLES
-        assert last.explain_silence(100) == ""
+        assert last.explain_missing_reply(100) == ""
         block[Block.CYCLES] += 1
-        assert last.explain_silence(101) == f"has not answered within {REPLY_CYCLES} cycles"
+        assert last.explain_missing_reply(101) == f"has not answered within {REPLY_CYCLES} cycles"
         stopped = ReplyDeadline(segment, layout.find_mailbox("lower.status"))
-        assert stopped.explain_silence(101) == stopped.explain_silence(501) == ""
+        assert stopped.explain_missing_reply(101) == stopped.explain_missing_reply(501) == ""
         assert (
-            stopped.explain_silence(502)
+            stopped.explain_missing_reply(502)
             == "has not answered, and has not completed a cycle since tick 101"
         )
     finally:

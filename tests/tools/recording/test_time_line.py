@@ -10,7 +10,7 @@ import pytest
 
 from rack.levels.peer import DRIFT_PPM
 from rack.tools.console.answer import Failure
-from rack.tools.recording.time_line import RackPlace, place_on_time_line
+from rack.tools.recording.time_line import RackAlignment, align_racks
 from tests.tools.machines import (
     CLOCK_NS,
     ERROR_NS,
@@ -25,7 +25,7 @@ from tests.tools.machines import (
 )
 
 
-def check_place(place: RackPlace, own: Machine, line: Machine) -> None:
+def check_place(place: RackAlignment, own: Machine, line: Machine) -> None:
     """Check that the time of each tick is right within the uncertainty."""
     ticks = np.arange(0, TICKS, 7)
     found = place.convert_ticks(ticks, 0)
@@ -42,7 +42,7 @@ def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(
 ) -> None:
     one = recorded(A, [B] if seen_by != "second" else [], tmp_path / "a")
     other = recorded(B, [A] if seen_by != "first" else [], tmp_path / "b", seed=2)
-    first, second = place_on_time_line([one, other])
+    first, second = align_racks([one, other])
     check_place(second, B, A)
     assert (first.convert_ticks(np.arange(TICKS), 5) == np.arange(TICKS) * CLOCK_NS + 5).all()
     assert first.uncertainty_ns == 0
@@ -58,12 +58,12 @@ def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(
 def test_racks_that_never_met_are_placed_through_a_common_peer(tmp_path: Path) -> None:
     a, b = recorded(A, [], tmp_path / "a"), recorded(B, [A, C], tmp_path / "b")
     c = recorded(C, [], tmp_path / "c")
-    places = place_on_time_line([c, a, b])
+    places = align_racks([c, a, b])
     check_place(places[1], A, C)
     check_place(places[2], B, C)
     assert len(places[1].offsets) == 2
     with pytest.raises(Failure, match=r"rack 'c' and 'a' never met: no recording holds"):
-        place_on_time_line([a, c])
+        align_racks([a, c])
 
 
 def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
@@ -72,7 +72,7 @@ def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         Failure, match=r"not of the same run: 'a' met a launch of 'b' that began 60\.00\d s earlier"
     ) as refused:
-        place_on_time_line([one, later])
+        align_racks([one, later])
     assert refused.value.status == 2
     assert "\n" not in str(refused.value)
 
@@ -80,10 +80,10 @@ def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
 def test_one_rack_twice_and_two_modes_are_refused(tmp_path: Path) -> None:
     one = recorded(A, [B], tmp_path / "a")
     with pytest.raises(Failure, match="both are of rack 'a'"):
-        place_on_time_line([one, one])
+        align_racks([one, one])
     stepped = recorded(replace(B, mode="lockstep"), [A], tmp_path / "b")
     with pytest.raises(Failure, match=r"b ran in lockstep, .*a in real time"):
-        place_on_time_line([one, stepped])
+        align_racks([one, stepped])
 
 
 def test_in_lockstep_imported_messages_must_equal_the_senders_messages(tmp_path: Path) -> None:
@@ -93,4 +93,4 @@ def test_in_lockstep_imported_messages_must_equal_the_senders_messages(tmp_path:
         Failure,
         match=r"message that 'a' imported into lan\.other at 0\.0000 s is not one that 'b' wrote",
     ):
-        place_on_time_line([one, other])
+        align_racks([one, other])

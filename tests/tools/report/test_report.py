@@ -19,7 +19,7 @@ from rack.levels.systems.hand.messages import HandStatus
 from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.tools.console.tables import show_blocks
 from rack.tools.launch.launch import run_rack
-from rack.tools.launch.verdict import ACROSS_RACKS, judge_run
+from rack.tools.launch.verdict import ACROSS_RACKS, build_verdict
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from rack.tools.report import arm_outcome
@@ -157,7 +157,7 @@ def test_the_response_of_a_rack_that_imports_messages_is_not_judged(folder: Path
     assert response is not None
     assert response["crosses_racks"] is False
     ended = Recording(folder).end_counts
-    judged = judge_run(ended, response | {"crosses_racks": True})
+    judged = build_verdict(ended, response | {"crosses_racks": True})
     assert judged == {"worked": True, "failures": [], "unjudged": [ACROSS_RACKS]}
 
 

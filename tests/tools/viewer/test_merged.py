@@ -14,7 +14,7 @@ from rack.tools.launch.continued import RepeatedRun, load_branch_config
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
-from rack.tools.recording.time_line import place_on_time_line
+from rack.tools.recording.time_line import align_racks
 from rack.tools.viewer.merged import write_merged
 from rack.tools.viewer.pictures import NoViewerError, open_screen
 from rack.tools.viewer.reading import read_component
@@ -50,7 +50,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 @pytest.mark.slow
 def test_a_view_built_from_files_equals_the_recorders_view(run: Recording, tmp_path: Path) -> None:
-    write_merged(place_on_time_line([run]), tmp_path / "again.rrd", lambda part: None)
+    write_merged(align_racks([run]), tmp_path / "again.rrd", lambda part: None)
     again, live = read_contents(tmp_path / "again.rrd"), read_contents(run.folder / "run.rrd")
     # Losses and limits are written once per block, and the blocks differ.
     loose = ("/recorder/rows_lost", "limits")
@@ -63,7 +63,7 @@ def test_a_view_built_from_files_equals_the_recorders_view(run: Recording, tmp_p
 @pytest.fixture(scope="module")
 def merged_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("both")
-    places = place_on_time_line([recorded(A, [B], folder / "a"), recorded(B, [A], folder / "b")])
+    places = align_racks([recorded(A, [B], folder / "a"), recorded(B, [A], folder / "b")])
     shown: list[float] = []
     write_merged(places, folder / "both.rrd", shown.append)
     assert shown == sorted(shown)

@@ -29,7 +29,7 @@ class EarlyEnd:
         self._words = rack.segment.words
         self._hold_before(max(0, rack.begins_at))
 
-    def judge_if_held(self) -> None:
+    def evaluate_if_held(self) -> None:
         """If the rack is held, end it if all verdicts are final. Otherwise let it continue."""
         tick = self._words[System.HELD] - 1
         if tick < 0 or self.is_reached:

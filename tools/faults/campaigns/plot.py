@@ -33,14 +33,14 @@ def plot_campaign(report: CampaignReport, path: Path) -> None:
     order = report.order
     with open_figure([path], *SIZE_IN) as figure:
         for position, draw in zip(
-            _list_places(figure), (_draw_delays, _draw_sizes, _draw_recoveries), strict=True
+            _list_positions(figure), (_draw_delays, _draw_sizes, _draw_recoveries), strict=True
         ):
             draw(figure.add_subplot(position), report)
         title = f"Faults injected into {order.name}: {report.trials_text}, seed {order.seed}"
         figure.suptitle(title, fontsize=11)
 
 
-def _list_places(figure: Figure) -> Iterator[SubplotSpec]:
+def _list_positions(figure: Figure) -> Iterator[SubplotSpec]:
     """Yield the positions of the three charts: one on the left, two on the right."""
     # Fixed margins: the numbers beside the left chart and the names of kinds always need room.
     grid = figure.add_gridspec(

@@ -306,7 +306,7 @@ def _watch_run(
     while rack.watch(killer.compute_wait_s() if certainty is None else HELD_S):
         killer.kill_due_board()
         if certainty is not None:
-            certainty.judge_if_held()
+            certainty.evaluate_if_held()
         now_s = time.monotonic()
         if stopped and now_s > deadline:
             return

@@ -40,7 +40,7 @@ def replay_physics(folder: Path, ticks: int) -> list[float]:
     config = recording.rack_config
     cell = build_rack_cell(config)
     model = enable_sleep(cell.model, config.scene)
-    first, last = _find_longest_stretch(recording)
+    first, last = _find_longest_motion(recording)
     status = f"{SERVO_BOARD}.status"
     command_ticks = recording.read_signal(status, "tick")
     is_in_stretch = (command_ticks >= first) & (command_ticks < last)
@@ -74,7 +74,7 @@ def replay_physics(folder: Path, ticks: int) -> list[float]:
     return times_us
 
 
-def _find_longest_stretch(recording: Recording) -> tuple[int, int]:
+def _find_longest_motion(recording: Recording) -> tuple[int, int]:
     """Return the first and last tick of the longest stretch without brakes.
 
     Both are ticks at which the state of the arm was recorded.

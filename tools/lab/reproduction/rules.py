@@ -43,7 +43,7 @@ from rack.tools.lab.reproduction.verdict import (
     compare_value,
     describe_unmet,
     rule_on,
-    rule_on_strays,
+    rule_on_rare_event,
 )
 from rack.tools.timing.charts import figure5
 
@@ -109,12 +109,12 @@ def judge_growth(chains: Chains) -> ClaimVerdict:
     """Check that a chain of boards misses no cycles after more boards were added."""
     grown = chains.grown
     on_time = compare_value("messages_on_time", grown.took.get(grown.boards, 0), ">=", 1)
-    return rule_on_strays("cycles_missed", grown.missed, grown.due, on_time)
+    return rule_on_rare_event("cycles_missed", grown.missed, grown.due, on_time)
 
 
 def judge_locks(chains: Chains) -> ClaimVerdict:
     """Check that boards that lock, read and unlock, as the paper's do, miss no cycles."""
-    return rule_on_strays("cycles_missed", chains.locked.missed, chains.locked.due)
+    return rule_on_rare_event("cycles_missed", chains.locked.missed, chains.locked.due)
 
 
 def judge_pipeline(chains: Chains) -> ClaimVerdict:
@@ -161,7 +161,7 @@ def judge_flow(run: NasremRun) -> ClaimVerdict:
     missing = sum(max(0, run.due[box] - 1 - run.messages[box]) for box in boxes)
     used_ways = sum(any(run.messages[box] for box in way) for way in ways)
     due = sum(run.due[box] for box in boxes)
-    return rule_on_strays(
+    return rule_on_rare_event(
         "messages_lacking", missing, due, compare_value("ways", used_ways, "=", len(ways))
     )
 
@@ -170,7 +170,7 @@ def judge_loop(run: NasremRun) -> ClaimVerdict:
     """Check that no cycle was missed."""
     tasks = run.executors.values()
     bad = sum(task.missed for task in tasks)
-    return rule_on_strays("cycles_missed", bad, sum(task.cycles for task in tasks))
+    return rule_on_rare_event("cycles_missed", bad, sum(task.cycles for task in tasks))
 
 
 def judge_losses(*runs: LossesRun) -> ClaimVerdict:
@@ -284,7 +284,7 @@ def judge_waits(waits: Waits) -> ClaimVerdict:
 
 def judge_update(run: FigureRun) -> ClaimVerdict:
     """Check that no plan update is preempted, even if the executor is released during it."""
-    return rule_on_strays("updates_preempted", run.preempted, run.met)
+    return rule_on_rare_event("updates_preempted", run.preempted, run.met)
 
 
 def judge_concurrency(*runs: FigureRun) -> ClaimVerdict:
@@ -292,10 +292,10 @@ def judge_concurrency(*runs: FigureRun) -> ClaimVerdict:
     late = sum(run.tasks[LEVEL].late for run in runs)
     due = sum(run.tasks[LEVEL].jobs for run in runs)
     plans = min(run.tasks[PLANNER].jobs for run in runs)
-    return rule_on_strays("cycles_late", late, due, compare_value("plans", plans, ">=", 1))
+    return rule_on_rare_event("cycles_late", late, due, compare_value("plans", plans, ">=", 1))
 
 
-def _compare_late_share(run: FigureRun, sign: str, name: str = "late_share") -> Check:
+def _compare_largest_late_share(run: FigureRun, sign: str, name: str = "late_share") -> Check:
     """Compare the larger of the shares of late cycles and late plans with `FAILING_SHARE`."""
     return compare_value(
         name,
@@ -321,7 +321,9 @@ def _check_undisturbed(run: FigureRun) -> list[Check]:
 def judge_working(run: FigureRun) -> ClaimVerdict:
     """Check that no job is late in a figure that works according to the paper."""
     late = check_none(late=sum(count.late for count in run.tasks.values()))
-    return rule_on(ideal=late, here=[_compare_late_share(run, "<=")], needs=_check_undisturbed(run))
+    return rule_on(
+        ideal=late, here=[_compare_largest_late_share(run, "<=")], needs=_check_undisturbed(run)
+    )
 
 
 def judge_failing(paper_run: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
@@ -331,9 +333,11 @@ def judge_failing(paper_run: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
         paper_run: Run of the figure.
         shorter: Runs with the shortest X that the paper permits. They should fail as well.
     """
-    shortest = [_compare_late_share(run, ">", "shortest_X_late_share") for run in shorter]
+    shortest = [_compare_largest_late_share(run, ">", "shortest_X_late_share") for run in shorter]
     return rule_on(
-        _compare_late_share(paper_run, ">"), ideal=shortest, needs=_check_undisturbed(paper_run)
+        _compare_largest_late_share(paper_run, ">"),
+        ideal=shortest,
+        needs=_check_undisturbed(paper_run),
     )
 
 
@@ -363,8 +367,8 @@ def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
     count = sum(bool(describe_unmet(check_planning(process_ms))) for process_ms in PAPER_X_MS)
     return rule_on(
         compare_value("contradicting_X", count, ">=", 1),
-        _compare_late_share(short, "<=", "shortest_X_late_share"),
-        _compare_late_share(long, ">", "longest_X_late_share"),
+        _compare_largest_late_share(short, "<=", "shortest_X_late_share"),
+        _compare_largest_late_share(long, ">", "longest_X_late_share"),
         holding=Ruling.CONTRADICTS,
     )
 

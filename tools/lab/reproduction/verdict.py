@@ -115,7 +115,7 @@ def rule_on(
     return ClaimVerdict(ruling, tuple(dict.fromkeys((*needs, *always, *ideal, *here))))
 
 
-def rule_on_strays(name: str, bad: int, due: int, *needs: Check) -> ClaimVerdict:
+def rule_on_rare_event(name: str, bad: int, due: int, *needs: Check) -> ClaimVerdict:
     """Rule on an event that must not happen.
 
     The claim holds within bounds if the event happened in at most `MAX_STRAY_SHARE` of all cases.

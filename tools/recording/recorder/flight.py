@@ -57,7 +57,7 @@ class FlightRecorder:
             self._keep_around(self._words[System.TICK])
         self._path = self._begin_stretch(self._began, self._began)
 
-    def find_occasions(self, ring: str, rows: np.ndarray, lost: int) -> None:
+    def keep_occasions(self, ring: str, rows: np.ndarray, lost: int) -> None:
         """Keep the stretches around all occasions in new rows of a ring.
 
         Args:

@@ -168,7 +168,7 @@ class RecorderProcess:
             self._process.stdin.write(self._request)
             self._process.stdin.flush()
 
-    def read_news(self) -> list[str]:
+    def read_notices(self) -> list[str]:
         """Return new messages to the user since the last call. Restarts the recorder if it died.
 
         Raises:

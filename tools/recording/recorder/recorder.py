@@ -278,7 +278,7 @@ class Recorder:
             self._spool.add_rows(name, rows, lost)
             self._tally.add_rows(name, rows, lost)
             if self._flight is not None:
-                self._flight.find_occasions(name, rows, lost)
+                self._flight.keep_occasions(name, rows, lost)
             if self._view is not None:
                 self._view.add(name, rows)
         if self._is_follower:

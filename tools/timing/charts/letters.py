@@ -143,13 +143,13 @@ def choose_label_times(panel: Panel, column_ns: int) -> range:
     widest = LABEL_COLUMNS
     while widest > columns:
         columns = widest
-        step = choose_label_step(panel, columns * column_ns)
+        step = choose_label_interval(panel, columns * column_ns)
         times = range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)
         widest = max((len(format_ms(time)) + 2 for time in times), default=0)
     return times
 
 
-def choose_label_step(panel: Panel, narrowest_ns: int) -> int:
+def choose_label_interval(panel: Panel, narrowest_ns: int) -> int:
     """Return the time between two labels of the axis, in ns.
 
     It is the cycle of a lane, unless all cycles are too short or too long.

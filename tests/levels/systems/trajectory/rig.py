@@ -74,7 +74,7 @@ class TrajectoryRig:
 
     def _connect(self) -> None:
         for port, message in self.written.items():
-            self.level.place_output(port, message)
+            self.level.store_output(port, message)
 
     def message(self, kind: type[M]) -> M:
         if kind not in self._kinds:

@@ -55,7 +55,7 @@ class PlanningRig:
     def start(self) -> None:
         self.planner = RequestPlanner(self.context)
         self.request = MotionRequest.zeros(SIZES)
-        self.planner.place_output("plan", Sender(self.request, self._send, lambda: 1))
+        self.planner.store_output("plan", Sender(self.request, self._send, lambda: 1))
 
     def _send(self) -> bool:
         """Queue a copy if there is a free place."""

@@ -95,11 +95,11 @@ def parse_response(report: Mapping[str, Any] | None) -> SystemResponse | None:
     """
     if report is None or report["crosses_racks"]:
         return None
-    ways = {way: _parse_way_response(report[way]) for way in ("command", "status")}
+    ways = {way: _parse_direction(report[way]) for way in ("command", "status")}
     return SystemResponse(report["sum_eq_3_3_ms"], ways)
 
 
-def _parse_way_response(direction: Mapping[str, Any]) -> WayResponse:
+def _parse_direction(direction: Mapping[str, Any]) -> WayResponse:
     """Return the response in one direction from its entry in a report."""
     delays = [beyond["delayed_by"] for beyond in direction["beyond"]]
     times = direction["measured_ms"]
