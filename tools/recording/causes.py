@@ -189,13 +189,13 @@ class Divergence:
     def _has_read_difference(
         self, source: MailboxSpec, reader: str, message: DivergentMessage
     ) -> bool:
-        """Return True if a task read a differing input before it wrote a differing message.
+        """Return True if a task had read a differing input when it wrote a differing message.
 
         Args:
             source: Mailbox that the task reads.
             reader: The task.
-            message: The task's own first differing message. The input counts only if it was
-                visible in the cycle that wrote this message.
+            message: First differing message of a mailbox that the task writes. The input counts
+                only if it was visible in the cycle that wrote this message.
         """
         earlier = self.divergent.get(source.name)
         grid = self.runs[0].layout.find_read_grid(source, reader)
@@ -225,7 +225,11 @@ class Divergence:
             yield ValueDifference("basis", int(here["basis"]), int(there["basis"]))
 
     def _find_event_clues(self, box: MailboxSpec, message: DivergentMessage) -> Iterator[Clue]:
-        """Yield clues for events that only one run has and that concern the writer or the rack."""
+        """Yield a clue for each event that may have caused a differing message.
+
+        The event occurred in only one run, not later than the message, and concerns the writer of
+        the message or the whole rack.
+        """
         boards = {name.partition(".")[0] for name in (box.writer, box.name)}
         about = {CLOCK, box.writer, box.name, *boards}
         event_clues = [list(self._list_event_clues(run)) for run in self.runs]
@@ -233,8 +237,8 @@ class Divergence:
             event_clues, reversed(event_clues), self.runs, strict=True
         ):
             row = find_row(run, box, message.serial)
-            # A death is reported some time after the first message is missing. Accept deaths until
-            # the run wrote a message with this serial, or until its end if it wrote none.
+            # A death is reported only after messages are already missing. Accept deaths up to the
+            # tick at which the run wrote this serial, or up to its end if it never did.
             written = NEVER if row is None else int(row["tick"])
             unmatched = Counter(event.key for event in other_run)
             for event in this_run:
@@ -247,7 +251,7 @@ class Divergence:
                     yield event.clue
 
     def _list_event_clues(self, run: Recording) -> Iterator[EventClue]:
-        """Yield a clue for each death, fault, command or demand among the events of a run."""
+        """Yield a clue for each death, fault, command or demand since the first common tick."""
         for event in run.events:
             kind = CLUES_BY_EVENT.get(event.get("code")) or CLUES_BY_EVENT.get(event["kind"])
             if kind is not None and event["tick"] >= self._begin:

@@ -1,4 +1,4 @@
-"""Checksums of the files of a run, so that damage is reported and never taken for data.
+"""Checksums of the files of a run, so that damage is reported and never mistaken for data.
 
 `checksums.xxh128` has the format of `xxh128sum -c`. Because a run may be killed at any time, each
 line of events.jsonl also contains its own checksum.

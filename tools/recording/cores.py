@@ -92,7 +92,7 @@ class CoreMeter:
         self._frequency_at = 0.0
 
     def read_counters(self) -> None:
-        """Read the counters, and update stolen times and lowest and highest frequencies."""
+        """Read the counters, and update the stolen times and the frequency range of each core."""
         counts = _read_steal()
         now = time.monotonic_ns()
         if counts != self._counts:

@@ -135,7 +135,7 @@ def _find_settled_cycles(recording: Recording, task: str, ticks: np.ndarray) -> 
 
 
 def list_restarts(recording: Recording) -> dict[str, list[int]]:
-    """Return a dictionary from task to the ticks at which its restarted process rejoined."""
+    """Return a dictionary from task to the ticks at which it rejoined the rack after a restart."""
     rejoin_ticks: dict[str, list[int]] = {}
     for event in recording.events:
         if event.get("code") == "rejoined":
@@ -163,7 +163,15 @@ def measure_budgets(
 
 
 def compute_budgets(cycles_by_task: Mapping[str, Cycles], percentile: float) -> dict[str, Budget]:
-    """Return a dictionary from board to the budget that covers its cycles from `read_cycles`."""
+    """Compute the budget of each level from its measured cycles.
+
+    Args:
+        cycles_by_task: Cycles of each task, from `read_cycles`.
+        percentile: Percentage of the cycles that must fit into the budget.
+
+    Returns:
+        Dictionary from board to budget.
+    """
     executors = {
         name: cycles for name, cycles in cycles_by_task.items() if cycles.task.role == "executor"
     }
@@ -176,10 +184,10 @@ def compute_budgets(cycles_by_task: Mapping[str, Cycles], percentile: float) -> 
 
 
 def _compute_budget(executor: Cycles, planner: Cycles | None, percentile: float) -> Budget:
-    """Return the budget that covers the cycles of one level."""
+    """Compute the budget of one level. `planner` is None for a level without a planner."""
 
     def worst_time(cycles: Cycles, times_ns: np.ndarray) -> int:
-        """Return the percentile of a unit function's times. Excluded cycles are left out."""
+        """Return the percentile of a unit function's times, without excluded cycles."""
         return compute_percentile(times_ns[cycles.is_judged], percentile)
 
     planner_parts = {}

@@ -131,7 +131,7 @@ def find_common_ticks(first_run: Recording, second_run: Recording) -> tuple[int,
 
 
 def _check_complete(recording: Recording) -> None:
-    """Raise `Failure` if a recording lacks rows."""
+    """Raise `Failure` if rows are missing from a recording."""
     if recording.kept:
         why = recording.kept_text
     elif lost := sum(recording.lost_rows.values()):
@@ -142,7 +142,11 @@ def _check_complete(recording: Recording) -> None:
 
 
 def _check_comparable(first_run: Recording, second_run: Recording) -> None:
-    """Raise `Failure` if two runs are of racks that cannot be compared."""
+    """Raise `Failure` if the racks of two runs cannot be compared.
+
+    The boards of one rack must include all boards of the other. Mailboxes that both racks have must
+    have equal fields, and at least one mailbox must be recorded in both runs.
+    """
     both = f"{first_run.folder} and {second_run.folder}"
     boards, others = ([task.board for task in run.layout.tasks] for run in (first_run, second_run))
     # One rack may have additional boards, for example a board that only monitors.

@@ -153,7 +153,7 @@ def _load_issued_commands(recording: Recording) -> list[Request]:
 
 
 def _format_type(box: MailboxSpec) -> str:
-    """Return message type, version and size of a mailbox as text, to compare and to report."""
+    """Return message type, version and size of a mailbox as text, for comparison and errors."""
     return f"{box.message} {box.version}, {box.size} bytes"
 
 

@@ -39,6 +39,9 @@ def format_recorded_line(folder: Path, lasted_s: float) -> str:
 
 
 def measure_sizes(folder: Path, lasted_s: float) -> dict[str, float | None]:
-    """Return the size of a recording, and its size per simulated second, as plain data."""
+    """Return the size of a recording and its size per simulated second, in bytes.
+
+    The size per second is None if `lasted_s` is 0.
+    """
     size = measure_size(folder)
     return {"bytes": size, "bytes_per_s": round(size / lasted_s, 1) if lasted_s else None}

@@ -102,7 +102,10 @@ def summarize_steal(recording: Recording) -> Document:
 
 
 def summarize_frequency(recording: Recording) -> dict[str, dict[str, float]] | None:
-    """Return the lowest and highest frequency of each core in MHz, or None if not measured."""
+    """Return a dictionary from core to its lowest and highest frequency in MHz.
+
+    Returns None if no frequency was measured.
+    """
     return {str(core): {"min": low, "max": high} for core, low, high in recording.cores.mhz} or None
 
 
@@ -110,10 +113,10 @@ def list_holds(recording: Recording) -> list[Document]:
     """List every hold of every level, earliest first.
 
     Returns:
-        Entries with level, times in seconds, `by` and `why`. `by` is "operator" for a hold that an
-        operator commanded, and `why` is the command. `by` is "holding" for a hold by the level
-        itself, and `why` is the last reason in its status. `until_s` is None if the hold lasted
-        until the end of the run.
+        Entries with level, `by`, `why`, and the beginning, end and duration of the hold in s. If an
+        operator commanded the hold, `by` is "operator" and `why` is the command. If the level
+        itself began the hold, `by` is "holding" and `why` is the last reason in its status.
+        `until_s` is None if the hold lasted until the end of the run.
     """
     levels = [
         mailbox.removesuffix(".status")

@@ -9,9 +9,9 @@ from rack.tools.recording.signal import Trigger
 
 
 class VisibleMessages:
-    """Finds the message that readers of a mailbox see at a given tick of a run.
+    """Finds the newest message that is visible in a mailbox at a given tick of a run.
 
-    A mailbox is loaded when it is first used.
+    The messages of a mailbox are loaded when it is first used.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -19,7 +19,7 @@ class VisibleMessages:
         self._rows: dict[str, np.ndarray] = {}
 
     def find_row(self, mailbox: str, tick: int) -> np.ndarray | None:
-        """Return the newest row of a mailbox that is visible at `tick`, or None if none is."""
+        """Return the newest row of a mailbox that is visible at `tick`, or None."""
         rows = self._load_rows(mailbox)
         visible = np.flatnonzero(rows["visible_at"] <= tick)
         return rows[visible[-1]] if len(visible) else None
@@ -28,8 +28,8 @@ class VisibleMessages:
         """Find the ticks at which a condition becomes true for the readers of its mailbox.
 
         Returns:
-            The ticks at which a message that meets the condition becomes visible while the message
-            before it does not meet the condition. Earliest first, shape (ticks,).
+            Ticks at which a message becomes visible that meets the condition, although the previous
+            message does not. In ascending order, shape (ticks,).
         """
         rows = self._load_rows(condition.signal.mailbox)
         holds = condition.evaluate_messages(rows["message"])

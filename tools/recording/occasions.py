@@ -60,7 +60,9 @@ class Retention(NamedTuple):
     def find_missing_windows(
         self, segment: Segment, kept: Sequence[tuple[int, int]], ticks: int
     ) -> list[TickRange]:
-        """Find the ranges of ticks that should have been kept but are missing or incomplete.
+        """Find the ranges of ticks that should have been kept but were not kept completely.
+
+        These are the newest ticks of the run, and the ticks around each alarm.
 
         Args:
             segment: Segment of the rack, whose alarm rings still contain the last alarms.
@@ -98,9 +100,9 @@ class Occasions:
         }
 
     def find_alarm_ticks(self) -> Iterator[int]:
-        """Yield the ticks of the occasions among the alarms since the last call.
+        """Yield the ticks of alarms since the last call, except `ORDINARY_ALARMS`.
 
-        The first call yields all alarms that the alarm rings still contain.
+        The first call also yields earlier alarms that the alarm rings still contain.
         """
         for ring in self._alarms:
             rows = ring.read_new_rows().rows

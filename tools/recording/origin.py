@@ -105,7 +105,7 @@ def _compute_state(name: str) -> str:
 
 @dataclass(frozen=True)
 class Origin:
-    """Reference to the original run of a continuation, a run that begins at a tick of another.
+    """The original run of a continuation. A continuation begins at a tick of another run.
 
     Attributes:
         folder: Folder of the original run, as the user named it.
@@ -119,7 +119,7 @@ class Origin:
 
     @classmethod
     def from_run(cls, run: Recording, tick: int) -> Self:
-        """Return the origin for a continuation of `run` from `tick` on."""
+        """Return the origin of a continuation of `run` that begins at `tick`."""
         return cls(str(run.folder), tick, run.launch.created_ns)
 
     @classmethod

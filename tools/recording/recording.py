@@ -122,7 +122,7 @@ class Recording:
 
     @cached_property
     def rack_config(self) -> RackConfig:
-        """The resolved config. Raises `Failure` that lists all of its mistakes."""
+        """The resolved config. If it is invalid, raises `Failure` with a list of all mistakes."""
         try:
             return read_stored(self.config)
         except ConfigError as error:
@@ -240,14 +240,14 @@ class Recording:
     def find_gaps(
         self, lost: Mapping[str, int] | None = None, ticks: int | None = None
     ) -> list[Gap]:
-        """Find the ranges of ticks in which rows are missing. Merges overlapping ranges.
+        """Find the ranges of ticks in which rows are missing. Overlapping ranges are merged.
 
         Args:
             lost: Number of lost rows of each task and mailbox. Defaults to the counts at the end of
                 the run.
             ticks: Length of the run in ticks. Defaults to its recorded length. If `lost` counts
-                more rows of a ring than the files report, the additional rows are missing between
-                the last recorded row of the ring and this tick.
+                more rows of a ring than the files report, the additional rows are assumed to be
+                missing between the last recorded row of the ring and this tick.
         """
         lost = self.lost_rows if lost is None else lost
         ticks = self.end_counts.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
@@ -275,7 +275,11 @@ class Recording:
         return int(self.read_signal(name, "tick")[-1]) if name in self.mailboxes else -1
 
     def count_traced_cycles(self) -> dict[str, tuple[int, int]]:
-        """Return recorded and total number of cycles of each task that lacks trace records."""
+        """Count the cycles of each task that lacks trace records.
+
+        Returns:
+            Dictionary from task to its recorded and its total number of cycles.
+        """
         traced = {task.name: len(self.read_trace(task.name)) for task in self.layout.tasks}
         return {
             name: (rows, rows + self.lost_rows[name])
@@ -325,7 +329,7 @@ class Recording:
     def find_core_and_priority(self, task: TaskSpec) -> tuple[int, int]:
         """Return the core and the priority with which a task ran.
 
-        If the end of the run was not recorded, these are the settings of the config.
+        If the end of the run was not recorded, the values are taken from the config.
         """
         counted = self.find_task_counts(task.name)
         return counted.get("core", task.core), counted.get("priority", task.priority)

@@ -90,7 +90,8 @@ class Tally:
     Attributes:
         tasks: Names of the tasks, whose rings are traces.
         lost: Number of rows of each ring that were overwritten before they were read.
-        taken: Number of the last record read from each ring. Starts at `before`.
+        taken: Number of the last record read from each ring. Initially the constructor's `before`,
+            or 0.
         rows: Number of rows read from each ring.
         kept: Ranges of ticks [first, end) that were not deleted. Consecutive stretches are one
             range.
@@ -119,7 +120,10 @@ class Tally:
                     self.add_rows(*block)
 
     def begin_stretch(self, stretch: StretchHead) -> None:
-        """Adopt the counts at the head of a stretch. Earlier stretches may have been deleted."""
+        """Begin a stretch, and set the counts to those in its head.
+
+        If no stretch was deleted before it, rows that are missing before it count as lost.
+        """
         follows = stretch.number == self.stretch_number + 1
         if follows:
             # Rows are missing here only if the file of the previous stretch is damaged.
@@ -196,7 +200,7 @@ class RunFiles(Tally):
         self._signals = create_signal_tables(folder / f"{SIGNALS}{suffix}", layout)
 
     def begin_stretch(self, stretch: StretchHead) -> None:
-        """Begin a stretch. Rows of deleted stretches before it do not count as lost."""
+        """Begin a stretch. Deleted stretches before it are not recorded as a gap."""
         if stretch.number != self.stretch_number + 1:
             self._reached = {name: (stretch.begin - 1, lost) for name, lost in self.lost.items()}
         super().begin_stretch(stretch)
@@ -288,7 +292,7 @@ def count_spool(folder: Path) -> Tally | None:
 
 
 def _lock_spool(file: IO[bytes], path: Path) -> None:
-    """Lock a spool, so that no recorder and no other reader uses it.
+    """Lock a spool, so that no recorder and no other reader can use it.
 
     Waits up to `FINISH_S` for a recorder that is finishing after its launcher has ended.
 

@@ -105,7 +105,11 @@ class Signal(Column):
         return self.select_part(super().extract_values(messages))
 
     def select_part(self, values: np.ndarray) -> np.ndarray:
-        """Apply the index to values of the whole field, of shape (messages, *field shape)."""
+        """Return the indexed part of the values of the whole field.
+
+        Args:
+            values: Value of the field in each message, shape (messages, *shape of the field).
+        """
         place: Any = (slice(None), *self.index)
         selected: np.ndarray = values[place]
         return selected
@@ -148,7 +152,7 @@ def list_signals(box: MailboxSpec) -> list[Signal]:
 
 
 def find_mailbox(name: str, boxes: Sequence[MailboxSpec]) -> MailboxSpec:
-    """Return the mailbox with this name. Raises `Failure` with similar names if there is none."""
+    """Return the mailbox with this name. If there is none, raises `Failure` with similar names."""
     known = {box.name: box for box in boxes}
     if name not in known:
         raise _build_failure("mailbox", name, known, boxes)

@@ -95,8 +95,8 @@ class Stalls:
 def analyze_stalls(recording: Recording) -> tuple[Stalls, dict[int, Occupation]]:
     """Find the absences of cores in a run, and the late or skipped cycles that they caused.
 
-    While the clock's core is absent without steal, the whole machine may be stopped, so that time
-    counts as an absence of every core.
+    If the clock's core is absent without steal, the whole machine may be stopped. Such a time
+    therefore counts as an absence of every core.
 
     Returns:
         The summary, and a dictionary from core to the times at which it was absent.
@@ -177,16 +177,16 @@ class _CycleTable:
         return int(self.lost[among & is_hit].sum())
 
     def find_stall_ends(self) -> np.ndarray:
-        """Return the end times of all stalls, the times during which executors lost cycles.
+        """Return the end times of stalls. A stall is a period in which executors lost cycles.
 
-        Delays that overlap, on any core, count as one stall.
+        Overlapping delays of cycles count as one stall, even on different cores.
         """
         # Planners are left out, because their time slice may be longer than a stall.
         counted = (self.lost > 0) & (self.rows["flags"] & Flag.PLANNED == 0)
         return Occupation(self.due_ns[counted], self.resumed_ns[counted]).ends
 
     def find_clock_absences(self, events: list[Document]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the times between the due and the actual wake-ups of a late clock board.
+        """Find the due and the actual time of each late wake-up of the clock board.
 
         Args:
             events: Events of the run. Only events with code "clock_late" are used.
@@ -206,11 +206,11 @@ class _CycleTable:
         return due_ns, due_ns + late_ns
 
     def find_idle_spans(self, on_core: np.ndarray, is_shown: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return the span before each cycle on a core in which the cycle was due but no task ran.
+        """Return, for each cycle on a core, the span in which it was due but no task ran.
 
         Args:
             on_core: Mask of the cycles on that core.
-            is_shown: False if due times are unknown, as in lockstep. All spans are empty then.
+            is_shown: Whether due times show absences. If not, as in lockstep, all spans are empty.
 
         Returns:
             Start and end time of each span, in ns of CLOCK_MONOTONIC.
@@ -244,9 +244,9 @@ def _detect_quota(ends: np.ndarray, periods_ns: dict[str, int]) -> Quota | None:
 
 
 def _count_at_one_phase(ends: np.ndarray, period_ns: int) -> int:
-    """Return the largest number of end times that fall into one window of the period.
+    """Return the largest number of end times that have about the same phase in a period.
 
-    The window has the same phase in every period. Its width is `WINDOW_PART` of `QUOTA_NS`.
+    Their phases lie within a window whose width is `WINDOW_PART` times `QUOTA_NS`.
     """
     phases = np.sort(ends % period_ns)
     around = np.append(phases, phases + period_ns)

@@ -126,7 +126,7 @@ class RackAlignment:
     Attributes:
         grid: Grid of the rack.
         reference_grid: Grid of the first rack.
-        offsets: Clock offsets that convert, one after the other, from the rack's machine to the
+        offsets: Clock offsets that are applied in order to convert from the rack's machine to the
             first rack's machine. Empty if both racks have the same ticks, as in lockstep, and for
             the first rack itself.
         is_tick_aligned: True if two runs of the same rack are aligned tick by tick.
@@ -195,7 +195,10 @@ class RackAlignment:
 
 
 def align_racks(recordings: Sequence[Recording]) -> list[RackAlignment]:
-    """Return the conversion of each recorded rack's times to the time line of the first rack.
+    """Align recorded racks on the time line of the first rack.
+
+    Returns:
+        Conversion of the times of each rack, in the order of `recordings`.
 
     Raises:
         Failure: The racks did not run together, or no recorded clock offsets connect them.
@@ -262,7 +265,10 @@ def align_runs(recordings: Sequence[Recording]) -> list[RackAlignment]:
 
 
 def _check_compatible(grid: RackGrid, others: Sequence[RackGrid]) -> None:
-    """Raise `Failure` if a rack cannot share a time line with one of the others."""
+    """Raise `Failure` if a rack cannot share a time line with one of the others.
+
+    Their names must differ, and either all racks or none must have run in lockstep.
+    """
     for other in others:
         if other.rack == grid.rack:
             where = f"{other.recording.folder} and {grid.recording.folder}"

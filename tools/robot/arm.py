@@ -53,13 +53,12 @@ class ArmParts:
 
 
 def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts:
-    """Find an arm by its tip or its joints. By default it is the longest one in the model.
+    """Find an arm by its tip or its joints, or else the longest arm of the model.
 
     Args:
         model: The compiled model.
-        tip: Body or site at the end of the arm. Empty to choose the arm by its joints, or else the
-            longest one.
-        joints: Joints of the arm, base to tool. Empty to take all between base and tip.
+        tip: Body or site at the end of the arm. Empty to choose the arm by `joints`.
+        joints: Joints of the arm, base to tool. Empty for all joints between base and tip.
 
     Raises:
         RobotError: A name is unknown, the model has no arm, or some joints have no drive.
@@ -85,7 +84,7 @@ def find_arm(model: mujoco.MjModel, tip: str, joints: Sequence[str]) -> ArmParts
             chain = chain[: chain.index(cut)]
         # If no joint of the chain is driven, --torque states the limits of all of them.
         driven_in_chain = driven & {*chain} or {*chain}
-        # A mobile base is held still: skip passive joints and slides without limits.
+        # Joints of a mobile base do not belong to the arm: skip passive joints and endless slides.
         while chain and (chain[0] not in driven_in_chain or _is_endless(model, chain[0])):
             chain = chain[1:]
         joints = [_joint_name(model, joint) for joint in chain]
@@ -134,7 +133,7 @@ def fix_joints(path: Path, moving_joints: Iterable[str]) -> list[str]:
     well.
 
     Args:
-        path: The file, as MuJoCo writes it. It is overwritten.
+        path: The file, which MuJoCo has written. It is overwritten.
         moving_joints: Names of the joints that remain movable.
 
     Returns:
@@ -182,7 +181,7 @@ def fix_joints(path: Path, moving_joints: Iterable[str]) -> list[str]:
 
 
 def _refers_to_removed(element: ElementTree.Element, removed: set[tuple[str, str]]) -> bool:
-    """Return whether an element, or one inside it, refers to a removed element."""
+    """Return True if an element, or one inside it, refers to a removed element."""
     for inner in element.iter():
         for key, value in inner.items():
             is_typed = key in ("objname", "refname")
@@ -234,7 +233,7 @@ def _find_longest_arm(
 
 
 def _is_endless(model: mujoco.MjModel, joint: int) -> bool:
-    """Return whether a joint is a slide without limits."""
+    """Return True if a joint is a slide without limits."""
     return bool(model.jnt_type[joint] == SCALAR_JOINTS[1] and not model.jnt_limited[joint])
 
 

@@ -53,9 +53,9 @@ BLOCK_PLACES = ((-0.04, -0.1), (0.04, -0.26), (-0.04, 0.1), (0.04, 0.26))
 MAX_TABLES = 4
 """Maximum number of tables on which the whole task is rehearsed."""
 SEARCH_S = 15.0
-"""Processor time for the search for a table, roughly. After that the arm gets a tour."""
+"""Approximate processor time after which the search for a table ends and a tour is planned."""
 REHEARSAL_S = 10.0
-"""Processor time for the task on one table.
+"""Longest processor time for planning the task on one table.
 
 Successful rehearsals took at most 1.6 s. Without a path between the blocks, each attempt to find
 one takes 2 s.
@@ -115,7 +115,7 @@ def find_assignment(draft: Draft) -> Assignment:
 
 
 def _find_transfers(draft: Draft, gripper: FittedGripper) -> Assignment | str:
-    """Find a table on which the arm can move two blocks, or return why this failed."""
+    """Find a table on which the arm can move two blocks. If there is none, return the reason."""
     cell = draft.cell()
     fingertips = gripper.fingertips
     width = min(fingertips.block_width, MAX_BLOCK_M)
@@ -185,7 +185,7 @@ def _locate_base(cell: Cell) -> Array:
 
 
 def _list_table_spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
-    """Yield positions to try for a table, for at most `SEARCH_S` of processor time."""
+    """Yield candidate positions of table and blocks until `SEARCH_S` of processor time is used."""
     base = _locate_base(cell)
     end = time.process_time() + SEARCH_S
     for height, distance, front in itertools.product(
@@ -201,7 +201,7 @@ def _list_table_spots(cell: Cell, reach: float) -> Iterator[TableSpot]:
 
 
 def _can_reach_blocks(cell: Cell, spot: TableSpot, half_height: float, lift: float) -> bool:
-    """Return whether the tool can be lowered to every block position.
+    """Return True if the tool can be lowered to every block position.
 
     Args:
         cell: The arm.
@@ -214,7 +214,7 @@ def _can_reach_blocks(cell: Cell, spot: TableSpot, half_height: float, lift: flo
     restarts = MAX_RESTARTS if len(cell.qpos) >= FULL_ORIENTATION else LEANING_RESTARTS
 
     def is_reached(place: Array) -> bool:
-        """Return whether the tool can be lowered to a position, for some finger direction."""
+        """Return True if the tool can be lowered to a position with any finger direction."""
         for quarter in QUARTER_TURNS:
             orientation = build_pointing_quaternion(DOWN, -(spot.direction + 0.5 * np.pi * quarter))
             placed = make_pose([*place, spot.top + half_height], orientation)
@@ -289,7 +289,12 @@ class _TimedMotionPlanner(MotionPlanner):
 
 
 def _rehearse_program(draft: Draft, scene: SceneConfig, actions: list[Document]) -> Rehearsal:
-    """Plan a whole program. Raises `Refused`, or `RobotError` if the start is in contact."""
+    """Plan a whole program.
+
+    Raises:
+        Refused: A motion cannot be planned.
+        RobotError: The cell is invalid, or the arm is in contact at the start.
+    """
     cell = draft.cell(scene)
     check_start(cell, draft.robot, "home", cell.home)
     data = cell.build_start_data()
@@ -299,7 +304,7 @@ def _rehearse_program(draft: Draft, scene: SceneConfig, actions: list[Document])
 
 
 def _find_tour(draft: Draft) -> Assignment:
-    """Find poses that can be reached one after the other. Raises `RobotError` if none can."""
+    """Find poses that can be reached one after the other. Raises `RobotError` if there are none."""
     cell = draft.cell()
     check_start(cell, draft.robot, "home", cell.home)
     planner = MotionPlanner(cell, EMPTY_SCENE, SEED)

@@ -75,7 +75,7 @@ EMPTY_SCENE = SceneConfig()
 
 @dataclass(frozen=True)
 class ArmOptions:
-    """Options of the user. An empty option leaves the choice to the draft."""
+    """Options that the user gave. For an empty option, `draft_arm` chooses a value."""
 
     tip: str = ""
     joints: tuple[str, ...] = ()
@@ -86,7 +86,7 @@ class ArmOptions:
 
 
 class FittedGripper(NamedTuple):
-    """A usable gripper, and the measures of what its fingers can grasp."""
+    """A usable gripper, and the measurements of its fingers."""
 
     config: GripperConfig
     fingertips: Fingertips
@@ -162,7 +162,7 @@ class Draft:
 
     @property
     def guessed(self) -> dict[str, str]:
-        """Keys of the table whose values are guesses, each with its reason."""
+        """Dictionary from each key whose value is a guess to the reason for the guess."""
         limits = self.limits
         torque = f"{TORQUE_MARGIN:g} times what weight, friction and inertia take"
         reasons = {
@@ -180,7 +180,7 @@ class Draft:
 
     @property
     def robot(self) -> RobotConfig:
-        """The table, validated. Raises `RobotError`."""
+        """The validated table. Raises `RobotError` if a value is invalid."""
         try:
             return RobotConfig(**self.table, guessed=tuple(self.guessed))
         except ValidationError as error:
@@ -191,12 +191,12 @@ class Draft:
     def cell(self, scene: SceneConfig = EMPTY_SCENE, **changes: Any) -> Cell:
         """Build the cell of the arm as drafted so far.
 
-        Keyword arguments override keys of the table. Raises `RobotError`.
+        Keyword arguments override keys of the table. Raises `RobotError` if the cell is invalid.
         """
         return build_unchecked_cell(self.robot.model_copy(update=changes), scene, CLOCK_NS)
 
     def write_model(self) -> None:
-        """Write the model to its file. Raises `RobotError`."""
+        """Write the model to its file. Raises `RobotError` if it cannot be compiled."""
         compile_spec(self.spec, self.model)
         self.model.write_text(self.spec.to_xml(), encoding="utf-8")
 
@@ -318,7 +318,7 @@ def _read_limits(
 
 
 def _find_mount(model: mujoco.MjModel, tip: str) -> str:
-    """Find the last body fixed to the tip of an arm, preferably one named like a tool."""
+    """Find a body fixed to the tip of an arm: one named like a tool, or else the last one."""
     carried = [model.body(tip).id]
     for body in range(carried[0] + 1, model.nbody):
         if model.body_parentid[body] in carried and not model.body_jntnum[body]:
@@ -400,8 +400,8 @@ def find_touching_bodies(
         cell: The arm and its surroundings.
         data: Simulation data of the cell, which this function sets to the pose.
         q: Positions of the joints, (joints,), in rad.
-        skin_m: Distance in m below which bodies count as touching. The geoms must have at least
-            half of it as margin.
+        skin_m: Distance in m below which bodies count as touching. The margin of each geom
+            must be at least half of it.
 
     Returns:
         Names of the bodies, sorted within each pair.
@@ -492,7 +492,9 @@ def find_home(
     low, high = cell.limits.position.T
 
     def compute_spare_torque(q: Array) -> float:
-        """Return the smallest fraction of torque left to a joint at rest, minus the minimum.
+        """Return the smallest torque reserve of a joint at rest, minus the required reserve.
+
+        Reserves are fractions of the joints' torque limits.
 
         Returns -1 for a pose out of range or in contact.
         """
@@ -516,7 +518,7 @@ def find_home(
     set_margins(cell.model, 0.5 * PREFERRED_CLEARANCE_M)
 
     def rate_pose(q: Array) -> float:
-        """Return a score from spare torque, tool direction (best downward) and clearance."""
+        """Score a pose by spare torque, clearance, and how far downward the tool points."""
         # Forward kinematics at `q` is a side effect of `find_touching_bodies`.
         is_near = bool(find_touching_bodies(cell, data, q, PREFERRED_CLEARANCE_M))
         downward = -float(data.site_xmat[cell.tool, 8])

@@ -43,7 +43,7 @@ class ArmExamination:
 
 
 def examine_arm(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> ArmExamination:
-    """Examine an arm in its cell. Contacts at home are reported instead of refused.
+    """Examine an arm in its cell. Contacts at home are reported as findings, not as errors.
 
     Args:
         robot: Table of the arm.
@@ -60,7 +60,7 @@ def examine_arm(robot: RobotConfig, scene: SceneConfig, clock_ns: int) -> ArmExa
 
 
 def _list_joints(cell: Cell, robot: RobotConfig) -> Iterator[Document]:
-    """Yield a record of figures for each joint."""
+    """Yield axis, limits, home position and gravity load of each joint."""
     data = cell.build_start_data()
     left, _ = Statics(cell).compute_load_limits(cell.home)
     for k, name in enumerate(robot.joints):
@@ -151,7 +151,10 @@ def _describe_fingers(cell: Cell, scene: SceneConfig) -> str:
 
 
 def _find_coupling_error(cell: Cell, config: GripperConfig) -> str:
-    """Return why the fingers do not settle where planning assumes them. Empty if they do."""
+    """Return the reason why the fingers do not settle at the positions that planning assumes.
+
+    Empty if they do.
+    """
     try:
         check_fingers(cell, config)
     except RobotError as error:

@@ -52,7 +52,7 @@ LOOSELY_ALIGNED_COSINE = 0.9
 
 
 class Fingertips(NamedTuple):
-    """Measures of what two fingers, or a finger and a jaw, can grasp."""
+    """Measurements of two fingers, or of a finger and a jaw, that limit what they can grasp."""
 
     tool: ToolConfig  # z out of the hand, y across
     opening: float  # m or rad: the widest at which they face each other
@@ -111,7 +111,7 @@ def measure_fingertips(cell: Cell, tip: str, has_one_finger: bool = False) -> Fi
 
 
 class _Fingers:
-    """Solid geoms of a gripper that can be posed from open to closed."""
+    """Solid geoms of a gripper, which can be moved between open and closed."""
 
     def __init__(self, cell: Cell, tip: str, is_one: bool) -> None:
         assert cell.gripper is not None, "there are fingers"
@@ -153,9 +153,9 @@ class _Fingers:
         self.across = _snap_to_axis(across - out * (across @ out), axes)  # (3,)
 
     def to_joint_position(self, closed_fraction: float) -> float:
-        """Return the position of the driven joint in m or rad.
+        """Convert a closed fraction to a position of the driven joint in m or rad.
 
-        `closed_fraction` is 0 for open and 1 for closed.
+        The fraction is 0 for open and 1 for closed.
         """
         return self._gripper.open + closed_fraction * (self._gripper.closed - self._gripper.open)
 
@@ -169,9 +169,9 @@ class _Fingers:
         return np.array(self.data.geom_xpos[self.geoms])
 
     def measure_gap(self, at: Array) -> tuple[float, float]:
-        """Measure the distances in m from a point to the fingers on both sides.
+        """Measure the distances in m from a point to the finger or jaw on each side.
 
-        A distance is infinite if there is no finger in that direction.
+        A distance is infinite if there is neither in that direction.
         """
         other = JAW_GROUP if self.is_one else FINGER_GROUP
         return self._cast_ray(at, self.across, FINGER_GROUP), self._cast_ray(
@@ -179,7 +179,7 @@ class _Fingers:
         )
 
     def list_points(self) -> list[Array]:
-        """List points between the fingers, or beside a fixed jaw, the outermost first."""
+        """List points between the fingers, or beside a fixed jaw, outermost first."""
         points = [self._middle + self.out * step * STEP_M for step in range(60, -40, -1)]
         if not self.is_one:
             return points
@@ -208,7 +208,7 @@ def choose_outward_tool(cell: Cell, body: str) -> tuple[str, ToolConfig | None]:
         body: Body at the end of the arm.
 
     Returns:
-        A site of the model, or the body with the pose of the tool on it.
+        Name of a suitable site and None, or name of the body and the tool's pose relative to it.
     """
     model = cell.model
     data = cell.build_start_data()

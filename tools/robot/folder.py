@@ -65,19 +65,19 @@ def _format_tables(draft: Draft, layout: Assignment, name: str) -> Iterator[str]
 
 
 def _format_keys(table: Mapping[str, Any], guessed: Mapping[str, str]) -> Iterator[str]:
-    """Yield a line of TOML for each key, with the reason of a guess as a comment."""
+    """Yield a line of TOML for each key, with the reason for a guess as a comment."""
     # JSON and TOML write numbers, strings and lists in the same way.
     for key, value in table.items():
         yield f"{key} = {encode_json(value)}" + _format_guess(guessed.get(key))
 
 
 def _format_guess(guess: str | None) -> str:
-    """Return a TOML comment that marks a guess, or an empty text without one."""
+    """Return a TOML comment with the reason for a guess, or "" if the value is not a guess."""
     return f"  # guessed: {guess}" if guess else ""
 
 
 def build_document(draft: Draft, layout: Assignment, folder: Path, name: str) -> dict[str, Any]:
-    """Build the answer to `--json`.
+    """Build the document that `--json` prints.
 
     Args:
         draft: The arm.

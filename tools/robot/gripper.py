@@ -157,7 +157,7 @@ def _measure_finger(
 
 
 def _compute_centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Array:
-    """Compute the centre of the geoms of a body and of those it carries, (3,), in m."""
+    """Compute the mean position of the geoms of a body and all bodies on it, (3,), in m."""
     geoms = list_geoms(model, mark_descendants(model, np.array([body])))
     if not len(geoms):
         return np.asarray(data.xipos[body])
@@ -165,7 +165,7 @@ def _compute_centre(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> Ar
 
 
 def _group_coupled_joints(model: mujoco.MjModel, arm: ArmParts) -> list[set[str]]:
-    """Group the joints of the gripper. Joints that equalities couple are in one group."""
+    """Group the joints of the gripper, so that joints coupled by equalities are in one group."""
     groups = [{name} for name in arm.fingers]
     for equality in range(model.neq):
         tied = {model.joint(joint).name for joint in find_coupled_joints(model, equality)} & {

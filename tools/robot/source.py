@@ -46,7 +46,7 @@ class Source:
     notes: list[str] = field(default_factory=list)  # changes that were made, one sentence each
 
     def compile_model(self) -> mujoco.MjModel:
-        """Compile the model in its current state. Raises `RobotError`."""
+        """Compile the model in its current state. Raises `RobotError` if it is invalid."""
         return compile_spec(self.spec, self.path)
 
 
@@ -91,7 +91,7 @@ def read_source(path: Path) -> Source:
 
 
 def _convert_urdf(path: Path, root: ElementTree.Element) -> Source:
-    """Convert a URDF, fixing its planar joints. Raises `RobotError`."""
+    """Convert a URDF, and fix its planar joints. Raises `RobotError` if it is invalid."""
     _check_tree(path, root)
     notes = _prepare_shapes(path, root)
     for joint in root.findall("joint[@type='planar']"):
@@ -131,7 +131,7 @@ def _check_tree(path: Path, root: ElementTree.Element) -> None:
 
 
 def _prepare_shapes(path: Path, root: ElementTree.Element) -> list[str]:
-    """Prepare the collision shapes of a URDF. Links without them use their visible shapes.
+    """Prepare the collision shapes of a URDF. A link without any gets its visible shapes.
 
     Returns notes for the user. Raises `RobotError` if no link has a shape that can be read.
     """
@@ -164,7 +164,7 @@ def _prepare_shapes(path: Path, root: ElementTree.Element) -> list[str]:
 
 
 def _is_only_visible(link: ElementTree.Element) -> bool:
-    """Return whether a link has visible shapes but no collision shapes."""
+    """Return True if a link has visible shapes but no collision shapes."""
     return link.find("collision") is None and link.find("visual") is not None
 
 
@@ -202,7 +202,7 @@ def _prepare_link_shapes(path: Path, link: ElementTree.Element, folder: str) -> 
 
 
 def _find_mesh(path: Path, name: str, meshes: str) -> Path:
-    """Find the file of a mesh. Raises `RobotError`.
+    """Find the file of a mesh. Raises `RobotError` if there is none or it cannot be used.
 
     Packages are searched for in all folders above the model. For a mesh in a format that MuJoCo
     does not read, a file of the same name in another format is accepted.

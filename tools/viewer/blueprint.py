@@ -134,7 +134,7 @@ def _build_common_log(racks: Mapping[str, RackViews], what: str) -> rrb.View:
 
     Args:
         racks: Dictionary from the name of each rack to its views.
-        what: What the racks are called in the title, "racks" or "runs".
+        what: Word for the racks in the title, "racks" or "runs".
     """
     logs = [f"{build_path(LOG)}/**", *(views.build_query(LOG) for views in racks.values())]
     return rrb.TextLogView(
@@ -171,7 +171,7 @@ class RackViews:
         return f"{self.build_path(*entity)}/**"
 
     def build_all_views(self, name: str | None = None) -> rrb.Container:
-        """Return a container with the title `name` that contains all views of the rack."""
+        """Return a container, titled `name`, with all views of the rack."""
         level_lanes = build_lanes_view(
             "levels and events, whole run", [self.build_query(EVENTS), self.build_query(LEVELS)]
         )
@@ -201,10 +201,10 @@ class RackViews:
         return rrb.Horizontal(left, right, column_shares=[2, 3], name=name)
 
     def list_main_curves(self) -> dict[str, list[str]]:
-        """Return a dictionary from plot title to the entities whose curves two runs compare.
+        """Return a dictionary from the title of each main plot to the entities of its curves.
 
-        The plots show tracking error, position, velocity and torque of the arm or, without an arm,
-        all fields of all messages.
+        The main plots are shown when two runs are compared. They contain tracking error, position,
+        velocity and torque of the arm or, without an arm, all fields of all messages.
         """
         if not self._joints:
             boxes = self._layout.mailboxes
@@ -294,11 +294,11 @@ class RackViews:
         ]
 
     def _list_field_paths(self, mailbox: MailboxSpec, *names: str) -> list[str]:
-        """Return the paths of the curves of these fields of a mailbox."""
+        """Return the entity paths at which the given fields of a mailbox are plotted."""
         return [self.build_path(SIGNALS, mailbox.name, name) for name in names]
 
     def _build_legend(self, what: str, name: str, names: Sequence[str]) -> rrb.View:
-        """Return the view of a legend that `write_legend` wrote.
+        """Return a view of the legend that `write_legend` wrote.
 
         Args:
             what: Name of the legend.
@@ -308,7 +308,10 @@ class RackViews:
         return build_legend_view(self.build_path(LEGEND, what), name, names)
 
     def _build_force_plots(self) -> list[rrb.View]:
-        """Return plots of contact forces with their limits. Empty without a wrist sensor."""
+        """Return plots of wanted and exerted forces, and of contact forces with limits.
+
+        Empty without a wrist sensor.
+        """
         if self._cell is None or self._cell.wrist is None:
             return []
         views = [
@@ -372,7 +375,7 @@ class RackViews:
         return _build_plot("signals", [self.build_query(SIGNALS)], True)
 
     def _build_load_plots(self) -> rrb.Container | rrb.View:
-        """Return plots of execution times and, in real time, of the use of the time slices."""
+        """Return plots of execution times and, in real time, of the used parts of time slices."""
         times = self.build_query(timing.TIMES)
         if self._config.clock.mode == "lockstep":
             return _build_plot("execution, ms", [times])

@@ -131,7 +131,7 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
 
 
 class PoseWriter:
-    """Writes the poses of all moving bodies, and points of the tool, from `ArmState` messages.
+    """Writes the poses of all moving bodies, and the tool's positions, from `ArmState` messages.
 
     The poses are computed by MuJoCo's kinematics. With `has_pushes`, the forces with which the
     scene pushes objects are written as arrows.
@@ -194,7 +194,7 @@ class PoseWriter:
         )
 
     def _write_pushes(self, when: Moment) -> None:
-        """Write the pushes that act on objects at a moment, or clear them when they have ended."""
+        """Write arrows for the pushes on objects at a moment, or clear them after the last push."""
         objects = self._cell.bodies
         forces = self._data.xfrc_applied[objects, :3]
         pushed = forces.any(axis=1)
@@ -238,7 +238,8 @@ class MarkWriter:
 
         Args:
             when: Time of the event.
-            event: The begin or end of a fault. A fault that concerns no joint marks the first one.
+            event: Beginning or end of a fault. If the fault concerns no joint, the first joint is
+                marked.
         """
         joint = event.subject if event.subject in self._joints else next(iter(self._joints))
         if event.code == "begins":
@@ -265,7 +266,10 @@ class MarkWriter:
 
 
 def compute_extent(cell: Cell) -> tuple[Array, float]:
-    """Return centre, shape (3,), and radius of a sphere around arm and objects, both in m."""
+    """Return centre and radius in m of a sphere that encloses the arm and the objects.
+
+    The centre has shape (3,).
+    """
     data = cell.build_start_data()
     model = cell.model
     geoms = np.union1d(
@@ -289,7 +293,7 @@ def build_path_part(stream: Stream, cell: Cell) -> ViewPart:
     """Return the view part that shows a `MovePlan` as path of the tool with way points.
 
     The path is shown from the tick at which the plan becomes visible. A plan without a path, for
-    example for the gripper, clears it.
+    example for the gripper, clears the path.
     """
     data = cell.build_start_data()
     for entity in (PATH, WAYPOINTS):
@@ -364,7 +368,7 @@ class GoalWriter:
             self._stream.log_at(block.find_visible_moment(row), GOALS, points)
 
     def write_status(self, block: RowBlock) -> None:
-        """Write the goal of the current move whenever it changes in a block of `MoveStatus`."""
+        """Write the new goal at each change of the current move in a block of `MoveStatus`."""
         for row in self._current_rows(block.messages["current"]):
             current = int(block.messages["current"][row])
             goals = [self._goals[current]] if current in self._goals else []

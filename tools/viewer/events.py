@@ -72,7 +72,7 @@ class EventWriter:
                 self._write(Event(**event))
 
     def _write(self, event: Event) -> None:
-        """Write an event to the log and its lane, and a fault or lost board to other views too."""
+        """Write an event to the log and its lane. Faults and lost boards go to other views too."""
         board = event.board or RACK_LANE
         when = Moment(max(0, event.tick), self._stream.times.to_monotonic(event.time_ns))
         text = f"{event.kind}: {board}: {event.text}"

@@ -60,7 +60,7 @@ class ContactPoint(NamedTuple):
         return f"contact/{self.name}"
 
     def compute_pose(self, data: mujoco.MjData) -> tuple[Array, Array]:
-        """Return position (in m) and quaternion (w first) of the frame for the poses in `data`."""
+        """Return position in m and quaternion (w first) of the frame for the poses in `data`."""
         quaternion = np.array([1.0, 0.0, 0.0, 0.0])
         if self.orientation_site is not None:
             mujoco.mju_mat2Quat(quaternion, data.site_xmat[self.orientation_site])

@@ -60,7 +60,7 @@ def format_serial(serial: int) -> str:
 
 
 def format_step(step: tuple[int, int]) -> str:
-    """Format a step of a grasp. `step` contains the number of earlier steps and the kind."""
+    """Format a step of a grasp, given as number of earlier steps and kind of step."""
     return f"{step[0] + 1} {format_enum(GraspKind, step[1])}"
 
 
@@ -96,7 +96,7 @@ def build_state_lane(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]
 
 
 def build_fired_lane(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
-    """Return the view part that shows which row of a state table fires, in a lane and the log."""
+    """Return the view part that writes the fired row of a state table to a lane and the log."""
     board = mailbox.name.partition(".")[0]
     changed_rows = build_change_finder()
 

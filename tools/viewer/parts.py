@@ -10,7 +10,7 @@ FILE = "run.rrd"
 
 
 def list_part_names(file: Path) -> Iterator[Path]:
-    """Yield the names of a file and of all possible further parts: run.rrd, run-2.rrd and so on."""
+    """Yield a file name, then the names of its possible further parts: run-2.rrd and so on."""
     yield file
     for part in count(2):
         yield file.with_stem(f"{file.stem}-{part}")

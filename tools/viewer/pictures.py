@@ -74,7 +74,7 @@ class Screen:
 
     @property
     def views(self) -> dict[str, str]:
-        """Dictionary from the name of each view that the viewer shows to its id."""
+        """Dictionary from name to id of all views that the viewer shows."""
         return {view.name: view.view_id for view in self._client.get_state().views}
 
     def take_picture(self, at_s: float, view: str | None = None) -> Picture:
@@ -153,14 +153,14 @@ def _explain_failure(window: ViewerWindow, otherwise: object) -> str:
 
     Args:
         window: The viewer. If it has ended with an error, that error is the reason.
-        otherwise: The reason in any other case.
+        otherwise: The reason to return in any other case.
     """
     reason = window.wait_until_closed() if window.wait_for_end(DYING_S) else otherwise
     return f"{reason}; {describe_missing_packages()}"
 
 
 def describe_missing_packages() -> str:
-    """Return a clause with the missing packages for drawing without a graphics card."""
+    """Return a clause that names the packages missing for drawing without a graphics card."""
     if shutil.which("dpkg-query") is None:
         return f"without a graphics card, these Debian packages are needed: {' '.join(PACKAGES)}"
     query = ["dpkg-query", "--show", "--showformat", "${Package} ${Status}\\n", *PACKAGES]

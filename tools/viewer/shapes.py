@@ -102,7 +102,7 @@ def _build_surface(
 
     Args:
         model: The model.
-        geom: The geom that has these triangles, and whose pose and colour they get.
+        geom: The geom that consists of these triangles. It determines their pose and colour.
         vertices: Positions in m in the frame of the geom, shape (n, 3).
         triangles: Indices of the vertices of each triangle, shape (triangles, 3).
     """

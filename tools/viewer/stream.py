@@ -212,7 +212,7 @@ def build_row_sampler(clock_ns: int) -> Callable[[Ints], Ints]:
     last = -1
 
     def sampled_rows(ticks: Ints) -> Ints:
-        """Return the index of the first row of each interval, which may span several blocks."""
+        """Return the index of the first row of each interval. Intervals may span blocks."""
         nonlocal last
         slots, first = np.unique(ticks // every, return_index=True)
         chosen = first[slots > last]
@@ -341,7 +341,7 @@ class Stream:
         self._recording.send_property(" ".join((*self._root, name)), values)
 
     def flush(self) -> None:
-        """Write all pending data to the file. Raises `RuntimeError` if that is not possible."""
+        """Write all pending data to the file. Raises `RuntimeError` if they cannot be written."""
         self._recording.flush(timeout_sec=FLUSH_S)
 
     def continue_in(self, file: Path) -> None:

@@ -65,7 +65,7 @@ def build_cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: boo
         moments = np.stack([rows[name] for name in MOMENTS], axis=1)
         within = ((moments - rows["release_ns"][:, None]) * speed).astype(np.int64)
         if lockstep:
-            # Spans that are cut off still begin at different times and in the right order.
+            # Let cut-off spans begin at different times, in the right order.
             within = np.minimum(within, last_ns + np.arange(len(MOMENTS)))
         ticks = np.repeat(block.ticks, len(MOMENTS))
         states = np.array([["read", work, "write", "wait"]] * len(rows))
@@ -179,7 +179,7 @@ class AgeWriter:
         style_curves(stream, self._lane, [f"{mailbox.name}, ms"], [colour])
 
     def add_messages(self, block: RowBlock) -> None:
-        """Add messages, whose ages are written from the tick at which they become visible."""
+        """Add messages. The age of each is written from the tick at which it becomes visible."""
         self._visible_at = np.concatenate((self._visible_at, block.rows["visible_at"]))
         self._made = np.concatenate((self._made, block.ticks))
 

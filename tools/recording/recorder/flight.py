@@ -73,6 +73,8 @@ class FlightRecorder:
     def advance_to(self, tick: int) -> None:
         """Begin a new stretch if the current one is long enough, and delete old ones.
 
+        Stretches near an occasion are not deleted.
+
         Call this when all rows written before `tick` are in the spool.
         """
         for alarm_tick in self._occasions.find_alarm_ticks():
@@ -111,7 +113,7 @@ class FlightRecorder:
         return self._spool.begin_stretch(stretch, end)
 
     def _keep_around(self, tick: int) -> None:
-        """Exempt the stretches around an occasion at `tick` from deletion."""
+        """Protect the stretches around an occasion at `tick` from deletion."""
         window = self._retention.find_window(tick)
         self._kept_until = max(self._kept_until, window.last)
         while self._sealed and self._sealed[-1].last >= window.first:

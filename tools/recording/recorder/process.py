@@ -53,7 +53,7 @@ The viewer's library may print more lines after that line.
 
 
 def format_write_failure(folder: Path, error: OSError, tick: int) -> str:
-    """Return a sentence that says why the recording ended before the run did.
+    """Return a sentence with the reason why the recording ended before the run.
 
     Args:
         folder: Folder of the run.
@@ -135,8 +135,8 @@ class RecorderProcess:
         Args:
             rack: Name of the rack.
             port: Port on which the recorder serves a viewer, or None.
-            words: Words of the rack's segment, through which the clock of a rack in lockstep is
-                told to wait for the recorder. None if the clock need not wait.
+            words: Words of the rack's segment. The recorder's process id is written there, so that
+                the clock of a rack in lockstep waits for it. None if the clock need not wait.
 
         Returns:
             True if the recorder has attached within `ATTACH_S`.
@@ -169,7 +169,7 @@ class RecorderProcess:
             self._process.stdin.flush()
 
     def read_notices(self) -> list[str]:
-        """Return new messages to the user since the last call. Restarts the recorder if it died.
+        """Return new messages for the user, and restart the recorder if it died.
 
         Raises:
             Failure: The files of the recording cannot be written.
@@ -216,7 +216,7 @@ class RecorderProcess:
         return f"{ended}; restarted, {self._restarts} of at most {MAX_RESTARTS} times"
 
     def _describe_end(self) -> str:
-        """Return the exit status of the recorder, with the last line that it printed on stderr.
+        """Return a text with the exit status of the recorder and its last line on stderr.
 
         Raises:
             Failure: The files of the recording could not be written.

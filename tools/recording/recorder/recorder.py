@@ -73,10 +73,10 @@ class Sink(Protocol):
         """
 
     def advance(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Process the rows received so far, which include everything before a tick.
+        """Process the rows received so far.
 
         Args:
-            tick: The tick.
+            tick: Tick before which all rows have been received.
             lost: Number of lost rows of each ring.
         """
 
@@ -187,8 +187,8 @@ class SafeSink:
     def _make_waiting_calls(self, until: float = 0.0) -> None:
         """Pass queued calls on to the sink, oldest first.
 
-        At least as many calls are passed on as were queued since the last pass, so that the queue
-        never grows, and more until the time `until`. Calls to a failed sink are dropped.
+        This passes on as many calls as were queued since the last pass, so that the queue never
+        grows, and more if there is time before `until`. Calls to a failed sink are dropped.
         """
         while len(self._waiting) > self._late or (self._waiting and time.monotonic() < until):
             call = self._waiting.popleft()
@@ -196,7 +196,7 @@ class SafeSink:
                 self._call_guarded(partial(call, sink))
 
     def _call_guarded(self, call: Callable[[], None]) -> None:
-        """Make a call to the sink. If the call fails, drop the sink and report the error."""
+        """Run a function that opens or uses the sink. If it fails, drop the sink and report it."""
         try:
             call()
         except Exception as error:
@@ -315,7 +315,7 @@ class Recorder:
         self.drain_rings()
 
     def close(self) -> None:
-        """Finish the files. The clock no longer waits for this recorder."""
+        """Stop the clock from waiting for this recorder, and finish the files."""
         if self._is_follower:
             self._words[System.FOLLOWER_PID] = 0
         if self._flight is not None:
