@@ -62,7 +62,7 @@ def find_other_run(run: Path, named: Path, asked: str = "") -> Path:
         run: Folder of the run.
         named: Folder of the other run, or "origin" for the run that `run` continues. The origin is
             looked for at its recorded path, then next to `run`.
-        asked: Command line option or request with which the message of a `Failure` begins.
+        asked: Command line option or request that is named at the beginning of error messages.
 
     Raises:
         Failure: The origin was requested, but `run` has none, or it no longer exists.

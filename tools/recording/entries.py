@@ -29,7 +29,7 @@ def load_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Re
     Args:
         config: Config of the rack that will be run with these messages.
         run: Folder of the recorded run.
-        asked: Command line option or request with which the message of a `Failure` begins.
+        asked: Command line option or request that is named at the beginning of error messages.
 
     Returns:
         Dictionary from adapter to the messages of its ports.

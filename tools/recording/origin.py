@@ -55,7 +55,7 @@ def check_code_state(recording: Recording, asked: str, anyway: bool) -> None:
 
     Args:
         recording: The run.
-        asked: Command line option or request with which the message begins.
+        asked: Command line option or request that is named at the beginning of the message.
         anyway: Whether to print a warning on stderr instead of raising `Failure`.
 
     Raises:

@@ -402,8 +402,8 @@ def _check_import(
     at_ns = sent["tick"] * peer.clock_ns
     content = [row.tobytes() for row in sent["message"]]
     for row in imported:
-        # `basis` is the time of sending in ticks of the importer. These may be longer than the
-        # sender's ticks, so the imported message may be any of several sent ones.
+        # `basis` is the time of sending in ticks of the importer. Such a tick may cover several
+        # ticks of the sender, so compare with every message sent in it.
         since_ns = int(row["basis"]) * importer.clock_ns
         first, end = np.searchsorted(at_ns, (since_ns, since_ns + importer.clock_ns))
         if first < end and row["message"].tobytes() not in content[first:end]:

@@ -90,7 +90,7 @@ class Sink(Protocol):
 
 
 class SafeSink:
-    """Shields the recorder from errors and delays of another sink, which writes the viewer's file.
+    """Protects the recorder from errors and delays of another sink, which writes the viewer's file.
 
     After its first error, which is reported through `tell`, the other sink is dropped and the
     recorder continues without it. Calls are queued, and passed on in `advance` when the rows are
