@@ -127,7 +127,7 @@ def check_circles(wiring: Wiring) -> Mistakes:
     except CycleError as error:
         circle = error.args[1][:-1]
         pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
-        # Blame a link that only one of its two boards names, if there is one.
+        # Report a link that only one of its two boards names, if there is one.
         upper, lower = min(reversed(pairs), key=lambda link: len(_find_declarations(config, *link)))
         board, key, end = _find_declarations(config, upper, lower)[0]
         at = circle.index(lower)
@@ -281,7 +281,7 @@ def check_schedule(wiring: Wiring) -> Mistakes:
 
 
 def _check_frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
-    """Check that the minor frame is whole ticks and that the major frame is a multiple of it.
+    """Check that the minor frame is a whole number of ticks and divides the major frame.
 
     The major frame must also not exceed `LONGEST_MAJOR`.
     """
