@@ -265,7 +265,7 @@ class Import:
         self.mark_present(tick)
 
     def _open_message(self, arrived: ReceivedMessage) -> Envelope | None:
-        """Check a received message and return its head.
+        """Check a received message and return its envelope.
 
         If the seal, the type, the length or a number is invalid, count the message as refused and
         return None.

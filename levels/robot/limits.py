@@ -166,7 +166,9 @@ class MotorPatience(NamedTuple):
 
         The result is at least `min_cycles` torque cycles.
 
-        `every` is the length of a torque cycle in ticks, and `tick_s` is the duration of a tick.
+        Args:
+            every: Length of a torque cycle in ticks.
+            tick_s: Duration of a tick, s.
         """
         # Adding a millionth makes 5 ms two cycles of 2.5 ms, in spite of rounding.
         return every * max(int(self.seconds / (every * tick_s) + 1e-6), self.min_cycles)

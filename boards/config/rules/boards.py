@@ -191,7 +191,10 @@ LONGEST_MAJOR = 10_000
 
 
 def check_clock(wiring: Wiring) -> Mistakes:
-    """Check that a tick is whole ns and not too short, and that lockstep has no `speed`."""
+    """Check that a tick is a whole number of ns and not too short in real time.
+
+    In lockstep, `speed` must be 1.
+    """
     config = wiring.config
     clock = wiring.config.clock
     if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
@@ -212,7 +215,11 @@ def check_clock(wiring: Wiring) -> Mistakes:
 
 
 def check_rates(wiring: Wiring) -> Mistakes:
-    """Check that each board has one period of whole ticks, not too long, and a smaller phase."""
+    """Check that each board has a valid period and a phase smaller than its period.
+
+    Exactly one of `rate_hz` and `every` must be given. The period must be a whole number of ticks,
+    at most `LONGEST_EVERY`.
+    """
     for name, board in wiring.config.board.items():
         place = f"board.{name}.rate_hz"
         if (board.rate_hz is None) == (board.every is None):
