@@ -169,7 +169,7 @@ class ArmExecutor(ArmDriver):
         return self.joints.wanted
 
     def _is_astray(self) -> bool:
-        """Return True if the boards above command a position too far from the sensed one.
+        """Return True if the boards above command a position too far from that of the arm.
 
         This happens for two cycles when sensors are trusted again and their position differs from
         the estimate.
