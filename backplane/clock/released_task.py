@@ -196,7 +196,7 @@ class Watchdog:
             )
 
     def _is_hanging(self, task: ReleasedTask) -> bool:
-        """Check whether a task hangs for certain: stopped, or waiting or computing for too long."""
+        """Check whether a task hangs: it is stopped, or has waited or computed for too long."""
         spec = task.spec
         pid = task.block[Block.PID]
         state = read_state(pid)
