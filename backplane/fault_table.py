@@ -88,7 +88,7 @@ class FaultEntry:
         self.parameters = segment.get_bytes(address + 8 * FAULT_WORDS, 8 * PARAMETERS).cast("d")
 
     def record_action(self, tick: int, must_be_found: bool = True) -> None:
-        """Record that the fault has acted once, for example has damaged one message.
+        """Record one action of the fault, such as the damage of one message.
 
         Args:
             tick: Tick of the action. The first action also sets `struck_tick` and `struck_ns`.
@@ -115,7 +115,7 @@ class FaultTable:
     def generation(self) -> int:
         """Counter that the clock increases whenever a fault begins or ends.
 
-        Tasks read the table only when it has changed.
+        Tasks read the table only when this counter has changed.
         """
         return self._words[System.FAULTS]
 

@@ -42,7 +42,7 @@ def read_regular_file(path: Path, limit_bytes: int) -> bytes:
         RefusedFileError: The file is not a regular file, or it is too large.
         OSError: The file cannot be opened or read, as by `open`.
     """
-    # Opening a device may already act on it, so its kind is checked first. The kind is checked
+    # Merely opening a device can have side effects, so the kind is checked first. It is checked
     # again once the file is open, because the path may name another file by that time.
     check_regular_file(path, limit_bytes)
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC

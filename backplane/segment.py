@@ -174,8 +174,8 @@ class Segment:
             # Take the lock before the segment has a name, so that no process ever finds the segment
             # of a live rack without it.
             life.take()
-            # With a descriptor, which absolute paths do not need, the link leads to the file, not
-            # to its path in /proc.
+            # The paths are absolute, but only with a directory descriptor does Python follow the
+            # symbolic link in /proc. Without one, it would link to the symbolic link itself.
             os.link(f"/proc/self/fd/{fd}", get_shm_path(layout.rack), src_dir_fd=fd)
         except OSError as error:
             os.close(fd)
@@ -226,7 +226,7 @@ class Segment:
         self.words[Head.LAUNCHER_NAMESPACE] = _pid_namespace()
         self.words[Head.CREATED_NS] = time.time_ns()
         self.words[Head.CREATED_MONOTONIC_NS] = time.monotonic_ns()
-        # This is stored last, so that no process attaches to half a segment.
+        # This is stored last, so that no process attaches to an incomplete segment.
         self.words[Head.MAGIC] = MAGIC
 
     def initialize_semaphores(self) -> None:

@@ -45,8 +45,8 @@ class Semaphore:
     """Semaphore in shared memory whose waits do not depend on the wall clock.
 
     `release()` posts it. `wait()` waits for a post until the time set by `set_deadline`, and
-    returns 0 if it has obtained the semaphore. Otherwise the time has passed, or a signal has ended
-    the wait early.
+    returns 0 if it has obtained the semaphore. Any other result means that the time has passed or
+    that a signal has ended the wait early.
     """
 
     def __init__(self, memory: memoryview, address: int) -> None:

@@ -53,7 +53,7 @@ class Controller(Protocol):
         """Do the work that is due before the tasks of `tick` are released."""
 
     def finish_release(self, tick: int) -> None:
-        """Do the work that is due after the tasks of `tick` were released."""
+        """Do the work that is due after the tasks of `tick` have been released."""
 
     def find_next_work_tick(self, tick: int) -> int:
         """Return the first tick after `tick` at which `begin_tick` is known to have work."""
@@ -148,7 +148,7 @@ class ClockDriver(ABC):
 
     @property
     def first_end_tick(self) -> int:
-        """Earliest tick at which the run can end. The tick at which a run ends is not run."""
+        """Earliest tick at which the run can end. A run ends before its end tick is executed."""
         return 0
 
     def wait_until_settled(self) -> None:
@@ -182,8 +182,8 @@ class ClockDriver(ABC):
             stop = words[System.STOP_TICK] = max(tick, 1)
         if stop and tick >= stop:
             return True
-        # Call this even if the end of this run is known. It also determines the end of the task,
-        # at which a run that continues this one may end.
+        # Call this function even if the end of this run is known. It also determines the end of
+        # the robot's task, at which a run that continues this one may end.
         end_tick = self._ended(tick)
         if not stop and end_tick is not None:
             stop = words[System.STOP_TICK] = max(end_tick, self.first_end_tick, 1)

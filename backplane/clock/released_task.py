@@ -95,7 +95,7 @@ class ReleasedTask:
         block[Block.RELEASED] = newest
 
     def find_next_event(self, tick: int) -> int:
-        """Return the next tick that cannot begin before the task finishes, or that releases it."""
+        """Return the task's deadline if it is after `tick`, otherwise its next release tick."""
         if self.deadline > tick:
             return self.deadline
         return tick + 1 + (self._phase - tick - 1) % self._every
@@ -106,7 +106,7 @@ class ReleasedTask:
         return block[Block.DONE] == block[Block.RELEASED] or self.is_lost or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
-        """Check whether the task lets `tick` begin: it is settled, or its deadline is later."""
+        """Check that `tick` need not wait for the task: it is settled, or its deadline is later."""
         self.deadline = self.block[Block.DEADLINE] - self._early
         return self.deadline > tick or self.is_settled()
 
@@ -196,7 +196,7 @@ class Watchdog:
             )
 
     def _is_hanging(self, task: ReleasedTask) -> bool:
-        """Check for proof that a task hangs: it is stopped, or has waited or computed too long."""
+        """Check whether a task hangs: it is stopped, or has waited or computed for too long."""
         spec = task.spec
         pid = task.block[Block.PID]
         state = read_state(pid)

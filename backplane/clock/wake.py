@@ -221,7 +221,7 @@ class NextCycle:
 
     @property
     def _has_begun(self) -> bool:
-        """True if the task is past its first release. Until then the clock may not have started."""
+        """True if the task is past its first release. Before that, the clock may not run yet."""
         return self._due > self._spec.phase
 
     def skip_until(self, tick: int) -> None:
@@ -256,7 +256,7 @@ class StoppedClockDetector:
         self._is_reported = False
 
     def compute_patience_ns(self, expected: int) -> int:
-        """Return the time to wait for a release before the clock is checked, in ns.
+        """Return the time, in ns, to wait for a release before the clock is checked.
 
         Args:
             expected: Tick of the release.
@@ -265,7 +265,10 @@ class StoppedClockDetector:
         return late if late > 0 else CLOCK_PATIENCE_TICKS * self._clock.period_ns
 
     def check(self) -> None:
-        """Raise an alarm, once per stop, if the clock's process is stopped, dead or blocked."""
+        """Raise an alarm if the clock's process is stopped, dead or blocked.
+
+        The alarm is raised once each time the clock stops.
+        """
         now = self._clock.compute_tick()
         newest = self._words[System.TICK]
         if now - newest < CLOCK_PATIENCE_TICKS:

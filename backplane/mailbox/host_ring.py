@@ -81,8 +81,8 @@ class HostReader:
         """
         head = self._box[Box.HEAD]
         oldest = self._box[Box.TAKEN] + 1
-        # If more messages wait than the ring may hold, the writer has overwritten some against the
-        # rules.
+        # If more messages wait than the ring may hold, a faulty writer has overwritten some of
+        # them.
         serial = max(oldest, head - self.spec.depth + SPARE_SLOTS)
         self.superseded += serial - oldest
         self._box[Box.TAKEN] = serial

@@ -80,7 +80,7 @@ class InterruptWriter(Writer):
 
 
 class InterruptLine:
-    """Mailbox that interrupts a board, with its arrivals as computed by one task of the board."""
+    """Mailbox that interrupts a board. A task of the board computes when its messages arrive."""
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.service_ns = get_interrupt_spec(spec).service_ns
@@ -153,7 +153,7 @@ class InterruptLine:
 
 
 class BoardInbox:
-    """Inbox of the board in a slot, as computed by one of its tasks.
+    """Inbox of the board in a slot, computed by one of the board's tasks.
 
     Attributes:
         lines: Mailboxes that interrupt the board, keyed by name.

@@ -124,7 +124,7 @@ class Writer:
             raise MailboxError(f"mailbox '{self.spec.name}' already has a writer (process {pid})")
         box[Box.WRITER_PID] = os.getpid()
         box[Box.EPOCH] = epoch = get_epoch(box[Box.EPOCH] + 1)
-        # Epoch and process are stored at once, so that no reader sees half a claim.
+        # Epoch and process are stored in one word, so that no reader sees half a claim.
         box[Box.CLAIMANT] = self.slots.signature = build_signature(epoch, os.getpid())
 
     def write(self, tick: int, now: int | None = None, basis: int | None = None) -> bool:

@@ -63,8 +63,8 @@ class MailboxLock:
             ):
                 self.held_up += 1
         # After a timeout, the kernel's lock is free if the holder of the semaphore is dead. One of
-        # the waiting processes then gets it. Even after a successful wait for the semaphore, the
-        # kernel's lock may be taken by such a process.
+        # the processes whose wait timed out then gets it. A process that has obtained the semaphore
+        # may therefore still find the kernel's lock taken.
         if not self._owner.take():
             return False
         self._box[Box.OWNER] = os.getpid()

@@ -73,7 +73,8 @@ def is_position_mailbox(spec: MailboxSpec) -> bool:
 def list_queues(layout: Layout) -> list[MailboxSpec]:
     """Return the queues between tasks.
 
-    The rings of host boards, which have no mailbox for a position, are not included.
+    The rings of host boards are not included: their readers have no mailbox in which to report
+    their positions.
     """
     names = {box.name for box in layout.mailboxes}
     return [
@@ -286,8 +287,8 @@ class QueueReader(Reader):
     def _can_take(self, serial: int, last: int, tick: int) -> bool:
         """Check whether the message with a given serial can be taken or skipped at `tick`.
 
-        A message is skipped if it is bad and its slot states a later visible tick than a good
-        message can have.
+        A bad message is skipped if the visible tick in its slot is later than that of any valid
+        message can be.
 
         Args:
             serial: Serial of the message.

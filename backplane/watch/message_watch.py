@@ -25,9 +25,9 @@ LONG_AGO = -(1 << 62)
 
 
 class MessageWatch:
-    """Checks the messages of one mailbox for one reader, from the reader's first read on.
+    """Checks the messages of one mailbox for one reader.
 
-    The message found by the first read is not checked.
+    Checks begin with the message after the one that the reader's first read finds.
 
     Attributes:
         seen: Serial of the newest message that was checked, -1 before the first read.
@@ -92,8 +92,8 @@ class MessageWatch:
         """
         slots = self._slots
         if not slots.is_intact(newest_serial):
-            # The message is already overwritten, which a writer of one message per cycle is too
-            # slow to do. Use the newest message instead.
+            # The message is already overwritten. A writer that sends one message per cycle would
+            # be too slow for that. Use the newest message instead.
             newest_serial = slots.box[0]
         if not self._copy_message(newest_serial):
             return False

@@ -110,7 +110,10 @@ class SilenceWatch(MessageWatch):
         return self.is_writer_lost(tick)
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Check whether the writer has been found dead or hanging. Its silence does not count."""
+        """Check whether the writer has been found dead or hanging.
+
+        A lack of messages alone does not make it lost.
+        """
         # A loss counts from the tick after it was found. Within that tick, the result would depend
         # on which process is faster.
         return self._reader.newest != NO_MESSAGE_TICK and 0 < self._block[Block.LOST] <= tick
@@ -131,7 +134,7 @@ class SilenceWatch(MessageWatch):
         # A serial whose slot is not filled counts as written: the message was lost, not suppressed.
         spec = self._reader.spec
         due = finished - (finished + spec.lead_ticks - spec.phase) % spec.every
-        # There may be no such cycle, if the writer was dead, late, or not released by the clock.
+        # That cycle was not run if the writer was dead, late, or not released by the clock.
         if self._cycles.find_end_ns(due) is None:
             return False
         return slots.copy_slot(head) and slots.serial == head and slots.tick < due

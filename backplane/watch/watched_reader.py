@@ -31,7 +31,7 @@ def open_watched(
     """Open a mailbox for a task, with checks of its messages.
 
     The silence of the writer is checked too, except for the clock, which writes operators' commands
-    without a period.
+    at irregular times.
 
     Args:
         segment: Memory of the rack.

@@ -554,7 +554,7 @@ class RackConfig(Table):
 
     @property
     def outside_state(self) -> str:
-        """Description of state outside the rack, which snapshots cannot contain. Empty without any.
+        """State outside the rack, which snapshots cannot contain, as text. Empty if there is none.
 
         A rack with such state repeats a run only if it replays the recorded outside messages.
         """

@@ -139,8 +139,8 @@ class CrateLine:
 class WarmCrate(CrateLine):
     """Crate for several racks in succession, which keeps imported and compiled code.
 
-    When a Rack closes it, it only leaves that rack. Its owner must end it by `end_crate`, or use it
-    as a context manager.
+    When a Rack closes the crate, the crate only leaves that rack. Its owner must call `end_crate`
+    or use it as a context manager.
 
     Attributes:
         is_last: Whether the crate ends when its present rack is closed.
@@ -188,7 +188,7 @@ class WarmCrate(CrateLine):
         """Read the attributes of a level from a snapshot.
 
         Args:
-            tick: Tick. The last snapshot at or before it is read.
+            tick: The last snapshot at or before this tick is read.
             task: Task of the level. Empty to get only the tick of the snapshot.
 
         Returns:

@@ -60,7 +60,7 @@ class ReportedWait:
 
 
 class PeerWaitReporter:
-    """Reporter of adapters that wait for another rack in lockstep, without a time limit."""
+    """Reports the racks for which adapters wait in lockstep, where waits have no time limit."""
 
     def __init__(self, segment: Segment, journal: Journal) -> None:
         self._segment = segment

@@ -209,7 +209,7 @@ class Recovery:
                 self._crate.try_request(PowerOff(name))
 
     def _find_printed_reason(self, board: str) -> str:
-        """Return the last line that a board printed about itself. Empty without any."""
+        """Return the last line that a board printed about itself. Empty if there is none."""
         printed = (event.text for event in reversed(self._journal.events))
         return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
 

@@ -189,7 +189,7 @@ def cycle_bound(count: int) -> Bound:
 def cycle_and_time_bound(count: int, time_ns: int) -> Bound:
     """Return a bound of `count` cycles of the task, but at least `time_ns`.
 
-    The time matters because the gains of a controller act in time, not in cycles.
+    The time is needed because a controller's gains, not its cycle, determine how fast it reacts.
     """
 
     def count_ticks(case: BoundCase) -> int:

@@ -109,7 +109,7 @@ class LanAdapter(Adapter):
 
     @classmethod
     def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return a dictionary from each port that a replay writes to True if it is an import.
+        """Return a dictionary from each port that a replay writes to whether it is an import.
 
         Only the messages of imports are sent one by one.
         """

@@ -265,7 +265,7 @@ class Import:
         self.mark_present(tick)
 
     def _open_message(self, arrived: ReceivedMessage) -> Envelope | None:
-        """Check a received message and return its head.
+        """Check a received message and return its envelope.
 
         If the seal, the type, the length or a number is invalid, count the message as refused and
         return None.
@@ -286,12 +286,12 @@ class Import:
     ) -> bool:
         """Return True if a message comes from the present launch and its age is known.
 
-        In lockstep that is always true: see `Barrier`. A message that may become acceptable is
-        stored for a later cycle, in place of the one stored before. Any other is counted as
-        coming from an unknown launch.
+        In lockstep every message is acceptable: see `Barrier`. Otherwise, a message that is not
+        acceptable yet but may become so is stored for a later cycle, in place of the one stored
+        before. A message that cannot become acceptable is counted as coming from an unknown launch.
 
         Args:
-            head: Head of the message.
+            head: Envelope of the message.
             arrived: The message as received.
             arrival_tick: Tick at which it arrived.
             tick: Current tick.

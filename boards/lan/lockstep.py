@@ -222,7 +222,7 @@ class Barrier:
         )
 
     def publish(self, key: str) -> Callable[[bytes, bytes], None]:
-        """Return a function that adds a payload and its envelope to the step of this cycle."""
+        """Return a function that adds a payload and its envelope to the next step message."""
         return lambda payload, envelope: self._exports.append(
             ReceivedMessage(key, envelope, payload)
         )
@@ -233,16 +233,16 @@ class Barrier:
         return lambda: (waiting.popleft() for _ in range(len(waiting)))
 
     def take_changes(self) -> Iterator[tuple[str, int, bool]]:
-        """Yield rack, launch and whether it is present, for each change since the last call."""
+        """Yield each change of presence since the last call, as (rack, launch, is present)."""
         changes = self._changes
         self._changes = []
         yield from changes
 
     def prepare_step(self, tick: int) -> None:
-        """Pack the exports since the last step into the step of this cycle.
+        """Pack the messages exported since the previous step into the step message of this cycle.
 
         Raises:
-            CannotGoOn: The step is too long.
+            CannotGoOn: The step message is too long.
         """
         awaited = [partner.rack for partner in self._partners.values() if not partner.is_out]
         content = pack_step(self.cycle_ns, awaited, self._exports)
@@ -255,7 +255,7 @@ class Barrier:
         self._steps.append((tick * self._tick_ns, content))
 
     def exchange_steps(self, tick: int) -> bool:
-        """Send the step of this cycle and wait for the steps of all other racks.
+        """Send the step message of this cycle and wait for those of all other racks.
 
         Returns:
             False if the run ended during the wait.

@@ -55,7 +55,10 @@ class ReplayedNetwork:
         self._tick = tick
 
     def take_changes(self) -> Iterator[tuple[str, int, bool]]:
-        """Yield the changes of presence up to this cycle, in the form of `Barrier.take_changes`."""
+        """Yield the recorded changes of presence up to this cycle, each of them once.
+
+        As in `Barrier.take_changes`, a change is a tuple (rack, launch, is present).
+        """
         while self._changes and self._changes[0][0] <= self._tick:
             _, rack, has_appeared = self._changes.pop(0)
             yield rack, NO_LAUNCH, has_appeared

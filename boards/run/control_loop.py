@@ -165,7 +165,7 @@ class PlannerLoop(Task):
         self._priority = self.block[Block.PRIORITY]
 
     def cycle(self, tick: int) -> None:
-        """Run the cycle released at `tick`. It makes a plan if one is wanted."""
+        """Run the cycle released at `tick`, and make a plan if one is wanted."""
         watch = self.stopwatch
         watch.start_cycle(tick, self.next_cycle.skipped)
         self.read(tick)

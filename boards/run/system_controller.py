@@ -79,7 +79,7 @@ class SystemController:
             self._handle_losses(tick)
 
     def finish_release(self, tick: int) -> None:
-        """Do the work that is due after the tasks of `tick` were released."""
+        """Do the work that is due after the tasks of `tick` have been released."""
         self._faults.act_within_tick(tick)
 
     def find_next_work_tick(self, tick: int) -> int:

@@ -102,7 +102,7 @@ class ClockGuard:
     """Reports ticks that the clock has skipped or begun late, for one of the fastest tasks.
 
     Even the fastest task need not cycle in every tick. Most skipped ticks then neither cost it a
-    release nor delay its cycles, so it finds skipped ticks from the clock's count.
+    release nor delay its cycles, so it learns of skipped ticks from the clock's count.
 
     Attributes:
         reported: Number of skipped ticks that this task has reported, including earlier

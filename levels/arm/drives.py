@@ -99,7 +99,7 @@ class LimitGate:
         return np.asarray(solve(self._inertia, torque - self._resisting) * self._period_s)
 
     def _find_nearest_torque(self, gain: Array, lowest_gain: Array, highest_gain: Array) -> Array:
-        """Return the torques that change the velocity as nearly by `gain` as the bounds permit.
+        """Return the torques whose velocity change is as close to `gain` as the bounds permit.
 
         Args:
             gain: Desired velocity change in a cycle, (joints,), rad/s.

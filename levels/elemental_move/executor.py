@@ -269,7 +269,7 @@ class ElementalMoveExecutor(Executor):
         opening_gap = status.opening - gripper.closed
         if not abs(opening_gap) < (self.settings.grasp_gap or gripper.rest_threshold):
             return ""
-        # Report a part of the travel, because an opening may be a length or an angle.
+        # Report a fraction of the travel, because an opening may be a length or an angle.
         travel_part = opening_gap / (gripper.open - gripper.closed)
         return f"the gripper has closed to {travel_part:.1%} of its way"
 

@@ -239,9 +239,10 @@ class CollisionChecker:
         return f"{pair} are {distance * 1e3:.1f} mm apart; valid: {required * 1e3:.1f} mm"
 
     def _compute_shortfalls(self) -> Array:
-        """Return by how much each close pair of geoms is closer than required, in m.
+        """Return the required minus the actual distance of each close pair of geoms, in m.
 
-        The pairs were found at the configuration checked last. Negative values are permitted.
+        The pairs were found at the configuration checked last. A pair with a negative value is far
+        enough apart.
         """
         contact = self._data.contact
         pairs = contact.geom

@@ -89,7 +89,7 @@ class PathMotion:
 
         Args:
             position: Position of the arm, (joints,), rad.
-            progress: Approximate part of the path that is done, 0 to 1.
+            progress: Approximate fraction of the path that is done, 0 to 1.
 
         Returns:
             Largest distance of a joint of the arm from that point, rad.

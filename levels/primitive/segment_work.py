@@ -184,7 +184,7 @@ class PathWork:
 
         Args:
             position: Position of the arm, (joints,), rad.
-            progress: Approximate part of the path that is done, 0 to 1.
+            progress: Approximate fraction of the path that is done, 0 to 1.
         """
         self._fresh = False
         self._clear_cycles = 0
@@ -238,7 +238,7 @@ class PathWork:
 
     @property
     def progress(self) -> float:
-        """Part of the path that is done, 0 to 1."""
+        """Fraction of the path that is done, 0 to 1."""
         length = self.motion.path.length
         return self.motion.s / length if length > 0.0 else 1.0
 

@@ -162,16 +162,20 @@ class MotorPatience(NamedTuple):
     min_cycles: int  # minimum number of torque cycles
 
     def ticks(self, every: int, tick_s: float) -> int:
-        """Return the patience in ticks, as a multiple of the torque cycle.
+        """Return the time in ticks, rounded down to a multiple of the torque cycle.
 
-        `every` is the length of a torque cycle in ticks, and `tick_s` is the duration of a tick.
+        The result is at least `min_cycles` torque cycles.
+
+        Args:
+            every: Length of a torque cycle in ticks.
+            tick_s: Duration of a tick, s.
         """
         # Adding a millionth makes 5 ms two cycles of 2.5 ms, in spite of rounding.
         return every * max(int(self.seconds / (every * tick_s) + 1e-6), self.min_cycles)
 
 
 def compute_patience(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPatience:
-    """Return the patience of the motors.
+    """Return the time for which the motors may keep their last torque.
 
     By default, it is the longest time that lengthens a stop from full speed by at most
     `PATIENCE_FRACTION`, according to two criteria. The first compares the angle through which

@@ -70,7 +70,7 @@ class ArmReport:
         Args:
             followed: How the level follows its set points.
             demand: Stop that the rack requires of the arm, if any.
-            speed_scale: Permitted part of full speed, up to 1.
+            speed_scale: Permitted fraction of full speed, up to 1.
         """
         arm = self.arm
         stopping = self.stopping

@@ -57,7 +57,7 @@ class ArmParams(Table):
     @field_validator("arm")
     @classmethod
     def _check_arm(cls, reference: str) -> str:
-        """Check that the class can be loaded and is a class of an arm."""
+        """Check that the class can be loaded and is an arm class."""
         find_arm(reference)
         return reference
 

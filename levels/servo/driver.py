@@ -65,7 +65,7 @@ class ArmDriver(Executor):
         followed: Id of the newest command from the level above.
         rests_on: Serial of the operator's command on which that command is based.
         abandoned: The arm was braked in the last cycle, so its set points were abandoned.
-        speed_scale: Permitted part of full speed, up to 1.
+        speed_scale: Permitted fraction of full speed, up to 1.
     """
 
     faults = ARM_STEPS
@@ -202,7 +202,7 @@ class ArmDriver(Executor):
 
     @abstractmethod
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return the report on set points, which becomes a part of the status."""
+        """Return the section of the status that reports on the set points."""
 
     @cached_property
     def _report(self) -> ArmReport:

@@ -247,7 +247,7 @@ class ServoLaw(ArmDriver):
         return self._holds
 
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return the report on set points, which becomes a part of the status."""
+        """Return the section of the status that reports on the set points."""
         operator = self.operator_control
         stands = operator.is_in_control
         cut = self.reference.refused + self._cut

@@ -41,8 +41,8 @@ class Reference:
     `take_command` accepts a set point; `compute_motion` returns the motion wanted at a tick.
 
     Attributes:
-        speed_scale: Part of full speed for the motion of `move_to` and for joining the set points,
-            up to 1.
+        speed_scale: Fraction of full speed, up to 1, for the motion of `move_to` and for joining
+            the set points.
         goal: Goal of `move_to`, (joints,), rad, until another motion begins, else None.
         holding: No set point is followed: the motion ramps to rest or is at rest.
         refused: Number of set points cut at the bounds, and of cycles in which one is NaN or due

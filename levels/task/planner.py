@@ -110,7 +110,7 @@ class TaskPlanner(Planner):
         return self.context.within_cycles * self.context.every
 
     def _may_be_unacknowledged(self, tick: int, since: int) -> bool:
-        """Return True while the executor's status may not acknowledge a published plan yet.
+        """Return True while the executor may not have had time to acknowledge a published plan.
 
         This process or an earlier one may have published the plan. `since` is the tick of the first
         cycle of this process.

@@ -91,7 +91,7 @@ class Rehearsal:
 def compute_finish_times(
     moves: Sequence[Rehearsed], visible_s: float, context: LevelContext, needs: TaskParams
 ) -> list[float]:
-    """Return the latest times, in s, at which the task level reads that each move is done.
+    """Return, for each move, the latest time in s at which the task level reads that it is done.
 
     A move begins when the previous move is done, its path is planned, and the window of segments
     has space for it. Each message waits at most one cycle to be read and one to become visible. The

@@ -127,7 +127,7 @@ def check_circles(wiring: Wiring) -> Mistakes:
     except CycleError as error:
         circle = error.args[1][:-1]
         pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
-        # Blame a link that only one of its two boards names, if there is one.
+        # Report a link that only one of its two boards names, if there is one.
         upper, lower = min(reversed(pairs), key=lambda link: len(_find_declarations(config, *link)))
         board, key, end = _find_declarations(config, upper, lower)[0]
         at = circle.index(lower)
@@ -191,7 +191,10 @@ LONGEST_MAJOR = 10_000
 
 
 def check_clock(wiring: Wiring) -> Mistakes:
-    """Check that a tick is whole ns and not too short, and that lockstep has no `speed`."""
+    """Check that a tick is a whole number of ns and not too short in real time.
+
+    In lockstep, `speed` must be 1.
+    """
     config = wiring.config
     clock = wiring.config.clock
     if abs(clock.period_ms * 1e6 - config.clock_ns) > 1e-3:
@@ -212,7 +215,11 @@ def check_clock(wiring: Wiring) -> Mistakes:
 
 
 def check_rates(wiring: Wiring) -> Mistakes:
-    """Check that each board has one period of whole ticks, not too long, and a smaller phase."""
+    """Check that each board has a valid period and a phase smaller than its period.
+
+    Exactly one of `rate_hz` and `every` must be given. The period must be a whole number of ticks,
+    at most `LONGEST_EVERY`.
+    """
     for name, board in wiring.config.board.items():
         place = f"board.{name}.rate_hz"
         if (board.rate_hz is None) == (board.every is None):
@@ -281,7 +288,7 @@ def check_schedule(wiring: Wiring) -> Mistakes:
 
 
 def _check_frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
-    """Check that the minor frame is whole ticks and that the major frame is a multiple of it.
+    """Check that the minor frame is a whole number of ticks and divides the major frame.
 
     The major frame must also not exceed `LONGEST_MAJOR`.
     """

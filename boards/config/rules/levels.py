@@ -112,7 +112,8 @@ def check_scene(wiring: Wiring) -> Mistakes:
 def check_robot(wiring: Wiring) -> Mistakes:
     """Check that the model file can be read and that `[robot]` is consistent.
 
-    Lists must have one value per joint, joints unique names, and a hand torque control.
+    Each list must have one value per joint, joint names must be unique, and a hand must have torque
+    control.
     """
     robot = wiring.config.robot
     if robot is None:

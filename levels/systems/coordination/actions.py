@@ -17,7 +17,7 @@ _ACTION: TypeAdapter[AnyAction] = TypeAdapter(AnyAction)
 
 
 def write_action(action: AnyAction, message: CellAction) -> None:
-    """Write an action into the `CellAction` of a message. Set other fields to 0."""
+    """Write an action into a `CellAction`. Fields that it does not need are set to 0."""
     for field in CellAction.message_type.fields:
         message.record[field.name] = np.zeros((), message.record.dtype[field.name])
     message.by = action.by or 0.0

@@ -158,7 +158,7 @@ class Agreement:
         return all(answer.has_message and not answer.is_lost for answer in answers)
 
     def _await_reports(self) -> None:
-        """Once every arm reports, begin with the step that the reports show.
+        """Once every arm reports, continue with the newest step that appears in the reports.
 
         If a report shows that the program has already ended, end it at the coordinator as well.
         """
@@ -215,7 +215,7 @@ class Agreement:
             self._start_next_step()
 
     def _await_cancelled(self) -> None:
-        """Once all arms have cancelled the step, ask again.
+        """Once all arms have cancelled the step, ask them again whether they can do it.
 
         End the program instead if an arm had begun or failed, or after `MAX_ATTEMPTS` attempts.
         """

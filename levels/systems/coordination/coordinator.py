@@ -239,7 +239,7 @@ class Coordinator(Executor):
         self._write_status(wait_reason, self.status)
 
     def _count_moves(self) -> tuple[int, int]:
-        """Return how many moves of the present step are done, and how many it has."""
+        """Return the number of completed moves and of all moves of the present step."""
         agreement = self._agreement
         reports = [self._readings[arm].message for arm in agreement.partners]
         present = agreement.program, agreement.order_id

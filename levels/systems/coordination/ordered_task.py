@@ -289,7 +289,7 @@ class OrderedTaskExecutor(TaskExecutor):
             super()._check_progress(plan, waits, tick)
 
     def _list_progress_values(self) -> tuple[int, ...]:
-        """Return values of the order whose change counts as progress."""
+        """Return the values of the order. A change of any of them counts as progress."""
         return self._taken.order, self._taken.response, self._begun, not self._absent
 
     def _write_status(self, plan: TaskPlan, waits: str) -> None:

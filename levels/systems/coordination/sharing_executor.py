@@ -43,7 +43,9 @@ class SharingServoParams(ServoParams):
 
 
 class SharingServoExecutor(ServoExecutor):
-    """Servo level that claims the shared objects its gripper touches, and fixes the others' copies.
+    """Servo level that claims the shared objects that its gripper touches.
+
+    It fixes its copies of the objects that other racks move.
 
     After a restart of its board it continues from its own last message. See `SharedBody`.
     """

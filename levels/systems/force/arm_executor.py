@@ -38,7 +38,8 @@ class ContactWrench:
         raw: Sample in the frame of the sensor, (6,), N, N m.
         wrench: Wrench of the contact on the tool, at the tool, in the world frame, (6,), N, N m.
         torque: Torques of the contact on the joints, (joints,), N m.
-        saturated: The sample is at the end of the range or NaN, so the contact may be stronger.
+        saturated: True if a value of the sample is NaN or at the end of the range, so that the
+            contact may be stronger.
     """
 
     def __init__(self, cell: Cell, wrist: Wrist, dynamics: Dynamics) -> None:

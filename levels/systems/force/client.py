@@ -115,8 +115,8 @@ class ForceProgram(Program):
     def find_contact_error(self, contact: ContactConfig, robot: RobotConfig | None) -> str:
         """Return the reason why a contact is invalid, or an empty string if it is valid.
 
-        Its frame must be in the program, only axes of force may have a speed, and its wrenches must
-        be within the limits of the arm.
+        The program must define its frame, only force-controlled axes may have a speed, and its
+        wrenches must be within the limits of the arm.
         """
         if contact.frame not in self.frame:
             return (

@@ -46,8 +46,9 @@ class ComplianceWatch:
         axis: Axis of that guard, or -1.
         sensed: Tick of the newest wrench, or -1.
         felt: Wrench of the contact on the tool, in the task frame, (6,), N, N m.
-        must_rest: The motion must end.
-        reason: Why the motion must end, or why the applied force is not the wanted one. Else empty.
+        must_rest: True if the motion must end.
+        reason: Why the motion must end, or why the applied force is not the wanted one. Empty if
+            neither is the case.
     """
 
     def __init__(self, most: tuple[float, float], every: int) -> None:
@@ -91,7 +92,7 @@ class ComplianceWatch:
         Args:
             compliance: Command and its verdict.
             wrench: Wrench and its verdict.
-            above_is_lost: The level above is lost.
+            above_is_lost: True if the level above is lost.
             tick: Tick of the cycle.
         """
         wanted = compliance.message

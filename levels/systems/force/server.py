@@ -88,7 +88,7 @@ class ServerWork(RequestWork):
 
         Args:
             time_s: Time of the sample.
-            hold: The motion must ramp to rest.
+            hold: True if the motion must ramp to rest.
         """
         super().step(time_s, hold)
         if self.contact.is_compliant:
@@ -110,7 +110,7 @@ class ServerWork(RequestWork):
         """End all requests with an error. The arm ramps to rest on the axes of motion.
 
         Args:
-            how: How the requests end, to report.
+            how: Outcome to report for the requests.
             reason: Reason to report.
             code: Error code to report.
         """
@@ -145,7 +145,10 @@ class ServerWork(RequestWork):
         return params
 
     def _check_forces(self) -> None:
-        """Update the time within tolerance. End compliance if forces do not settle in `reach`."""
+        """Update how long the forces have been within tolerance, and how long not settled.
+
+        If the forces do not settle within `reach`, end the requests and compliance.
+        """
         errors = self.compute_force_errors()
         current = self.agenda.current
         params = self._params

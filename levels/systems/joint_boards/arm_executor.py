@@ -31,8 +31,8 @@ class JointTorques(CommandsAbove):
 
     Attributes:
         torque: Torques of all boards, (joints,), N m.
-        wanted: Motion that the boards want. Its accelerations are not known.
-        moves: The boards want a joint to move.
+        wanted: Motion commanded by the boards. Its accelerations are not known.
+        moves: True if a commanded velocity is not zero.
         rests_on: Serial of the newest operator's command on which the torques are based.
     """
 
@@ -70,7 +70,7 @@ class JointTorques(CommandsAbove):
 
 
 class ArmExecutor(ArmDriver):
-    """Drives an arm with the torques of the boards above: all of its joints, or none.
+    """Drives an arm with the torques of the boards above. Either all joints are driven or none.
 
     While it reports `stopped`, these boards must bring the joints to rest and hold them. If they do
     not do so in time, the arm is braked. It is also braked if a board is lost or late. The brakes
@@ -144,7 +144,7 @@ class ArmExecutor(ArmDriver):
             self.orders.refuse_newest(refusal)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
-        """Return the motion that the boards above want, or None if the arm must be braked."""
+        """Return the motion commanded by the boards above, or None if the arm must be braked."""
         if self.arm.braked and self._braked_at is None:
             self._waiting = "braked until the boards above have seen it"
             return None
@@ -169,7 +169,7 @@ class ArmExecutor(ArmDriver):
         return self.joints.wanted
 
     def _is_astray(self) -> bool:
-        """Return True if the boards above want the braked arm too far from its position.
+        """Return True if the boards above command a position too far from that of the arm.
 
         This happens for two cycles when sensors are trusted again and their position differs from
         the estimate.
@@ -188,7 +188,7 @@ class ArmExecutor(ArmDriver):
         """Return True if the time for the boards above to bring the arm to rest is over.
 
         Args:
-            stops: The arm must stop.
+            stops: True if the arm must stop.
             tick: Tick of the cycle.
         """
         if not stops:
@@ -219,7 +219,7 @@ class ArmExecutor(ArmDriver):
         return self.payload.mass > 0.0
 
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
-        """Return the report on the torques from above, which becomes a part of the status."""
+        """Return the section of the status that reports the set points of the boards above."""
         is_held = self.orders.is_holding
         reason = self.stopping.reason or self._waiting
         if is_held and not reason:

@@ -223,8 +223,8 @@ class NetworkGateway(JointGateway):
     def _follow_clock(self, ahead_s: float) -> None:
         """Update the difference between the clocks of the two racks, because they drift apart.
 
-        While references are followed, it only changes in small steps, so that the motion does not
-        jolt.
+        While references are followed, the difference changes only in small steps, so that the
+        motion does not jerk.
 
         Args:
             ahead_s: Newest time of the other rack minus the time of this one.

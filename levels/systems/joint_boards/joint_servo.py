@@ -177,7 +177,11 @@ class JointServo(Executor):
         operator.orders.fill_status(self.status, self._rests_on)
 
     def _obey_command(self, command: OperatorCommand) -> str:
-        """Switch a modification or set a parameter. Return why that failed, or an empty string."""
+        """Switch a modification or set a parameter.
+
+        Returns:
+            The reason for a failure, or an empty string.
+        """
         if command.what == Operation.MODIFY:
             return self._modified.switch_modification(command.name, command.goal == Goal.ON)
         self.settings, refusal = set_live(self.settings, command.name)
@@ -216,7 +220,7 @@ class JointServo(Executor):
         """Initialise from the first status of the arm.
 
         Args:
-            has_status: A status of the arm has arrived.
+            has_status: True if a status of the arm has arrived.
             arm: Status of the arm.
 
         Returns:
@@ -269,8 +273,8 @@ class JointServo(Executor):
         Args:
             status: Status to write.
             arm: Status of the arm.
-            is_silent: The status of the arm is missing or too old.
-            stopped: The joints must come to rest.
+            is_silent: True if the status of the arm is missing or too old.
+            stopped: True if the joints must come to rest.
         """
         operator = self.operator_control
         holding = self.reference.holding

@@ -130,7 +130,9 @@ def _find_state_flaws(table: StateTable) -> Iterator[str]:
 def _find_case_flaws(
     state: str, rows: Mapping[int, RowConfig], vocabulary: Vocabulary
 ) -> Iterator[str]:
-    """Yield a line for each overlap of two rows, row that never fires, and uncovered case.
+    """Yield a line for each mistake in the cases that the rows of a state cover.
+
+    Mistakes are rows that overlap, rows with `else` that never fire, and cases without a row.
 
     Args:
         state: Name of the state.

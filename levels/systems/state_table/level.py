@@ -292,7 +292,8 @@ class StateTableExecutor(Executor):
             (tick - self._state_since_tick) * self.context.tick_s > self.table.patience_s
         ]
         if self.vocabulary.commands:
-            # Do not compare the words: the same command has other words only if a table was edited.
+            # Compare sender and serial, not the words, because an edited table may have other words
+            # for the same command.
             is_new = self._newest[:2] != self._taken[:2] and self._newest.serial > 0
             command = self._newest if is_new else self._taken
             values["command"] = command.words.partition(" ")[0] or "none"

@@ -176,7 +176,11 @@ class PrimitiveTable(StateTableExecutor):
         }
 
     def _update_following(self) -> Array:
-        """Update how long the boards below have followed, and return the joint positions, rad."""
+        """Count the cycles for which the boards below have followed the set points.
+
+        Returns:
+            Joint positions, (joints,), in rad.
+        """
         readings = list(self.statuses.values())
         statuses = [reading.message for reading in readings]
         position: Array = statuses[0].position

@@ -35,14 +35,14 @@ def copy_request(record: Any) -> MotionRequest:
 
 
 def find_request_error(request: MotionRequest, ranges: Array) -> str:
-    """Return why no arm with these joint ranges can carry out a request.
+    """Return the reason why a request is invalid for an arm with these joint ranges.
 
     Args:
         request: Request to check.
         ranges: Position limits of the joints, (joints, 2), rad.
 
     Returns:
-        The reason. Empty if the request may be possible.
+        The reason, or an empty string if no mistake is found.
     """
     if request.kind not in VALID_KINDS:
         return f"kind {request.kind}; permitted: {VALID_KINDS[0]} to {VALID_KINDS[-1]}"
