@@ -105,7 +105,7 @@ USAGE_ERRORS = (
 
 
 def main() -> None:
-    """Run the command line, and report a user's mistake in one line."""
+    """Run the command line. Mistakes of the user are reported in one line."""
     if sys.platform != "linux":
         sys.exit(
             f"rack runs only on Linux, not on {sys.platform}: it needs /dev/shm, pidfds and"
@@ -118,7 +118,7 @@ def main() -> None:
         try:
             run_commands()
         except OSError:
-            # If stdout is broken, this call reports it.
+            # If stdout is the cause, this call exits. It prints nothing if the pipe is closed.
             _flush_stdout("\n")
             raise
         finally:

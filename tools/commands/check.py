@@ -164,7 +164,7 @@ def _use_measured_budgets(config: RackConfig, run: Path, percentile: float) -> R
 
 
 def _compute_abilities(config: RackConfig) -> Abilities | None:
-    """Compute reach and payload of a rack's arm at rest. None if it has a hand or no arm."""
+    """Compute reach and static payload of an arm. None for a rack with a hand or without an arm."""
     robot = config.robot
     if robot is None or robot.hand is not None:
         return None

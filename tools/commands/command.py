@@ -133,7 +133,7 @@ def command(
 
 
 def print_reply(reply: Reply, as_json: bool) -> None:
-    """Print the reply of a level at once. End the program with status 1 if the level refused."""
+    """Print the reply of a level, and flush stdout. Exit with status 1 if the level refused."""
     print_answer(asdict(reply) | {"worked": reply.worked}, reply.line, as_json)
     sys.stdout.flush()
     if not reply.worked:

@@ -154,8 +154,8 @@ def _set_latch(rack: str, reset: bool) -> tuple[int, str]:
     """Set or clear the latch of a rack on this machine, and wait until the clock has applied it.
 
     Returns:
-        The current tick, and a text that tells why the arm reacts only later if the rack is held.
-        Otherwise the text is empty.
+        The current tick, and the reason why the arm does not react yet if the rack is held. The
+        reason is empty if the rack is not held.
     """
     segment = Segment.attach(rack)
     words = segment.words

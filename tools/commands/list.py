@@ -39,7 +39,7 @@ def describe_rack(name: str) -> Document:
     """Return a document with the name, state and details of one rack.
 
     `age_s` is the time since its launch. `launcher` is the process id of its launcher, or None if
-    that is in another PID namespace. The document of a foreign rack has neither.
+    the launcher is in another PID namespace. The document of a foreign rack has neither.
     """
     try:
         segment = Segment.attach(name)

@@ -70,7 +70,7 @@ def new(
 
 
 def _find_name_problem(kind: str, name: str) -> str:
-    """Return why the module, its rack or its board cannot have this name. Empty if they can."""
+    """Return the reason why a new module cannot have this name, or an empty string."""
     if not re.fullmatch(RACK_NAME, name) or not name.isidentifier() or keyword.iskeyword(name):
         return "must be at most 40 of a-z, 0-9 and '_', begin with a letter, and not be a keyword"
     if name in list_names() or name in load("nasrem").board:

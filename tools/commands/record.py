@@ -98,7 +98,7 @@ def record(
 
 
 def _save_recording(segment: Segment, folder: Path) -> tuple[Document, str]:
-    """Save what has been recorded of a running rack. Returns the answer as data and as a line."""
+    """Save the recording of a running rack so far. Returns the answer as data and as a line."""
     name = segment.layout.rack
     run = find_run_folder(segment)
     if run is None:
@@ -164,7 +164,7 @@ def _record_racks(racks: Sequence[Segment], folder: Path, view: bool) -> list[st
         view: True to open the viewer. Only for one rack.
 
     Returns:
-        Notes for the user.
+        Messages for the user.
     """
     names = [rack.layout.rack for rack in racks]
     if duplicates := [name for at, name in enumerate(names) if name in names[:at]]:
@@ -207,7 +207,7 @@ def _await_runs(
         unfinished: Message for the user if finishing takes too long after Ctrl-C.
 
     Returns:
-        Notes of the recorders for the user.
+        Messages of the recorders for the user.
     """
     notes: list[str] = []
     ended = Event()

@@ -113,7 +113,7 @@ def _open_viewer(*recordings: Path) -> None:
 
 
 def _write_file(runs: Sequence[Path], out: Path, place: Places) -> None:
-    """Merge runs into the file `out`, and print the notes of `merge_runs` on stderr.
+    """Merge runs into the file `out`, and print the messages of `merge_runs` on stderr.
 
     Raises `Failure` if `out` exists or is not an .rrd file.
     """
@@ -131,11 +131,11 @@ def merge_runs(runs: Sequence[Path], out: Path, place: Places = align_racks) -> 
     Args:
         runs: Run folders.
         out: The file.
-        place: Function that puts the runs on one time line. By default they are treated as racks
-            that ran together.
+        place: Function that puts the runs on one time line. The default is for racks that ran
+            together.
 
     Returns:
-        Notes for the user about the times of the runs.
+        Messages for the user about the times of the runs.
 
     Raises:
         Failure: A run cannot be read, or the runs have no time in common.

@@ -244,13 +244,13 @@ def _write_draft(
 
 
 def _format_answer(document: Document, folder: Path, name: str) -> Iterator[str]:
-    """Yield lines that tell what was written, what is guessed, and how to run it."""
+    """Yield lines about the written folder: its robot, the guesses, and the command to run it."""
     joints = document["joints"]
     yield f"{folder}: {len(joints)} joints, {', '.join(joints)}; {document['task']}"
     yield from document["notes"]
     for key, why in document["guessed"].items():
         yield f"guessed: {key}: {why}"
     config_path = folder / f"{name}.toml"
-    # A file of that name beside the folder would be found first.
+    # `rack run NAME` would prefer a file NAME.toml in the current directory.
     is_found = folder == Path(name) and not Path(config_path.name).exists()
     yield f"rack run {name if is_found else shlex.quote(str(config_path))}"

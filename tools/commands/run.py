@@ -143,8 +143,8 @@ def run(
         if origin is not None:
             warm = crate if isinstance(crate, WarmCrate) else None
             begins = stack.enter_context(open_beginning(rack_config, origin, warm, anyway))
-        # Applies from the start of the run to the end of its report. During the launch, `run_rack`
-        # lets a signal end the command at once.
+        # From here to the end of the report, a signal ends the run in an orderly manner. Only
+        # during the launch, `run_rack` lets a signal end the command at once.
         unfinished = UNFINISHED_HINT.format(folder) if folder else ""
         stack.enter_context(INTERRUPT.stop_orderly(unfinished=unfinished))
         with open_display(silent=as_json) as display:
@@ -189,7 +189,7 @@ def _preload_levels(crate: CrateLine | None, tables: Tables) -> CrateLine | None
 def _report_run(
     config: RackConfig, folder: Path | None, result: RunResult, as_json: bool
 ) -> Document:
-    """Write, print and return the report. If it cannot be written, the run has failed."""
+    """Write, print and return the report. The run counts as failed if it cannot be written."""
     from rack.tools.recording.folder_size import format_recorded_line
     from rack.tools.report.report import build_unrecorded_report, write_report
     from rack.tools.report.report_markdown import format_summary

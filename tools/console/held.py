@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def describe_wait(segment: Segment) -> str:
-    """Return a text that tells what a request to a held rack waits for. Empty if it is not held."""
+    """Return the reason why requests to a rack wait. Empty if the rack is not held."""
     tick = segment.words[System.HELD] - 1
     if tick < 0:
         return ""

@@ -1,9 +1,9 @@
 """SIGINT, SIGTERM and SIGHUP end a command within 2 s, with exit status 128 + signal.
 
 They leave no process and no segment behind. A command with nothing to finish ends inside the signal
-handler. Python's own way, an exception raised there, was rejected: it may occur after a segment has
+handler. Raising an exception there, as Python does, was rejected: it may occur after a segment has
 been created and before its owner has been recorded, and libraries that are being imported turn it
-into other errors. A command with something to finish uses `stop_orderly`, and gets `BOUND_S`.
+into other errors. A command with something to finish uses `stop_orderly`, and has `BOUND_S` for it.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Interrupt:
     def stop_orderly(
         self, stop: Callable[[], object] = lambda: None, unfinished: str = ""
     ) -> Iterator[None]:
-        """Let the first signal call `stop`, after which the command is expected to end by itself.
+        """Call `stop` at the first signal, after which the command is expected to end by itself.
 
         Args:
             stop: Called in the signal handler, or at once if a signal has been received already.
@@ -88,18 +88,18 @@ class Interrupt:
             self._reactions.pop()
 
     def end_at_once(self) -> AbstractContextManager[None]:
-        """Let a signal end the process in the signal handler, even inside `stop_orderly`."""
+        """End the process in the signal handler at a signal, even inside `stop_orderly`."""
         return self.stop_orderly(self.end_process)
 
     def raise_interrupted(self) -> AbstractContextManager[None]:
-        """Let the first signal raise `Interrupted`.
+        """Raise `Interrupted` at the first signal.
 
-        Use it for waits, and where contexts have files to clean up.
+        Use this for waits, and where the exit of a context must clean up files.
         """
         return self.stop_orderly(_raise_interrupted)
 
     def exit_if_signalled(self) -> None:
-        """If a signal was received, end the process with its exit status.
+        """If a signal was received, end the process with the exit status of that signal.
 
         Call this when the command has finished.
         """
@@ -155,7 +155,8 @@ INTERRUPT = Interrupt()
 def _is_resource_tracker(pid: int) -> bool:
     """Return whether a process is Python's resource tracker.
 
-    It removes the semaphores of a process pool when this process has ended, and must not be killed.
+    The tracker must not be killed: after this process has ended, it removes the semaphores of
+    process pools.
     """
     with suppress(OSError):
         return b"multiprocessing.resource_tracker" in Path(f"/proc/{pid}/cmdline").read_bytes()
@@ -178,9 +179,9 @@ def _leave_terminal() -> None:
 
 
 def _kill_children(family: list[int]) -> None:
-    """Kill every descendant in this session and wait for its end.
+    """Kill the given descendants of this process, and wait until they have ended.
 
-    A viewer window has its own session and stays open.
+    A viewer window is not among them, because it has its own session, and stays open.
     """
     for pid in family:
         with suppress(ProcessLookupError):
@@ -207,7 +208,7 @@ def list_descendants(pid: int, session: int | None = None) -> Iterator[int]:
         pid: The process.
         session: Only processes of this session. None for all.
     """
-    # The files of a process that has ended in the meantime cannot be read.
+    # A process may end before its files are read.
     children: list[int] = []
     with suppress(OSError):
         for thread in Path(f"/proc/{pid}/task").iterdir():
@@ -220,7 +221,7 @@ def list_descendants(pid: int, session: int | None = None) -> Iterator[int]:
 
 
 def _remove_racks(killed: list[int]) -> None:
-    """Remove the racks of this process, because its `killed` children no longer can."""
+    """Remove the racks of this process and of its `killed` children."""
     # Look the module up instead of importing it: a signal handler may run in the middle of an
     # import. If it is not loaded, this process has not made any racks.
     remove_own = getattr(sys.modules.get("rack.boards.crate.clean"), "remove_own_racks", None)

@@ -29,7 +29,7 @@ def can_draw() -> bool:
 def open_figure(
     paths: Sequence[Path], width_in: float, height_in: float, **settings: Any
 ) -> Iterator[Figure]:
-    """Provide an empty figure that is saved at the end. Equal figures give identical files.
+    """Provide an empty figure, and save it at the end. Equal figures give identical files.
 
     Args:
         paths: Files to write, with endings in `PICTURE_FORMATS`.

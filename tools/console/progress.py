@@ -33,7 +33,7 @@ class Progress:
         self._print(f"about {seconds / 60.0:.0f} minutes")
 
     def begin_run(self, text: str) -> None:
-        """Announce the run that begins."""
+        """Show a text about the run that begins."""
         self._bar.update(self._task, description=text)
         self._print(text)
 
@@ -53,7 +53,7 @@ class Progress:
             self._print(f"  {line}")
 
     def _print(self, line: str) -> None:
-        """Print a line if progress is shown as lines."""
+        """Print a line if progress is shown as printed lines."""
         if self._prints_lines:
             print(line, flush=True)
 

@@ -184,7 +184,7 @@ def render_markdown(blocks: Iterable[str | TextTable]) -> str:
 
 
 def render_text(blocks: Iterable[str | TextTable], width: int | None = None) -> Iterator[str]:
-    """Yield the lines of a text. Its tables are fitted to `width`, if given."""
+    """Yield lines of text and of tables. Tables are fitted to `width`, unless it is None."""
     for block in blocks:
         if isinstance(block, TextTable):
             yield from format_table(block.head, block.rows, width, block.dropped)
@@ -201,7 +201,7 @@ def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
 
 
 def print_blocks(blocks: Iterable[str | TextTable]) -> None:
-    """Print text and tables on stdout. Tables are fitted to a terminal, but complete in a pipe."""
+    """Print text and tables on stdout. Only a terminal limits the width of tables."""
     terminal = create_console()
     if terminal.is_terminal:
         show_blocks(blocks, terminal)
@@ -210,15 +210,15 @@ def print_blocks(blocks: Iterable[str | TextTable]) -> None:
 
 
 def format_decimal(value: float | None, digits: int = 3) -> str:
-    """Format a number with a fixed number of decimals, or "-" for None."""
+    """Format a number with a fixed number of decimals, or return "-" for None."""
     return "-" if value is None else f"{value:.{digits}f}"
 
 
 def format_figure(distribution: Mapping[str, Any] | None, key: str) -> str:
-    """Format the value of one key of a distribution, or "-" if the distribution is None."""
+    """Format one value of a distribution, or return "-" if the distribution is None."""
     return "-" if distribution is None else format_decimal(distribution[key])
 
 
 def format_ms(time_ns: float | None) -> str:
-    """Format a time in ms, to the microsecond, without trailing zeros. "-" for None."""
+    """Format a time in ms, to the microsecond, without trailing zeros. Return "-" for None."""
     return "-" if time_ns is None else f"{time_ns * 1e-6:.3f}".rstrip("0").rstrip(".")

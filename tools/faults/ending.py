@@ -115,7 +115,7 @@ def list_strikes(segment: Segment, joints: Sequence[str]) -> tuple[Strike, ...]:
 def read_arm(segment: Segment) -> ArmEnd:
     """Return the state of a rack's arm from its newest messages.
 
-    A rack without an arm has no violations and is at rest.
+    For a rack without an arm, there are no violations and `is_at_rest` is True.
     """
     arm_statuses = [status for _, status in iterate_statuses(segment, "violations")]
     all_states = [*arm_statuses, *(state for _, state in iterate_arm_states(segment))]

@@ -1,4 +1,4 @@
-"""Events as evidence of faults: which event may detect which fault, and which reactions follow."""
+"""Events as evidence of faults: possible detections of a fault, and reactions to it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def _to_codes(alarms: Iterable[Alarm]) -> set[str]:
 
 
 DETECTION_KINDS = ("detection", "miss", DIED)
-"""Kinds of events that can be a detection."""
+"""Kinds of events that can count as detections."""
 MAILBOX_ALARMS = _to_codes(alarm for alarm in Alarm if Alarm.STALE <= alarm <= Alarm.QUEUE_FULL)
 CLOCK_ALARMS = _to_codes(
     alarm for alarm in Alarm if Alarm.CLOCK_STOPPED <= alarm <= Alarm.CLOCK_LATE
@@ -32,7 +32,7 @@ BRAKES = "brakes_closed"
 LATCHED = "latched"
 """Code of the reaction to a fault that lasted too long: brakes stay closed and the task ends."""
 COLLISION = Alarm.COLLISION.name.lower()
-"""Code of a collision. Brakes that close in the same tick react to it and not to a fault."""
+"""Code of a collision. Brakes that close in the same tick are a reaction to it."""
 UNDONE_BY: Mapping[str, str] = {BRAKES: "brakes_opened", "demand": "demand", "restart": "rejoined"}
 """Code of the recovery that undoes each reaction."""
 TAKE_CYCLES: tuple[Where, ...] = ("process", "load", "core", "lock", "clock")
@@ -47,7 +47,7 @@ class Detection:
         event: The event.
         delay: Ticks from the fault's first action, without ticks that the clock skipped.
         bound: Largest permitted delay in ticks. None if there is no bound.
-        delay_ms: Delay in ms of wall-clock time. None in lockstep, where it means nothing.
+        delay_ms: Delay in ms of wall-clock time. None in lockstep, where it is meaningless.
         bound_ms: Bound in ms for a death in real time, which replaces `bound`. None otherwise.
     """
 
@@ -79,9 +79,9 @@ class Detection:
 def can_be_detection(event: Event, strike: Strike) -> bool:
     """Return True if an event can be the detection of a fault.
 
-    It must be of the right kind, concern the same target, and not come before the fault. A death
-    may have the tick before the fault's tick, because a fault may act shortly before other
-    processes can read the new tick.
+    The event must have one of the codes by which the kind of the fault is reported, concern the
+    same target, and not precede the fault. A death may precede it by one tick, because a fault may
+    act shortly before other processes can read the new tick.
     """
     return (
         event.kind in DETECTION_KINDS
@@ -95,7 +95,7 @@ def can_explain(strike: Strike, event: Event) -> bool:
     """Return True if an event during a fault may be its detection or one of its consequences."""
     consequence = strike.record.consequence
     if event.kind == "miss":
-        # A fault that takes one task's cycles may take cycles of any task on the same core.
+        # A fault that makes one task miss cycles can have this effect on any task of its core.
         return takes_cycles(strike)
     if event.kind == DIED:
         return strike.board == event.board and consequence.ends_process
@@ -116,7 +116,8 @@ def concerns_target(event: Event, strike: Strike) -> bool:
         return event.subject == strike.board
     if event.code in CLOCK_ALARMS:
         return strike.board == CLOCK
-    # An alarm about all joints may concern any joint, and a fault of all joints any alarm.
+    # An alarm about all joints concerns the joint of any fault. A fault of all joints may cause
+    # an alarm about any joint.
     return not event.subject or not strike.joint or event.subject in (strike.joint, ALL_JOINTS)
 
 
@@ -128,9 +129,10 @@ class SkippedTicks:
         self._skips = [event for event in events if event.kind == "miss" and event.code == name]
 
     def count_between(self, first: int, last: int) -> int:
-        """Return the number of ticks after `first`, up to `last`, that the clock skipped.
+        """Return the number of ticks that the clock skipped after tick `first`, up to `last`.
 
-        Every task reports the skips that it has noticed, so the largest count of one task is taken.
+        Each task reports only the skips that it notices, so the result is the largest number that
+        any one task reported.
         """
         by_task = Counter[str]()
         for event in self._skips:
@@ -202,8 +204,8 @@ def find_aftermath(
 def _can_react(strike: Strike, reaction: Event) -> bool:
     """Return True if a reaction may have been caused by a fault.
 
-    Only faults that take cycles make the brakes close because of missed cycles. Only kinds that may
-    latch cause a latch.
+    If the brakes closed because of missed cycles, the fault must be one for which `takes_cycles`
+    is True. If the reaction is a latch, the kind of the fault must permit a latch.
     """
     if reaction.code == LATCHED:
         return strike.record.consequence.latches

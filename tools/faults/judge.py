@@ -59,7 +59,7 @@ class Judgement:
         reactions: Codes of the reactions to it.
         is_recovered: Whether the rack recovered from the fault within the bound.
         recovery: Ticks from the fault's first action until every reaction was undone and affected
-            messages flowed again. None if that was not seen or if there was no reaction.
+            mailboxes had new messages. None if this did not happen, or if nothing was affected.
         recovery_bound: Largest permitted value of `recovery`. None if the launch was refused.
         lacking: Required reactions that did not follow.
         is_latched: Whether the fault ended the task, as its kind permits.
@@ -91,7 +91,7 @@ class Judgement:
 
     @property
     def fraction_of_bound(self) -> float | None:
-        """Delay divided by its bound, both in ms if possible. None without a bound."""
+        """Delay divided by its bound. None without a delay or a bound, and for a bound of 0."""
         if self.bound_ms is not None and self.delay_ms is not None:
             return self.delay_ms / self.bound_ms
         return self.delay / self.bound if self.bound and self.delay is not None else None
@@ -132,10 +132,10 @@ def judge_faults(
 ) -> FaultVerdict:
     """Evaluate the faults of a run from its events.
 
-    An event is the detection of one fault only. If it fits two faults, it counts for the one that
-    acted first and has no detection yet. A fault of the arm that ended undetected before its bound
-    counts as not having acted, and so does a fault whose run ended before the bound of its
-    recovery.
+    Each event counts as the detection of at most one fault. If it fits several, it counts for the
+    first to act that has no detection yet. A fault counts as not having acted in two cases: it is a
+    fault of the arm that ended undetected before it had to be detected, or the run ended without a
+    recovery before the bound of the recovery.
 
     Args:
         strikes: Faults of the run.
@@ -215,7 +215,7 @@ class Judge:
     def _compute_window(self, strike: Strike) -> tuple[int, int]:
         """Return the first and the last tick at which an event may be caused by a fault."""
         if strike.record.takes_mailbox and self._layout.find_task(strike.board).role == "planner":
-            # The planner itself may notice the fault, but only when it makes its next plan.
+            # The planner itself may detect the fault, but only when it makes its next plan.
             return strike.first_tick - 1, self._last
         return strike.first_tick - 1, self._find_last_effect(
             strike, min(find_end(strike), self._last)
@@ -230,7 +230,7 @@ class Judge:
     def _list_detections(self, strike: Strike, last_tick: int, used: set[int]) -> list[Detection]:
         """Return the possible detections of a fault up to `last_tick`, without events in `used`."""
         if not strike.count:
-            # It need not be detected, so any later detection belongs to something else.
+            # The fault need not be detected, so an event after its end has another cause.
             last_tick = min(last_tick, strike.ends)
         fitting = (
             event
@@ -274,13 +274,14 @@ class Judge:
         reader = event.board if event.code in MAILBOX_ALARMS else None
         bound = self._compute_bound(strike, reader)
         if self._run.is_lockstep:
-            # In lockstep the clock waits for the end of a process that it has killed itself. An
-            # external kill is not known to the clock, which runs as fast as it can, so neither
-            # ticks nor time measure the delay.
+            # In lockstep the clock waits for the end of each process that it kills. It does not
+            # know of an external kill, and runs on as fast as it can. Neither ticks nor time
+            # measure the delay in this case.
             if event.kind == DIED and strike.kind == EXTERNAL:
                 bound = None
             return Detection(event, delay, bound)
-        # The delay may be negative: a fault of the arm is recorded after the cycle that found it.
+        # The difference may be negative, because a fault of the arm is recorded after the cycle
+        # that found it.
         delay_ms = max(0, event.time_ns - self._run.offset_ns - strike.time_ns) * 1e-6
         bound_ms = (RACK_NS + MEMORY_NS) * 1e-6 if event.kind == DIED else None
         return Detection(event, delay, bound, delay_ms, bound_ms)
@@ -382,7 +383,7 @@ def report_faults(recorded: Sequence[Mapping[str, Any]], layout: Layout) -> Repo
     )
     restarts = Counter(event.board for event in events if event.code == "restart")
     return {
-        # Faults that never struck come last.
+        # Faults that never acted come last.
         "faults": [
             _build_row(judgement, layout)
             for judgement in sorted(

@@ -1,4 +1,4 @@
-"""Faults in a running rack: written as in a config, added to its fault table, and followed."""
+"""Injects faults, given in the form of a config, into a running rack and follows their state."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class LiveRack:
         self._check_fault(fault)
         entry = self._table.add_fault(checked)
         if KINDS[fault.kind].where == "core":
-            # This process itself takes the core.
+            # For such a fault, this process itself occupies the core.
             self._print_waiting(entry)
             run_core_fault(self._segment, entry.index)
         elif fault.tick is None and fault.when is None:
@@ -101,7 +101,7 @@ class LiveRack:
         self._table.disarm_fault(entry)
         words = self._segment.words
         tick = words[System.TICK]
-        # Wait for a tick that cannot begin the fault any more. A held clock begins no fault.
+        # Wait until the fault can no longer begin. No fault begins while the clock is held.
         self._wait_until(lambda: words[System.TICK] > tick + 1 or words[System.HELD] > 0, BEGIN_S)
         if not self._table.free_entry(entry):
             raise Failure(
@@ -142,7 +142,7 @@ class LiveRack:
             "seed", (self._config.seed + self._segment.words[System.INJECTED]) % SEEDS
         )
         try:
-            # Values from a command line are texts, so let numbers be converted from text.
+            # Values from a command line are strings, so allow conversion from strings to numbers.
             return FaultConfig.model_validate(settings, strict=False)
         except ValidationError as error:
             raise ConfigError(convert_errors(error, FaultConfig, settings)) from None
@@ -151,8 +151,8 @@ class LiveRack:
         """Check that this process can inject a fault into a running rack.
 
         Raises:
-            ConfigError: The fault cannot begin in a running rack, or lacks an end.
-            Failure: This process may not take a core.
+            ConfigError: The fault cannot begin in a running rack, or has no end but needs one.
+            Failure: This process is not permitted to occupy a core.
         """
         tick = self._segment.words[System.TICK]
         where = KINDS[fault.kind].where
@@ -176,7 +176,7 @@ class LiveRack:
         set_priority(0)
 
     def _wait_until(self, holds: Callable[[], bool], timeout_s: float | None) -> bool:
-        """Wait until a condition holds or the run is over. Return False after a time-out."""
+        """Wait until a condition holds or the run is over. Return False after `timeout_s`."""
         deadline = math.inf if timeout_s is None else time.monotonic() + timeout_s
         while not holds() and not self._segment.run_is_over:
             if time.monotonic() > deadline:

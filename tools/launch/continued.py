@@ -2,8 +2,7 @@
 
 `rack run --from RUN@TIME` and `rack rewind` use it. Lockstep is deterministic, so the rack reaches
 each tick in the same state as in the recorded run. Commands of operators are repeated, and messages
-of host boards and other racks are replayed. Up to that tick nothing is changed. A branch may differ
-only from that tick on.
+of host boards and other racks are replayed. A branch differs from the run only from that tick on.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ class RepeatedRun:
 
     Args:
         recording: The run.
-        asked: Prefix of the text of each `Failure`. Empty for the folder of the run.
+        asked: Prefix of the text of each `Failure`. If empty, the folder of the run is used.
         crate: A crate that was started earlier, to save time.
         anyway: True to repeat the run even if its code or files have changed since.
     """
@@ -84,7 +83,7 @@ class RepeatedRun:
         extend_path(ran.python_path)
         check_code_state(recording, self._error_prefix, anyway)
         self.crate = crate or WarmCrate()
-        # The crate imports them while this process reads the run.
+        # The crate imports the levels while this process reads the run.
         self.crate.try_request(
             Preload(list_class_names(ran), tuple(sys.path), build_cell_config(ran))
         )
@@ -171,7 +170,7 @@ class RepeatedRun:
             yield rack
 
     def _unique_config(self, ending: str) -> RackConfig:
-        """Return the config of the run with a unique name, since the original may be in use."""
+        """Return the run's config under a unique name, because its own name may be in use."""
         config = load_branch_config(self.recording)
         return config.model_copy(update={"name": f"{config.name[:16]}-{ending}-{os.getpid()}"})
 
@@ -203,24 +202,24 @@ class RepeatedRun:
         return replace(begins, requests=load_operator_commands(run))
 
     def _find_continuation(self, tick: int) -> Continuation:
-        """Return how a rack continues from the newest snapshot up to `tick`.
+        """Return the point from which a rack continues: the newest snapshot at or before `tick`.
 
-        The result includes the numbers of faults and commands of the config, which the snapshot
-        already contains.
+        The snapshot already contains the faults and commands of the config. The result includes
+        their numbers.
         """
         ran = self.recording.rack_config
         return Continuation(tick, len(ran.fault), len(ran.command), self._losses)
 
     @cached_property
     def _losses(self) -> tuple[tuple[str, int], ...]:
-        """Boards that died in this run or in a run that it continues, each with its tick."""
+        """Boards that died in this run or in one that it continues, each with the tick of death."""
         died = (event for event in self.recording.events if event["kind"] == "died")
         earlier = () if self._parent is None else self._parent._losses
         before = (loss for loss in earlier if loss[1] < (self._branched_at or 0))
         return (*before, *((death["board"], death["tick"]) for death in died))
 
     def _nearest_snapshot_tick(self, tick: int) -> int:
-        """Return the tick of the newest snapshot up to `tick`."""
+        """Return the tick of the newest snapshot at or before `tick`."""
         return self.crate.read_attributes(tick, "").tick
 
     def _report_differences(self, mailboxes: Sequence[str], tick: int) -> None:
@@ -272,7 +271,7 @@ def find_run_config(origin: str) -> Path:
 def open_beginning(
     config: RackConfig, origin: str, crate: WarmCrate | None = None, anyway: bool = False
 ) -> Iterator[Beginning]:
-    """Yield a state of a recorded run from which a rack can continue. Valid inside the context.
+    """Provide a state of a recorded run from which a rack can continue, valid inside the context.
 
     Args:
         config: Config of the rack, which may be a branch of the run.
@@ -305,7 +304,7 @@ def parse_tick(recording: Recording, text: str, asked: str = "") -> int:
     Args:
         recording: The run.
         text: The time.
-        asked: Prefix of the text of a `Failure`.
+        asked: Prefix of the text of the `Failure`.
 
     Raises:
         Failure: The time is not a number, outside the run, or between two recorded stretches.

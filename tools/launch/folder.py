@@ -71,7 +71,7 @@ class EventLog:
     def write_outcome(self, outcome: Document) -> None:
         """Write the outcome, close the file, and sort its events.
 
-        During the run, events are written in the order in which they are reported.
+        Before, they are in the order of their reports, which may differ from that of their ticks.
         """
         self._write_entry({"time_ns": time.time_ns(), "kind": "outcome", **outcome})
         self.close()
@@ -80,7 +80,7 @@ class EventLog:
 
     def close(self) -> None:
         """Close the file, whether or not it has an outcome."""
-        # Closing repeats a failed write, which would fail again.
+        # After a failed write, closing would write again and fail again.
         with suppress(OSError):
             self._file.close()
 

@@ -83,7 +83,8 @@ class RunResult:
     """A finished run: its outcome, its faults, and the counts from every task's control block.
 
     Attributes:
-        recording: "complete", "none" if no recording was wanted, or a text about what is missing.
+        recording: "complete", "none" if no recording was wanted, or a text that states what is
+            missing.
         rows_lost: Dictionary from task or mailbox to its number of missing rows.
         clock_offset_ns: Time to add to CLOCK_MONOTONIC, which boards use, to get the wall-clock
             time of events.
@@ -331,7 +332,7 @@ def _watch_rack(
 def compare_recording(
     folder: Path, segment: Segment, why: str, ticks: int
 ) -> tuple[str, dict[str, int]]:
-    """Compare the files of a run with the number of rows that were written to the rings.
+    """Compare the number of rows in the files of a run with the number written to the rings.
 
     Args:
         folder: Folder of the run.
@@ -340,8 +341,8 @@ def compare_recording(
         ticks: Ticks of the run.
 
     Returns:
-        "complete" or a text about what is missing, and a dictionary from task or mailbox to its
-        number of missing rows.
+        "complete" or a text that states what is missing, and a dictionary from task or mailbox to
+        its number of missing rows.
     """
     # Import late, because these libraries would delay the launch.
     from rack.tools.recording.occasions import Retention

@@ -25,7 +25,7 @@ MAX_STOP_S = 3.0
 
 @dataclass(frozen=True)
 class OtherRackEnd:
-    """The end of another rack. `folder` is None if its run was not recorded."""
+    """Outcome of the run of another rack. `folder` is None if the run was not recorded."""
 
     rack: str
     cause: str
@@ -35,7 +35,7 @@ class OtherRackEnd:
 
 
 class LaunchedProcess(NamedTuple):
-    """Process of another rack. Its report goes to a memory file, as no one would read a pipe."""
+    """Process of another rack. It prints its report to a memory file, which needs no reader."""
 
     config: str
     process: subprocess.Popen[bytes]

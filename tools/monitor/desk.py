@@ -32,9 +32,9 @@ from rack.tools.monitor.newest_messages import NewestMessages
 from rack.tools.monitor.replies import Reply, ReplyDeadline, ReplyReader, find_answering_status
 
 MAX_SILENCE_S = 5.0
-"""A wait fails after this time without a tick."""
+"""Time without a tick after which a wait fails."""
 EXPLAIN_AFTER_S = 1.5
-"""A wait is explained on stderr after this time."""
+"""Time after which a wait is explained on stderr."""
 CHECK_INTERVAL_S = 0.001
 """Time between two checks of the rack."""
 GOAL_KEYS = ("joints", "position", "quaternion", "direction")
@@ -225,15 +225,15 @@ class LevelCommander:
     def _poll_run(self, about: str, awaited: str) -> Iterator[bool]:
         """Check the rack repeatedly, and yield each time whether the run is over.
 
-        A long wait is explained once on stderr. Raises `Failure` if the clock stops ticking
-        although the rack is not held.
+        After `EXPLAIN_AFTER_S` it prints once on stderr what is awaited. Raises `Failure` if the
+        clock stops ticking although the rack is not held.
         """
         words = self._segment.words
         tick = words[System.TICK]
         changed = time.monotonic()
         note_at = changed + EXPLAIN_AFTER_S
         while True:
-            # Read this before the statuses: a reply written just before the run ended still counts.
+            # The caller reads statuses after this, so that a last reply before the end counts.
             yield self._segment.run_is_over
             time.sleep(CHECK_INTERVAL_S)
             now = time.monotonic()

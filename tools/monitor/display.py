@@ -76,7 +76,7 @@ DEFAULT_EVENT_STYLE = "yellow"
 HIDDEN_EVENTS = ("launch", "start", "end", "miss")
 """Kinds of events that the table shows already: for example, it counts misses."""
 BRIEF_TICKS = 10
-"""Brakes engaged by missed cycles for fewer ticks than this are only counted."""
+"""Braking because of missed cycles for fewer ticks than this is counted, but not shown."""
 
 
 class Display:
@@ -166,7 +166,7 @@ class RackView:
     def __rich_console__(
         self, terminal: Console, options: ConsoleOptions
     ) -> Iterator[RenderableType]:
-        """Yield what rich draws, as wide as the terminal permits."""
+        """Yield the texts and tables of the view, fitted to the width of the terminal."""
         snapshot = self.snapshot
         width = options.max_width
         yield _format_head(snapshot)

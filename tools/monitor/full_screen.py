@@ -36,7 +36,7 @@ from rack.tools.monitor.snapshot import RackMonitor, Snapshot
 
 REFRESH_INTERVAL_S = 0.2
 LATENESS_BORDERS_US = (-np.inf, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, np.inf)
-"""Borders in us of the classes of lateness in which cycles are counted."""
+"""Borders, in us, of the lateness classes in which cycles are counted."""
 INJECT = "inject"
 """First word of a fault on the command line. Any other word is the level of a command."""
 CORE_FAULTS = [kind.name for kind in KINDS if kind.where == "core"]

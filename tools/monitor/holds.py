@@ -20,9 +20,9 @@ from rack.levels.operator import Answer, Operation, OperatorCommand, find_answer
 from rack.tools.monitor.newest_messages import NewestMessages
 
 STANDSTILL_S = 5.0
-"""A held rack without motion for this simulated time is reported by an event."""
+"""Simulated time without motion after which a held rack is reported by an event."""
 RELAYED_PREFIX = re.compile(r"(?:holding|waiting for \w+): ")
-"""Words that a level puts before a reason of the level below."""
+"""Prefix that a level adds to a reason that it relays from the level below."""
 COMPARED_CHARACTERS = 60
 """Number of characters that identify a reason. Levels that relay a long reason cut off its end."""
 NEEDED_COMMANDS = {Error.DISABLED: "enable", Error.DRIVES: "reset"}
@@ -33,7 +33,7 @@ OPERATOR_FIELDS = frozenset({"standing", "order", "answer"})
 
 @dataclass(frozen=True)
 class Hold:
-    """A level or an arm that is prevented from doing its work.
+    """A level, a board or the arm that cannot proceed, with the reason.
 
     Attributes:
         since_s: Simulated time at which the hold began.
@@ -76,7 +76,7 @@ def find_holds(newest: NewestMessages) -> tuple[Hold, ...]:
 
 
 def _list_holds(newest: NewestMessages) -> Iterator[Hold]:
-    """Yield the hold of an emergency stop, then those of lost boards, then those of levels."""
+    """Yield holds by an emergency stop, then of boards that await other racks, then of levels."""
     segment = newest.segment
 
     def hold(level: str, since: int, why: str, release: str = "") -> Hold:

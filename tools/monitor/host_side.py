@@ -60,7 +60,7 @@ def list_host_rows(segment: Segment) -> tuple[HostRow, ...]:
     rows = []
     for host in segment.layout.hosts:
         block = segment.get_block(host.name)
-        # The process that runs a host board locks this word, and the kernel unlocks it.
+        # The process of a host board locks this word. When it ends, the kernel unlocks the word.
         is_running = segment.is_locked(segment.map.blocks[host.name] + 8 * Block.PID)
         state = to_enum(TaskState, block[Block.STATE]).name.lower() if is_running else AWAY
         if block[Block.STATE] == TaskState.ENDED:
@@ -74,7 +74,7 @@ def list_host_rows(segment: Segment) -> tuple[HostRow, ...]:
 def count_restarts(segment: Segment, writer: str) -> int:
     """Count how often a new process took over the mailboxes of a task or host board.
 
-    Each process writes in a new epoch.
+    Each new process increments the writer's epoch. The first process writes in epoch 1.
     """
     return max([0, *(head[Box.EPOCH] - 1 for head in _list_heads(segment, writer))])
 

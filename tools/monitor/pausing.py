@@ -73,7 +73,7 @@ class Stepper:
         self._await_hold_at(tick)
 
     def find_end_tick(self, at: int, cycles: int, level: str | None) -> int:
-        """Return the tick after the one at which the last of `cycles` cycles is released.
+        """Return the tick that follows the release of the last of `cycles` cycles.
 
         Args:
             at: The current tick.

@@ -20,7 +20,7 @@ def poll_run(segment: Segment, interval_s: float) -> Iterator[bool]:
     is_last = False
     with INTERRUPT.stop_orderly(ended.set):
         while not is_last:
-            # Read this first, so that the caller's last reading includes the end of the run.
+            # Read this before the caller reads the rack, so that its last reading is complete.
             is_over = segment.run_is_over
             is_last = is_over or ended.wait(interval_s)
             yield is_over

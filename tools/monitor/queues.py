@@ -42,7 +42,7 @@ def list_queue_fills(newest: NewestMessages) -> tuple[QueueFill, ...]:
     """Return the current state of every queue of a rack."""
     fills = []
     for box in list_queues(newest.segment.layout):
-        # Read the position first: messages taken after this still count as unread.
+        # Read the reader's position first: messages taken after this still count as unread.
         position = newest.read_message(get_position_mailbox(box.name))
         words = newest.segment.get_box(box.name)
         unread = words[Box.SENT] - (0 if position is None else position.taken)

@@ -21,7 +21,7 @@ One reads the command, one makes the reply visible, one may answer another opera
 under way.
 """
 NO_CYCLE_S = 1.0
-"""A level that completes no cycle for this simulated time is no longer waited for."""
+"""Simulated time without a completed cycle after which a wait for a level ends."""
 
 Fate = Literal["waiting", "given", "taken", "done", "refused", "superseded"]
 """State of a command."""
@@ -39,7 +39,7 @@ class Reply:
         fate: "waiting" if the rack is held, "given" until the level answers. It stays "given" if
             the level's status has no fields for answers.
         objection: Why the command was refused.
-        waits: Text that tells what a waiting command waits for. Empty for other commands.
+        waits: Why a waiting command waits. Empty for other commands.
     """
 
     serial: int

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 SignalRows = list[tuple[int, list[Any]]]
-"""Ticks with the value of each signal. A value is None before the first message of its signal."""
+"""Rows of a tick and the value of each signal, None before the first message of the signal."""
 
 
 class WrittenMessages(NamedTuple):
@@ -46,7 +46,7 @@ class SignalReader:
     def read_new(self) -> Iterator[WrittenMessages]:
         """Yield the messages since the last call.
 
-        The first call yields the messages that are still in the rings, up to 2 s.
+        The first call yields the messages that are still in the rings, which cover up to 2 s.
         """
         for name, ring in self._rings.items():
             rows, lost = ring.read_new_rows()
@@ -55,7 +55,7 @@ class SignalReader:
 
 
 class SignalHistory:
-    """Recent values of some signals by tick. A signal keeps its value until its next message.
+    """Recent values of signals. A signal keeps its value until its next message.
 
     Attributes:
         settling_ticks: Number of ticks within which all messages released at a tick are written.
@@ -232,7 +232,7 @@ class SignalPlot:
 
 
 def _list_numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
-    """Yield each number of a value with its name, which begins with the index of the number."""
+    """Yield name and value of each number. The name of an array element begins with its index."""
     if isinstance(value, list):
         for index, element in enumerate(value):
             yield from _list_numbers(f"[{index}] {name}", element)

@@ -102,12 +102,13 @@ class Snapshot:
         lines: Asserted utility lines, and warnings.
         demand: Safety demand on the arm, normally "none".
         faults: Active faults.
-        holds: Levels, or the arm, that are prevented from doing their work.
+        holds: Levels and boards that cannot proceed, and a braked arm.
         hosts: Boards of the host side.
         entries: Traffic to and from the host boards.
         queues: All queues, including empty ones.
         inboxes: Inboxes of the boards that messages interrupt.
-        exchanges: Ages of the messages in use by boards with an exchange, by board and port.
+        exchanges: For each board with an exchange, a dictionary from port to the age of the
+            message in use.
         peers: Other racks on the network.
         imports: Messages from other racks.
         exports: Messages to other racks.

@@ -180,7 +180,7 @@ def write_credentials(folder: Path, files: Mapping[str, bytes]) -> None:
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, content in files.items():
-        # Create the file with its final mode, and never follow a link that somebody has left.
+        # Create the file with its final mode, and do not follow an existing link.
         fd = os.open(
             folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, OWNER_ONLY
         )

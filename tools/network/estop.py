@@ -124,7 +124,7 @@ class EstopSession:
         rack = self._address.rack
         rack_text = f"rack '{rack}' at {self._address.endpoint}"
         first_s = time.monotonic()
-        # Whether the rack has accepted a request. Its adapter answers in its next cycle.
+        # True once the rack has accepted a request, which its adapter answers in its next cycle.
         was_taken = False
         while True:
             began_s = time.monotonic()

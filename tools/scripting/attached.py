@@ -206,7 +206,7 @@ class AttachedRack:
         deadline = time.monotonic() + timeout_s
         is_last = False
         while not is_last:
-            # Read this first, so that the caller's last reading includes the end of the run.
+            # Read this before the caller reads the rack, so that its last reading is complete.
             is_last = self._segment.run_is_over or time.monotonic() > deadline
             yield
             time.sleep(READ_INTERVAL_S)
@@ -218,7 +218,7 @@ class AttachedRack:
 
     @convert_errors()
     def record(self, folder: str | Path | None = None) -> Path:
-        """Record the rack until `close`, beginning with the last two seconds, still in its rings.
+        """Record the rack until `close`, beginning with the last two seconds in its rings.
 
         Args:
             folder: Folder of the recording. None for runs/<rack>-<time>.

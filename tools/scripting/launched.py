@@ -46,8 +46,9 @@ class LaunchedRack(CrateRack):
         Args:
             config: A config by name or path, or a loaded one.
             lockstep: Start a tick only when every due task has finished: exact and repeatable.
-            settings: Values in place of the config's, by dotted keys or nested: {"clock.speed": 2}
-                or {"clock": {"speed": 2}}. A key that contains a dot is quoted, as in TOML.
+            settings: Values that replace the config's, under dotted or nested keys:
+                {"clock.speed": 2} or {"clock": {"speed": 2}}. A key that contains a dot is quoted,
+                as in TOML.
             faults: A fault script by name or path.
             out: New or empty folder into which the run is recorded, as `rack run` does. None to
                 record nothing.

@@ -79,7 +79,9 @@ class RecordedMoment:
         seconds: float | None = None,
         anyway: bool = False,
     ) -> Rack:
-        """Continue the run in the background, in lockstep. Close the rack, or use it as a context.
+        """Continue the run in the background, in lockstep, and return its rack.
+
+        The caller must close the rack, or use it as a context.
 
         Args:
             settings: Changed values, as in "board.servo.params.bandwidth=80". Any change makes the

@@ -64,7 +64,7 @@ class RecordedRun:
 
     @cached_property
     def report(self) -> Document:
-        """The content of report.json, which is updated first if missing or older than the run."""
+        """Content of report.json. The file is updated first if it is missing or out of date."""
         return load_report(self.folder)[0]
 
     def to_pandas(self, mailbox: str) -> DataFrame:
@@ -175,7 +175,7 @@ class RecordedSignal:
     def _list_marks(self) -> dict[int, str]:
         """Return a dictionary from tick to the text that marks it in a plot.
 
-        If a process died at the tick at which a fault begins, only the later event is marked.
+        If a fault begins and a process dies at the same tick, only the later event is marked.
         """
         marks: dict[int, str] = {}
         for event in _list_events(self._recording):

@@ -41,9 +41,10 @@ class RewindAnswer:
 
 
 class RewoundRun:
-    """A recorded run and the current `tick`.
+    """A recorded run that is inspected at a current `tick`.
 
-    Use it as a context. Inside it the run can be repeated in the background, with snapshots.
+    Use it as a context. To show objects of levels or run branches, it repeats the run in the
+    background. The processes of the repeated run end with the context.
     """
 
     def __init__(self, folder: Path, anyway: bool = False) -> None:
@@ -71,7 +72,7 @@ class RewoundRun:
             self._again.crate.end_crate()
 
     def _prepare_repeated_run(self) -> RepeatedRun:
-        """Return the repeated run. If its crate has ended, start it again."""
+        """Return the repeated run. If its crate has ended, start a new one."""
         if self._again is None or self._again.crate.is_over:
             self._again = RepeatedRun(self.recording, anyway=self._anyway)
         return self._again

@@ -16,7 +16,7 @@ def list_settings(tables: Mapping[str, Any], outer: str = "") -> Iterator[str]:
     """Convert tables of Python values to settings, in the form that --set takes.
 
     Args:
-        tables: Values by key. Keys may be dotted, and values may be tables.
+        tables: Dictionary from key to value. Keys may be dotted, and values may be tables.
         outer: Dotted prefix of all keys.
 
     Raises:

@@ -58,7 +58,7 @@ class Start:
 class BaseRack:
     """The faultless rack of one worker process.
 
-    Its snapshots belong to that process's crate, and the process's trials use its name.
+    Its snapshots belong to the crate of the worker. Trials of the worker use the same rack name.
     """
 
     def __init__(self, config: RackConfig, name: str) -> None:

@@ -177,7 +177,7 @@ class Campaign:
         lacking = +Counter(dict.fromkeys(kinds, order.injections))
         rack = self._describe_rack(lockstep)
         tried = set[str]()
-        # Faults that need a whole trial each are left to later rounds, which leave cores free.
+        # Begin with faults that can share a trial. Later rounds have fewer trials and free cores.
         round_kinds = [kind for kind in lacking if find_record(kind).recoverable] or list(lacking)
         for turn in range(ROUNDS):
             seed = f"{order.seed} {turn}"

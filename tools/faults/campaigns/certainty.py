@@ -30,7 +30,7 @@ class EarlyEnd:
         self._hold_before(max(0, rack.begins_at))
 
     def evaluate_if_held(self) -> None:
-        """If the rack is held, end it if all verdicts are final. Otherwise let it continue."""
+        """If the rack is held, end the trial if all verdicts are final, or continue it."""
         tick = self._words[System.HELD] - 1
         if tick < 0 or self.is_reached:
             return
@@ -101,6 +101,6 @@ class _ForesightedJudge(Judge):
         certain_tick = self._find_last_effect(strike, ends) + 1
         if certain_tick > tick:
             return certain_tick
-        # A planner may notice a fault of its plans, or write its next message, at any later time.
+        # A planner may detect a fault of its plans, or write its next message, at any later time.
         is_open = self._compute_window(strike)[1] >= tick and judgement.seen != "detected"
         return retry_tick if is_open or not judgement.is_recovered else tick

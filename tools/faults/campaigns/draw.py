@@ -337,7 +337,7 @@ def _pack_plans(
 
 
 def _distribute_cards(room_ticks: int, cards: Sequence[FaultCard]) -> list[TrialShare]:
-    """Distribute faults over trials: longest first, each to the fullest trial with room for it."""
+    """Assign each fault, longest first, to the fullest trial that has room for it."""
     shares: list[TrialShare] = []
     for card in sorted(cards, key=lambda card: -card.window):
         fitting = [share for share in shares if share.has_room_for(card)]
@@ -351,8 +351,9 @@ def _distribute_cards(room_ticks: int, cards: Sequence[FaultCard]) -> list[Trial
 def _choose_order(room_ticks: int, cards: Sequence[FaultCard], rng: Random) -> list[FaultCard]:
     """Return the faults of a trial in the best of several random orders.
 
-    In the best order, each fault begins before the end of the task, which earlier faults may have
-    prolonged, and faults of the arm come late, because the arm is at rest at first.
+    In the best order, each fault begins before the end of the task, which earlier faults may
+    prolong, and the first fault of the arm begins as late as possible, because the arm is at rest
+    at first.
     """
     orders = [rng.sample(cards, len(cards)) for _ in range(SHUFFLES)]
 

@@ -103,7 +103,7 @@ def check_violation_counter(config: RackConfig) -> None:
 
 @contextmanager
 def run_load() -> Iterator[str]:
-    """Keep the disks and all cores of this process busy. Yield a description of the load.
+    """Keep the disks and all cores of this process busy, and provide a description of the load.
 
     Uses `stress-ng` if it is installed.
     """

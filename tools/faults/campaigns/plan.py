@@ -59,7 +59,7 @@ class Plan:
 
     @property
     def name(self) -> str:
-        """Name of the run, made of its number or, without a number, of its purpose."""
+        """Name of the run, built from its number, or from its purpose if the number is 0."""
         return f"trial {self.number}" if self.number else f"{self.purpose} run"
 
     @property
@@ -72,7 +72,7 @@ class Plan:
         """Return a copy of a config with this plan's clock mode and faults and a new rack name."""
         clock: dict[str, Any] = {"mode": "realtime"}
         if self.lockstep:
-            # A speed has no meaning in lockstep.
+            # A speed is meaningless in lockstep.
             clock = {"mode": "lockstep", "speed": 1.0}
         faults = tuple(FaultConfig.model_validate(table) for table in self.faults)
         return config.model_copy(
@@ -101,7 +101,7 @@ class Plan:
 def needs_real_time(kind: str) -> bool:
     """Return True if faults of a kind are not useful in lockstep.
 
-    Either the kind is impossible in lockstep, or its delay has no meaning because no simulated
+    Either the kind is impossible in lockstep, or its delay is meaningless because no simulated
     time passes while a process dies.
     """
     return kind == EXTERNAL or KINDS[kind].realtime
@@ -176,16 +176,17 @@ class Targets:
     def _is_detectable(self, kind: Kind, box: MailboxSpec) -> bool:
         """Return True if a fault of this kind in a mailbox can be detected.
 
-        The mailbox needs readers, and messages must be frequent enough: plans, for example, are not
-        periodic.
+        The mailbox must have readers. A fault of its writer is detected by missing messages, so it
+        also needs messages at regular intervals, which only executors write.
         """
-        # The clock writes only for an operator, and a host board at any time.
+        # Exclude writers without a role: the clock writes only for operators, and a host board at
+        # any time.
         role = self._roles.get(box.writer)
         if role is None or not box.readers:
             return False
         if kind.where == "lock" and box.protocol != "lock":
             return False
-        # A queue is written on demand, and its reader's position is not written through a port.
+        # A queue is written on demand. The position of its reader is not written through a port.
         if kind.where == "writer" and (box.protocol == "queue" or is_position_mailbox(box)):
             return False
         return role in kind.tasks and (kind.where != "writer" or role == "executor")

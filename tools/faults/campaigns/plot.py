@@ -29,7 +29,7 @@ MAX_FRACTION = 1.5
 
 
 def plot_campaign(report: CampaignReport, path: Path) -> None:
-    """Draw a campaign into an image: delays against bounds, curves of size, recovery times."""
+    """Draw the charts of a campaign into one image: delays, effects of size, recovery times."""
     order = report.order
     with open_figure([path], *SIZE_IN) as figure:
         for position, draw in zip(
@@ -109,9 +109,9 @@ def _name_rows(axes: Axes, names: list[str]) -> None:
 
 
 def _compute_fraction(fault: Judgement) -> float | None:
-    """Return the delay of a fault as a fraction of its bound.
+    """Return the detection delay of a fault as a fraction of its bound. None without a detection.
 
-    With a bound of 0 (the same cycle) the result is 0 if it is met, else beyond the chart.
+    For a bound of 0, the result is 0 if the delay is 0, and otherwise too large for the chart.
     """
     if fault.bound == 0 and fault.bound_ms is None:
         return 0.0 if fault.delay == 0 else 2 * MAX_FRACTION

@@ -168,8 +168,8 @@ class CampaignReport:
         }
 
     def _list_notes(self) -> list[str]:
-        """Return the distinct notes of all real-time launches."""
-        # Omit lockstep, where every launch notes that all boards share one core.
+        """Return the distinct messages of all real-time launches."""
+        # Omit lockstep, where each launch has the message that all boards share one core.
         runs = [run for run in self.results.runs if not run.plan.lockstep]
         return list(dict.fromkeys(note for run in runs for note in run.notes))
 

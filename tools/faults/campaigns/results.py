@@ -210,7 +210,8 @@ def _judge_faults(trial: Trial) -> FaultVerdict:
 def _judge_start_fault(kind: str, board: str, trial: Trial) -> Judgement:
     """Evaluate a fault of a rack whose launch was refused.
 
-    A fault of the self-test is detected if the refusal names its board. Others did not act.
+    A fault of the self-test counts as detected if the refusal names its board. Other faults did not
+    act.
     """
     if KINDS[kind].where != "start":
         return Judgement(kind, board, -1, "not struck")

@@ -103,7 +103,7 @@ def compute_by_kind(faults: Sequence[Judgement], clock_ns: int) -> dict[str, Kin
 
 
 Z95 = 1.959964
-"""95 % of a normal distribution are within this many standard deviations."""
+"""Number of standard deviations within which 95 % of a normal distribution lie."""
 RULE_95 = 0.05
 
 

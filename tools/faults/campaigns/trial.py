@@ -267,7 +267,7 @@ def format_levels(segment: Segment) -> str:
 
 
 def is_late(segment: Segment) -> bool:
-    """Return True if a level ended with an error because it could not meet a time."""
+    """Return True if a level ended with an error because it could not meet a deadline."""
     return any(
         status.state == State.ERROR and status.error == Error.TOO_LATE
         for _, status in iterate_statuses(segment, "error")

@@ -109,7 +109,7 @@ class Workers:
             self._stop()
 
     def _stop(self) -> None:
-        """Terminate the workers. The racks of trials in progress are removed, not stopped."""
+        """Terminate the workers. The racks of their trials are removed without being stopped."""
         for process in active_children():
             process.terminate()
 
