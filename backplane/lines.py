@@ -45,7 +45,7 @@ class UtilityLines:
 
     @property
     def reset_obstacles(self) -> list[str]:
-        """Reasons why the emergency stop must not be reset: asserted lines and lost boards."""
+        """Reasons why the emergency stop must not be reset: SYSFAIL, ACFAIL and lost boards."""
         reasons = [f"SYSFAIL of slot {slot}" for slot in self.sysfail]
         reasons += ["ACFAIL"] if self.acfail else []
         return reasons + [

@@ -123,7 +123,7 @@ class OperatorTable:
         If no entry is free, the entry of the command that was issued longest ago is reused.
 
         Raises:
-            OperatorTableError: All entries wait for their ticks.
+            OperatorTableError: Every entry waits for its tick or is leased.
         """
         with hold_lock(self._segment.fd, self._segment.map.operator):
             return self._fill_entry(request, Client.NONE)
@@ -141,7 +141,7 @@ class OperatorTable:
             client: `Client.LEASES` to make the level hold when this process ends or is silent.
 
         Raises:
-            OperatorTableError: All entries wait for their ticks.
+            OperatorTableError: Every entry waits for its tick or is leased.
         """
         with ExitStack() as stack:
             with hold_lock(self._segment.fd, self._segment.map.operator):
@@ -226,7 +226,7 @@ class OperatorTable:
         """Fill a free or reusable entry with a request. The caller must hold the table's lock.
 
         Raises:
-            OperatorTableError: All entries wait for their ticks.
+            OperatorTableError: Every entry waits for its tick or is leased.
         """
         settled = [e for e in self.entries if not self.is_waiting(e) and not e.is_leased]
         if not settled:

@@ -198,7 +198,7 @@ class Writer:
         yield
 
     def show_published(self) -> None:
-        """Make published messages visible to readers. Under this protocol they already are."""
+        """Make published messages visible to readers. Only queues need this step."""
 
     @property
     def serial(self) -> int:
