@@ -73,8 +73,8 @@ def add_commands(config: RackConfig, commands: Sequence[CommandConfig]) -> RackC
 def compute_lateness_us(recording: Recording, task: str) -> np.ndarray:
     """Return the lateness of each cycle after the start-up of the run, (n,), in us.
 
-    After skipped releases the lateness counts from the first skipped one, as for any program that
-    oversleeps grid points.
+    After skipped releases, the lateness is measured from the first skipped one, as for any program
+    that sleeps past several grid points.
     """
     rows = recording.read_trace(task)
     if len(rows):

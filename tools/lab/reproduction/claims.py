@@ -80,7 +80,7 @@ def _build_system_claim(
     judge: Callable[..., ClaimVerdict] = rules.judge_links,
     rack: str = "",
 ) -> PaperClaim:
-    """Build a claim on one of the paper's systems, judged by the messages between its parts.
+    """Build a claim about one of the paper's systems, whose rule counts messages between its parts.
 
     Args:
         name: Anchor of the claim.
