@@ -1,7 +1,7 @@
 """Summary of a check.
 
-It tells whether the rack fits, where it is tightest, how fast it responds, the abilities of its
-arm, and the changes that would make it fit.
+It states whether the rack fits, its smallest margin, its response time, the abilities of its arm,
+and the changes that would make it fit.
 """
 
 from __future__ import annotations

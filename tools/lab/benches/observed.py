@@ -34,8 +34,8 @@ UNVIEWED_SETTINGS = (
 )
 """Settings of a rack whose recording is not viewed.
 
-The flight recorder writes no file for the viewer, which would double the work of a recorder at 1
-kHz. Missed cycles are measured and therefore do not fail the run.
+The flight recorder writes no file for the viewer, because this would double the work of a recorder
+at 1 kHz. Missed cycles are measured and therefore do not fail the run.
 """
 
 

@@ -34,7 +34,7 @@ class Transport(NamedTuple):
     Attributes:
         message: Local message of the sender.
         send: Sends the message.
-        readers: Receive the message, one function per reader.
+        readers: One function per reader, which receives the message.
     """
 
     message: AnyMessage

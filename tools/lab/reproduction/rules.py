@@ -77,7 +77,7 @@ def check_done(*runs: TaskRun) -> list[Check]:
 
 
 def judge_determinism(runs: Sequence[ComparedRun]) -> ClaimVerdict:
-    """Check that lockstep runs are equal and that real-time runs diverge only after a miss.
+    """Check that lockstep runs are equal and real-time runs diverge only after a missed deadline.
 
     The claim holds only within bounds if no real-time run without a missed deadline is equal to
     the runs in lockstep.
@@ -229,8 +229,8 @@ def judge_equation(number: str, run: NasremRun) -> ClaimVerdict:
 def judge_sum(run: NasremRun) -> ClaimVerdict:
     """Check that the longest response in each direction is at most the sum of equation 3.3.
 
-    If it is longer, the claim still holds within bounds, provided that every response beyond the
-    bound of the clock's grid was delayed by a missed cycle.
+    If it is longer, the claim still holds within bounds, provided that a missed cycle delayed every
+    response that exceeds the longest one possible on the grid.
     """
     assert run.response is not None, "it is a hierarchy"
     ways = run.response.ways

@@ -22,7 +22,7 @@ COMPARISONS = {
 
 
 class Ruling(StrEnum):
-    """Outcome of a claim."""
+    """Outcome of the test of a claim."""
 
     HOLDS = "holds"
     BOUNDED = "bounded"

@@ -130,10 +130,10 @@ class Patterns(NamedTuple):
 
 @dataclass(frozen=True)
 class PatternDetail:
-    """Longest stretches, in ns, that are too short to appear in patterns.
+    """Limits, in ns. Stretches up to these lengths are left out of patterns.
 
     Attributes:
-        short_ns: Dictionary from each unit function to this limit.
+        short_ns: Dictionary from each unit function to its limit.
         gap_ns: Limit for stretches in which the core is idle.
     """
 

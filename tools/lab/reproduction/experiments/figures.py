@@ -1,4 +1,4 @@
-"""Figures 2 to 4 of the paper: run by real processes, and computed for every X.
+"""Figures 2 to 4 of the paper, run with real processes and computed from budgets.
 
 X is the processor time that the executor takes in each cycle.
 """

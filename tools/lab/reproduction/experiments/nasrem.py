@@ -80,7 +80,7 @@ class NasremRun(TaskRun):
 
     Attributes:
         ticks: Length of the run.
-        verdicts: Every equation for every subject.
+        verdicts: Verdicts on every equation for every subject.
         executors: Cycles of each executor.
         due: Number of messages that the writer of each mailbox should have sent.
     """
