@@ -242,7 +242,7 @@ def _judge_tasks(
 def compute_core_loads(
     recording: Recording, cycles_by_task: Mapping[str, Cycles], rack: RackTiming
 ) -> dict[int, float]:
-    """Return the fraction of each core's time that its tasks, except the clock board, used.
+    """Return the fraction of each core's time that its tasks used. The clock board is excluded.
 
     An executor is counted as if it ran at every release, including skipped ones, so the load of an
     overloaded core exceeds 1.
@@ -274,5 +274,8 @@ def compute_cycle_ns(rack: RackTiming, task: TaskSpec) -> int:
 
 
 def compute_slice_ns(rack: RackTiming, task: TaskSpec) -> int:
-    """Return the time slice of a task in wall-clock ns: R_i of an executor, d R_i of a planner."""
+    """Return the time slice of a task in wall-clock ns.
+
+    It is R_i for an executor, and d R_i for a planner whose plans take d cycles.
+    """
     return task.slice * rack.tick_ns

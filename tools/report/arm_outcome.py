@@ -89,11 +89,11 @@ def _find_drops(recording: Recording, row: int) -> Iterator[Document]:
 
 
 def summarize_motion(recording: Recording) -> Document | None:
-    """Return the tracking error and the event counts of an arm.
+    """Return the RMS and peak tracking error and the event counts of an arm.
 
     Returns:
-        RMS and peak error in mrad, or None if no status contains the error, and the numbers of
-        touches, exceeded limits, and refused or clipped commands. None without an arm.
+        The errors in mrad, which are None if no status contains them, and the numbers of touches,
+        exceeded limits, and refused or clipped commands. The result is None without an arm.
     """
     status = find_signals(recording, *DRIVING)
     counts = _read_counts(recording, status)

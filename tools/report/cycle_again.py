@@ -104,14 +104,14 @@ def _repeat_in_run(run: Recording, cycle: DivergentCycle, until: int) -> _Repeat
     Args:
         run: The run.
         cycle: The cycle.
-        until: Tick up to which the rack is run, after the message of the cycle has become visible.
+        until: Tick up to which the rack is run, one after the cycle's message becomes visible.
     """
     with RepeatedRun(run, f"{run.folder} at tick {cycle.tick}", anyway=True) as again:
         attributes = again.read_levels(cycle.tick)[cycle.writer]
         repetitions = []
         for _ in range(REPETITIONS):
             with again.run_rack_to(until) as rack:
-                # Serial and chain identify the message that the cycle wrote.
+                # Serial and chained checksum identify the message that the cycle wrote.
                 wrote = find_chains(rack.segment, until)[cycle.mailbox]
                 repetitions.append(
                     (wrote, tuple(list_differing_mailboxes(run, rack.segment, until)))

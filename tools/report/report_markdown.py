@@ -101,7 +101,7 @@ def _format_notes(report: RunReport) -> Iterator[str]:
 
 
 def _format_selection(rows: Sequence[Any], which: str) -> str:
-    """Return the end of a heading that says which rows of a long table are shown.
+    """Return a suffix for a heading, which says which rows of a long table are shown.
 
     Args:
         rows: All rows.
@@ -114,7 +114,7 @@ def _format_selection(rows: Sequence[Any], which: str) -> str:
 
 
 def _format_holds(rack: str, holds: Sequence[Document]) -> Blocks:
-    """Yield the section on holds, with commands to release holds that an operator did not end."""
+    """Yield the section on holds, with commands to release an operator's holds that never ended."""
     yield from ("", f"## Holds: {len(holds)}{_format_selection(holds, 'longest')}", "")
     rows = [
         {
@@ -140,7 +140,11 @@ def _format_holds(rack: str, holds: Sequence[Document]) -> Blocks:
 
 
 def _build_state_table(levels: dict[str, list[Document]]) -> TextTable:
-    """Return a table of levels, each with its most frequent row and its last new row."""
+    """Return a table of the levels that follow state tables.
+
+    For each level it gives the number of state-table rows that fired, the most frequent row, and
+    the row that was the last to fire for the first time.
+    """
     rows = []
     for level, fired in levels.items():
         most_frequent = max(fired, key=lambda row: row["cycles"])
@@ -162,7 +166,7 @@ def _build_state_table(levels: dict[str, list[Document]]) -> TextTable:
 
 
 def _format_machine(report: RunReport) -> Iterator[str]:
-    """Yield notes on absences of cores, with their causes if known, and on changes of frequency."""
+    """Yield notes on times when a core was unavailable, and on changes of the core frequencies."""
     steal = report.steal
     stalls = report.stalls
     frequency = report.frequency_mhz or {}

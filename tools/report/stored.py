@@ -54,7 +54,7 @@ def load_report(folder: Path) -> tuple[Document, str]:
     """
     report = read_stored_report(folder)
     if report is None:
-        # This import is slow, so it is done only if needed.
+        # Import this only if needed, because the import is slow.
         from rack.tools.report.report import write_report
 
         report = write_report(folder)

@@ -120,11 +120,11 @@ def _describe_patience(config: RackConfig, layout: Layout) -> Iterator[Document]
 
 
 def _describe_monitors(config: RackConfig) -> Iterator[Document]:
-    """Yield, for each arm, the largest sensor error of each joint that does not brake the arm."""
+    """Yield, for each arm, the largest sensor errors at which its brakes do not engage."""
     robot = config.robot
     if robot is None:
         return
-    # MuJoCo takes 0.5 s to import, therefore import it only for racks with an arm.
+    # MuJoCo takes 0.5 s to import, so import it only for racks with an arm.
     from rack.levels.arm import find_arm
     from rack.levels.robot.cell import replace_encoders
     from rack.levels.servo.control import ArmParams
@@ -262,4 +262,5 @@ def format_arm_lines(data: Document) -> Iterator[str]:
 
 
 def _format_address(address: int) -> str:
+    """Format a bus address as a hexadecimal number with at least six digits."""
     return f"0x{address:06x}"

@@ -1,4 +1,4 @@
-"""A config judged by the timing model, and changes of single boards judged on the whole rack."""
+"""A config evaluated with the timing model, and changes of one board with their effects."""
 
 from __future__ import annotations
 
@@ -85,13 +85,13 @@ class JudgedConfig:
 
     @property
     def failures(self) -> tuple[EquationVerdict, ...]:
-        """Verdicts that fail."""
+        """Verdicts on equations and bounds that do not hold."""
         return tuple(verdict for verdict in self.verdicts if not verdict.holds)
 
     def find_failures(self, board: str) -> set[tuple[str, str, str]]:
         """Return the keys of the failures of a board's tasks.
 
-        If they have none, return the keys of overloads of the board's cores.
+        If no task fails, return the keys of the overloads of the board's cores.
         """
         names = {board, f"{board}.planner"}
         own = {verdict.key for verdict in self.failures if verdict.subject in names}
@@ -119,7 +119,7 @@ class JudgedConfig:
 
 @dataclass(frozen=True)
 class Change:
-    """Other settings for a board.
+    """A change of the settings of one board.
 
     Attributes:
         board: Name of the board.
@@ -144,9 +144,9 @@ class Change:
     def cost(self) -> tuple[bool, float, int, int]:
         """Cost for comparison with other changes.
 
-        Its parts are, in order of importance, a core that this machine lacks, the slowdown, the new
-        cores and slots, and the number of keys. A longer cycle makes a level slower and its plans
-        older, therefore both factors count.
+        Its parts are, in order of importance, whether this machine lacks a new core, the slowdown,
+        the cost of new cores and slots, and the number of changed keys. A longer cycle makes a
+        level slower and its plans older, so the slowdown is the product of both factors.
         """
         cores = {*self.after.timing.cores.values()} - {*self.before.timing.cores.values()}
         is_core_missing = any(find_core(core) != core for core in cores)
@@ -209,7 +209,7 @@ class Change:
         yield age
 
     def _describe_sharing(self, core: int) -> str:
-        """Return which other tasks are on a core, and whether this machine has the core."""
+        """Describe which other tasks are on a core, and whether this machine has the core."""
         own_tasks = (self.board, f"{self.board}.planner")
         others = [
             name

@@ -161,7 +161,9 @@ def _measure_chain(
 def _list_delays(
     recording: Recording, levels: Sequence[str], since: int, until: int
 ) -> Iterator[str]:
-    """Yield a text for each fault, lost board and board with late cycles between two ticks.
+    """Yield a text for each cause of delay between two ticks.
+
+    The causes are faults, lost boards, and boards with late cycles.
 
     Args:
         recording: Recording of the run.

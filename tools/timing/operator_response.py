@@ -49,7 +49,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class AnsweredCommand:
-    """One command. Times are ticks.
+    """An operator command and its effect. Times are in ticks, except `wall_ms`.
 
     Attributes:
         serial: Serial of the command.
@@ -226,9 +226,7 @@ def measure_response(recording: Recording) -> OperatorResponse | None:
 def _find_answers(
     recording: Recording, level: str, path: CommandPath, lockstep: bool
 ) -> Iterator[AnsweredCommand]:
-    """Yield the commands given to a level.
-
-    Each contains the first cycle of the lowest level that depends on it, if any.
+    """Yield each command to a level, with the first cycle of the lowest level that depends on it.
 
     Args:
         recording: Recording of the run.
@@ -237,7 +235,8 @@ def _find_answers(
         lockstep: Whether the run was in lockstep.
     """
     box = f"{level}.operator"
-    # A clock that died while giving a command may have given it twice. The first one counts.
+    # If the clock board died while it gave a command, the command may have been given twice. Only
+    # the first one counts.
     serials, rows = np.unique(recording.read_signal(box, "id"), return_index=True)
     whats, given, visible, stamps = (
         recording.read_signal(box, n)[rows] for n in ("what", "tick", "visible_at", "stamp_ns")

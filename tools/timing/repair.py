@@ -107,7 +107,7 @@ def find_repair(rack: JudgedConfig) -> Repair:
 def _list_failing_boards(rack: JudgedConfig) -> list[str]:
     """Return the boards with failures, beginning with those whose own tasks fail.
 
-    Boards of higher priority precede those of lower priority.
+    Within each of these two groups, boards are sorted by descending priority.
     """
     failing = [name for name in rack.timing.levels if rack.find_failures(name)]
     own = {verdict.subject.partition(".")[0] for verdict in rack.failures}
@@ -118,10 +118,10 @@ def _list_failing_boards(rack: JudgedConfig) -> list[str]:
 def find_changes(rack: JudgedConfig, board: str) -> list[Change]:
     """Return the smallest change of each kind that makes a board fit, sorted by `Change.cost`.
 
-    Priorities and cores already in use are cheapest, then new slots and cores, then older plans and
-    longer cycles by their factor. The cycle may be that of another board on the same core. If no
-    single change helps, loose coupling of the planner on another core is combined with a longer
-    cycle.
+    Other priorities and moves to cores already in use cost least. New slots and cores cost more.
+    Longer cycles and older plans cost most, depending on their factor. A change may also apply to
+    another board on the same core. If no single change is enough, the planner is coupled loosely on
+    another core and the cycle becomes longer.
     """
     changes = [*_find_own_changes(rack, board), *_find_changes_of_others(rack, board)]
     if not changes:
@@ -134,7 +134,7 @@ def find_changes(rack: JudgedConfig, board: str) -> list[Change]:
 
 
 def _find_own_changes(rack: JudgedConfig, board: str) -> Iterator[Change]:
-    """Yield the smallest helpful change of each kind to the board's own settings."""
+    """Yield the smallest sufficient change of each kind to the board's own settings."""
     older = [{"within_cycles": d} for d in _list_plan_cycles(rack.timing.build_level(board))]
     cores = [{"core": core} for core in _list_other_cores(rack, rack.config.board[board].core)]
     places = list(_list_loose_couplings(rack, board))
@@ -228,8 +228,8 @@ def _list_longer_cycles(
         if level.within_cycles is not None and level.plan_within_ns is not None:
             cycles = max(min(cycles, level.plan_within_ns // (longer * timing.tick_ns)), 1)
             changed = {"within_cycles": cycles}
-        # Filter before the search, because soundness is not monotonic: a longer cycle may fit the
-        # grid of the other levels less well, or leave too few cycles for plans.
+        # Filter before the search, because a longer cycle is not always better: it may fit the grid
+        # of the other levels less well, or leave too few cycles for plans.
         if rack.is_acceptable_change(
             timing.replace_board(board, every=longer, within_cycles=cycles), board
         ):
@@ -251,7 +251,7 @@ def _list_loose_couplings(rack: JudgedConfig, board: str) -> Iterator[Settings]:
 
 
 def _list_plan_cycles(level: LevelTiming) -> range:
-    """Return the larger numbers of cycles that a plan may take. Empty without a planner."""
+    """Return numbers of cycles per plan above the current number. Empty without a planner."""
     if level.within_cycles is None:
         return range(0)
     longest = min(level.within_cycles * MAX_FACTOR, MAX_CYCLES)
@@ -263,8 +263,8 @@ def _list_plan_cycles(level: LevelTiming) -> range:
 def _list_other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
     """Yield the cores to which a task could move.
 
-    Cores in use come first, in the order of their load, then an unused one. The cores of a board
-    without a budget are left out, because their free time is unknown.
+    Cores in use come first, sorted by ascending load, followed by one unused core. The cores of a
+    board without a budget are left out, because their free time is unknown.
     """
     timing = rack.timing
     used = set(timing.cores.values())
@@ -282,7 +282,7 @@ def _list_other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
 def _try_change(
     rack: JudgedConfig, board: str, settings: Settings, target: str | None
 ) -> Change | None:
-    """Return the change of a board if it removes the failures of the board `target`.
+    """Return the change of a board if it removes all failures of the board `target`, else None.
 
     If `target` is None, it must remove the failures of the changed board itself.
     """
@@ -295,7 +295,7 @@ def _try_change(
 def _try_each(
     rack: JudgedConfig, board: str, tried: Iterable[Settings], target: str | None = None
 ) -> Change | None:
-    """Return the first change that works, as `_try_change` decides."""
+    """Return the first change that `_try_change` accepts, or None."""
     return next(
         (c for settings in tried if (c := _try_change(rack, board, settings, target)) is not None),
         None,
@@ -305,7 +305,7 @@ def _try_each(
 def _search_first(
     rack: JudgedConfig, board: str, tried: Sequence[Settings], target: str | None = None
 ) -> Change | None:
-    """Return the first change that works, as `_try_change` decides; see `search_first`."""
+    """Return the first change that `_try_change` accepts, found with `search_first`, or None."""
     return search_first(tried, lambda settings: _try_change(rack, board, settings, target))
 
 

@@ -1,7 +1,7 @@
 """Summary of a check.
 
-It tells whether the rack fits, where it is tightest, how fast it responds, the abilities of its
-arm, and the changes that would make it fit.
+It states whether the rack fits, its smallest margin, its response time, the abilities of its arm,
+and the changes that would make it fit.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def format_summary(
 
 
 def _format_verdict(forecast: Forecast, measuring: str) -> Iterator[str]:
-    """Yield whether the rack fits, and everything that was not counted."""
+    """Yield lines that say whether the rack fits, and what the verdict does not include."""
     names: dict[str, list[str]] = {}
     for name, why in forecast.uncounted.items():
         names.setdefault(why, []).append(f"'{name}'")
@@ -91,8 +91,8 @@ def _format_verdict(forecast: Forecast, measuring: str) -> Iterator[str]:
 def find_tightest(verdicts: Sequence[EquationVerdict]) -> Iterator[str]:
     """Yield a line about the verdict with the smallest margin relative to its right side.
 
-    Equalities are left out because they have no margin, and the response of the system because it
-    is exact.
+    Equalities are left out, because they have no margin, and so are the verdicts on the system
+    response, because it is computed exactly.
     """
     bounds = [
         verdict

@@ -64,7 +64,7 @@ def format_forecast(forecast: Forecast) -> Blocks:
 
 
 def _format_schedule(forecast: Forecast) -> Blocks:
-    """Yield a table of a static schedule, with a row per board of every distinct frame."""
+    """Yield a table of a static schedule, with a row for each board in each distinct frame."""
     if forecast.rack.schedule is None:
         return
     minor, major = forecast.rack.schedule
@@ -112,7 +112,7 @@ def build_level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> 
     """Build a table with the cycle of each level, the parts of the cycle and the residual, in ms.
 
     Args:
-        levels: Levels, each with a word for the first column after its name.
+        levels: Levels, each with its word in the column after the names.
         about: Heading of this column.
     """
     rows: Iterable[Row] = (
@@ -138,11 +138,13 @@ def build_level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> 
 
 
 def build_verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> TextTable:
-    """Build a table with a row per verdict: both sides, the margin, and whether it holds.
+    """Build a table with a row per verdict.
+
+    It gives the left and right side of the equation, the margin, and whether the equation holds.
 
     Args:
-        verdicts: Verdicts, each with its side, "predicted" or "measured". The table has no column
-            of sides if they are empty.
+        verdicts: Verdicts, each with its origin, "predicted" or "measured". If all origins are
+            empty, the table has no column for them.
     """
     rows: Iterable[Row] = (
         {
@@ -162,7 +164,7 @@ def build_verdict_table(verdicts: Iterable[tuple[str, EquationVerdict]]) -> Text
 
 
 def format_side(value: float, unit: str) -> str:
-    """Format one side of an equation. A time is in ms, anything else has three digits."""
+    """Format one side of an equation: a time in ms, or a number with three significant digits."""
     if isinf(value):
         return "endless" if value > 0 else "-"
     return format_ms(value) if unit == "ns" else f"{value:.3g}"
@@ -195,7 +197,7 @@ def _build_response_table(responses: Iterable[TaskResponse]) -> TextTable:
 
 
 def _build_inbox_table(inboxes: Iterable[Mapping[str, Any]]) -> TextTable:
-    """Build a table with a row per interrupted board, with the cost and the worst burst."""
+    """Build a table of the boards that receive interrupts, with the costs and the worst bursts."""
     rows: Iterable[Row] = (
         {
             "board": inbox["task"],

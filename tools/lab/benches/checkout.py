@@ -85,11 +85,11 @@ def build_checkout_command(tree: Path) -> RackCommand:
             f"{tree}: has no environment .venv; to create it: make -C {tree} {ENVIRONMENT_TARGET}",
             2,
         )
-    # The working directory may be another tree. Safe path keeps it from being searched first.
+    # The working directory may be another tree. PYTHONSAFEPATH prevents imports from it.
     inherited = {name: value for name, value in os.environ.items() if name not in MODULE_VARIABLES}
     environment = {**inherited, "PYTHONSAFEPATH": "1"}
     locate = RackCommand(tree.resolve().name, (str(python), "-c", PRINT_TREE), environment)
-    # A copied environment still runs the tree from which it was copied.
+    # An environment that was copied together with its tree still runs the original tree.
     if (actual := Path(locate.run(bound_s=PRINT_TREE_TIMEOUT_S).strip())) != tree.resolve():
         raise Failure(
             f"{tree}: its .venv belongs to {actual}; to renew it: make -C {tree} clean "

@@ -50,7 +50,7 @@ class CycleRun(NamedTuple):
     """The cycles of one run.
 
     Attributes:
-        cycles: Cycles of each executor, by board.
+        cycles: Dictionary from boards to the cycles of their executors.
         physics_us: Processor time of each replayed tick of physics, us. Empty without a replay.
     """
 

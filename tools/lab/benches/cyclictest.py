@@ -24,18 +24,18 @@ CYCLICTEST = "cyclictest"
 MAX_BIN_US = 100_000
 """Largest lateness with a separate bin in the histogram, us.
 
-Larger ones are counted at the maximum.
+All larger ones are counted as the largest measured lateness.
 """
 EXTRA_TIMEOUT_S = 30.0
-"""Time that the program may take in addition to its wakes, s."""
+"""Time that the program may take in addition to the time of its grid, s."""
 
 
 class WakeGrid(NamedTuple):
-    """Points in time for which the program sleeps.
+    """Time grid to whose points the program sleeps.
 
     Attributes:
         core: Core of the program.
-        period_ns: Distance of the points, ns.
+        period_ns: Time between two points, ns.
         wakes: Number of points.
         priority: SCHED_FIFO priority.
     """
@@ -63,7 +63,7 @@ def is_fifo_permitted() -> bool:
 def run_cyclictest(grid: WakeGrid) -> np.ndarray:
     """Run `cyclictest` and return the lateness of every wake-up, (n,), in us, ascending.
 
-    Idle cores are left as they are (`--laptop`), as a rack leaves them by default.
+    The program lets idle cores sleep (`--laptop`), as a rack does by default.
 
     Raises:
         Failure: If the program fails.
@@ -96,8 +96,8 @@ def compute_late_share(runs: Sequence[np.ndarray], period_ns: int) -> float | No
     Skipped points are included.
 
     Args:
-        runs: Lateness of the wakes in each run, us.
-        period_ns: Distance of the grid points, ns.
+        runs: Lateness of the wake-ups in each run, us.
+        period_ns: Time between two grid points, ns.
 
     Returns:
         The fraction. None if there are no runs.

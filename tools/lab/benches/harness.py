@@ -5,7 +5,7 @@ The help of each bench states the question that it answers. A bench is a functio
 the function, shows the progress on the terminal, and prints the results as text or as one JSON
 document.
 
-The speed of a machine drifts by a factor of two within a day, therefore absolute times mean little.
+The speed of a machine drifts by a factor of two within a day, so absolute times mean little.
 `call_interleaved` calls the contestants alternately, in an order that changes from round to round.
 Each one is judged by the ratio of its median to the median of the baseline in the same case. A peer
 that is not installed is reported as `Absent`, and the others are still measured.

@@ -49,8 +49,8 @@ def measure_launches(
         rounds: Number of rounds of launches and commands.
         kills: Number of kills of the board that drives the arm.
         against: Another checkout, launched alternately. None if there is none.
-        share: Whether to run racks even on cores that another one uses.
-        progress: Shows both parts.
+        share: Whether to run racks even on cores that another rack uses.
+        progress: Shows the progress of launches, commands and kills.
 
     Raises:
         Failure: If a command fails, or the rack has no arm.

@@ -1,8 +1,8 @@
 """Speed of racks in lockstep, compared with their levels in one process and another checkout.
 
 The levels alone are a fair limit only if they do the same work. Their last messages and serials are
-therefore compared once with a recorded run. Their processor time is measured, because no other
-program on the machine prolongs it.
+therefore compared once with a recorded run. Their processor time is measured, because it does not
+include interruptions by other programs.
 """
 
 from __future__ import annotations
@@ -57,7 +57,9 @@ class BareRun:
 def measure_lockstep(
     against: Path | None, racks: Mapping[str, float | None], rounds: int, progress: Progress
 ) -> Comparison:
-    """Run every rack, its levels without a rack, and the rack of another checkout alternately.
+    """Measure the speed of each rack, of its levels alone, and of the rack in another checkout.
+
+    The contestants run alternately.
 
     Args:
         against: The other checkout. None if there is none.
@@ -69,7 +71,7 @@ def measure_lockstep(
         Times per simulated second, ms.
 
     Raises:
-        Failure: If a run fails, or if the levels without a rack did different work.
+        Failure: If a run fails, or if the messages of the levels alone differ from the rack's.
     """
     commands = build_rack_commands(against)
     progress.set_total(EXPECTED_S * len(racks) * (1 + rounds * (1 + len(commands))))
@@ -147,7 +149,7 @@ def _check_bare_run(rack: str, options: Sequence[object], folder: Path) -> int:
         Length of the run, ticks.
 
     Raises:
-        Failure: If the levels alone did different work.
+        Failure: If the messages of the levels alone differ from those that were recorded.
     """
     this_tree = build_rack_commands(None)[0]
     this_tree.run("run", rack, "--lockstep", *options, "--out", folder, bound_s=RUN_TIMEOUT_S)
@@ -162,10 +164,10 @@ def _check_bare_run(rack: str, options: Sequence[object], folder: Path) -> int:
 
 
 def find_differences(recording: Recording, bare: BareRun) -> Iterator[str]:
-    """Yield every mailbox or message field in which a recorded run and its levels alone differ.
+    """Yield every mailbox or message field in which a run of the levels alone differs.
 
-    Of each mailbox, the newest message that was visible before the end is compared. Later messages
-    may not be recorded.
+    In each mailbox, only the newest message that was visible before the end is compared, because
+    later messages may not be recorded.
     """
     for name in sorted({*recording.mailboxes, *bare.serials}):
         visible_rows = np.flatnonzero(recording.read_signal(name, "visible_at") < bare.ticks)

@@ -55,8 +55,8 @@ RATES_HZ = (400.0, 500.0, 1000.0, 2000.0)
 MAX_LATE_SHARE = 0.001
 """Largest share of late cycles at which a rate counts as held.
 
-It applies to the cycles that a board misses in addition to the machine's late wakes, and to the
-wakes of `cyclictest` that are late by a cycle.
+It applies to the wake-ups of `cyclictest` that are late by a cycle or more, and to the cycles that
+a board misses in addition to these.
 """
 MAX_STEP_MS = 0.5
 """Longest time step of the simulated arm, ms, as in the bundled racks."""
@@ -101,15 +101,16 @@ def change_rate(config: RackConfig, rate_hz: float) -> RackConfig:
 class RateFigures:
     """Results of all runs at one rate.
 
-    The rate is held if no run failed, and if neither the late wakes of the machine nor the
-    additional missed cycles of the rack exceed `MAX_LATE_SHARE`.
+    The rate is held if no run failed, and if neither the share of `cyclictest`'s late wake-ups nor
+    the share of cycles that the rack missed in addition exceeds `MAX_LATE_SHARE`.
 
     Attributes:
         rate_hz: The rate.
         cycles: Number of cycles of the rack's fastest board that were due.
         missed: Share of these cycles that were missed or skipped.
-        late: Share of `cyclictest`'s wakes that were late by a cycle or more. None if it is absent.
-        failure: Reason for which a run ended early. Empty if none did.
+        late: Share of `cyclictest`'s wake-ups that were late by a cycle or more. None without
+            `cyclictest`.
+        failure: Reason why a run ended early. Empty if none did.
     """
 
     rate_hz: float
@@ -120,7 +121,7 @@ class RateFigures:
 
     @property
     def reason(self) -> str:
-        """Why the rate is not held. Empty if it is held."""
+        """Reason why the rate is not held. Empty if it is held."""
         late = self.late or 0.0
         if self.failure or late > MAX_LATE_SHARE:
             return self.failure or "the machine is late"
@@ -128,7 +129,7 @@ class RateFigures:
 
     @property
     def verdict(self) -> str:
-        """Verdict on the rate: held, or not held with the reason."""
+        """Verdict on the rate: "held", or "not held" followed by the reason."""
         return f"not held: {self.reason}" if self.reason else "held"
 
 
@@ -203,6 +204,7 @@ class MachineComparison(Comparison):
 
 
 def _format_case(rate_hz: float) -> str:
+    """Format a rate as the name of its case."""
     return f"{rate_hz:g} Hz"
 
 
@@ -295,9 +297,9 @@ class RackRun(NamedTuple):
     """One run of a contestant.
 
     Attributes:
-        late_us: Lateness of its wakes, us.
+        late_us: Lateness of its wake-ups, us.
         counts: Counts of the board's cycles. Empty for `cyclictest`.
-        failure: Reason for which a rack's run ended early. Empty if it did not.
+        failure: Reason why a rack's run ended early. Empty if it did not.
     """
 
     late_us: np.ndarray
@@ -306,7 +308,7 @@ class RackRun(NamedTuple):
 
 
 def _run_rack(rack: RackConfig, board: str, seconds: float, share: bool, awake: bool) -> RackRun:
-    """Run a rack once, and return a board's lateness and cycle counts and the failure, if any."""
+    """Run a rack once, and return the lateness and cycle counts of a board, and any failure."""
     with (
         TemporaryDirectory(prefix="rack-bench-") as folder,
         keep_cores_awake() if awake else nullcontext(),
@@ -317,7 +319,7 @@ def _run_rack(rack: RackConfig, board: str, seconds: float, share: bool, awake: 
 
 
 def _run_cyclictest(grid: WakeGrid) -> RackRun:
-    """Run `cyclictest` once. Only the lateness of the result is filled."""
+    """Run `cyclictest` once, and return its lateness as a run without cycle counts."""
     return RackRun(run_cyclictest(grid))
 
 
@@ -326,8 +328,8 @@ def compare_idle_cores(samples: Sequence[Sample], who: str) -> str:
 
     A wake-up is lost if it is late by a period or more. The setting with fewer lost wake-ups wins
     if the counts differ by more than two standard deviations. Otherwise the setting with the
-    smaller worst lateness wins, because a host that takes the core away first shows in the worst
-    lateness.
+    smaller worst lateness wins, because a host that takes the core away affects the worst lateness
+    first.
 
     Args:
         samples: Lateness of all contestants.

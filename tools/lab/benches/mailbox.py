@@ -148,7 +148,7 @@ def build_exchange(name: str, transport: Transport, lengths: dict[str, int]) -> 
         lengths: Lengths of the message's arrays.
 
     Raises:
-        Failure: If a reader receives another message than the one sent.
+        Failure: If a reader receives a message other than the one that was sent.
     """
     message, send, readers = transport
     for key, length in (("position", "joints"), ("velocity", "joints"), ("torque", "rest")):
@@ -195,7 +195,7 @@ def _open_mailbox(protocol: Protocol, case: Case) -> Iterator[Transport]:
 def _build_reader(segment: Segment, box: MailboxSpec, task: str) -> Callable[[int], AnyMessage]:
     """Build a function that reads a mailbox as a board does.
 
-    Without machine code, the checks on the writer are left out.
+    If compiled code cannot read the mailbox, the checks on the writer are left out.
     """
     inbox = open_inbox(segment, task)
     watched_reader = open_watched(segment, box.name, AlarmWriter(segment, task), ReadingTask(inbox))
@@ -228,8 +228,8 @@ def _build_layout(rack: str, protocol: Protocol, case: Case) -> Layout:
     )
     interrupt = None
     if protocol == "interrupt":
-        # Each reader has its inbox to itself, because every message is served before the next one
-        # is sent.
+        # No message has to wait for another one, because every message is served before the next
+        # one is sent.
         interrupt = InterruptSpec(
             1_000_000, 50_000, 16, due=1, ahead=1, slots=tuple(task.slot for task in tasks[1:])
         )

@@ -34,8 +34,8 @@ UNVIEWED_SETTINGS = (
 )
 """Settings of a rack whose recording is not viewed.
 
-The flight recorder writes no file for the viewer, which would double the work of a recorder at 1
-kHz. Missed cycles are measured and therefore do not fail the run.
+The flight recorder writes no file for the viewer, because this would double the work of a recorder
+at 1 kHz. Missed cycles are measured and therefore do not fail the run.
 """
 
 
@@ -73,8 +73,8 @@ def add_commands(config: RackConfig, commands: Sequence[CommandConfig]) -> RackC
 def compute_lateness_us(recording: Recording, task: str) -> np.ndarray:
     """Return the lateness of each cycle after the start-up of the run, (n,), in us.
 
-    After skipped releases the lateness counts from the first skipped one, as for any program that
-    oversleeps grid points.
+    After skipped releases, the lateness is measured from the first skipped one, as for any program
+    that sleeps past several grid points.
     """
     rows = recording.read_trace(task)
     if len(rows):

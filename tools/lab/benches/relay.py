@@ -18,7 +18,7 @@ class FirstBoard(Executor):
     status = Output(Relayed)
 
     def process(self, tick: int) -> None:
-        """Send a message with the tick of this cycle."""
+        """Send a message that contains the tick of this cycle."""
         self.status.state = State.EXECUTING
         self.status.sent = tick
 
@@ -30,6 +30,6 @@ class Relay(Executor):
     status = Output(Relayed)
 
     def process(self, tick: int) -> None:
-        """Pass on the newest message, or -1 before the first one."""
+        """Pass on the tick in the newest message. Sends -1 until the first message is received."""
         self.status.state = State.EXECUTING
         self.status.sent = self.message.message.sent if self.message.has_message else -1

@@ -34,7 +34,7 @@ class Transport(NamedTuple):
     Attributes:
         message: Local message of the sender.
         send: Sends the message.
-        readers: Receive the message, one function per reader.
+        readers: One function per reader, which receives the message.
     """
 
     message: AnyMessage
@@ -77,6 +77,7 @@ def open_iceoryx2_blackboard(dtype: np.dtype, readers: int) -> Iterator[Transpor
         get = reader.get
 
         def fetch(raw: memoryview) -> None:
+            """Copy the newest value into `raw`."""
             raw[:] = get().data
 
         return fetch
@@ -92,6 +93,7 @@ def open_multiprocessing_pipe(dtype: np.dtype, readers: int) -> Iterator[Transpo
     pipes = [multiprocessing.Pipe(duplex=False) for _ in range(readers)]
 
     def send(tick: int) -> None:
+        """Send the bytes of the message through every pipe."""
         for _, sender in pipes:
             sender.send_bytes(message.raw)
 
@@ -123,6 +125,7 @@ def open_horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
         rmtree(SHM_FOLDER / f"horus_{namespace}", ignore_errors=True)
 
     def send(tick: int) -> None:
+        """Send the bytes of the message as an image."""
         image.copy_from(bytes(message.raw))
         topic.send(image)
 
@@ -130,6 +133,7 @@ def open_horus_image(dtype: np.dtype, readers: int) -> Iterator[Transport]:
         """Build a function that copies the next received image into a buffer."""
 
         def fetch(raw: memoryview) -> None:
+            """Copy the next image into `raw`."""
             raw[:] = np.asarray(receive()).reshape(-1).data
 
         return fetch
@@ -149,11 +153,12 @@ PEERS = (
 def _build_reader(
     dtype: np.dtype, fetch: Callable[[memoryview], object]
 ) -> Callable[[int], AnyMessage]:
-    """Build a reader with a local message, whose bytes are filled by `fetch`."""
+    """Build a function that fills a local message with `fetch` and returns it."""
     message = AnyMessage(dtype)
     raw = message.raw
 
     def read_message(tick: int) -> AnyMessage:
+        """Receive the bytes of a message into the local message, and return it."""
         fetch(raw)
         return message
 

@@ -1,7 +1,7 @@
 """The claims of the paper, section by section.
 
-Each has a sentence of the paper, the experiments and the rule that judge it, and the reason for the
-ruling if it holds.
+Each claim consists of a sentence of the paper, the experiments that test it, a rule that derives
+the ruling, and the reason for the ruling if the claim holds.
 """
 
 from __future__ import annotations
@@ -80,7 +80,9 @@ def _build_system_claim(
     judge: Callable[..., ClaimVerdict] = rules.judge_links,
     rack: str = "",
 ) -> PaperClaim:
-    """Build a claim on one of the paper's systems, judged by the messages between its parts.
+    """Build a claim about one of the paper's systems.
+
+    The default rule counts the messages between the parts of the system.
 
     Args:
         name: Anchor of the claim.

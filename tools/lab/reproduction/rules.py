@@ -52,16 +52,16 @@ TASK_DONE = "task done"
 FAILING_SHARE = 0.5
 """Share of late cycles or plans above which a run counts as failing.
 
-A figure fails in all cycles or in none, therefore the exact value does not matter.
+A figure fails in all cycles or in none, so the exact value does not matter.
 """
 PAPER_X_MS = [MIN_X_MS, 1.5, 2.0, 2.5, MAX_X_MS]
-"""Values of X in the figures over the range that the paper permits, ms."""
+"""Values of X, ms, that cover the range that the paper permits in its figures."""
 MIN_PLAN_MS = 3.0
 """Shortest time of the planner per cycle, ms: "The planner runs at least 3 ms each cycle"."""
 MAX_EXCHANGE_DIFFERENCE_MS = 40.0
 """Largest difference between two waits for an exchange, ms.
 
-A wait lasts up to one cycle of 20 ms above, and two of 10 ms on the network.
+A wait lasts up to one cycle of 20 ms in the machine above, and two of 10 ms on the network.
 """
 PAPER_HZ = {"servo": 400.0, "primitive": 50.0}
 MAX_RATE_ERROR = 0.01
@@ -72,12 +72,16 @@ ROUNDING_MS = 1e-6
 
 
 def check_done(*runs: TaskRun) -> list[Check]:
-    """Check that all tasks were done."""
+    """Check that all tasks were completed."""
     return check_none(tasks_not_done=sum(run.ended != TASK_DONE for run in runs))
 
 
 def judge_determinism(runs: Sequence[ComparedRun]) -> ClaimVerdict:
-    """Compare digests. A run may diverge only after its first missed deadline."""
+    """Check that lockstep runs are equal and real-time runs diverge only after a missed deadline.
+
+    The claim holds only within bounds if no real-time run without a missed deadline is equal to
+    the runs in lockstep.
+    """
     digest = runs[0].digest
     lockstep_runs = [run for run in runs if run.mode == "lockstep"]
     realtime_runs = [run for run in runs if run.mode == "realtime"]
@@ -118,7 +122,7 @@ def judge_locks(chains: Chains) -> ClaimVerdict:
 
 
 def judge_pipeline(chains: Chains) -> ClaimVerdict:
-    """Check that every message takes exactly as many cycles as there are levels."""
+    """Check that every message passes the chain in exactly as many cycles as there are levels."""
     lockstep_counts, realtime_counts = chains.lockstep.took, chains.realtime.took
     sent, arrived = sum(lockstep_counts.values()), sum(realtime_counts.values())
     early = sum(count for took, count in realtime_counts.items() if took < LEVELS)
@@ -137,7 +141,7 @@ def judge_pipeline(chains: Chains) -> ClaimVerdict:
 
 
 def judge_replication() -> ClaimVerdict:
-    """Rule that replication is untestable: no experiment replaces a board by a replica."""
+    """Return the ruling "untestable", because no experiment replaces a board with a replica."""
     return rule_on(needs=[compare_value("replicas", 0, ">=", 1)])
 
 
@@ -154,7 +158,7 @@ def judge_communication(run: NasremRun, partitions: Sequence[PartitionFigures]) 
 
 
 def judge_flow(run: NasremRun) -> ClaimVerdict:
-    """Check that every cycle of a writer sends its command and its status."""
+    """Check that the writers of commands and statuses sent a message in every cycle."""
     ways = [[box for box in run.due if box.endswith(way)] for way in (".command", ".status")]
     boxes = [box for way in ways for box in way]
     # A run may end before the last message is written.
@@ -174,7 +178,10 @@ def judge_loop(run: NasremRun) -> ClaimVerdict:
 
 
 def judge_losses(*runs: LossesRun) -> ClaimVerdict:
-    """Check that every loss is detected and recovered within its bounds and all tasks are done."""
+    """Check that every loss is detected and recovered within its bounds.
+
+    All tasks must be completed despite the losses.
+    """
     faults = [fault for run in runs for fault in run.faults]
     failures = check_none(
         not_detected_in_bound=sum(not fault.is_within for fault in faults),
@@ -186,7 +193,7 @@ def judge_losses(*runs: LossesRun) -> ClaimVerdict:
 
 
 def judge_goto(runs: GotoRuns) -> ClaimVerdict:
-    """Check that A is done by its deadline, and that an impossible deadline starts no motion."""
+    """Check that A is reached by its deadline, and that the arm does not move if it cannot be."""
     early, met = runs.early, runs.met
     begun = early.moved + (early.done_s is not None)
     done_s = inf if met.done_s is None else met.done_s
@@ -195,7 +202,7 @@ def judge_goto(runs: GotoRuns) -> ClaimVerdict:
 
 
 def check_equations(verdicts: Iterable[EquationVerdict]) -> list[Check]:
-    """Compare both sides of an equation for every subject. Times are in ms."""
+    """Convert each verdict to a comparison of both sides of its equation, with times in ms."""
     checks = []
     for verdict in verdicts:
         scale = MS if verdict.unit == "ns" else 1.0
@@ -220,10 +227,10 @@ def judge_equation(number: str, run: NasremRun) -> ClaimVerdict:
 
 
 def judge_sum(run: NasremRun) -> ClaimVerdict:
-    """Check that the longest responses do not exceed the sum of equation 3.3, in ms.
+    """Check that the longest response in each direction is at most the sum of equation 3.3.
 
-    The claim holds within bounds if every response beyond the grid's bound was delayed by a missed
-    cycle.
+    If it is longer, the claim still holds within bounds, provided that a missed cycle delayed every
+    response that exceeds the longest one possible on the grid.
     """
     assert run.response is not None, "it is a hierarchy"
     ways = run.response.ways
@@ -241,7 +248,7 @@ def judge_sum(run: NasremRun) -> ClaimVerdict:
 
 
 def judge_background(background: FigureRun, in_cycle: FigureRun) -> ClaimVerdict:
-    """Check that a level is late if it stores data in its cycle, but not if in the background."""
+    """Check that a level is late if it stores data in its cycle, but not if its planner does so."""
     return rule_on(
         compare_value("blocks_stored", background.tasks[PLANNER].jobs, ">=", 1),
         compare_value(
@@ -257,7 +264,10 @@ def judge_background(background: FigureRun, in_cycle: FigureRun) -> ClaimVerdict
 
 
 def judge_loose_coupling(normal: NetworkRun, slower: NetworkRun) -> ClaimVerdict:
-    """Check that a slower network delays the response as expected without missed servo cycles."""
+    """Check that a slower network delays the response by about `EXTRA_DELAY_MS`.
+
+    The servo rack must not miss any cycle.
+    """
     later_ms = 0.0
     if normal.response_ms is not None and slower.response_ms is not None:
         later_ms = slower.response_ms - normal.response_ms
@@ -306,9 +316,10 @@ def _compare_largest_late_share(run: FigureRun, sign: str, name: str = "late_sha
 
 
 def _check_undisturbed(run: FigureRun) -> list[Check]:
-    """Return the check that a run must pass to count as a run of a figure.
+    """Return the check that other programs did not disturb a run of a figure.
 
-    An executor is late in almost all cycles or in almost none. Anything between is a disturbance.
+    Without a disturbance, an executor is late in almost all cycles or in almost none. The list is
+    empty if it is late in most cycles.
     """
     late_share = run.compute_late_share(LEVEL)
     return (
@@ -319,7 +330,7 @@ def _check_undisturbed(run: FigureRun) -> list[Check]:
 
 
 def judge_working(run: FigureRun) -> ClaimVerdict:
-    """Check that no job is late in a figure that works according to the paper."""
+    """Check that no job is late in a figure that, according to the paper, works."""
     late = check_none(late=sum(count.late for count in run.tasks.values()))
     return rule_on(
         ideal=late, here=[_compare_largest_late_share(run, "<=")], needs=_check_undisturbed(run)
@@ -327,7 +338,7 @@ def judge_working(run: FigureRun) -> ClaimVerdict:
 
 
 def judge_failing(paper_run: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
-    """Check that many jobs are late in a figure that fails according to the paper.
+    """Check that many jobs are late in a figure that, according to the paper, fails.
 
     Args:
         paper_run: Run of the figure.
@@ -342,16 +353,17 @@ def judge_failing(paper_run: FigureRun, *shorter: FigureRun) -> ClaimVerdict:
 
 
 def check_planning(process_ms: float) -> tuple[Check, Check]:
-    """Compare figure 2 at one X with both sentences of the paper on its planner.
+    """Check two sentences of the paper about figure 2's planner for one value of X.
 
-    The planner runs at least `MIN_PLAN_MS` in each cycle, and plans within the permitted cycles.
+    They say that the planner runs for at least `MIN_PLAN_MS` in each cycle, and that it finishes a
+    plan within the permitted number of cycles.
 
     Args:
         process_ms: X, the processor time of the executor in a cycle, ms.
     """
     config = load(FIG2.config, build_settings(FIG2.config, process_ms))
     level = build_rack_timing(config, resolve_layout(config)).build_level(LEVEL)
-    # By the pattern "RXWPU" each cycle contains U, but a whole plan needs U only once.
+    # In the pattern "RXWPU" each cycle contains U, but a whole plan needs U only once.
     each_ms = (level.residual_ns - level.update_ns) * MS
     work_ns = (level.plan_ns or 0) + level.update_ns
     cycles = ceil(work_ns / level.residual_ns) if level.residual_ns > 0 else inf
@@ -363,7 +375,10 @@ def check_planning(process_ms: float) -> tuple[Check, Check]:
 
 
 def judge_sweep(short: FigureRun, long: FigureRun) -> ClaimVerdict:
-    """Check that two sentences of the paper contradict each other, by computation and in runs."""
+    """Check, by computation and in runs, that the paper's two sentences contradict each other.
+
+    These are the sentences that `check_planning` evaluates.
+    """
     count = sum(bool(describe_unmet(check_planning(process_ms))) for process_ms in PAPER_X_MS)
     return rule_on(
         compare_value("contradicting_X", count, ">=", 1),
@@ -383,10 +398,10 @@ def judge_tables(runs: TableRuns) -> ClaimVerdict:
 
 
 def judge_levels(run: NasremRun) -> ClaimVerdict:
-    """Check that every level has its nominal rate and leaves out no cycle.
+    """Check that every level runs at its nominal rate and leaves out no cycle.
 
-    The nominal rate is the paper's, or else the config's. A gap of two periods or more between
-    cycles means that one was left out.
+    The nominal rate is given by the paper or, if the paper gives none, by the config. A gap of two
+    periods or more between cycles means that a cycle was left out.
     """
     config = load(NAME)
     rates = check_done(run)
@@ -414,7 +429,7 @@ def judge_switch(run: SwitchRun) -> ClaimVerdict:
 
 
 def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
-    """Check that slow levels miss few cycles, and that fast ones miss more if coupled tightly.
+    """Check that slow levels miss few cycles, and that tight coupling makes fast levels miss more.
 
     According to the figure, multitasking is enough for slow levels, but fast levels need separate
     processors.
@@ -445,9 +460,10 @@ def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
 
 
 def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimVerdict:
-    """Check that the responses of some systems in whole tasks are within their bounds, in ms.
+    """Check that the response of each system, measured in its whole task, is within its bound.
 
-    The claim holds within bounds if every longer response was delayed by a missed cycle.
+    If a response is longer, the claim still holds within bounds, provided that every response
+    beyond the bound was delayed by a missed cycle.
 
     Args:
         names: Names of the systems.
@@ -510,7 +526,10 @@ def judge_links(
 
 
 def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
-    """Apply `judge_links` to RCCL. The claim holds in full only if every joint has a processor."""
+    """Apply `judge_links` to RCCL, and also check that every joint has a separate processor.
+
+    If joints share processors, the claim holds only within bounds.
+    """
     joints = [
         task.core for task in resolve_layout(load("rccl")).tasks if task.board.startswith("joint")
     ]
@@ -519,9 +538,9 @@ def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
 
 
 def judge_predictable(run: ResponseRun) -> ClaimVerdict:
-    """Check that responses occur at the predicted ticks and within equations 3.2 and 3.3.
+    """Check that responses occur at the predicted ticks and within the bounds of eqs 3.2 and 3.3.
 
-    The claim holds within bounds if only the sum of equation 3.3 is exceeded.
+    If only the sum of equation 3.3 is exceeded, the claim holds within bounds.
     """
     realtime = run.realtime
     upper_checks, sum_checks = (

@@ -22,7 +22,7 @@ COMPARISONS = {
 
 
 class Ruling(StrEnum):
-    """Outcome of a claim."""
+    """Outcome of the test of a claim."""
 
     HOLDS = "holds"
     BOUNDED = "bounded"
@@ -92,14 +92,15 @@ def rule_on(
     needs: Sequence[Check] = (),
     holding: Ruling = Ruling.HOLDS,
 ) -> ClaimVerdict:
-    """Rule on a claim by comparisons alone.
+    """Derive the ruling on a claim from comparisons.
 
     Args:
         always: Comparisons that the claim requires on every machine.
         ideal: Further comparisons, which may fail because of disturbances of this machine.
-        here: Comparisons that replace the ideal ones for the claim to hold within bounds.
+        here: Weaker comparisons. If an ideal one fails but these are met, the claim holds within
+            bounds.
         needs: Conditions without which a run cannot test the claim.
-        holding: Ruling if the claim is met.
+        holding: Ruling if all comparisons except `here` are met.
 
     Returns:
         The ruling with every comparison, without repetitions.
@@ -116,7 +117,7 @@ def rule_on(
 
 
 def rule_on_rare_event(name: str, bad: int, due: int, *needs: Check) -> ClaimVerdict:
-    """Rule on an event that must not happen.
+    """Return the ruling on a claim that an event never happens.
 
     The claim holds within bounds if the event happened in at most `MAX_STRAY_SHARE` of all cases.
 

@@ -30,7 +30,7 @@ TICKS = {
     10.0: "10 s",
     60.0: "1 min",
 }
-"""Labels of the axis by cycle, s."""
+"""Dictionary from cycle times, s, to labels of the axis."""
 REGION_COLOURS = ("#DDDDDD", "#F4C7B5", "#BFE3D8", "#C9DDF0")
 """Colours from the fastest region to the slowest, light tints of Paul Tol's palette."""
 EDGE_COLOUR = "#222222"
@@ -75,7 +75,7 @@ REGIONS = (
 A bound belongs to the faster region, except 1 ms.
 """
 COUPLING_REGIONS = {"tight": "multitasking", "loose": "asynchronous"}
-"""Short name of the region in which the figure has each coupling."""
+"""Dictionary from couplings to the short names of the regions for which the figure gives them."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def find_region(cycle_s: float) -> Region:
 
 
 def format_figure(config: RackConfig) -> Iterator[str]:
-    """Yield the figure as text: every level with the kind of concurrency that suits it."""
+    """Yield the figure as text: a heading, and a line with the cycle and remark of every level."""
     yield f"figure 5: levels of {config.name} in the regions of implementation, by their cycles"
     yield ""
     yield from (
@@ -213,7 +213,7 @@ def _draw_levels(axes: Axes, levels: Sequence[PlacedLevel]) -> None:
 
 
 def _format_remark(region: Region, coupling: str) -> str:
-    """Return a comparison of a coupling with the one that the figure gives for a region."""
+    """Return a remark that says whether the figure gives this coupling for a region."""
     if coupling == "none":
         return "no planner to couple"
     actual = f"coupled {coupling}ly"

@@ -40,15 +40,15 @@ class Subject:
 
 
 def find_subject(text: str, settings: Sequence[str], out: Path | None) -> Subject:
-    """Find the folder of a run, or else a config by name or path.
+    """Return the run or the config that a chart is to show.
 
     Args:
-        text: Folder, name or path.
+        text: Folder of a run, or else the name or path of a config.
         settings: Changes to the config, as for `--set`.
         out: Folder for the pictures. None for the default.
 
     Raises:
-        Failure: If there is no such run, or settings are given for a run.
+        Failure: If there is no such folder, or settings are given for a run.
         ConfigError: If the config is not valid.
     """
     path = Path(text)
@@ -109,12 +109,13 @@ def build_gantt(
     Args:
         subject: Config or run.
         options: Window that the user asked for.
-        process_ns: Dictionary from boards to their times of X in successive cycles of the schedule,
-            ns.
+        process_ns: Dictionary from boards to their times of X, ns, in successive cycles of the
+            schedule.
         progress: Receives the fraction of a run that has been read.
 
     Raises:
-        Failure: If the subject has no chart, or none in this window.
+        Failure: If the subject has neither a run in real time nor a budget, or if the window cannot
+            be shown.
     """
     name = subject.config.name
     run = subject.run

@@ -64,10 +64,13 @@ def format_panel(panel: Panel, column_ns: int) -> Iterator[str]:
 
 
 def choose_column_ns(window_ns: int, shortest_ns: int | None) -> int:
-    """Return the width of a column, in ns: 1, 2 or 5 times a power of ten.
+    """Return the width of a column, in ns, which is 1, 2 or 5 times a power of ten.
 
-    A column is as wide as `shortest_ns` permits, if it is given, but at least so wide that the
-    window fits into `MAX_COLUMNS`.
+    Args:
+        window_ns: Length of the window, ns. A column is wide enough for the window to fit into
+            `MAX_COLUMNS`.
+        shortest_ns: Upper limit of the width, ns, unless the window requires a wider column. None
+            for the narrowest column with which the window fits.
     """
     steps: list[int] = [digit * 10**power for power in range(3, 12) for digit in (1, 2, 5)]
     fits = next((step for step in steps if window_ns <= MAX_COLUMNS * step), steps[-1])
@@ -88,7 +91,7 @@ def _format_lane(chart: Chart, lane: Lane, column_ns: int) -> str:
             column_start = column * column_ns
             shares[column][letter] += min(end, column_start + column_ns) - max(start, column_start)
     for share in shares:
-        # Idle is added last and loses to a letter with the same share of the column.
+        # Idle time is added last, so that another letter with the same share is preferred.
         share[IDLE] = column_ns - share.total()
     return "".join(max(share, key=share.__getitem__) for share in shares)
 
@@ -110,7 +113,7 @@ def _format_marks(panel: Panel, lane: Lane, column_ns: int) -> str:
 
 
 def format_label_row(labels: Iterable[tuple[int, str]]) -> str:
-    """Return a row of labels, each of which begins at its column or after the previous label."""
+    """Return a row of labels. Each begins at its column or, if taken, after the previous label."""
     row = ""
     for column, label in labels:
         row = row.ljust(column) + label
@@ -120,14 +123,15 @@ def format_label_row(labels: Iterable[tuple[int, str]]) -> str:
 def choose_frame_labels(
     panel: Panel, character_ns: int, prefix: str = "|"
 ) -> list[tuple[int, int]]:
-    """Return the number and the start, in ns, of each minor frame to be labelled.
-
-    These frames are far enough apart for their labels.
+    """Choose the minor frames to label, which are far enough apart for their labels.
 
     Args:
         panel: Panel with minor frames.
         character_ns: Time that a character takes on the axis, ns.
         prefix: Text of a label before the number.
+
+    Returns:
+        Number and start, in ns, of each of these frames.
     """
     frames = panel.frames
     widest_ns = max(len(f"{prefix}{number}") for number in frames) * character_ns
@@ -137,7 +141,7 @@ def choose_frame_labels(
 
 
 def choose_label_times(panel: Panel, column_ns: int) -> range:
-    """Return the times, in ns, to write along the axis, far enough apart for the numbers."""
+    """Return the times, in ns, at which the axis is labelled, far enough apart for the labels."""
     chart = panel.chart
     columns = 0
     widest = LABEL_COLUMNS
@@ -152,7 +156,8 @@ def choose_label_times(panel: Panel, column_ns: int) -> range:
 def choose_label_interval(panel: Panel, narrowest_ns: int) -> int:
     """Return the time between two labels of the axis, in ns.
 
-    It is the cycle of a lane, unless all cycles are too short or too long.
+    It is the shortest cycle of a lane from `narrowest_ns` to half of the window or, if there is no
+    such cycle, a round number of at least `narrowest_ns`.
     """
     longest_ns = (panel.chart.end_ns - panel.chart.start_ns) // 2
     cycles = sorted(lane.cycle_ns for lane in panel.lanes)

@@ -34,7 +34,7 @@ from rack.tools.timing.charts.patterns import (
 )
 
 BLOCK_NS = 1_000_000_000
-"""Time of a run that is read at once, ns. It keeps memory independent of the run's length."""
+"""Length of the part of a run that is read at once, ns, which limits the required memory."""
 
 
 class TracedRun:
@@ -105,7 +105,7 @@ class TracedRun:
     def find_middle_ns(self, task: TimedTask) -> int:
         """Return the time, in ns, of a task's first release in the second half of the run.
 
-        Of a planner, only the releases of plans count. Returns 0 if there is no release.
+        For a planner, only the releases of plans count. Returns 0 if there is no release.
         """
         ticks = self._records[task.name][0]["tick"]
         index = int(np.searchsorted(ticks, self.end_ns // self.config.tick_ns // 2))
@@ -144,7 +144,7 @@ class TracedRun:
     def _select_rows(self, task: TimedTask, start_ns: int, end_ns: int) -> np.ndarray:
         """Return the trace records of a task that overlap a stretch of time."""
         rows, longest_ns = self._records[task.name]
-        # A skipped release is recorded with the next one.
+        # A skipped release is recorded with the next release that is not skipped.
         bounds = (
             (start_ns - longest_ns) // self.config.tick_ns,
             (end_ns + task.every_ns) // self.config.tick_ns + 1,
@@ -157,7 +157,7 @@ class TracedRun:
     def _records(self) -> dict[str, tuple[np.ndarray, int]]:
         """Dictionary from each task to its trace records and its longest response in ns.
 
-        Of a planner, only the records of plans are included.
+        For a planner, only the records of plans are included.
         """
         records = {}
         for task in self.tasks:
@@ -228,8 +228,8 @@ def _list_spans(traced: Sequence[_TaskTrace]) -> Iterator[Span]:
     for trace in traced:
         task = trace.task
         for release, unit, stretch in trace.list_units():
-            # A critical section runs at its ceiling. Tasks of equal priority cannot preempt it, but
-            # it starts after them.
+            # A critical section runs at its priority ceiling. If it overlaps a task of equal
+            # priority, the task ran first, because it cannot preempt the section.
             is_locked = unit is Unit.UPDATE and task.ceiling > task.priority
             priority = task.ceiling if is_locked else task.priority
             levels[-priority, is_locked].append((task, release, unit, stretch))

@@ -58,8 +58,9 @@ class Panel:
         kind: "schedule" or "measured".
         chart: Spans and jobs in the window.
         lanes: Rows of the chart.
-        patterns: Dictionary from lane names to patterns, over the whole run or a longer schedule.
-        counts: Dictionary from task names to numbers of jobs, over the same time.
+        patterns: Dictionary from lane names to patterns. They are counted over the whole run or, in
+            a schedule, over several slices of the slowest task.
+        counts: Dictionary from task names to numbers of jobs, counted over the same time.
         frame_ns: Minor frame of a static schedule, ns. 0 if there is none.
     """
 

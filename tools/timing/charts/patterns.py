@@ -47,7 +47,7 @@ class Lane:
         planner: Name of the planner. None if it has another lane, or if there is none.
         priority: Highest priority of the tasks.
         cycle_ns: Cycle of the level, ns.
-        slice_ns: Time for one plan, or one cycle without a planner, ns.
+        slice_ns: Time for one plan, or for one cycle if there is no planner, ns.
         phase_ns: Start of the first cycle, ns.
     """
 
@@ -110,8 +110,8 @@ class Patterns(NamedTuple):
     """Number of occurrences of each pattern in a lane.
 
     Attributes:
-        plans: Patterns over the cycles of a plan.
-        cycles: Patterns of single cycles without a plan.
+        plans: Counts of the patterns of plans, each over all cycles of the plan.
+        cycles: Counts of the patterns of single cycles without a plan.
     """
 
     plans: Counter[str]
@@ -130,10 +130,10 @@ class Patterns(NamedTuple):
 
 @dataclass(frozen=True)
 class PatternDetail:
-    """Limits, in ns, up to which stretches are left out of patterns.
+    """Limits, in ns. Stretches up to these lengths are left out of patterns.
 
     Attributes:
-        short_ns: Limit for each unit function.
+        short_ns: Dictionary from each unit function to its limit.
         gap_ns: Limit for stretches in which the core is idle.
     """
 
@@ -149,7 +149,7 @@ class PatternDetail:
             for unit, median in median_ns.items()
         }
         if lane.is_tight:
-            # The plan is in local memory. Reading it is not communication, unless it takes long.
+            # Reading a plan from local memory does not count as communication unless it takes long.
             short[Unit.EXCHANGE] = longest
         return cls(short, round(MAX_GAP_CYCLE_FRACTION * lane.cycle_ns))
 
@@ -160,7 +160,7 @@ def count_patterns(chart: Chart, lane: Lane, within: Stretch, detail: PatternDet
     The cycles of a plan are separated by " | ".
 
     Args:
-        chart: Chart that extends beyond the stretch by a slice.
+        chart: Chart, which must extend beyond the stretch by one slice.
         lane: Lane whose patterns are counted.
         within: Start and end of the stretch, ns.
         detail: Limits up to which stretches are left out.
@@ -168,7 +168,7 @@ def count_patterns(chart: Chart, lane: Lane, within: Stretch, detail: PatternDet
     counted = Patterns.build_empty()
     spans = [span for span in chart.spans if span.core == lane.core]
     starts = [span.start_ns for span in spans]
-    # Without the maximum the ends may be unsorted, because ordinary scheduling mixes tasks.
+    # The running maximum sorts the ends, which may be unsorted under ordinary scheduling.
     ends = list(accumulate((span.end_ns for span in spans), max))
     for start, cycles, is_plan in _list_plans_and_cycles(chart, lane, within):
         end = start + cycles * lane.cycle_ns

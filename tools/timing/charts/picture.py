@@ -54,9 +54,9 @@ BAR_HEIGHT = 0.66
 LETTER_PT = 9.0
 MIN_LETTER_PT = 5.0
 LETTER_POINT_FRACTION = 1 / 520
-"""Fraction of the window that each point of a letter's size takes.
+"""Fraction of the window's length that a letter needs for each point of its size.
 
-A W is as wide as high, and has a margin on both sides.
+The letter W is as wide as it is high, and has a margin on both sides.
 """
 MIN_CYCLE_FRACTION = 0.024
 """Fraction of the window above which the start of a cycle is marked."""

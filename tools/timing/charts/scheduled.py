@@ -83,8 +83,8 @@ class Schedule:
         Raises:
             Failure: If too many cycles would have to be simulated.
         """
-        # The schedule repeats with the least common multiple of all slices, but if tasks have
-        # phases, the first repetition differs.
+        # The schedule repeats after the least common multiple of all slices. If tasks have phases,
+        # the first repetition differs.
         cycles = [
             len(self._variants.get(task.name, (task.parts,))) * task.every_ns for task in self.tasks
         ]

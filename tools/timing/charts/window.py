@@ -1,4 +1,4 @@
-"""The window of time that a chart shows, by the options of the command."""
+"""The window of time that a chart shows, chosen with the options of the command."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class WindowOptions:
         """Return the start and the end of the window, in ns.
 
         Args:
-            task: Task whose cycles limit the window. The default window shows two of its plans.
+            task: Task that determines the window. It shows at most `MAX_CYCLES` of its cycles.
             extent_ns: Length of the run, ns. None for a schedule, which has no end.
             start_ns: Default start, ns.
             length_ns: Default length, ns. None for two plans of the task.
@@ -83,13 +83,13 @@ def choose_task(tasks: Sequence[TimedTask]) -> TimedTask:
 
 
 def parse_process_times(process: Sequence[str]) -> dict[str, list[int]]:
-    """Parse times of X from texts such as "level=3,2", in ms.
+    """Parse texts such as "level=3,2", which give times of X of a level in successive cycles, ms.
 
     Returns:
         Dictionary from levels to times, ns.
 
     Raises:
-        Failure: If a text has another form, or a negative time.
+        Failure: If a text does not have this form, or contains a negative time.
     """
     process_ns = {}
     for text in process:
@@ -108,4 +108,5 @@ def parse_process_times(process: Sequence[str]) -> dict[str, list[int]]:
 
 
 def _format_window(start_ns: int, end_ns: int) -> str:
+    """Format the start and the end of a window in ms."""
     return f"{format_ms(start_ns)} to {format_ms(end_ns)} ms"

@@ -71,7 +71,7 @@ class Workshop:
 
     @property
     def rack(self) -> str:
-        """Name of the experiments' racks in shared memory. Only one of them runs at a time."""
+        """Name in shared memory of all racks of the experiments, which run one at a time."""
         return f"{RACK_PREFIX}-{os.getpid()}"
 
     def prepare(self) -> None:
@@ -183,7 +183,7 @@ class StoredResult:
         found: The record as plain data.
         took_s: Time that the experiment took, s.
         made_at: Local time at which it was finished.
-        lacking: Reason for which this machine cannot run the experiment. Empty if it can.
+        lacking: Reason why this machine cannot run the experiment. Empty if it can.
         depends: Everything on which the result depends.
     """
 

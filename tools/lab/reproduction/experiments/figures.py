@@ -1,4 +1,4 @@
-"""Figures 2 to 4 of the paper: run by real processes, and computed for every X.
+"""Figures 2 to 4 of the paper, run with real processes and computed from budgets.
 
 X is the processor time that the executor takes in each cycle.
 """
@@ -187,8 +187,8 @@ def _count_updates_around(updates: np.ndarray, times_ns: np.ndarray) -> int:
 def _find_least_disturbed_run(figure: FigureRack, workshop: Workshop) -> TracedRun:
     """Return the run with the fewest late cycles of the executor.
 
-    Other programs may take cores away, therefore a run with late cycles is repeated. A figure
-    whose schedule already makes the executor late runs only once.
+    A run with late cycles is repeated, because other programs may have taken cores away. A figure
+    whose schedule already makes the executor late is run only once.
     """
     runs: list[tuple[int, TracedRun]] = []
     is_late_by_schedule = bool(figure.build_panel().chart.list_late_jobs(LEVEL))

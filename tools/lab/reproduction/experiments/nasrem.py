@@ -58,8 +58,8 @@ class ExecutorCycles:
     """The cycles of an executor.
 
     Attributes:
-        cycles: Number of judged cycles.
-        missed: Number of judged cycles that were missed or skipped.
+        cycles: Number of evaluated cycles.
+        missed: Number of evaluated cycles that were missed or skipped.
         done: Number of all cycles.
         slice_ms: Time slice of the executor, ms.
         largest_gap_ms: Largest time between two cycles, ms.
@@ -80,7 +80,7 @@ class NasremRun(TaskRun):
 
     Attributes:
         ticks: Length of the run.
-        verdicts: Every equation for every subject.
+        verdicts: Verdicts on every equation for every subject.
         executors: Cycles of each executor.
         due: Number of messages that the writer of each mailbox should have sent.
     """
@@ -193,7 +193,7 @@ def _compare_run(run: ObservedRun, reference: Recording | None) -> ComparedRun:
 
 @dataclass(frozen=True)
 class LossesRun:
-    """A run with a script of faults.
+    """A run with a fault script.
 
     Attributes:
         faults: Verdict on each fault.
@@ -205,7 +205,7 @@ class LossesRun:
 
 
 def _measure_losses(script: str, workshop: Workshop) -> LossesRun:
-    """Run the rack's whole task in real time with a script of faults."""
+    """Run the rack's whole task in real time with a fault script."""
     result, recording = workshop.run(script, workshop.load_config(NAME, (), script))
     judgements = report_faults(recording.events, recording.layout)["faults"]
     return LossesRun(TypeAdapter(tuple[Judgement, ...]).validate_python(judgements), result.worked)
@@ -246,12 +246,12 @@ class GotoRuns:
 
 
 def _measure_goto(workshop: Workshop) -> GotoRuns:
-    """Run GOTO A without a deadline, with one that is too early, and with a possible one."""
+    """Run GOTO A without a deadline, with one that is too early, and with one that can be met."""
     soft = _run_goto(workshop, "goto", None)
     if soft.done_s is None:
         raise Failure("goto without a time was not done")
     early = _run_goto(workshop, "goto-too-early", round(TOO_EARLY_FRACTION * soft.done_s, 2))
-    # Without a refusal, use the time of the first run as the deadline.
+    # If the early deadline was not refused, use the time of the first run as the deadline.
     by_s = ceil((early.earliest_s or soft.done_s) * 10) / 10
     return GotoRuns(early, _run_goto(workshop, "goto-by", by_s))
 

@@ -18,7 +18,7 @@ NAME = "nasrem"
 SECONDS = 12.0
 """Time of a run, s.
 
-In lockstep every level has planned by half of it. On one processor this takes longer.
+In lockstep, every level has made a plan after half of this time. On one processor it takes longer.
 """
 LAUNCH_S = 3.0
 
@@ -125,7 +125,8 @@ def _measure_partition(
 def _count_task(task: TaskSpec, run: Recording) -> TaskFigures:
     """Count the cycles of a task, or the plans of a planner."""
     rows = run.read_trace(task.name)
-    # Releases without a plan are traced only if they were late. Only their skipped releases count.
+    # A planner's release without a plan is traced only if it was late. Such a record counts only
+    # for the releases that were skipped before it.
     _, skipped = count_misses_and_skips(rows)
     if task.role == "planner":
         rows = select_plans(rows)

@@ -62,7 +62,10 @@ class ResponseRun(ChartedRecord):
 
 
 def _measure_response(workshop: Workshop) -> ResponseRun:
-    """Run the rack in both clock modes, and in lockstep without the hold of the moving arm."""
+    """Run the rack in both clock modes, and in lockstep again without the hold of the moving arm.
+
+    The second lockstep run shows at which tick the torque begins to depend on this hold.
+    """
     run, lockstep = run_with_commands(workshop, "lockstep")
     _, realtime = run_with_commands(workshop, "realtime")
     predicted = next((c.predicted for c in lockstep.commands if c.given == MOVING_HOLD_TICK), None)

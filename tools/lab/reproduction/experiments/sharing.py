@@ -65,7 +65,7 @@ def _measure_chains(workshop: Workshop) -> Chains:
 
 
 def _measure_chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> ChainRun:
-    """Run a chain of boards. Count its messages for each number of cycles that they took."""
+    """Run a chain of boards, and count how many messages took each number of cycles."""
     run = _run_chain(label, workshop, chain, protocol)
     missed, due = count_cycles(run.result.tasks[name] for name in chain.names)
     last = f"{chain.names[-1]}.status"

@@ -1,8 +1,8 @@
 """Measurement of the context switch t_cs of equations 3.8 and 3.9.
 
 An executor wakes up while its planner computes on the same core. The planner reads the clock in a
-loop until it sees a gap, and the executor notes the times at which it was awake. The gap minus the
-executor's time is the time of two switches.
+loop until it sees a gap, and the executor records the times at which it was awake. The gap minus
+the executor's time is the time of two switches.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ def _run_executor(semaphore: Semaphore, shared: _Shared) -> None:
 
 
 def _run_planner(semaphore: Semaphore, shared: _Shared) -> None:
-    """Run the planner, which computes until it is interrupted, and record its longest gap."""
+    """Run the planner: for each wake-up, read the clock in a loop and record the longest gap."""
     gaps = shared.gaps
     awake = shared.awake
     for number in range(shared.wakes):
@@ -149,8 +149,8 @@ def _run_planner(semaphore: Semaphore, shared: _Shared) -> None:
         end_index = 2 * number + 1
         awake_ns = 0
         while not awake_ns and last_ns - begin_ns < MAX_GAP_WAIT_NS:
-            # Read this before the clock. Wherever the executor interrupts this loop, the next value
-            # of the clock then shows the gap.
+            # Read this before the clock, so that the next value of the clock shows the gap wherever
+            # the executor interrupts this loop.
             awake_ns = awake[end_index]
             now_ns = monotonic_ns()
             if now_ns - last_ns > longest_ns:

@@ -262,7 +262,7 @@ def _record_two_racks(
 
 
 def _build_servo_config(workshop: Workshop, later_ms: int) -> RackConfig:
-    """Build the config of the servo rack, with delayed messages if the network is slower."""
+    """Build the config of the servo rack, which receives messages `later_ms` later than normal."""
     peer = f"lan.peer_{workshop.rack.replace('-', '_')}"
     added = [
         f'adapter.lan.listen=["{_format_socket(workshop)}"]',
