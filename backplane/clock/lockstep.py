@@ -130,7 +130,7 @@ class LockstepDriver(ClockDriver):
         if len(due) != 1 or controller is None or self._one_at_a_time:
             return tick + 1
         (alone,) = due
-        # The cycle of a slower executor lasts several ticks, which may begin before it ends.
+        # A slower executor has several ticks in a cycle. They may begin while the cycle still runs.
         if alone.spec.every > 1 or alone.spec.role != "executor" or alone.is_stopped:
             return tick + 1
         words = self.words

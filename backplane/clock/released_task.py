@@ -32,11 +32,11 @@ class ReleasedTask:
 
     Attributes:
         index: Index of the task in the layout.
-        sleeps: True if in real time it sleeps until its grid points by its own timer.
+        sleeps: True if in real time the task wakes itself at its grid points with a timer.
         is_posted: True if it waits for its semaphore, which `wake()` posts.
         done: Semaphore that it posts in lockstep to report a finished release.
-        missed: Number of releases in a row that it has missed. While it still finishes releases,
-            each one late, the number stays at 2.
+        missed: Number of consecutive releases missed. It stays at 2 as long as the task still
+            finishes its releases late.
         deadline: Tick before which it must finish its release or plan, or send its messages if
             that is earlier. This is the value last read from the control block, in which the
             task postpones it when it begins a plan.

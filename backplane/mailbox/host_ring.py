@@ -70,7 +70,7 @@ class HostReader:
 
     @property
     def written_tick(self) -> int:
-        """Tick at which the message taken last was written."""
+        """Tick at which the most recently taken message was written."""
         return self._slots.tick
 
     def take_oldest(self) -> AnyMessage | None:

@@ -141,7 +141,7 @@ class LayoutBuilder:
         )
         if box.protocol == "interrupt":
             yield self._add_interrupts(box, writer, readers)
-        # The reader of a queue is missing if its board has mistakes.
+        # A queue has no reader if the reader's board is left out because of mistakes.
         elif box.protocol == "queue" and readers:
             yield from self._build_queue(box, capacity, readers[0], writer)
         else:

@@ -185,7 +185,7 @@ class Resolved:
 
 
 def _examine(config: RackConfig, further: Iterable[Mistake] = ()) -> Examination:
-    """Check a config. Raises `ConfigError` if it has mistakes or `further` is not empty."""
+    """Check a config. Raises `ConfigError` with its mistakes and those already in `further`."""
     commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
     examination = Examination(config, list_faults(config), commands)
     if mistakes := [*examination.mistakes, *further]:

@@ -131,8 +131,8 @@ class LanAdapter(Adapter):
         self._rack = segment.rack
         self._launch = launch
         self._grid = OwnGrid(segment, self.context.every)
-        # Every rack that is still running shows its token again within one lease and one attempt
-        # to connect.
+        # After a restart, the tokens of running racks reappear at the latest after one lease and
+        # one attempt to connect.
         confirm_by_tick = words[System.TICK] + self._grid.ticks_in(
             (table.lease_ms + RETRY_MS[1]) * 1e6
         )

@@ -222,7 +222,7 @@ class LanLink:
 
 
 def _to_bytes(content: zenoh.ZBytes | None) -> bytes | None:
-    """Convert a payload or an attachment to bytes. None, for no content, remains None."""
+    """Convert a payload or an attachment to bytes. Return None if there is no content."""
     return None if content is None else content.to_bytes()
 
 

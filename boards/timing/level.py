@@ -63,7 +63,10 @@ class BoardTiming:
 
     @property
     def is_plan_budgeted(self) -> bool:
-        """Whether the budget contains planning time. A run without plans measures none."""
+        """Whether the budget contains planning time.
+
+        A budget that was measured in a run without plans does not.
+        """
         return self.has_planner and self.budget is not None and self.budget.plan_ns > 0
 
     @property

@@ -142,7 +142,7 @@ def find_end(plan: MovePlan) -> Array:
 
 
 def is_close(a: Array, b: Array) -> bool:
-    """Return True if a path that begins at `b` can follow a path that ends at `a`.
+    """Return True if two configurations agree within the tolerance for joining paths.
 
     Args:
         a: End of the first path, (joints,), rad.

@@ -255,7 +255,7 @@ def make_stop(path: BlendedPath, limits: Limits, state: PathState) -> Trajectory
     rate = path.bounds.first[path.find_pieces(state.s)]
     max_acceleration = compute_least_ratio(limits.acceleration, rate)
     max_jerk = compute_least_ratio(limits.jerk, rate)
-    # Motion must rest at a stop, because the path continues in another direction.
+    # The motion has to come to rest at a stop, where the path changes its direction.
     end = (
         next((s for s in path.stops if s > state.s - COINCIDENT_RAD), path.length) + COINCIDENT_RAD
     )

@@ -53,7 +53,7 @@ class Pose(NamedTuple):
         return norm(self._compute_turn(other))
 
     def interpolate_to(self, other: Pose, part: float) -> Pose:
-        """Return a pose on the straight motion to `other`, which turns at a constant rate.
+        """Interpolate to another pose, linearly in position and in the angle of rotation.
 
         Args:
             other: Pose at the end of the motion.

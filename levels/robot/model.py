@@ -79,7 +79,7 @@ def drop_fixed_inertias(body: mujoco.MjsBody) -> bool:
         True if any was removed.
     """
     is_dropped = False
-    # Iterating over the lists of a body's children would raise the error of the compilation again.
+    # Do not iterate over the lists of a body: they raise the error of a failed compilation again.
     child = body.first_body()
     while child is not None:
         if child.first_joint() is None:

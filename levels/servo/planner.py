@@ -13,7 +13,7 @@ from rack.levels.robot.dynamics import Dynamics, Payload
 
 
 class ServoPlanner(Planner):
-    """Plans the inertia at the next set point, including a held object, at every release."""
+    """Computes the inertia at the next set point, held object included, at every release."""
 
     above = Input(JointCommand, "above.command")
     status = Input(ServoStatus, "own.status")

@@ -105,7 +105,7 @@ class JudgedConfig:
         return failing < old and not failing & before.find_failures(board)
 
     def is_acceptable_change(self, changed: RackTiming, board: str) -> bool:
-        """Return True if a changed board meets its equations and adds no failure of the system.
+        """Return True if a changed board meets its timing equations and the system gets no worse.
 
         This check is quick and ignores the effect on other tasks of the core.
         """

@@ -120,7 +120,7 @@ class OperatorResponse:
 
     @property
     def mispredicted_commands(self) -> list[AnsweredCommand]:
-        """Commands that took effect at another tick than predicted.
+        """Commands that did not take effect at the predicted tick.
 
         Only paths with an exact prediction are compared.
         """

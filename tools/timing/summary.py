@@ -34,7 +34,7 @@ def format_summary(
 
     Args:
         forecast: Timing of the rack.
-        fitting: Changes that make it fit.
+        fitting: Config changes with which the rack fits.
         arm: Abilities of the arm. None for a rack without one.
         joints: Names of the arm's joints.
         measuring: Command that measures budgets. Empty if they were measured.

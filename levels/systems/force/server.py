@@ -327,7 +327,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
                 self._enter_mode(Mode.RELEASED, "forces released, the position is held")
 
     def _enter_mode(self, mode: Mode, description: str) -> None:
-        """Enter a mode without a client. The reason in the status contains `description`."""
+        """Enter a mode in which no client is served. The reason in the status has `description`."""
         self._without = mode
         self._since = self._now
         silent = f"no sign of life from the client for {self.settings.silence:g} s"

@@ -130,7 +130,7 @@ class Campaign:
             results = Results(nominal)
             for lockstep in order.modes:
                 self._run_fault_trials(results, lockstep)
-            # Runs of kills alternate between the modes.
+            # Trials of kills alternate between lockstep and real time.
             rack = self._describe_rack(False not in order.modes)
             kills = kill_plans(rack, order.kills, order.seed, order.modes, self._number + 1)
             results.trials += self._run_plans(kills)

@@ -21,10 +21,10 @@ _R = TypeVar("_R")
 
 
 def run_in_board_environment(work: Callable[_P, _R], *args: _P.args, **kwargs: _P.kwargs) -> _R:
-    """Call a function in a new process with the environment of boards.
+    """Call a function in a new process that has the environment of a board.
 
     Args:
-        work: Function of a module. Arguments and result must be plain data.
+        work: Function at module level. Arguments and result must be plain data.
         args: Positional arguments.
         kwargs: Keyword arguments.
 

@@ -147,7 +147,7 @@ def _run_kind(
 ) -> CycleRun:
     """Run one rack and return its cycles.
 
-    A lockstep run of this tree's arm is followed by a replay of its physics.
+    After a lockstep run of this tree, the physics of its arm is replayed alone for comparison.
     """
     folder = Path(mkdtemp(dir=scratch))
     lockstep = kind.mode == "lockstep"
