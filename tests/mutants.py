@@ -153,7 +153,7 @@ def examined(mutant: Mutant | None, core: int) -> str:
         status, text = campaign(Path(folder), kinds, core)
     if mutant is None:
         return "" if status == 0 else f"a campaign without any mutation fails:\n{text}"
-    wanted = f"{mutant.kind}: " if mutant.kind not in KINDS else f"{mutant.kind} of "
+    wanted = mutant.kind if mutant.kind not in KINDS else f"{mutant.kind} of "
     return (
         ""
         if status == 1 and wanted in text
