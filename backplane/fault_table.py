@@ -38,7 +38,7 @@ class Stage(IntEnum):
 class Injection:
     """Description of one fault before it is entered into the table.
 
-    The fields are those of `FaultEntry`. `when` is a condition: mailbox index, field index, and the
+    `FaultEntry` describes the fields. `when` is a condition: mailbox index, field index, and the
     value that the field must have for the fault to begin.
     """
 

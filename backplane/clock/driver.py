@@ -27,14 +27,14 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Run, System
 
 LEAD_NS = 300_000
-"""Time by which the clock begins a tick ahead of its grid point.
+"""The clock begins a tick this long before its grid point.
 
-It covers the clock's wake-up and its work in a tick.
+The time covers the clock's wake-up and its work in a tick.
 """
 LATE_DIVISOR = 2
 """A delay of more than one tick divided by this number shows that a core was taken away.
 
-It applies to the clock's wake-up, and to time in which nothing runs although tasks are due.
+Both late wake-ups of the clock and idle time while tasks are due are compared with it.
 """
 LEAD_DIVISOR = 3
 """The clock's lead over its grid point is at most one tick divided by this number."""

@@ -91,17 +91,7 @@ class LockWriter(DoubleBufferWriter):
     def publish_message(
         self, tick: int, visible_at: int, basis: int, damage: Sequence[int] = ()
     ) -> bool:
-        """Publish `message` inside the critical section.
-
-        Args:
-            tick: Release tick of the cycle that writes.
-            visible_at: Tick from which the message is visible.
-            basis: Tick of the oldest information on which the message depends.
-            damage: Bits to flip, see `Slots.publish_message`.
-
-        Returns:
-            False if the wait for the lock timed out.
-        """
+        """Publish `message` as `Writer.publish_message` does, inside the critical section."""
         obtained = self.lock.acquire()
         self.held_up = self.lock.held_up
         if not obtained:

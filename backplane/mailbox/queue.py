@@ -176,14 +176,7 @@ class QueueWriter(Writer):
     ) -> bool:
         """Write `message` to its slot. Readers find it only after `show_published` is called.
 
-        Args:
-            tick: Release tick of the cycle that writes.
-            visible_at: Tick from which the message is visible.
-            basis: Tick of the oldest information on which the message depends.
-            damage: Bits to flip, see `Slots.publish_message`.
-
-        Returns:
-            True, because this access cannot time out.
+        See `Writer.publish_message` for the arguments. This access cannot time out.
         """
         self.slots.publish_message(tick, visible_at, basis, damage)
         return True
