@@ -236,7 +236,7 @@ def _write_draft(
     (folder / f"{name}.toml").write_text(
         format_config(drafted, layout, name, model), encoding="utf-8"
     )
-    picture = draw_arm(drafted.cell(layout.scene), folder / f"{name}.png")
+    picture = draw_arm(drafted.build_cell(layout.scene), folder / f"{name}.png")
     if picture == NO_PICTURE:
         drafted.notes.append(picture)
     drafted.notes = [_hide_folder(folder, note, model) for note in drafted.notes]

@@ -116,7 +116,7 @@ def find_assignment(draft: Draft) -> Assignment:
 
 def _find_transfers(draft: Draft, gripper: FittedGripper) -> Assignment | str:
     """Find a table on which the arm can move two blocks. If there is none, return the reason."""
-    cell = draft.cell()
+    cell = draft.build_cell()
     fingertips = gripper.fingertips
     width = min(fingertips.block_width, MAX_BLOCK_M)
     # The tool goes to the centre of a standing block, so the block keeps the fingers off the table.
@@ -295,7 +295,7 @@ def _rehearse_program(draft: Draft, scene: SceneConfig, actions: list[Document])
         Refused: A motion cannot be planned.
         RobotError: The cell is invalid, or the arm is in contact at the start.
     """
-    cell = draft.cell(scene)
+    cell = draft.build_cell(scene)
     check_start(cell, draft.robot, "home", cell.home)
     data = cell.build_start_data()
     situation = Situation(data.xpos[cell.bodies].copy(), data.xquat[cell.bodies].copy())
@@ -305,7 +305,7 @@ def _rehearse_program(draft: Draft, scene: SceneConfig, actions: list[Document])
 
 def _find_tour(draft: Draft) -> Assignment:
     """Find poses that can be reached one after the other. Raises `RobotError` if there are none."""
-    cell = draft.cell()
+    cell = draft.build_cell()
     check_start(cell, draft.robot, "home", cell.home)
     planner = MotionPlanner(cell, EMPTY_SCENE, SEED)
     statics = Statics(cell)

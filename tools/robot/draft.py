@@ -188,7 +188,7 @@ class Draft:
             key = ".".join(map(str, first["loc"]))
             raise RobotError(f"robot.{key} = {first['input']}: {first['msg'].lower()}") from None
 
-    def cell(self, scene: SceneConfig = EMPTY_SCENE, **changes: Any) -> Cell:
+    def build_cell(self, scene: SceneConfig = EMPTY_SCENE, **changes: Any) -> Cell:
         """Build the cell of the arm as drafted so far.
 
         Keyword arguments override keys of the table. Raises `RobotError` if the cell is invalid.
@@ -261,7 +261,7 @@ def _run_steps(source: Source, options: ArmOptions, folder: Path, name: str) -> 
             result.spec = load_spec(path)
     if not options.tool:
         result.tool = _choose_tool(result)
-    result.exclude = _find_overlaps(result.cell())
+    result.exclude = _find_overlaps(result.build_cell())
     result.limits = limits = _compute_limits(result)
     if limits.bandwidth is not None:
         notes.append(
@@ -343,7 +343,7 @@ def _fit_gripper(draft: Draft) -> FittedGripper:
     config, guess = fit_gripper(draft.spec, compile_spec(draft.spec, draft.model), arm, wanted)
 
     draft.write_model()
-    cell = draft.cell(gripper=config)
+    cell = draft.build_cell(gripper=config)
     fingertips = measure_fingertips(cell, arm.tip)
     notes = []
     if fingertips.has_one_finger:
@@ -351,9 +351,11 @@ def _fit_gripper(draft: Draft) -> FittedGripper:
         why = f"; their meshes are cut to {pieces} convex pieces" if pieces else ""
         notes.append(f"one finger closes on a fixed jaw{why}")
         draft.write_model()
-        fingertips = measure_fingertips(draft.cell(gripper=config), arm.tip, has_one_finger=True)
+        fingertips = measure_fingertips(
+            draft.build_cell(gripper=config), arm.tip, has_one_finger=True
+        )
     config = config.model_copy(update={"open": round(fingertips.opening, 5)})
-    cell = draft.cell(gripper=config)
+    cell = draft.build_cell(gripper=config)
     # Home is not known yet, so let the fingers settle without contacts with the rest of the arm.
     is_gripper = np.isin(np.arange(cell.model.ngeom), cell.geoms.gripper)
     cell.model.geom_contype *= is_gripper
@@ -365,7 +367,7 @@ def _fit_gripper(draft: Draft) -> FittedGripper:
 def _choose_tool(draft: Draft) -> ToolFrame:
     """Place the tool between the fingers, or at the end of an arm without a usable gripper."""
     if draft.gripper is None:
-        tool = choose_outward_tool(draft.cell(), draft.tool.name)
+        tool = choose_outward_tool(draft.build_cell(), draft.tool.name)
         return ToolFrame(*tool, "z along the last joint, outward")
     fingertips = draft.gripper.fingertips
     sides = "finger and fixed jaw" if fingertips.has_one_finger else "the fingers"
@@ -422,7 +424,7 @@ def _compute_limits(draft: Draft) -> JointLimits:
     dry friction needs it.
     """
     stated = draft.limits
-    cell = draft.cell()
+    cell = draft.build_cell()
     dynamics = Dynamics(cell)
     velocity = np.array(stated.velocity)
     weight, drag, inertia = np.zeros((3, len(velocity)))
@@ -482,7 +484,7 @@ def find_home(
     """
     wanted = draft.options.home
     keyframes = draft.keyframes
-    cell = draft.cell(scene)
+    cell = draft.build_cell(scene)
     data = cell.build_start_data()
     checker = CollisionChecker(cell, scene)
     later = CollisionChecker(cell, scene)

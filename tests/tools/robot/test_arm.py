@@ -122,7 +122,7 @@ def test_springs_stay_springs_and_other_passive_joints_are_held(tmp_path: Path) 
     made = draft_arm(
         read_source(written(tmp_path, text, "arm.xml")), ArmOptions(), tmp_path, "drafted"
     )
-    model = made.cell().model
+    model = made.build_cell().model
     names = [model.joint(k).name for k in range(model.njnt)]
     assert set(names) == {*JOINTS, "flex1"}
     assert model.joint("flex1").stiffness[0] == 20.0

@@ -31,7 +31,7 @@ def test_dry_friction_of_light_links_follows_the_equation_of_motion(tmp_path: Pa
     source = read_source(written(tmp_path, with_friction(urdf(gripper=False))))
     made = draft_arm(source, ArmOptions(), tmp_path, "drafted")
     assert "dry friction acts within 1 ms" in made.notes
-    cell = made.cell()
+    cell = made.build_cell()
     dynamics = Dynamics(cell)
     velocity = np.full(6, SPEED)
     friction = dynamics.friction(velocity)
