@@ -179,10 +179,12 @@ def resolve_paths(tables: Tables, folder: Path) -> Tables:
     tables = change_texts(tables, ("robot", "model"), find)
     tables = change_texts(tables, ("python_path",), lambda text: str((folder / text).resolve()))
     tables = change_texts(tables, ("adapter", ANY, "certificates"), lambda text: str(folder / text))
-    racks = ("adapter", ANY, "launch")
-    tables = change_texts(
-        tables, racks, lambda text: str(_find_referenced_file(text, folder) or text)
-    )
+    for key in ("launch", "partners"):
+        tables = change_texts(
+            tables,
+            ("adapter", ANY, key),
+            lambda text: str(_find_referenced_file(text, folder) or text),
+        )
     anchored: Tables = change_texts(tables, STATE_TABLES, find)
     return anchored
 

@@ -64,6 +64,10 @@ class ImportConfig(Table):
     """rate of the exchange [Hz]; divides the adapter's"""
     max_age_ms: Positive
     """age from which a message is old and its writer counts as lost [ms]; simulated time"""
+    delay_ms: Positive | None = None
+    """longest time that a message may take from its export to its arrival [ms]; simulated time"""
+    max_lost: int = Field(0, ge=0, le=1000)
+    """messages in a row that may be lost without a longer response than the bound"""
 
     @property
     def rack(self) -> str:
@@ -113,6 +117,9 @@ class LanTable(Table):
     lockstep waits for them"""
     launch: tuple[str, ...] = ()
     """configs of racks that `rack run` also launches on this machine, each in a separate process"""
+    partners: tuple[str, ...] = ()
+    """configs of racks with which `rack check` and reports join this one's timing, besides those in
+    launch"""
     estop_from: tuple[PeerName, ...] = ()
     """names, proved by certificates, that may set the emergency stop from another machine, with
     rack estop HOST/RACK"""

@@ -153,8 +153,17 @@ class Export:
         self.must_resend = False
         written_tick = source.newest
         payload = bytes(reading.message.raw)
-        times = written_tick, grid.time_ns(written_tick), grid.stamp_ns(written_tick)
-        head = Envelope(self._kind, self._launch, count.serial, count.sent, *times)
+        stamp_ns = grid.stamp_ns(written_tick)
+        head = Envelope(
+            self._kind,
+            self._launch,
+            count.serial,
+            count.sent,
+            written_tick,
+            grid.time_ns(written_tick),
+            stamp_ns,
+            age_ns=stamp_ns - grid.stamp_ns(min(source.basis, written_tick)),
+        )
         self._put(payload, self._sealer.seal(self._key, head, payload))
 
     def write_counts(self, record: Any) -> None:
@@ -259,6 +268,8 @@ class Import:
             return
         self.count.taken += 1
         self._basis = basis
+        origin_ns = self._grid.to_local_ns(newest, self._peer, newest.age_ns)
+        self.count.origin_s = origin_ns * 1e-9
         out.message.raw[:] = self._buffer.raw
         # Ticks of mailboxes cannot be negative, but the message may predate this rack's tick 0.
         out.send(max(0, basis))

@@ -29,8 +29,8 @@ from rack.boards.lan.keys import parse_sender
 if TYPE_CHECKING:
     from rack.boards.lan.credentials import Credentials
 
-_HEAD = Struct("<4sIHQQQQqqq")
-_MAGIC = b"RLN2"
+_HEAD = Struct("<4sIHQQQQqqqq")
+_MAGIC = b"RLN3"
 MAX_SEAL_BYTES = 72
 """Length of the longest seal in bytes."""
 MAX_ENVELOPE_BYTES = _HEAD.size + MAX_CHAIN_BYTES + MAX_SEAL_BYTES
@@ -50,6 +50,7 @@ class Envelope(NamedTuple):
         time_ns: Simulated time of that tick.
         stamp_ns: CLOCK_MONOTONIC of that tick on the sender's machine. In lockstep, `time_ns`.
         flags: Meaning depends on the kind.
+        age_ns: Time in ns from the tick of the oldest information in the message until `tick`.
     """
 
     kind: int
@@ -60,6 +61,7 @@ class Envelope(NamedTuple):
     time_ns: int
     stamp_ns: int
     flags: int = 0
+    age_ns: int = 0
 
 
 class Flaw(IntEnum):
@@ -120,7 +122,7 @@ class Sealer:
             payload: Content of the message.
         """
         chain = self._pair.chain if self._pair else b""
-        packed = _HEAD.pack(_MAGIC, head.flags, len(chain), *head[:7]) + chain
+        packed = _HEAD.pack(_MAGIC, head.flags, len(chain), *head[:7], head.age_ns) + chain
         digest = _compute_digest(key, packed, payload)
         return packed + (self._pair.sign_digest(digest) if self._pair else digest)
 
@@ -143,12 +145,12 @@ class Sealer:
             or envelope[:4] != _MAGIC
         ):
             return self._count_flaw(Flaw.MALFORMED)
-        _, flags, chain_bytes, *fields = _HEAD.unpack_from(envelope)
+        _, flags, chain_bytes, *fields, age_ns = _HEAD.unpack_from(envelope)
         end = _HEAD.size + chain_bytes
         digest = _compute_digest(key, envelope[:end], payload)
         if not self._has_valid_seal(key, digest, envelope[_HEAD.size : end], envelope[end:]):
             return self._count_flaw(Flaw.UNSIGNED)
-        return Envelope._make((*fields, flags))
+        return Envelope._make((*fields, flags, age_ns))
 
     def _has_valid_seal(self, key: str, digest: bytes, chain: bytes, seal: bytes) -> bool:
         """Return True if the seal was made by the sender that the key expression names.

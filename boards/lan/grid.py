@@ -54,15 +54,27 @@ class OwnGrid:
     def to_local_tick(self, head: Envelope, peer: PeerRack, tick: int) -> int:
         """Convert the time at which another rack wrote a message to a tick of this rack.
 
-        The result is early by the uncertainty of the clock comparison, so a message never counts as
-        younger than it is.
+        A message never counts as younger than it is: see `to_local_ns`.
 
         Args:
             head: Envelope of the message.
             peer: The rack that wrote it. In real time its clock offset must be known.
             tick: Current tick, the upper limit of the result.
         """
+        return min(tick, self.to_local_ns(head, peer) // self._clock_ns)
+
+    def to_local_ns(self, head: Envelope, peer: PeerRack, age_ns: int = 0) -> int:
+        """Convert the time of a message of another rack to simulated time of this rack in ns.
+
+        The result is early by the uncertainty of the clock comparison.
+
+        Args:
+            head: Envelope of the message.
+            peer: The rack that wrote it. In real time its clock offset must be known.
+            age_ns: Convert the time this long before the message was written.
+        """
         if self.is_lockstep:
-            return min(tick, head.time_ns // self._clock_ns)
-        here_ns = head.stamp_ns - (peer.offset_ns or 0) - peer.uncertainty_ns
-        return min(tick, (here_ns - self._clock.compute_time_ns(0)) // self._clock.period_ns)
+            return head.time_ns - age_ns
+        here_ns = head.stamp_ns - age_ns - (peer.offset_ns or 0) - peer.uncertainty_ns
+        real_ns = here_ns - self._clock.compute_time_ns(0)
+        return real_ns * self._clock_ns // self._clock.period_ns

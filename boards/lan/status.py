@@ -57,6 +57,9 @@ class LanImport(Message, version=1):
         unit="tick", doc="age of its information in this rack's ticks, -1 if there is none"
     )
     age_s: float = field(unit="s", doc="the same in simulated time, -1 if there is none")
+    origin_s: float = field(
+        unit="s", doc="when its oldest information arose, in simulated time of this rack"
+    )
 
 
 class LanFlaws(Message, version=1):

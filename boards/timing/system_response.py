@@ -63,12 +63,12 @@ def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxS
     sampled = [
         box for box in layout.mailboxes if box.protocol != "queue" and not is_position_mailbox(box)
     ]
-    return _find_longest_row(
+    return find_mailbox_row(
         layout, boards[:-1], {box.name for box in sampled if boards[-1] in box.readers}
     )
 
 
-def _find_longest_row(
+def find_mailbox_row(
     layout: Layout, boards: Sequence[str], taken: Collection[str]
 ) -> tuple[MailboxSpec, ...]:
     """Return the longest sequence of mailboxes, each based on the previous, that ends in `taken`.
@@ -79,7 +79,7 @@ def _find_longest_row(
         return ()
     last = [box for box in layout.mailboxes if box.writer == boards[-1] and box.name in taken]
     return max(
-        ((*_find_longest_row(layout, boards[:-1], box.rests_on), box) for box in last),
+        ((*find_mailbox_row(layout, boards[:-1], box.rests_on), box) for box in last),
         key=len,
         default=(),
     )

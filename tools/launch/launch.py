@@ -28,6 +28,7 @@ from rack.tools.monitor.holds import StandstillDetector
 from rack.tools.monitor.newest_messages import NewestMessages
 from rack.tools.monitor.queues import list_queue_fills
 from rack.tools.monitor.snapshot import RackMonitor
+from rack.tools.recording.joined import write_joined_paths
 from rack.tools.recording.origin import Origin, write_code_state
 from rack.tools.recording.recorder.process import RecorderProcess
 
@@ -235,6 +236,7 @@ def create_run_folder(
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "config.toml").write_text(config.to_toml_text())
         write_code_state(config, folder)
+        write_joined_paths(config, folder)
         if origin is not None:
             origin.write(folder)
         log.open_file(folder / "events.jsonl")

@@ -12,7 +12,10 @@ from rack.boards.events import Outcome
 from rack.tools.console.answer import Document
 
 UNRECORDED = "the system response: nothing is recorded"
-ACROSS_RACKS = "the system response: there are no bounds yet for a response across racks"
+ACROSS_RACKS = (
+    "the system response across racks: the config names no other rack in adapter.lan.partners or"
+    " launch"
+)
 
 
 def build_verdict(ended: Mapping[str, Any], response: Document | None) -> Document:

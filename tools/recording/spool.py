@@ -43,7 +43,7 @@ from rack.tools.recording.checksums import (
     is_cut_off,
     parse_checked_line,
 )
-from rack.tools.recording.file_names import CODE, CONFIG, ORIGIN, SPOOL
+from rack.tools.recording.file_names import CODE, CONFIG, JOINED, ORIGIN, SPOOL
 
 FLUSH_S = 0.1
 """Time between two writes of the spool.
@@ -147,7 +147,7 @@ class Spool:
                 raise Failure(f"{self.path}: another recorder is still writing it")
             if not self.path.stat().st_size:
                 # The launcher has written these files before it starts the recorder.
-                Checksums(folder).store(CONFIG, ORIGIN, CODE)
+                Checksums(folder).store(CONFIG, ORIGIN, CODE, JOINED)
                 _write_part(self._file, SpoolHead(asdict(layout), launch))
             with self.path.open("rb") as file:
                 recorded_head = read_head(file, self.path)

@@ -7,23 +7,20 @@ acts on it, and a status back up.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-
-import numpy as np
+from collections.abc import Sequence
 
 from rack.backplane.layout import MailboxSpec
 from rack.boards.config import build_rack_timing
 from rack.boards.timing.chains import ParallelChains
 from rack.boards.timing.rack import RackTiming
 from rack.boards.timing.system_response import find_path_mailboxes
-from rack.boards.timing.trace_times import compute_distribution, count_misses_and_skips
 from rack.boards.timing.verdicts import name_response_subject
 from rack.tools.console.answer import Document
-from rack.tools.monitor.network import read_entries
+from rack.tools.monitor.network import ADAPTER, read_entries
+from rack.tools.recording.joined import read_joined_paths
 from rack.tools.recording.recording import Recording
-
-LOSS_CODES = ("died", "hang")
-"""Event codes of a lost board."""
+from rack.tools.timing.chain_response import NOT_MEASURED, build_direction, measure_chain
+from rack.tools.timing.joined_response import group_joined_paths, measure_joined_response
 
 
 def measure_system_response(recording: Recording) -> Document | None:
@@ -32,26 +29,33 @@ def measure_system_response(recording: Recording) -> Document | None:
     The main figures belong to the chains with the longest response; `others` contains the same
     figures for all other chains. `beyond` lists the responses that exceed their bound, with the
     causes of delay that the run shows. `unseen` counts responses that cannot be measured because
-    the recording lacks messages. `crosses_racks` is true if the rack imports messages of others,
-    which the bounds do not cover.
+    the recording lacks messages. A direction whose information comes from another rack has no
+    levels among the chains of this rack. Instead, `others` contains a chain across the racks.
+    `crosses_racks` is true if such chains are missing, because the run does not know the timing of
+    other racks.
 
     Returns:
         The response as plain data. None without a hierarchy.
     """
     rack = build_rack_timing(recording.rack_config, recording.layout)
-    first = rack.hierarchy
-    if not first.chains:
-        return None
+    paths = read_joined_paths(recording)
     imported = read_entries(recording.config)
-    return {
-        **_measure_response(recording, rack, first),
-        "crosses_racks": imported is not None and bool(imported.imports),
-        "others": [
-            _measure_response(recording, rack, chains)
-            for chains in rack.chain_groups
-            if chains != first
-        ],
-    }
+    documents = [
+        _measure_response(recording, rack, chains)
+        for chains in sorted(rack.chain_groups, key=lambda chains: chains != rack.hierarchy)
+    ]
+    documents += [
+        document
+        for group in group_joined_paths(paths or ())
+        if (document := measure_joined_response(recording, group)) is not None
+    ]
+    if not documents:
+        return None
+    # Without measurements, a response needs no place beside others.
+    measured = [one for one in documents if one["command"]["levels"] or one["status"]["levels"]]
+    first, *others = measured or documents[:1]
+    crosses_racks = paths is None and imported is not None and bool(imported.imports)
+    return {**first, "crosses_racks": crosses_racks, "others": others}
 
 
 def _measure_response(recording: Recording, rack: RackTiming, chains: ParallelChains) -> Document:
@@ -85,6 +89,8 @@ def _measure_direction(
     """
     layout = recording.layout
     paths = [(boards, find_path_mailboxes(layout, boards)) for boards in chains]
+    if any(_comes_from_another_rack(recording, boxes) for _, boxes in paths):
+        return NOT_MEASURED
     hop_count = min(len(mailboxes) for _, mailboxes in paths)
     start = len(levels) - hop_count - 1 if hop_count else len(levels)
     bound_ms = (
@@ -93,98 +99,15 @@ def _measure_direction(
         * 1e-6
     )
     measurements = [
-        _measure_chain(recording, boards[start:], boxes[-hop_count:], bound_ms)
+        measure_chain(recording, boards[start:], boxes[-hop_count:], bound_ms)
         for boards, boxes in paths
         if hop_count and {box.name for box in boxes} <= set(recording.mailboxes)
     ]
-    responses_ms = np.concatenate([np.zeros(0), *(ms for ms, _, _ in measurements)])
-    beyond = [each for _, late, _ in measurements for each in late]
-    return {
-        "levels": list(levels[start:]),
-        "measured_ms": compute_distribution(responses_ms),
-        "bound_ms": bound_ms,
-        "holds": not beyond if len(responses_ms) else None,
-        "beyond": beyond,
-        "unseen": sum(unseen for _, _, unseen in measurements),
-    }
+    return build_direction(levels[start:], bound_ms, measurements)
 
 
-def _measure_chain(
-    recording: Recording, boards: Sequence[str], boxes: Sequence[MailboxSpec], bound_ms: float
-) -> tuple[np.ndarray, list[Document], int]:
-    """Measure the responses along one chain.
-
-    The worst case is information that arrives just after a release whose message passed the whole
-    chain. It has to wait for the next such release.
-
-    Args:
-        recording: Recording of the run.
-        boards: Boards of the chain.
-        boxes: Mailboxes between them.
-        bound_ms: Bound of the response, ms.
-
-    Returns:
-        The responses in ms, those beyond the bound, and the number that could not be measured.
-    """
-    layout = recording.layout
-    mailbox = boxes[-1].name
-    first, last = (layout.find_task(boards[at]).every for at in (0, -1))
-    tick_ms = layout.clock_ns * 1e-6
-    basis = recording.read_signal(mailbox, "basis")
-    visible_at = recording.read_signal(mailbox, "visible_at")
-    # The first messages depend only on their own ticks, because no information had arrived when
-    # they were written. They do not count.
-    first_basis = max(int(recording.read_signal(box.name, "visible_at")[0]) for box in boxes)
-    valid_rows = np.flatnonzero(basis >= first_basis)
-    arrived, at = np.unique(basis[valid_rows], return_index=True)
-    at = valid_rows[at]
-    visible = visible_at[at[1:]]
-    read = layout.find_read_grid(boxes[-1], boards[-1])
-    acts = visible + (read.phase - visible) % read.every + last
-    ms = (acts - arrived[:-1] - first) * tick_ms
-    is_seen = np.ones(len(ms), bool)
-    if recording.lost_rows.get(mailbox) or recording.kept:
-        # The first message with the information may be among the unrecorded ones.
-        gaps = np.cumsum(np.diff(recording.read_signal(mailbox, "serial"), prepend=0) > 1)
-        is_seen = gaps[at[1:]] == gaps[at[:-1]]
-    beyond = [
-        {
-            "tick": int(arrived[k]),
-            "ms": round(float(ms[k]), 6),
-            "delayed_by": list(_list_delays(recording, boards, int(arrived[k]), int(acts[k]))),
-        }
-        for k in np.flatnonzero(is_seen & (ms > bound_ms + tick_ms / 2))
-    ]
-    return ms[is_seen], beyond, int(np.count_nonzero(~is_seen))
-
-
-def _list_delays(
-    recording: Recording, levels: Sequence[str], since: int, until: int
-) -> Iterator[str]:
-    """Yield a text for each cause of delay between two ticks.
-
-    The causes are faults, lost boards, and boards with late cycles.
-
-    Args:
-        recording: Recording of the run.
-        levels: Boards that the information passes.
-        since: First tick.
-        until: Tick after the last.
-    """
-    for fault in recording.end_counts.get("faults", ()):
-        if 0 <= fault["began"] < until and not 0 <= fault["ends"] <= since:
-            yield f"fault: {fault['kind']} of {fault['board']}"
-    lost = [
-        e["subject"] or e["board"]
-        for e in recording.events
-        if e.get("code") in LOSS_CODES and since <= e["tick"] < until
-    ]
-    yield from (f"{board} was lost" for board in dict.fromkeys(lost))
-    for name in levels:
-        rows = recording.read_trace(name)
-        last_tick = until + recording.layout.find_task(name).every
-        missed, skipped = count_misses_and_skips(
-            rows[(rows["tick"] >= since) & (rows["tick"] < last_tick)]
-        )
-        if missed or skipped:
-            yield f"{name}: {missed} missed, {skipped} skipped"
+def _comes_from_another_rack(recording: Recording, boxes: Sequence[MailboxSpec]) -> bool:
+    """Return True if the first of these mailboxes depends on a message of another rack."""
+    imported = read_entries(recording.config)
+    names = () if imported is None else (f"{ADAPTER}.{port}" for port in imported.imports)
+    return bool(boxes) and not {*names}.isdisjoint(boxes[0].rests_on)

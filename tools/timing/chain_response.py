@@ -1,0 +1,174 @@
+"""Measured response along one chain of boards, and the causes of long responses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rack.backplane.layout import MailboxSpec
+from rack.boards.timing.trace_times import compute_distribution, count_misses_and_skips
+from rack.tools.console.answer import Document
+from rack.tools.recording.recording import Recording
+
+LOSS_CODES = ("died", "hang")
+"""Event codes of a lost board."""
+
+
+NOT_MEASURED: Document = {
+    "levels": [],
+    "measured_ms": None,
+    "bound_ms": None,
+    "holds": None,
+    "beyond": [],
+    "unseen": 0,
+}
+"""Response in a direction that is not measured along these boards."""
+
+
+class Origins(NamedTuple):
+    """When the information in the messages of a chain arrived at the first board of another rack.
+
+    Attributes:
+        basis: Ticks at which the other rack wrote its messages, in ascending order.
+        arrived: When the information in each of these messages arrived there, in ticks of this rack
+            and fractions of them.
+        first_ticks: Cycle of that board in ticks of this rack.
+        list_delays: Yields a text for each cause of delay on the way to this rack, for information
+            that arrived at a tick.
+    """
+
+    basis: np.ndarray
+    arrived: np.ndarray
+    first_ticks: float
+    list_delays: Callable[[float], Iterator[str]]
+
+
+class ChainResponses(NamedTuple):
+    """Responses along one chain.
+
+    Attributes:
+        ms: The measured responses.
+        beyond: Entries for the responses that exceed the bound.
+        unseen: Number of responses that could not be measured.
+    """
+
+    ms: np.ndarray
+    beyond: list[Document]
+    unseen: int
+
+
+def measure_chain(
+    recording: Recording,
+    boards: Sequence[str],
+    boxes: Sequence[MailboxSpec],
+    bound_ms: float,
+    origins: Origins | None = None,
+) -> ChainResponses:
+    """Measure the responses along one chain.
+
+    The worst case is information that arrives just after a release whose message passed the whole
+    chain. It has to wait for the next such release.
+
+    Args:
+        recording: Recording of the run.
+        boards: Boards of the chain.
+        boxes: Mailboxes between them.
+        bound_ms: Bound of the response, ms.
+        origins: Origins of the information, if it comes from another rack.
+    """
+    layout = recording.layout
+    mailbox = boxes[-1].name
+    first: float = layout.find_task(boards[0]).every
+    last = layout.find_task(boards[-1]).every
+    tick_ms = layout.clock_ns * 1e-6
+    basis = recording.read_signal(mailbox, "basis")
+    visible_at = recording.read_signal(mailbox, "visible_at")
+    # The first messages depend only on their own ticks, because no information had arrived when
+    # they were written. They do not count.
+    first_basis = max(int(recording.read_signal(box.name, "visible_at")[0]) for box in boxes)
+    valid_rows = np.flatnonzero(basis >= first_basis)
+    arrived, at = np.unique(basis[valid_rows], return_index=True)
+    at = valid_rows[at]
+    if origins is not None:
+        # Without the status of the adapter, the origin of a message is unknown.
+        is_known = np.isin(arrived, origins.basis)
+        arrived, at = arrived[is_known], at[is_known]
+        arrived = origins.arrived[np.searchsorted(origins.basis, arrived)]
+        first = origins.first_ticks
+    visible = visible_at[at[1:]]
+    read = layout.find_read_grid(boxes[-1], boards[-1])
+    acts = visible + (read.phase - visible) % read.every + last
+    ms = (acts - arrived[:-1] - first) * tick_ms
+    is_seen = np.ones(len(ms), bool)
+    if recording.lost_rows.get(mailbox) or recording.kept:
+        # The first message with the information may be among the unrecorded ones.
+        gaps = np.cumsum(np.diff(recording.read_signal(mailbox, "serial"), prepend=0) > 1)
+        is_seen = gaps[at[1:]] == gaps[at[:-1]]
+    beyond = [
+        {
+            "tick": int(arrived[k]),
+            "ms": round(float(ms[k]), 6),
+            "delayed_by": [
+                *(() if origins is None else origins.list_delays(arrived[k + 1])),
+                *_list_delays(recording, boards, int(arrived[k]), int(acts[k])),
+            ],
+        }
+        for k in np.flatnonzero(is_seen & (ms > bound_ms + tick_ms / 2))
+    ]
+    return ChainResponses(ms[is_seen], beyond, int(np.count_nonzero(~is_seen)))
+
+
+def _list_delays(
+    recording: Recording, levels: Sequence[str], since: int, until: int
+) -> Iterator[str]:
+    """Yield a text for each cause of delay between two ticks.
+
+    The causes are faults, lost boards, and boards with late cycles.
+
+    Args:
+        recording: Recording of the run.
+        levels: Boards that the information passes.
+        since: First tick.
+        until: Tick after the last.
+    """
+    for fault in recording.end_counts.get("faults", ()):
+        if 0 <= fault["began"] < until and not 0 <= fault["ends"] <= since:
+            yield f"fault: {fault['kind']} of {fault['board']}"
+    lost = [
+        e["subject"] or e["board"]
+        for e in recording.events
+        if e.get("code") in LOSS_CODES and since <= e["tick"] < until
+    ]
+    yield from (f"{board} was lost" for board in dict.fromkeys(lost))
+    for name in levels:
+        rows = recording.read_trace(name)
+        last_tick = until + recording.layout.find_task(name).every
+        missed, skipped = count_misses_and_skips(
+            rows[(rows["tick"] >= since) & (rows["tick"] < last_tick)]
+        )
+        if missed or skipped:
+            yield f"{name}: {missed} missed, {skipped} skipped"
+
+
+def build_direction(
+    levels: Sequence[str], bound_ms: float, measurements: Sequence[ChainResponses]
+) -> Document:
+    """Return the responses along parallel chains in one direction as plain data.
+
+    Args:
+        levels: Levels of the chains, in the direction of the information.
+        bound_ms: Bound of the response.
+        measurements: Responses along each chain.
+    """
+    responses_ms = np.concatenate([np.zeros(0), *(one.ms for one in measurements)])
+    beyond = [each for one in measurements for each in one.beyond]
+    return {
+        "levels": list(levels),
+        "measured_ms": compute_distribution(responses_ms),
+        "bound_ms": bound_ms,
+        "holds": not beyond if len(responses_ms) else None,
+        "beyond": beyond,
+        "unseen": sum(one.unseen for one in measurements),
+    }
