@@ -7,10 +7,11 @@ import json
 import re
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import SHM_FOLDER
 from rack.boards.config import CONFIGS, load
 from rack.levels.operator import Answer
+from rack.tools.viewer.window import find_free_port
 from tests import golden
 from tests.boards.lan.racks import ended, running, watch
 from tests.machine import needs_lab
@@ -287,3 +289,71 @@ def test_a_rack_that_was_lost_is_lost_again(rack_name: str, tmp_path: Path) -> N
     lost = [found_lost(folder) for folder in (run, tmp_path / "again")]
     assert len(lost[0]) == len(LOSS)
     assert lost[1] == lost[0]
+
+
+def find_responses(report: dict[str, Any], direction: str, end: str) -> list[dict[str, Any]]:
+    """Return the measured responses in a direction between levels, the last of which is `end`."""
+    response = report["system_response"]
+    found = [one[direction] for one in (response, *response["others"])]
+    return [one for one in found if one["levels"] and one["levels"][-1] == end]
+
+
+@pytest.mark.slow
+def test_in_lockstep_the_longest_response_across_racks_is_the_predicted_one(
+    rack_name: str, tmp_path: Path
+) -> None:
+    general = configs(rack_name, tmp_path)[1]
+    command = [*RACK, "run", general, "--lockstep", "--seconds", "3", "--json", "--share"]
+    done = subprocess.run(
+        command, cwd=tmp_path, timeout=MOST_S, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    upper = json.loads(done.stdout)
+    lower = json.loads((tmp_path / upper["others"][0]["folder"] / "report.json").read_text())
+    assert not [text for one in (upper, lower) for text in one["unjudged"] if "response" in text]
+    (status,) = find_responses(upper, "status", f"{rack_name}/planning")
+    (order,) = find_responses(lower, "command", f"{rack_name}-servo/arm")
+    assert status["levels"][0] == f"{rack_name}-servo/arm"
+    assert order["levels"][0] == f"{rack_name}/trajectory"
+    for response in (status, order):
+        assert response["measured_ms"]["max"] == pytest.approx(response["bound_ms"])
+        assert response["holds"]
+
+
+@pytest.mark.thorough
+@pytest.mark.alone
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("delay_ms", [0, 5, 30])
+def test_on_a_slow_network_each_long_response_has_a_cause(
+    delay_ms: int, rack_name: str, tmp_path: Path
+) -> None:
+    servo, general = configs(rack_name, tmp_path)
+    near, far = find_free_port(), find_free_port()
+    relay = [sys.executable, "-m", "tests.slow_link", str(near), str(far), str(delay_ms)]
+    shared = ["--share", "--json", "--seconds", "6", "--set", "adapter.lan.insecure=true"]
+    shared += ["--set", "adapter.lan.estop_from=[]"]
+    listening = ["--set", f'adapter.lan.listen=["tcp/127.0.0.1:{far}"]']
+    connecting = ["--set", f'adapter.lan.connect=["tcp/127.0.0.1:{near}"]']
+    alone = ["--set", "adapter.lan.launch=[]", "--set", 'adapter.lan.partners=["servo.toml"]']
+    runs = (
+        [*RACK, "run", servo, *shared, *listening, "--out", "lower"],
+        [*RACK, "run", general, *shared, *connecting, *alone, "--out", "upper"],
+    )
+    link = subprocess.Popen(relay)
+    try:
+        started = [
+            subprocess.Popen(run, cwd=tmp_path, stdout=subprocess.PIPE, text=True) for run in runs
+        ]
+        lower, upper = (json.loads(one.communicate(timeout=MOST_S)[0]) for one in started)
+    finally:
+        link.kill()
+        link.wait()
+    (status,) = find_responses(upper, "status", f"{rack_name}/planning")
+    (order,) = find_responses(lower, "command", f"{rack_name}-servo/arm")
+    for response in (status, order):
+        assert response["measured_ms"]["max"] > 0.0
+        assert all(one["delayed_by"] or one["network"] for one in response["beyond"])
+    if delay_ms > 20:
+        # The budget of the link is 20 ms.
+        causes = [cause for excess in order["beyond"] for cause in excess["network"]]
+        assert any(cause.startswith("the link took ") for cause in causes)

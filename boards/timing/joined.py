@@ -100,6 +100,8 @@ class JoinedPath:
             is the earliest whose release the messages carry on to the last.
         port: Import of the last rack through which the information arrives.
         first_cycle_ms: Cycle of the first board.
+        exchange_ms: Longest time between two messages of the import: its period, or the cycle of
+            the writer.
         far_ms: Longest time from the first board's release until the release of the cycle that
             wrote the imported message.
         link_ms: Longest time from that release until the import takes the message over.
@@ -112,6 +114,7 @@ class JoinedPath:
     stations: tuple[tuple[str, str], ...]
     port: str
     first_cycle_ms: float
+    exchange_ms: float
     far_ms: float
     link_ms: float
     response_ms: float
@@ -192,6 +195,7 @@ class JoinedRacks:
         taken_ns = link.compute_taken_ns(self._find_releases(writer), is_lockstep)
         times_ns = (
             self.find_cycle_ns(stations[0]),
+            max(link.exported.every, writer_ns),
             self.compute_response_ns(far) - writer_ns,
             writer_ns + taken_ns,
             self.compute_response_ns(stations),

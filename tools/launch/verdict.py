@@ -59,11 +59,13 @@ def _list_long_responses(response: Document) -> Iterator[str]:
     for chains in (response, *response["others"]):
         for direction in ("command", "status"):
             chain = chains[direction]
-            if count := sum(not excess["delayed_by"] for excess in chain["beyond"]):
+            if unexcused := [excess for excess in chain["beyond"] if not excess["delayed_by"]]:
+                longest = max(unexcused, key=lambda excess: excess["ms"])
+                causes = "".join(f"; {cause}" for cause in longest.get("network", ()))
                 yield (
                     f"the response of a {direction} along {' > '.join(chain['levels'])} took up to"
-                    f" {chain['measured_ms']['max']:g} ms; bound: {chain['bound_ms']:g} ms, {count}"
-                    " times exceeded without a lost cycle"
+                    f" {chain['measured_ms']['max']:g} ms; bound: {chain['bound_ms']:g} ms,"
+                    f" {len(unexcused)} times exceeded without a lost cycle{causes}"
                 )
 
 

@@ -303,7 +303,8 @@ def _format_response(response: Document) -> Blocks:
             selection = _format_selection(exceeding, "longest")
             yield from ("", f"{direction}: {len(exceeding)} exceeded the bound{selection}:")
         for slow in sorted(exceeding, key=lambda slow: -slow["ms"])[:MAX_SHOWN_ROWS]:
-            why = "; ".join(slow["delayed_by"]) or "no cause is recorded"
+            causes = [*slow["delayed_by"], *slow.get("network", ())]
+            why = "; ".join(causes) or "no cause is recorded"
             yield f"- {slow['ms']:g} ms from tick {slow['tick']}: {why}"
         if unseen := measured["unseen"]:
             yield from ("", f"{direction}: {unseen} not measured, because messages are missing.")

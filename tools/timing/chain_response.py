@@ -35,14 +35,15 @@ class Origins(NamedTuple):
         arrived: When the information in each of these messages arrived there, in ticks of this rack
             and fractions of them.
         first_ticks: Cycle of that board in ticks of this rack.
-        list_delays: Yields a text for each cause of delay on the way to this rack, for information
-            that arrived at a tick.
+        list_delays: Yields a text for each cause of delay on the way to this rack. Its arguments
+            are two successive values of `arrived`; the response ends with the message of the
+            second.
     """
 
     basis: np.ndarray
     arrived: np.ndarray
     first_ticks: float
-    list_delays: Callable[[float], Iterator[str]]
+    list_delays: Callable[[float, float], Iterator[str]]
 
 
 class ChainResponses(NamedTuple):
@@ -110,10 +111,8 @@ def measure_chain(
         {
             "tick": int(arrived[k]),
             "ms": round(float(ms[k]), 6),
-            "delayed_by": [
-                *(() if origins is None else origins.list_delays(arrived[k + 1])),
-                *_list_delays(recording, boards, int(arrived[k]), int(acts[k])),
-            ],
+            "delayed_by": [*_list_delays(recording, boards, int(arrived[k]), int(acts[k]))],
+            "network": [] if origins is None else [*origins.list_delays(*arrived[k : k + 2])],
         }
         for k in np.flatnonzero(is_seen & (ms > bound_ms + tick_ms / 2))
     ]

@@ -85,9 +85,10 @@ def find_origins(recording: Recording, path: JoinedPath) -> Origins:
     arrived = origin_s * 1e3 / tick_ms
     rack, board = path.stations[-1 - len(path.boards)]
 
-    def list_delays(tick: float) -> Iterator[str]:
+    def list_delays(earlier: float, tick: float) -> Iterator[str]:
         """Yield a text for each cause of delay before the message with this origin was taken."""
         row = taken[np.flatnonzero(arrived[taken] == tick)[0]]
+        gap_ms = (tick - earlier) * tick_ms
         far_ms = (basis[row] - arrived[row]) * tick_ms
         link_ms = (ticks[row] - basis[row]) * tick_ms
         if far_ms > path.far_ms + tick_ms:
@@ -102,6 +103,11 @@ def find_origins(recording: Recording, path: JoinedPath) -> Origins:
             )
         if missing := int(lost[row] - lost[max(row - 1, 0)]):
             yield f"{missing} messages of '{rack}/{board}' were lost before it"
+        elif gap_ms > path.exchange_ms + tick_ms:
+            yield (
+                f"'{rack}/{board}' sent nothing new for {gap_ms:g} ms; it should every"
+                f" {path.exchange_ms:g} ms"
+            )
 
     order = taken[np.argsort(basis[taken], kind="stable")]
     return Origins(basis[order], arrived[order], path.first_cycle_ms / tick_ms, list_delays)

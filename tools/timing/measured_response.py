@@ -54,7 +54,7 @@ def measure_system_response(recording: Recording) -> Document | None:
     # Without measurements, a response needs no place beside others.
     measured = [one for one in documents if one["command"]["levels"] or one["status"]["levels"]]
     first, *others = measured or documents[:1]
-    crosses_racks = paths is None and imported is not None and bool(imported.imports)
+    crosses_racks = not paths and imported is not None and bool(imported.imports)
     return {**first, "crosses_racks": crosses_racks, "others": others}
 
 

@@ -91,11 +91,16 @@ class SystemResponse:
 def parse_response(report: Mapping[str, Any] | None) -> SystemResponse | None:
     """Return the response in a report.
 
-    None without a hierarchy, or if the hierarchy crosses racks and therefore has no bound.
+    None without a hierarchy, or if it crosses racks whose timing the run does not know.
     """
     if report is None or report["crosses_racks"]:
         return None
-    ways = {way: _parse_direction(report[way]) for way in ("command", "status")}
+    ways = {
+        way: _parse_direction(report[way])
+        for way in ("command", "status")
+        # A direction that ends in another rack is measured there.
+        if report[way]["bound_ms"] is not None
+    }
     return SystemResponse(report["sum_eq_3_3_ms"], ways)
 
 
