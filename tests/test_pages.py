@@ -278,7 +278,11 @@ def test_every_command_of_the_pages_has_a_test() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "printed"),
-    [("message", "12.5 (6,)\n"), ("signal", "time over\n(400, 6) rad\n")],
+    [
+        ("message", "12.5 (6,)\n"),
+        ("signal", "time over\n(400, 6) rad\n"),
+        ("moment", "(6,)\n[0.     0.0025 0.005 ]\n"),
+    ],
 )
 def test_a_program_of_a_page_prints_what_it_says(name: str, printed: str, tmp_path: Path) -> None:
     (block,) = {
@@ -315,3 +319,13 @@ def test_the_prompt_of_rewind_answers_as_its_page_shows(
     assert len(answers) == len(lines)
     assert not [answer for answer in answers if "error" in answer]
     assert (tmp_path / "slower" / "report.json").is_file()
+
+
+def test_every_measured_figure_has_a_date_a_commit_and_a_command() -> None:
+    text = (ROOT / "tools" / "MEASURED.md").read_text()
+    rows = re.findall(r"^\| (?!bench \||figure \||-)(.+) \|$", text, re.MULTILINE)
+    cells = [re.split(r"\s*\|\s*", row) for row in rows if not row.startswith("---")]
+    assert cells
+    assert not [row for row in cells if len(row) not in (4, 6) or not row[0] or not row[1]]
+    assert not [row for row in cells if not re.fullmatch(r"\d{4}-\d\d-\d\d", row[-2])]
+    assert not [row for row in cells if not re.fullmatch(r"[0-9a-f]{8}", row[-1])]
