@@ -124,7 +124,7 @@ def test_the_example_level_is_the_one_in_configs() -> None:
 def pages() -> list[Path]:
     """Return all pages of the project."""
     root = README.parent
-    return [*root.glob("*.md"), *PAGES[2:], *(root / "configs").glob("*/**/*.md")]
+    return [*root.glob("*.md"), *PAGES[2:], *(root / "configs").rglob("*.md")]
 
 
 def test_every_file_that_the_pages_link_to_exists() -> None:
