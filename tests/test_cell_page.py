@@ -34,8 +34,8 @@ ONE_MACHINE = ("unshare", "--net", "--pid", "--fork", "--kill-child", "--mount-p
 MOST_S = 240.0
 
 
-def test_the_page_of_the_boards_has_the_same_commands() -> None:
-    page = (CONFIGS.parent / "boards" / "README.md").read_text()
+def test_the_page_of_networks_has_the_same_commands() -> None:
+    page = (CONFIGS.parent / "boards" / "NETWORK.md").read_text()
     lines = re.findall(r"(?m)^rack (run cell.*)$", page)
     assert [shlex.split(line, comments=True) for line in lines] == BLOCKS[0]
 

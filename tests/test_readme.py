@@ -1,5 +1,5 @@
 """The README and the floors' pages are true: their commands run, as does the example level, as it
-stands there."""
+stands there. Commands that need a run or a running rack: test_pages.py."""
 
 from __future__ import annotations
 
@@ -23,26 +23,37 @@ TO_ITS_END = "k1607"
 """The rack of which the whole run is made and recorded."""
 README = Path(__file__).parent.parent / "README.md"
 FLOORS = ("backplane", "boards", "levels", "configs", "tools")
-PAGES = [README, *(README.parent / floor / "README.md" for floor in FLOORS)]
+WRITTEN_BY_PROGRAM = "REFERENCE.md"
+PAGES = [
+    README,
+    README.parent / "ARCHITECTURE.md",
+    *(
+        page
+        for floor in FLOORS
+        for page in sorted((README.parent / floor).glob("*.md"))
+        if page.name != WRITTEN_BY_PROGRAM
+    ),
+]
 TEXT = "\n".join(page.read_text() for page in PAGES)
 MOST_LINES, MOST_WORDS, MOST_PAGE_LINES = 120, 1500, 430
 BLOCK = re.compile(r"<!-- test: (\S+) -->\n```\w+\n(.*?)```", re.DOTALL)
 
+CODE = re.compile(r"```.*?```", re.DOTALL)
 SHELL = re.compile(r"```sh\n(.*?)```", re.DOTALL)
 ELSEWHERE = re.compile(
     r"<|\.toml|RUN|rack"
     r" (status|top|watch|mailbox|stop|pause|resume|set|record|replay|rewind|inject|estop)"
-    r"|rack (command|prompt)"
+    r"|rack (command|prompt|campaign|export|bench (?!mailbox))"
     r"|kill-each-board|--view|--step"
-    r"|reproduce|rack run (cell|brown)|rack lan"
+    r"|reproduce|rack run (arm|cell|brown)|rack lan"
 )
-"""Commands that need a run, or a running rack, of another line: they have tests of their own in
-tests/tools."""
+"""Commands that need a run, or a running rack, of another line: test_pages.py runs them, or names
+the test that does."""
 COMMANDS = {
     line.partition("#")[0].strip(): int("exit status 1" in line)
     for block in SHELL.findall(TEXT)
     for line in block.splitlines()
-    if line.startswith("rack ") and not ELSEWHERE.search(line)
+    if line.startswith("rack ") and not ELSEWHERE.search(line.partition("#")[0])
 }
 
 
@@ -81,7 +92,7 @@ def test_the_pages_show_the_commands() -> None:
     assert {"run", "check", "list", "clean", "bench", "gantt"} <= {
         line.split()[1] for line in COMMANDS
     }
-    table = PAGES[-1].read_text().partition("## Commands")[2]
+    table = (README.parent / "tools" / "README.md").read_text().partition("## Commands")[2]
     rows = re.findall(r"^\| ([a-z ]+) \| (`.*`) \|$", table, re.MULTILINE)
     listed = {goal.capitalize(): tuple(re.findall(r"`(\w+)`", names)) for goal, names in rows}
     assert listed == {group: tuple(found) for group, found in cli.COMMANDS.items()}
@@ -103,9 +114,9 @@ def test_the_readme_is_a_front_door_and_pages_have_an_end() -> None:
 
 
 def test_the_example_level_is_the_one_in_configs() -> None:
-    shown = BLOCK.findall(TEXT)
-    assert {name for name, _ in shown} == {"power.py", "metered.toml"}
     own_level = README.parent / "configs" / "examples" / "own-level"
+    shown = [(name, block) for name, block in BLOCK.findall(TEXT) if (own_level / name).exists()]
+    assert {name for name, _ in shown} == {"power.py", "metered.toml"}
     for name, block in shown:
         assert block == (own_level / name).read_text()
 
@@ -113,7 +124,7 @@ def test_the_example_level_is_the_one_in_configs() -> None:
 def pages() -> list[Path]:
     """Return all pages of the project."""
     root = README.parent
-    return [*root.glob("*.md"), *PAGES[1:], *(root / "configs").rglob("*.md")]
+    return [*root.glob("*.md"), *PAGES[2:], *(root / "configs").rglob("*.md")]
 
 
 def test_every_file_that_the_pages_link_to_exists() -> None:
@@ -124,6 +135,28 @@ def test_every_file_that_the_pages_link_to_exists() -> None:
     ]
     assert links
     assert not [f"{page.name}: {link}" for page, link in links if not (page.parent / link).exists()]
+
+
+def anchors(page: Path) -> set[str]:
+    """Return the anchors of the headings of a page, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", CODE.sub("", page.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", text.lower()).replace(" ", "-") for text in headings}
+
+
+def test_every_heading_that_the_pages_link_to_exists() -> None:
+    links = [
+        (page, page.parent / file if file else page, anchor)
+        for page in pages()
+        for file, anchor in re.findall(
+            r"\]\((?!https?:)([^)#\s]*)#([^)]+)\)", CODE.sub("", page.read_text())
+        )
+    ]
+    assert links
+    assert not [
+        f"{page.name}: {target.name}#{anchor}"
+        for page, target, anchor in links
+        if anchor not in anchors(target)
+    ]
 
 
 def test_the_map_names_every_package_and_no_other_on_one_page() -> None:

@@ -3,8 +3,8 @@
     python -m tests.tools.robot.tried FOLDER [--only TEXT]
 
 Downloads the packages by pip (600 MB), unpacks them to FOLDER, and runs `rack robot new MODEL` and
-`rack run NAME --lockstep` for each arm. Prints a row of the table in levels/README for each arm,
-and writes details to FOLDER/tried.jsonl. One arm takes one to three minutes.
+`rack run NAME --lockstep` for each arm. Prints a row of the table in levels/TRIED-ARMS.md for each
+arm, and writes details to FOLDER/tried.jsonl. One arm takes one to three minutes.
 """
 
 from __future__ import annotations
