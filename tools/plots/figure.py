@@ -7,6 +7,8 @@ from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from rack.tools.console.pictures import open_figure
 from rack.tools.plots.curves import Panel, Plot, build_panels
 from rack.tools.plots.marks import MAX_LEGEND_ENTRIES, MarkGroup, MarkKind, group_marks
@@ -51,7 +53,7 @@ def draw_panel(
     for curve in panel.curves:
         times, values = curve.time_s, curve.values
         if end_s is not None:
-            times, values = [*times, max(end_s, times[-1])], [*values, values[-1]]
+            times, values = np.append(times, end_s), np.append(values, values[-1])
         look = f"C{curve.number % 10}{'--' if curve.is_other else '-'}"
         axes.step(times, values, look, where="post", label=curve.label, linewidth=1.2)
     axes.set_ylabel(panel.label)
@@ -76,8 +78,7 @@ def draw_panel(
         else:
             times_s = [mark.time_s for mark in group.marks]
             top = MISS_HEIGHT if group.kind == "miss" else 1.0
-            style = "-" if group.kind == "miss" else "--"
-            entry = axes.vlines(times_s, 0.0, top, colour, style, transform=height, linewidth=1.2)
+            entry = axes.vlines(times_s, 0.0, top, colour, "--", transform=height, linewidth=1.2)
         entry.set_label(group.label)
         entries.append(entry)
     return entries
