@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from rack.backplane.json_text import encode_json
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
@@ -20,7 +21,7 @@ from rack.boards.crate.alarm_events import AlarmReader
 from rack.tools.commands.record import save_run
 from rack.tools.commands.status import find_run_folder
 from rack.tools.commands.watch import await_trigger, check_writable, parse_span_s
-from rack.tools.console.answer import Failure, print_json
+from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, argument, option
 from rack.tools.console.pictures import NO_PICTURES, PICTURE_FORMATS, can_draw
@@ -151,7 +152,8 @@ def plot(
 
         save_plot(drawn, out)
     if as_json:
-        print_json({**drawn.to_document(), "picture": out and str(out)})
+        # On one line, because there may be thousands of values.
+        print(encode_json({**drawn.to_document(), "picture": out and str(out)}))
     elif out is not None:
         print(f"picture: {out}")
     else:
@@ -247,6 +249,8 @@ def _plot_rings(segment: Segment, request: PlotRequest) -> Plot:
         all_series = history.build_series(tick + after)
         marks.append(Mark(tick * tick_s, "trigger", request.when))
         window_s = max(tick - before, 0) * tick_s, (tick + after) * tick_s
+    if others:
+        all_series = [series._replace(run=segment.rack) for series in all_series]
     marks += list_event_marks((alarm.event for alarm in alarms.read_alarms()), tick_s)
     marks += [
         Mark(hold.since_s, "hold", f"{hold.level}: {hold.why}")

@@ -49,8 +49,7 @@ class Series(NamedTuple):
         """
         ticks = recording.read_signal(signal.mailbox, "tick")
         if not len(ticks):
-            why = f"not recorded: the run has no message of {signal.mailbox}"
-            raise Failure(f"{signal.name}: {why}", 2)
+            raise Failure(f"{signal.name}: no message of {signal.mailbox} is recorded", 2)
         values = signal.select_part(recording.read_signal(signal.mailbox, signal.label))
         return cls(signal, ticks * (recording.layout.clock_ns * 1e-9), values, run, is_other)
 

@@ -96,7 +96,9 @@ def draw_plot(
 
     legends = [_build_legend(panel, size) for panel in panels]
     all_points = [
-        [_list_points(panel, curve, window_s, size) for curve in panel.curves] for panel in panels
+        # The curves of the other run are below.
+        [_list_points(panel, curve, window_s, size) for curve in reversed(panel.curves)]
+        for panel in panels
     ]
     scales = [_build_scale(*pair) for pair in zip(panels, all_points, strict=True)]
     # The panels are aligned if all labels are equally long.
@@ -111,7 +113,8 @@ def draw_plot(
     height = max((size.height - taken) // len(panels), MIN_HEIGHT)
     lines: list[Text] = []
     for panel, points, scale, legend in zip(panels, all_points, scales, legends, strict=True):
-        box = size._replace(height=height)
+        wanted = 2 * len(scale.labels) + 3 if panel.names else height
+        box = size._replace(height=min(height, wanted))
         drawn = _draw_panel(points, scale, indent, [group for _, group in groups], window_s, box)
         lines += [Text(panel.label or "value"), drawn, *legend]
     lanes = [_draw_lane(letter, group, indent, window_s, size) for letter, group in groups]
