@@ -12,7 +12,7 @@ from rack.tools.commands.replay import find_viewer_files, merge_runs
 from rack.tools.commands.watch import check_writable
 from rack.tools.console.answer import Failure, print_answer
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.console.parameters import Json, argument, option
+from rack.tools.console.parameters import Json, RunFolder, option
 from rack.tools.console.progress import announce_waiting
 from rack.tools.launch.continued import parse_tick
 from rack.tools.recording.recording import Recording
@@ -20,7 +20,7 @@ from rack.tools.viewer.parts import FILE
 
 
 def picture(
-    run: Path = argument("RUN", "folder of a run, as in runs/nasrem-20250101-120000, or a run.rrd"),
+    run: RunFolder,
     at: float = option("--at S", "simulated time to look at, s", ..., min=0.0, max=1e9),
     out: Path | None = option(
         "--out FILE.png", "file to write; default: picture-<S>s.png in the folder of the run"
@@ -48,21 +48,16 @@ def picture(
     """
     if cell and view is not None:
         raise Failure("--cell, --view: give one of them", 2)
-    is_file = run.suffix == ".rrd"
-    if is_file and not run.is_file():
-        raise Failure(f"{run}: no such file", 2)
-    if is_file and cell:
-        raise Failure("--cell: needs the folder of the run", 2)
-    if not is_file:
-        parse_tick(Recording(run), str(at), "--at ")
-    path = out or (run.parent if is_file else run) / f"picture-{at:g}s.png"
+    recording = Recording(run)
+    tick = parse_tick(recording, str(at), "--at ")
+    path = out or run / f"picture-{at:g}s.png"
     if path.suffix != ".png":
         raise Failure(f"--out {path}: the name of a picture must end in .png", 2)
     check_writable(path)
     with announce_waiting("drawing; without a graphics card this may take a minute", as_json):
         notes: list[str] = []
         if cell:
-            _draw_cell(run, at, path)
+            _draw_cell(recording, tick, path)
         else:
             notes = _draw_view(run, at, view, path)
     document = {"picture": str(path), "at_s": at, "view": view, "notes": notes}
@@ -75,7 +70,7 @@ def _draw_view(run: Path, at_s: float, view: str | None, path: Path) -> list[str
     """Draw the first view of a run, or one of its views, with the viewer.
 
     Args:
-        run: Folder of the run, or a file for the viewer.
+        run: Folder of the run.
         at_s: Simulated time.
         view: Title of the only view to draw, or a part of it. None for all views.
         path: File to write.
@@ -103,24 +98,21 @@ def _draw_view(run: Path, at_s: float, view: str | None, path: Path) -> list[str
     return list(drawn.complaints)
 
 
-def _draw_cell(run: Path, at_s: float, path: Path) -> None:
+def _draw_cell(recording: Recording, tick: int, path: Path) -> None:
     """Draw the cell of a run with MuJoCo. Raises `Failure`."""
-    recording = Recording(run)
     boxes = [box.name for box in recording.layout.mailboxes if box.message == "arm_state"]
-    config = recording.rack_config
-    if not boxes or config.robot is None:
-        raise Failure(f"--cell: rack '{recording.layout.rack}' has no arm", 2)
-    tick = round(at_s * 1e9 / recording.layout.clock_ns)
-    row = int(np.searchsorted(recording.read_signal(boxes[0], "tick"), tick, "right")) - 1
-    if row < 0:
-        raise Failure(f"--at {at_s:g}: {boxes[0]} has no message yet", 2)
+    robot = recording.rack_config.robot
+    ticks = recording.read_signal(boxes[0], "tick") if boxes else ()
+    row = int(np.searchsorted(ticks, tick, "right")) - 1
+    if robot is None or row < 0:
+        raise Failure(f"--cell: rack '{recording.layout.rack}' has recorded no arm until then", 2)
     import mujoco
 
     from rack.levels.robot.cell import build_cell
     from rack.levels.robot.engine import view_state
     from rack.tools.robot.picture import NO_PICTURE, draw_arm
 
-    cell = build_cell(config.robot, config.scene, config.clock_ns)
+    cell = build_cell(robot, recording.rack_config.scene, recording.layout.clock_ns)
     data = cell.build_start_data()
     view_state(cell.model, data, recording.read_signal(boxes[0], "state")[row])
     mujoco.mj_forward(cell.model, data)

@@ -70,9 +70,9 @@ def watch(
       rack watch nasrem servo.status.torque --when "servo.status.position[2] > -2.5" --before 0.5s
     """
     before_s, after_s, every_s = (
-        parse_span_s("--before", before),
-        parse_span_s("--after", after),
-        parse_span_s("--every", every),
+        _parse_seconds("--before", before),
+        _parse_seconds("--after", after),
+        _parse_seconds("--every", every),
     )
     if out is not None and when is None:
         raise Failure("--out needs --when; give both, or neither", 2)
@@ -100,7 +100,7 @@ def watch(
     )
 
 
-def parse_span_s(option: str, text: str) -> float:
+def _parse_seconds(option: str, text: str) -> float:
     """Parse the time of an option in s. Raises `Failure`."""
     seconds = -1.0
     with suppress(ValueError):

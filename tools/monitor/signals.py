@@ -15,8 +15,8 @@ import numpy as np
 from rack.backplane.json_text import encode_json
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
-from rack.tools.plots.curves import Series, build_panels
-from rack.tools.plots.terminal import draw_plot, measure_terminal
+from rack.tools.plots.curves import Plot, Series
+from rack.tools.plots.terminal import draw_plot
 from rack.tools.recording.signal import Signal
 
 if TYPE_CHECKING:
@@ -224,9 +224,8 @@ class SignalPlot:
         """Redraw the curves up to tick `last`."""
         to_s = self._history.to_time_s(last)
         window_s = max(to_s - self._span_s, 0.0), max(to_s, self._history.tick_s)
-        panels = build_panels(
-            [series.cut(*window_s) for series in self._history.build_series(last)]
-        )
+        series = [series.cut(*window_s) for series in self._history.build_series(last)]
         # Leave one line free, because the terminal would scroll otherwise.
-        size = measure_terminal(self._live.console, margin=1)
-        self._live.update(draw_plot(panels, (), window_s, size), refresh=True)
+        console = self._live.console
+        drawn = draw_plot(Plot("", series, [], window_s), console, console.height - 1)
+        self._live.update(drawn, refresh=True)

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
 
-from rack.boards.events import Event
+from rack.tools.recording.divergence import find_tick_range
 from rack.tools.recording.history import list_holds, list_misses
 from rack.tools.recording.recording import Recording
 
-MarkKind = Literal[
-    "fault", "detection", "miss", "hold", "lost", "restart", "first difference", "trigger"
-]
 MAX_LEGEND_ENTRIES = 12
-"""Largest number of curves or marks that a legend lists."""
-MAX_TEXT = 90
-"""Largest number of characters of a mark's text in a legend."""
+"""Largest number of curves and marks that a legend lists."""
+MARKED_CODES = {"begins": "fault", "died": "lost", "rejoined": "restart"}
+"""Kinds of marks by code of an event. Detections have many codes."""
 
 
 class Mark(NamedTuple):
@@ -26,83 +23,51 @@ class Mark(NamedTuple):
         time_s: Time at which it happened or began.
         kind: Kind of mark.
         text: Description.
-        until_s: End of a hold. None for an instant, and for a hold that has not ended.
+        until_s: Time at which it ended. The same as `time_s` for an instant.
     """
 
     time_s: float
-    kind: MarkKind
+    kind: str
     text: str
-    until_s: float | None = None
-
-    def find_end_s(self, last_s: float) -> float:
-        """Return the end of the mark. A hold that has not ended lasts until `last_s`."""
-        if self.kind != "hold":
-            return self.time_s
-        return last_s if self.until_s is None else self.until_s
+    until_s: float
 
 
-class MarkGroup(NamedTuple):
-    """Marks with a common entry in the legend, earliest first."""
-
-    kind: MarkKind
-    label: str
-    marks: list[Mark]
-
-
-def list_event_marks(events: Iterable[Event], tick_s: float) -> list[Mark]:
-    """Return the marks of events. Other events, such as the launch, are left out."""
-    marks = []
-    for event in events:
-        kind: MarkKind
-        if event.kind == "fault" and event.code == "begins":
-            kind = "fault"
-        elif event.kind in ("detection", "miss"):
-            kind = event.kind
-        elif event.kind == "died":
-            kind = "lost"
-        elif event.code == "rejoined":
-            kind = "restart"
-        else:
-            continue
-        # The texts about lost and restarted boards name the board.
-        text = event.text if kind in ("lost", "restart") else f"{event.board}: {event.text}"
-        marks.append(Mark(event.tick * tick_s, kind, text))
-    return marks
-
-
-def list_recorded_marks(recording: Recording) -> list[Mark]:
-    """Return the marks of a recorded run."""
+def list_marks(recording: Recording) -> list[Mark]:
+    """Return the marks of a recorded run, earliest first."""
     tick_s = recording.layout.clock_ns * 1e-9
-    events = (
-        Event(**event) for event in recording.events if event["kind"] not in ("outcome", "miss")
-    )
-    marks = list_event_marks(events, tick_s)
+    marks = []
+    for event in recording.events:
+        is_detection = event["kind"] == "detection"
+        if kind := "detection" if is_detection else MARKED_CODES.get(event.get("code", "")):
+            time_s = event["tick"] * tick_s
+            marks.append(Mark(time_s, kind, f"{event['board']}: {event['text']}", time_s))
     for miss in list_misses(recording):
-        what = "missed its deadline" if miss["what"] == "late" else "skipped releases"
-        marks.append(Mark(miss["tick"] * tick_s, "miss", f"{miss['task']} {what}"))
-    marks += [
-        Mark(hold["since_s"], "hold", f"{hold['level']}: {hold['why']}", hold["until_s"])
-        for hold in list_holds(recording)
-    ]
-    return marks
+        time_s = miss["tick"] * tick_s
+        marks.append(Mark(time_s, "miss", f"{miss['task']} {miss['what']}", time_s))
+    end_s = find_tick_range(recording)[1] * tick_s
+    for hold in list_holds(recording):
+        until_s = end_s if hold["until_s"] is None else hold["until_s"]
+        marks.append(Mark(hold["since_s"], "hold", f"{hold['level']}: {hold['why']}", until_s))
+    return sorted(marks)
 
 
-def group_marks(marks: Sequence[Mark]) -> list[MarkGroup]:
-    """Group equal marks. If they do not fit into a legend, group them by kind."""
+def group_marks(marks: Iterable[Mark]) -> dict[str, list[Mark]]:
+    """Group equal marks, and return them by their entry in a legend.
+
+    If there are too many entries, marks are grouped by kind.
+    """
     groups: defaultdict[tuple[str, ...], list[Mark]] = defaultdict(list)
     for mark in marks:
-        groups[mark.kind, mark.text].append(mark)
+        groups[mark[1:3]].append(mark)
     if len(groups) > MAX_LEGEND_ENTRIES:
         groups.clear()
         for mark in marks:
-            groups[mark.kind,].append(mark)
-    return [MarkGroup(group[0].kind, _format_label(group), group) for group in groups.values()]
+            groups[mark[1:2]].append(mark)
+    return {_format_entry(*group): group for group in groups.values()}
 
 
-def _format_label(marks: Sequence[Mark]) -> str:
-    """Return the legend entry of a group: the first mark, and the number of further ones."""
-    first = marks[0]
-    until = "" if first.until_s is None else f" to {first.until_s:g}"
-    more = f" (and {len(marks) - 1} more)" if len(marks) > 1 else ""
-    text = first.text if len(first.text) <= MAX_TEXT else f"{first.text[: MAX_TEXT - 3]}..."
-    return f"{first.kind}, {first.time_s:g}{until} s: {text}{more}"
+def _format_entry(first: Mark, *others: Mark) -> str:
+    """Return the entry of a group: its first mark, and the number of the others."""
+    until = f" to {first.until_s:g}" * (first.until_s > first.time_s)
+    more = f" (and {len(others)} more)" * bool(others)
+    return f"{first.kind}, {first.time_s:g}{until} s: {first.text}{more}"

@@ -14,7 +14,7 @@ from rack.tools.console.answer import Document, Failure
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.launch.continued import parse_tick
 from rack.tools.plots.curves import Series, build_panels, require_number
-from rack.tools.plots.marks import MAX_LEGEND_ENTRIES, group_marks, list_recorded_marks
+from rack.tools.plots.marks import MAX_LEGEND_ENTRIES, group_marks, list_marks
 from rack.tools.recording.in_force import VisibleMessages
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import Signal, find_mailbox, list_signals
@@ -156,9 +156,10 @@ class RecordedSignal:
 
         axes = axes or pyplot.figure(layout="constrained").add_subplot()
         (panel,) = build_panels([Series(self.signal, self.time_s, self.values)])
-        marks = draw_panel(axes, panel, group_marks(list_recorded_marks(self._recording)))
+        end_s = max(self.time_s, default=0.0)
+        marks = draw_panel(axes, panel, group_marks(list_marks(self._recording)), end_s)
         axes.set_xlabel("simulated time, s")
-        if 1 < len(panel.curves) + len(marks) <= MAX_LEGEND_ENTRIES:
+        if 1 < len(axes.get_lines()) + len(marks) <= MAX_LEGEND_ENTRIES:
             axes.legend(fontsize="small")
         return axes
 

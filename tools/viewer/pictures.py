@@ -69,18 +69,16 @@ class Screen:
         self._client = client
 
     def find_view(self, name: str) -> str:
-        """Return the id of the only view whose title contains a text, in any case.
+        """Return the id of the view whose title contains a text: of the shortest such title.
 
         Raises:
-            Failure: No view, or more than one, has such a title. The message lists them.
+            Failure: No view has such a title. The message lists all titles.
         """
         views = {view.name: view.view_id for view in self._client.get_state().views}
         found = [title for title in views if name.lower() in title.lower()]
-        if name in views or len(found) == 1:
-            return str(views[name if name in views else found[0]])
-        why = "several views" if found else "no such view"
-        titles = "; ".join(dict.fromkeys(sorted(found or views)))
-        raise Failure(f"--view {name}: {why}: {titles}", 2)
+        if not found:
+            raise Failure(f"--view {name}: no such view: {'; '.join(views)}", 2)
+        return str(views[min(found, key=len)])
 
     def take_picture(self, at_s: float, view: str | None = None) -> Picture:
         """Go to a simulated time, wait until the picture no longer changes, and return it.
