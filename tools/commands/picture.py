@@ -21,7 +21,7 @@ from rack.tools.viewer.parts import FILE
 
 def picture(
     run: RunFolder,
-    at: float = option("--at S", "simulated time to look at, s", ..., min=0.0, max=1e9),
+    at: float = option("--at S", "simulated time to look at, s", ...),
     out: Path | None = option(
         "--out FILE.png", "file to write; default: picture-<S>s.png in the folder of the run"
     ),

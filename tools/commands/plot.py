@@ -144,7 +144,7 @@ def _build_plot(
     all_series = _read_signals(recording, signals, name)
     marks = list_marks(recording)
     tick_s = recording.layout.clock_ns * 1e-9
-    begins_s, ends_s = (tick * tick_s for tick in find_tick_range(recording))
+    begins_s, ends_s = (round(tick * tick_s, 9) for tick in find_tick_range(recording))
     if against is not None:
         other = find_other_run(run, against)
         others = _read_signals(Recording(other), signals, other.name)

@@ -43,7 +43,8 @@ class Series(NamedTuple):
             Failure: The signal is a text, or none of its messages is recorded.
         """
         require_number(signal)
-        times_s = recording.read_signal(signal.mailbox, "tick") * recording.layout.clock_ns * 1e-9
+        ticks = recording.read_signal(signal.mailbox, "tick")
+        times_s = np.round(ticks * recording.layout.clock_ns * 1e-9, 9)
         if not len(times_s):
             raise Failure(f"{signal.name}: no message of {signal.mailbox} is recorded", 2)
         values = recording.read_signal(signal.mailbox, signal.label)

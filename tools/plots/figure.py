@@ -42,12 +42,15 @@ def draw_panel(
     Returns:
         Entries of the marks for a legend.
     """
+    run, style = panel.series[0].run, "-"
     for series in panel.series:
-        is_other = series.run != panel.series[0].run
-        for number, (label, values) in enumerate(series.list_curves(panel.is_alone)):
-            look = f"C{number % 10}--" if is_other else f"C{number % 10}"
-            times = np.append(series.time_s, end_s)
-            axes.step(times, np.append(values, values[-1:]), look, where="post", label=label)
+        if series.run != run:
+            run, style = series.run, "--"
+            # Equal signals of both runs have equal colours.
+            axes.set_prop_cycle(None)
+        times = np.append(series.time_s, end_s)
+        for label, values in series.list_curves(panel.is_alone):
+            axes.step(times, np.append(values, values[-1:]), style, where="post", label=label)
     axes.set_ylabel(panel.label)
     if states := panel.series[0].signal.spec.values:
         names, numbers = zip(*states, strict=True)

@@ -39,10 +39,10 @@ def list_marks(recording: Recording) -> list[Mark]:
     for event in recording.events:
         is_detection = event["kind"] == "detection"
         if kind := "detection" if is_detection else MARKED_CODES.get(event.get("code", "")):
-            time_s = event["tick"] * tick_s
+            time_s = round(event["tick"] * tick_s, 9)
             marks.append(Mark(time_s, kind, f"{event['board']}: {event['text']}", time_s))
     for miss in list_misses(recording):
-        time_s = miss["tick"] * tick_s
+        time_s = round(miss["tick"] * tick_s, 9)
         marks.append(Mark(time_s, "miss", f"{miss['task']} {miss['what']}", time_s))
     end_s = find_tick_range(recording)[1] * tick_s
     for hold in list_holds(recording):
