@@ -72,7 +72,7 @@ class Series(NamedTuple):
             yield f"{name}{place} {self.run}".strip(), self.values[(slice(None), *index)]
 
 
-class Panel(NamedTuple):
+class SignalPanel(NamedTuple):
     """Signals with a common axis of values.
 
     Attributes:
@@ -126,7 +126,7 @@ def require_number(signal: Signal) -> None:
         raise Failure(f"{signal.name}: is a text; only numbers can be plotted", 2)
 
 
-def build_panels(all_series: list[Series]) -> list[Panel]:
+def build_panels(all_series: list[Series]) -> list[SignalPanel]:
     """Return a panel for each unit and each set of states, in the order of the series."""
     groups: defaultdict[object, list[Series]] = defaultdict(list)
     for series in all_series:
@@ -135,5 +135,5 @@ def build_panels(all_series: list[Series]) -> list[Panel]:
     for group in groups.values():
         signal = group[0].signal
         is_alone = len({series.signal.name for series in group}) == 1
-        panels.append(Panel(signal.heading if is_alone else signal.unit, group, is_alone))
+        panels.append(SignalPanel(signal.heading if is_alone else signal.unit, group, is_alone))
     return panels

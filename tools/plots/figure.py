@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rack.tools.console.pictures import open_figure
-from rack.tools.plots.curves import Panel, Plot, build_panels
+from rack.tools.plots.curves import SignalPanel, Plot, build_panels
 from rack.tools.plots.marks import Mark, group_marks
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ MARK_COLOURS = {
 
 
 def draw_panel(
-    axes: Axes, panel: Panel, groups: Mapping[str, list[Mark]], end_s: float
+    axes: Axes, panel: SignalPanel, groups: Mapping[str, list[Mark]], end_s: float
 ) -> list[Artist]:
     """Draw a panel and the marks.
 
