@@ -42,7 +42,7 @@ def draw_plot(plot: Plot, console: Console, height: int) -> Text:
     has_colours = console.color_system is not None and not console.no_color
     groups = [*zip(ascii_uppercase, group_marks(plot.marks).items(), strict=False)]
     panels = build_panels(plot.series)
-    rows = height - 2 * len(groups)
+    rows = height - 2 * len(groups) - 1
     pieces: list[Text] = []
     for panel in panels:
         plotext.clear_figure()
@@ -67,7 +67,8 @@ def draw_plot(plot: Plot, console: Console, height: int) -> Text:
         if states := panel.series[0].signal.spec.values:
             names, numbers = zip(*states, strict=True)
             plotext.yticks(numbers, names)
-        for letter, (_, marks) in groups:
+        # The letter of the earlier mark covers the others.
+        for letter, (_, marks) in reversed(groups):
             for mark in marks:
                 ends = np.clip((mark.time_s, mark.until_s), *plot.window_s).tolist()
                 plotext.plot(ends, [min(lows, default=0.0)] * 2, marker=letter, color=None)
@@ -77,6 +78,7 @@ def draw_plot(plot: Plot, console: Console, height: int) -> Text:
         plotext.xlim(*plot.window_s)
         pieces += [Text(panel.label), Text.from_ansi(plotext.build().rstrip("\n"))]
         pieces += [legend] * (len(curves) > 1)
+    pieces.append(Text("simulated time, s".rjust(console.width)))
     return Text("\n").join([*pieces, *(Text(f"{letter} {entry}") for letter, (entry, _) in groups)])
 
 
