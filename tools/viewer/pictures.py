@@ -68,17 +68,22 @@ class Screen:
     def __init__(self, client: ViewerClient) -> None:
         self._client = client
 
+    @property
+    def views(self) -> dict[str, str]:
+        """Dictionary from title to id of all views that the viewer shows."""
+        return {view.name: view.view_id for view in self._client.get_state().views}
+
     def find_view(self, name: str) -> str:
         """Return the id of the view whose title contains a text: of the shortest such title.
 
         Raises:
             Failure: No view has such a title. The message lists all titles.
         """
-        views = {view.name: view.view_id for view in self._client.get_state().views}
+        views = self.views
         found = [title for title in views if name.lower() in title.lower()]
         if not found:
             raise Failure(f"--view {name}: no such view: {'; '.join(views)}", 2)
-        return str(views[min(found, key=len)])
+        return views[min(found, key=len)]
 
     def take_picture(self, at_s: float, view: str | None = None) -> Picture:
         """Go to a simulated time, wait until the picture no longer changes, and return it.
