@@ -44,6 +44,8 @@ COMMANDS = {
         "mailbox": "Show the newest message in a mailbox of a running rack.",
         "record": "Record a running rack.",
         "replay": "Open recordings in the viewer, several racks on one time line.",
+        "plot": "Plot signals of a run, or of a running rack.",
+        "picture": "Draw the viewer's first view of a run, or its cell.",
         "export": "Write a recorded run as an MCAP file.",
         "report": "Report on a recorded run, or compare two runs.",
     },

@@ -100,11 +100,8 @@ def record(
 def _save_recording(segment: Segment, folder: Path) -> tuple[Document, str]:
     """Save the recording of a running rack so far. Returns the answer as data and as a line."""
     name = segment.layout.rack
-    run = find_run_folder(segment)
-    if run is None:
-        raise Failure(f"--save {name}: the rack is not recorded; 'rack record {name}' records it")
     with INTERRUPT.raise_interrupted():
-        save_run(run, folder)
+        copy_recording(segment, folder, "--save ")
         traces = [rows["tick"] for rows in Recording(folder).cycles.values()]
         if not traces:
             raise Failure(f"--save {name}: nothing is recorded yet")
@@ -117,6 +114,25 @@ def _save_recording(segment: Segment, folder: Path) -> tuple[Document, str]:
     summary = f"saved into {folder}: {since_s:.2f} s to {until_s:.2f} s, {size_note}"
     times = {"since_s": since_s, "until_s": until_s}
     return {"rack": name, "folder": str(folder), **times, "bytes": size}, summary
+
+
+def copy_recording(segment: Segment, into: Path, asked: str = "") -> None:
+    """Copy the recording of a running rack so far to a new run folder.
+
+    Args:
+        segment: The rack.
+        into: The new folder.
+        asked: Prefix of the text of the `Failure`.
+
+    Raises:
+        Failure: The rack is not recorded.
+    """
+    name = segment.layout.rack
+    run = find_run_folder(segment)
+    if run is None:
+        why = f"the rack is not recorded; 'rack record {name}' records it"
+        raise Failure(f"{asked}{name}: {why}")
+    save_run(run, into)
 
 
 def save_run(folder: Path, into: Path) -> None:

@@ -65,7 +65,7 @@ def replay(
             raise Failure("--against: give exactly one RUN", 2)
         place = align_runs
         runs = [find_other_run(runs[0], against), *runs]
-    if out is None and len(runs) == 1 and (recordings := _find_viewer_files(runs[0])):
+    if out is None and len(runs) == 1 and (recordings := find_viewer_files(runs[0])):
         _open_viewer(*recordings)
         return
     parts = [part for run in runs for part in _list_runs(run)]
@@ -83,7 +83,7 @@ def replay(
         )
 
 
-def _find_viewer_files(run: Path) -> list[Path]:
+def find_viewer_files(run: Path) -> list[Path]:
     """Return the viewer's files of a run. A long run and a restarted recorder have several.
 
     Raises `Failure` for a damaged file.

@@ -23,6 +23,7 @@ from rack.tools.monitor.signals import (
     SignalRows,
     format_value,
 )
+from rack.tools.plots.terminal import NO_CURVES
 from rack.tools.recording.signal import Signal, Trigger
 
 READ_INTERVAL_S = 0.02
@@ -81,13 +82,13 @@ def watch(
     if when is None:
         _show_signals(segment, shown_signals, every_s, as_json)
         return
-    _check_writable(out or Path(f"{rack}.csv"))
+    check_writable(out or Path(f"{rack}.csv"))
     trigger = Trigger.parse(when, boxes)
     ticks_before, ticks_after = (
         round(s * 1e9 / segment.layout.clock_ns) for s in (before_s, after_s)
     )
     strip = SignalHistory(segment, shown_signals, ticks_before + ticks_after, [trigger.signal])
-    tick = _await_trigger(segment, strip, trigger, ticks_after)
+    tick = await_trigger(segment, strip, trigger, ticks_after)
     path = out or Path(f"{rack}-{tick}.csv")
     rows = strip.list_rows(tick - ticks_before, tick + ticks_after)
     _save_csv(path, strip, rows)
@@ -110,7 +111,7 @@ def _parse_seconds(option: str, text: str) -> float:
     return seconds
 
 
-def _check_writable(path: Path) -> None:
+def check_writable(path: Path) -> None:
     """Raise `OSError` if a file cannot be written.
 
     Call this before the capture. Otherwise the captured messages could be lost.
@@ -138,7 +139,7 @@ def _show_signals(
             try:
                 view = stack.enter_context(SignalPlot(strip, span, terminal))
             except ImportError:
-                print("no curves without plotext: pip install 'nasrem-rack[live]'", file=sys.stderr)
+                print(NO_CURVES, file=sys.stderr)
         for is_over in poll_run(segment, READ_INTERVAL_S):
             strip.read_new()
             settles = 0 if is_over else strip.settling_ticks
@@ -147,7 +148,7 @@ def _show_signals(
         raise Failure(f"{strip.lost} messages were overwritten before they could be shown")
 
 
-def _await_trigger(segment: Segment, history: SignalHistory, trigger: Trigger, after: int) -> int:
+def await_trigger(segment: Segment, history: SignalHistory, trigger: Trigger, after: int) -> int:
     """Wait until a condition holds, and then for `after` more ticks.
 
     Args:

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from threading import Timer
 
 from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
@@ -92,3 +93,15 @@ def create_reading_progress(
             print(f"{activity}: {fraction:.0%}", file=sys.stderr, flush=True)
 
     return show
+
+
+@contextmanager
+def announce_waiting(text: str, silent: bool) -> Iterator[None]:
+    """Print a text on stderr if the context lasts longer than `LINE_INTERVAL_S`."""
+    timer = Timer(LINE_INTERVAL_S, print, (text,), {"file": sys.stderr, "flush": True})
+    if not silent:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

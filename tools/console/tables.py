@@ -22,10 +22,10 @@ UNLIMITED_WIDTH = 1_000_000
 """Width of a table that is neither cut nor wrapped."""
 
 
-def create_console() -> Console:
-    """Return a rich console on stdout, with a fixed width if stdout is not a terminal."""
+def create_console(pipe_width: int = PIPE_WIDTH) -> Console:
+    """Return a rich console on stdout. It has `pipe_width` if stdout is not a terminal."""
     stdout_console = Console()
-    return stdout_console if stdout_console.is_terminal else Console(width=PIPE_WIDTH)
+    return stdout_console if stdout_console.is_terminal else Console(width=pipe_width)
 
 
 def terminal_width() -> int | None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Iterator, Sequence
+from math import nan
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
@@ -14,6 +15,8 @@ import numpy as np
 from rack.backplane.json_text import encode_json
 from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.segment import Segment
+from rack.tools.plots.curves import Plot, Series
+from rack.tools.plots.terminal import draw_plot
 from rack.tools.recording.signal import Signal
 
 if TYPE_CHECKING:
@@ -128,6 +131,22 @@ class SignalHistory:
                 table[tick] = [newest.get(signal.name) for signal in self.signals]
         return [*table.items()]
 
+    def build_series(self, last: int) -> list[Series]:
+        """Return the stored values of the signals up to tick `last`. Texts are left out."""
+        all_series = []
+        for signal in self.signals:
+            if signal.is_text:
+                continue
+            rows = [row for row in self._changes[signal.mailbox] if row[0] <= last]
+            numbers: dict[Any, float] = dict(signal.spec.values)
+            numbers[None] = nan
+            values = np.array([values[signal.name] for _, values in rows], object)
+            values = np.array([numbers.get(value, value) for value in values.flat], float)
+            shape = signal.shape[len(signal.index) :]
+            times_s = np.array([tick for tick, _ in rows]) * self.tick_s
+            all_series.append(Series(signal, times_s, values.reshape(len(rows), *shape)))
+        return all_series
+
     def to_time_s(self, tick: int) -> float:
         """Convert a tick to simulated time in s."""
         return round(tick * self.tick_s, 9)
@@ -186,12 +205,12 @@ class SignalPlot:
     """
 
     def __init__(self, history: SignalHistory, span: int, terminal: Console) -> None:
-        import plotext
+        # Fail before the first plot.
+        import plotext  # noqa: F401
         from rich.live import Live
 
-        self._plotext = plotext
         self._history = history
-        self._span = span
+        self._span_s = history.to_time_s(span)
         self._live = Live(console=terminal, auto_refresh=False, vertical_overflow="crop")
 
     def __enter__(self) -> Self:
@@ -202,39 +221,11 @@ class SignalPlot:
         self._live.stop()
 
     def show_until(self, last: int) -> None:
-        """Redraw the curves over the last `span` ticks up to tick `last`."""
-        from rich.text import Text
-
-        rows = self._history.list_rows(last - self._span, last)
-        plot = self._plotext
-        plot.clear_figure()
-        # Use the colours of the terminal.
-        plot.theme("clear")
+        """Redraw the curves up to tick `last`."""
+        to_s = self._history.to_time_s(last)
+        window_s = max(to_s - self._span_s, 0.0), max(to_s, self._history.tick_s)
+        series = [series.cut(*window_s) for series in self._history.build_series(last)]
         # Leave one line free, because the terminal would scroll otherwise.
-        plot.plotsize(self._live.console.width, max(self._live.console.height - 1, 4))
-        plot.xlabel("simulated time, s")
-        for name, points in self._list_curves(rows).items():
-            times, values = zip(*points, strict=True)
-            plot.plot(times, values, label=name, marker="braille")
-        self._live.update(Text.from_ansi(plot.build()), refresh=True)
-
-    def _list_curves(self, rows: SignalRows) -> dict[str, list[tuple[float, float]]]:
-        """Return a dictionary from the name of a curve to its points, (time in s, value).
-
-        A signal with several numbers has a curve for each.
-        """
-        curves = defaultdict(list)
-        for tick, values in rows:
-            for signal, value in zip(self._history.signals, values, strict=True):
-                for name, number in _list_numbers(signal.heading, value):
-                    curves[name].append((self._history.to_time_s(tick), number))
-        return curves
-
-
-def _list_numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
-    """Yield name and value of each number. The name of an array element begins with its index."""
-    if isinstance(value, list):
-        for index, element in enumerate(value):
-            yield from _list_numbers(f"[{index}] {name}", element)
-    elif isinstance(value, int | float):
-        yield name, value
+        console = self._live.console
+        drawn = draw_plot(Plot("", series, [], window_s), console, console.height - 1)
+        self._live.update(drawn, refresh=True)

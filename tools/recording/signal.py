@@ -218,6 +218,8 @@ class Trigger:
 
     def evaluate_messages(self, messages: np.ndarray) -> np.ndarray:
         """Return True for each message that meets the condition, shape (messages,)."""
-        return np.asarray(
-            COMPARISONS[self.comparison](self.signal.extract_values(messages), self.number)
-        )
+        return self.evaluate_values(self.signal.extract_values(messages))
+
+    def evaluate_values(self, values: np.ndarray) -> np.ndarray:
+        """Return True for each value of the signal that meets the condition, shape (messages,)."""
+        return np.asarray(COMPARISONS[self.comparison](values, self.number))

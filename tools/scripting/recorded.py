@@ -13,6 +13,8 @@ from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.launch.continued import parse_tick
+from rack.tools.plots.curves import Series, build_panels, require_number
+from rack.tools.plots.marks import MAX_LEGEND_ENTRIES, group_marks, list_marks
 from rack.tools.recording.in_force import VisibleMessages
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import Signal, find_mailbox, list_signals
@@ -22,9 +24,6 @@ from rack.tools.scripting.moment import RecordedMoment
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from pandas import DataFrame
-
-MAX_LEGEND_ENTRIES = 12
-"""Largest number of curves and marks that the legend of a plot lists."""
 
 
 def open_run(folder: str | Path) -> RecordedRun:
@@ -137,7 +136,7 @@ class RecordedSignal:
         return _build_table([self])
 
     def plot(self, axes: Axes | None = None) -> Axes:
-        """Plot the signal over simulated time, and mark where faults begin and processes die.
+        """Plot the signal over simulated time, with the marks of `rack plot`.
 
         Args:
             axes: Axes of matplotlib to draw on. None for a new figure.
@@ -148,42 +147,21 @@ class RecordedSignal:
         Raises:
             Failure: The signal is a text, or matplotlib is missing.
         """
-        if self.signal.is_text:
-            raise Failure(f"{self.name}: is a text; only numbers can be plotted", 2)
+        require_number(self.signal)
         if not can_draw():
             raise Failure(NO_PICTURES)
         from matplotlib import pyplot
 
+        from rack.tools.plots.figure import draw_panel
+
         axes = axes or pyplot.figure(layout="constrained").add_subplot()
-        curves = self.values.reshape(len(self.values), -1)
-        places = [_format_index(index) or self.name for index in np.ndindex(self.shape)]
-        axes.step(self.time_s, curves, where="post", label=places)
+        (panel,) = build_panels([Series(self.signal, self.time_s, self.values)])
+        end_s = max(self.time_s, default=0.0)
+        marks = draw_panel(axes, panel, group_marks(list_marks(self._recording)), end_s)
         axes.set_xlabel("simulated time, s")
-        axes.set_ylabel(self.signal.heading)
-        if self.signal.spec.values:
-            names, numbers = zip(*self.signal.spec.values, strict=True)
-            axes.set_yticks(numbers, names)
-        tick_s = self._recording.layout.clock_ns * 1e-9
-        marks = self._list_marks()
-        for tick, text in marks.items():
-            label = f"{tick * tick_s:g} s: {text}"
-            axes.axvline(tick * tick_s, color="tab:red", linestyle="--", label=label)
-        if 1 < len(places) + len(marks) <= MAX_LEGEND_ENTRIES:
+        if 1 < len(axes.get_lines()) + len(marks) <= MAX_LEGEND_ENTRIES:
             axes.legend(fontsize="small")
         return axes
-
-    def _list_marks(self) -> dict[int, str]:
-        """Return a dictionary from tick to the text that marks it in a plot.
-
-        If a fault begins and a process dies at the same tick, only the later event is marked.
-        """
-        marks: dict[int, str] = {}
-        for event in _list_events(self._recording):
-            if event.kind == "fault" and event.code == "begins":
-                marks[event.tick] = f"{event.board}: {event.text}"
-            elif event.kind == "died":
-                marks[event.tick] = event.text
-        return marks
 
 
 def _list_events(recording: Recording) -> list[Event]:

@@ -1,19 +1,15 @@
-"""Draws pictures of a recording without a screen.
-
-Usage: `python -m rack.tools.viewer.pictures RUN/run.rrd OUT.png --at 7.5`.
-"""
+"""Draws pictures of a recording with the viewer, without a screen."""
 
 from __future__ import annotations
 
-import argparse
 import shutil
-import socket
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread, Timer
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +17,7 @@ from rerun.experimental import ViewerClient
 
 from rack.tools.console.answer import Failure
 from rack.tools.viewer.stream import SIM_TIME
-from rack.tools.viewer.window import HOST, ViewerWindow, find_free_port, format_url
+from rack.tools.viewer.window import ViewerWindow, find_free_port, format_url
 
 TIMEOUT_S = 30.0
 POLL_S = 0.05
@@ -74,20 +70,32 @@ class Screen:
 
     @property
     def views(self) -> dict[str, str]:
-        """Dictionary from name to id of all views that the viewer shows."""
+        """Dictionary from title to id of all views that the viewer shows."""
         return {view.name: view.view_id for view in self._client.get_state().views}
+
+    def find_view(self, name: str) -> str:
+        """Return the id of the view whose title contains a text: of the shortest such title.
+
+        Raises:
+            Failure: No view has such a title. The message lists all titles.
+        """
+        views = self.views
+        found = [title for title in views if name.lower() in title.lower()]
+        if not found:
+            raise Failure(f"--view {name}: no such view: {'; '.join(views)}", 2)
+        return views[min(found, key=len)]
 
     def take_picture(self, at_s: float, view: str | None = None) -> Picture:
         """Go to a simulated time, wait until the picture no longer changes, and return it.
 
         Args:
             at_s: The simulated time in s.
-            view: Name of the only view to draw. By default all views are drawn.
+            view: Title of the only view to draw, or a part of it. By default all views are drawn.
 
         Raises:
-            KeyError: No view has that name.
+            Failure: No view has that title.
         """
-        view_id = None if view is None else self.views[view]
+        view_id = None if view is None else self.find_view(view)
         self._client.set_time(
             SIM_TIME, duration=np.timedelta64(round(at_s * 1e9), "ns"), play_state="paused"
         )
@@ -111,24 +119,57 @@ class Screen:
 
 
 @contextmanager
-def open_screen(recording: Path) -> Iterator[Screen]:
-    """Open a recording in a headless viewer, which is closed at the end of the context.
+def open_screen(*recordings: Path) -> Iterator[Screen]:
+    """Open the files of a recording in a headless viewer, which is closed with the context.
 
     Raises:
-        NoViewerError: The viewer does not run, for example because graphics libraries are missing.
+        NoViewerError: The viewer does not run, for example because graphics libraries are missing,
+            or it ends while it is used.
     """
     port = find_free_port()
     # `ViewerClient.spawn` would start a viewer that listens on every network.
     window = ViewerWindow(headless=True, port=port)
+    # Calls of the client do not return if the viewer hangs.
+    watchdog = Timer(3.0 * TIMEOUT_S, window.end)
+    watchdog.start()
     try:
         client = _connect_client(window, port)
-        try:
+        for recording in recordings:
             client.open(str(recording.resolve()))
-        except (ConnectionError, RuntimeError) as error:
-            raise NoViewerError(_explain_failure(window, error)) from None
         yield Screen(client)
+    except (ConnectionError, RuntimeError) as error:
+        raise NoViewerError(_explain_failure(window, error)) from None
     finally:
+        watchdog.cancel()
         window.close()
+
+
+def draw_picture(recordings: Sequence[Path], at_s: float, view: str | None) -> Picture:
+    """Draw a picture in a thread, because calls of the client block signals.
+
+    Args:
+        recordings: Files of the recording.
+        at_s: The simulated time in s.
+        view: Title of the only view to draw, or a part of it. None for all views.
+
+    Raises:
+        Failure: The viewer does not run, or has no such view.
+    """
+    answers = SimpleQueue[Picture | Exception]()
+
+    def draw() -> None:
+        """Put the picture, or the error, into the queue."""
+        try:
+            with open_screen(*recordings) as screen:
+                answers.put(screen.take_picture(at_s, view))
+        except Exception as error:
+            answers.put(error)
+
+    Thread(target=draw, daemon=True).start()
+    answer = answers.get()
+    if isinstance(answer, Exception):
+        raise answer
+    return answer
 
 
 def _connect_client(window: ViewerWindow, port: int) -> ViewerClient:
@@ -139,13 +180,11 @@ def _connect_client(window: ViewerWindow, port: int) -> ViewerClient:
     """
     deadline = time.monotonic() + TIMEOUT_S
     while window.is_open and time.monotonic() < deadline:
-        with socket.socket() as probe:
-            if probe.connect_ex((HOST, port)) == 0:
-                return ViewerClient.connect(format_url(port))
+        if window.is_listening(port):
+            return ViewerClient.connect(format_url(port))
         time.sleep(POLL_S)
-    raise NoViewerError(
-        _explain_failure(window, f"the viewer did not listen within {TIMEOUT_S:g} s")
-    )
+    why = f"the viewer did not listen on port {port} within {TIMEOUT_S:g} s"
+    raise NoViewerError(_explain_failure(window, why))
 
 
 def _explain_failure(window: ViewerWindow, otherwise: object) -> str:
@@ -155,49 +194,20 @@ def _explain_failure(window: ViewerWindow, otherwise: object) -> str:
         window: The viewer. If it has ended with an error, that error is the reason.
         otherwise: The reason to return in any other case.
     """
-    reason = window.wait_until_closed() if window.wait_for_end(DYING_S) else otherwise
-    return f"{reason}; {describe_missing_packages()}"
+    reason = otherwise
+    if window.wait_for_end(DYING_S):
+        reason = window.wait_until_closed() or "the viewer ended without an error"
+    return "; ".join(filter(None, (str(reason), describe_missing_packages())))
 
 
 def describe_missing_packages() -> str:
-    """Return a clause that names the packages missing for drawing without a graphics card."""
+    """Return a clause that names the packages missing for drawing without a graphics card.
+
+    Empty if none is missing.
+    """
     if shutil.which("dpkg-query") is None:
         return f"without a graphics card, these Debian packages are needed: {' '.join(PACKAGES)}"
     query = ["dpkg-query", "--show", "--showformat", "${Package} ${Status}\\n", *PACKAGES]
     installed = subprocess.run(query, capture_output=True, text=True, check=False).stdout
     missing = [name for name in PACKAGES if f"{name} install ok installed" not in installed]
-    if not missing:
-        return "no package for drawing is missing"
-    return f"missing packages: apt-get install {' '.join(missing)}"
-
-
-def main() -> int:
-    """Save one picture, and print the problems that the viewer reported.
-
-    Returns:
-        The exit status: 0, 1 if the viewer reported problems, or the status of a failure.
-    """
-    parser = argparse.ArgumentParser(
-        prog="python -m rack.tools.viewer.pictures", description=__doc__
-    )
-    parser.add_argument("recording", type=Path, help="a run.rrd")
-    parser.add_argument("out", type=Path, help="PNG file to write")
-    parser.add_argument(
-        "--at", type=float, required=True, metavar="S", help="simulated time to look at, s"
-    )
-    parser.add_argument("--view", metavar="NAME", help="draw only the view with this title")
-    options = parser.parse_args()
-    try:
-        with open_screen(options.recording) as screen:
-            look = screen.take_picture(options.at, options.view)
-    except Failure as failure:
-        print(failure, file=sys.stderr)
-        return failure.status
-    options.out.write_bytes(look.png)
-    for complaint in look.complaints:
-        print(complaint, file=sys.stderr)
-    return 1 if look.complaints else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    return f"missing packages: apt-get install {' '.join(missing)}" if missing else ""

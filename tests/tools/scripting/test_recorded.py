@@ -118,13 +118,16 @@ def test_a_plot_has_units_names_and_marks(small: Path, tmp_path: Path) -> None:
             events.write(format_checked_line(asdict(event)))
     signals = rack.open_run(folder).signals
     axes = signals["lower.status.count"].plot()
-    count, *marks = axes.get_lines()
-    np.testing.assert_array_equal(count.get_ydata(), signals["lower.status.count"].values)
+    (count,) = axes.get_lines()
+    values = signals["lower.status.count"].values
+    np.testing.assert_array_equal(count.get_ydata(), [*values, values[-1]])
     assert axes.get_xlabel() == "simulated time, s"
     assert axes.get_ylabel() == "lower.status.count"
-    assert [(mark.get_xdata()[0], mark.get_label()) for mark in marks] == [
-        (1.0, "1 s: lower: wave begins"),
-        (2.0, "2 s: board 'lower' ended"),
+    marks = {mark.get_label(): mark.get_segments() for mark in axes.collections}  # type: ignore[attr-defined]
+    assert [(label, lines[0][0][0]) for label, lines in marks.items()] == [
+        ("fault, 1 s: lower: wave begins", 1.0),
+        ("fault, 2 s: lower: kill begins", 2.0),
+        ("lost, 2 s: lower: board 'lower' ended", 2.0),
     ]
     state = signals["lower.status.state"].plot(pyplot.figure().add_subplot())
     assert "executing" in [label.get_text() for label in state.get_yticklabels()]

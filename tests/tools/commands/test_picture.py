@@ -1,0 +1,94 @@
+"""Tests `rack picture`: the viewer's first view, the cell alone, and what it says if it cannot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from tests.shared_runs import nasrem_run, small_run
+from tests.tools.command_line import rack
+
+NO_DRIVER = {
+    "VK_DRIVER_FILES": "/nowhere",
+    "VK_ICD_FILENAMES": "/nowhere",
+    "WGPU_BACKEND": "vulkan",
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return nasrem_run(tmp_path_factory)
+
+
+@pytest.mark.slow
+def test_the_first_view_and_one_of_its_views_are_drawn(run: Path, tmp_path: Path) -> None:
+    # A run of a flight recorder has no run.rrd.
+    (run / "run.rrd").rename(tmp_path / "run.rrd")
+    shown = rack("picture", run, "--at", 6)
+    (tmp_path / "run.rrd").rename(run / "run.rrd")
+    if shown.stderr.startswith("no picture: "):
+        pytest.skip(shown.stderr)
+    assert shown.stdout.splitlines()[0] == f"picture: {run / 'picture-6s.png'}"
+    path = tmp_path / "boards.png"
+    assert rack("picture", run, "--at", 6, "--view", "Boards", "--out", path).returncode == 0
+    with Image.open(run / "picture-6s.png") as whole, Image.open(path) as part:
+        assert part.width < whole.width
+        assert len(part.convert("RGB").getcolors(1 << 24) or ()) > 10
+
+
+@pytest.mark.slow
+def test_the_cell_is_drawn_without_the_viewer(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in NO_DRIVER.items():
+        monkeypatch.setenv(name, value)
+    paths = [tmp_path / f"{at}.png" for at in (1, 6)]
+    for at, path in zip((1, 6), paths, strict=True):
+        shown = rack("picture", run, "--at", at, "--cell", "--out", path)
+        if shown.stderr.startswith("no picture: it needs OpenGL"):
+            pytest.skip(shown.stderr)
+        assert (shown.returncode, shown.stdout) == (0, f"picture: {path}\n")
+    # The arm has moved in between.
+    assert paths[0].read_bytes() != paths[1].read_bytes()
+
+
+@pytest.mark.slow
+def test_without_a_driver_the_cause_and_what_to_do_are_one_line(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in NO_DRIVER.items():
+        monkeypatch.setenv(name, value)
+    shown = rack("picture", run, "--at", 1, "--out", tmp_path / "out.png")
+    assert (shown.returncode, shown.stdout) == (1, "")
+    line = shown.stderr.splitlines()[-1]
+    assert line.startswith("no picture: ")
+    assert "No graphics adapter was found" in line
+    assert line.endswith("; --cell draws the cell without it")
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--at", "7"), "--at 7.0: must be 0 to 6.4975 s"),
+        (("--at", "nan"), "--at nan: must be 0 to 6.4975 s"),
+        (("--at", "1", "--out", "a.jpg"), "--out a.jpg: the name of a picture must end in .png"),
+        (("--at", "1", "--out", "nowhere/a.png"), '"nowhere/a.png": No such file or directory'),
+        (("--at", "1", "--cell", "--view", "boards"), "--cell, --view: give one of them"),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(
+    run: Path, tmp_path: Path, words: tuple[str, ...], message: str
+) -> None:
+    shown = rack("picture", run, *words, folder=tmp_path)
+    assert (shown.returncode, shown.stdout, shown.stderr) == (2, "", f"{message}\n")
+
+
+def test_a_rack_without_an_arm_has_no_cell(tmp_path_factory: pytest.TempPathFactory) -> None:
+    run = small_run(tmp_path_factory)
+    shown = rack("picture", run, "--at", 1, "--cell")
+    assert shown.returncode == 2
+    assert shown.stderr.startswith("--cell: rack ")
+    assert not (run / "picture-1s.png").exists()

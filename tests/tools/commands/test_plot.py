@@ -1,0 +1,190 @@
+"""Tests `rack plot` as a user runs it: curves, marks, comparisons, pictures, refusals."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import xml.etree.ElementTree as ElementTree
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from rack.boards.config import load
+from rack.boards.events import Event
+from rack.tools.recording.checksums import format_checked_line
+from tests.shared_runs import slow_run, small_run
+from tests.tools.command_line import rack
+from tests.tools.held_racks import held_rack
+from tests.tools.recordings import cycle, recorded
+
+COUNT, STATE = "lower.status.count", "lower.status.state"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The small run, with a fault, a detection, a lost board and its restart."""
+    folder = small_run(tmp_path_factory)
+    with (folder / "events.jsonl").open("a") as events:
+        for tick, kind, code in (
+            (400, "fault", "begins"),
+            (404, "detection", "hang"),
+            (404, "died", "died"),
+            (500, "recovery", "rejoined"),
+            (600, "fault", "ends"),
+        ):
+            event = Event(0, tick, kind, "lower", f"{code} it", code)  # type: ignore[arg-type]
+            events.write(format_checked_line(asdict(event)))
+    return folder
+
+
+def test_curves_and_marks_are_printed_in_80_columns_without_colours(run: Path) -> None:
+    shown = rack("plot", run, COUNT, STATE)
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert "\x1b" not in shown.stdout
+    lines = shown.stdout.splitlines()
+    assert max(map(len, lines)) == 80
+    assert lines[0].strip() == COUNT
+    assert lines[-4:] == [
+        "A fault, 1 s: lower: begins it",
+        "B detection, 1.01 s: lower: hang it",
+        "C lost, 1.01 s: lower: died it",
+        "D restart, 1.25 s: lower: rejoined it",
+    ]
+    assert "executing" in shown.stdout
+
+
+def test_the_values_of_a_window_are_those_of_the_recording(run: Path) -> None:
+    shown = rack("plot", run, COUNT, STATE, "--from", 1, "--to", 1.005, "--json")
+    found = json.loads(shown.stdout)
+    count, state = found["curves"]
+    assert count["time_s"] == pytest.approx([1.0, 1.0025, 1.005])
+    assert count["values"] == sorted(count["values"])
+    assert set(state["values"]) <= {"idle", "executing", "done"}
+    assert [mark["kind"] for mark in found["marks"]] == ["fault"]
+    assert (found["window_s"], found["picture"]) == ([1.0, 1.005], None)
+
+
+def test_a_condition_chooses_the_window(run: Path) -> None:
+    (whole,) = json.loads(rack("plot", run, COUNT, "--json").stdout)["curves"]
+    middle = whole["values"][len(whole["values"]) // 2]
+    condition = f"{COUNT} >= {middle}"
+    found = json.loads(rack("plot", run, COUNT, "--when", condition, "--json").stdout)
+    (trigger,) = [mark for mark in found["marks"] if mark["kind"] == "trigger"]
+    first = next(at for at, value in enumerate(whole["values"]) if value >= middle)
+    at_s = whole["time_s"][first]
+    assert (trigger["time_s"], trigger["text"]) == (at_s, condition)
+    assert found["window_s"] == pytest.approx([max(at_s - 0.5, 0.0), min(at_s + 1.0, 4.0)])
+
+
+@pytest.mark.slow
+def test_two_runs_are_compared_and_their_first_difference_is_marked(
+    run: Path, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    slow, same = slow_run(tmp_path_factory), tmp_path / "same"
+    shutil.copytree(run, same)
+    found = json.loads(rack("plot", run, COUNT, "--against", same, "--json").stdout)
+    assert [curve["run"] for curve in found["curves"]] == ["run", "same"]
+    assert "first difference" not in {mark["kind"] for mark in found["marks"]}
+    found = json.loads(rack("plot", run, COUNT, "--against", slow, "--json").stdout)
+    (mark,) = [mark for mark in found["marks"] if mark["kind"] == "first difference"]
+    here, there = (
+        dict(zip(curve["time_s"], curve["values"], strict=True)) for curve in found["curves"]
+    )
+    differing = [time_s for time_s in here if time_s in there and here[time_s] != there[time_s]]
+    assert mark["time_s"] == min(differing)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("suffix", ["png", "svg"])
+def test_a_picture_is_saved_by_its_suffix(run: Path, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"plot.{suffix}"
+    shown = rack("plot", run, COUNT, STATE, "--out", path)
+    assert (shown.stdout, shown.stderr) == (f"picture: {path}\n", "")
+    if suffix == "png":
+        assert path.read_bytes().startswith(b"\x89PNG")
+    else:
+        assert ElementTree.parse(path).getroot().tag.endswith("svg")
+        # matplotlib draws letters as shapes, and names each text in a comment.
+        text = path.read_text()
+        assert "<!-- simulated time, s -->" in text
+        assert "<!-- fault, 1 s: lower: begins it -->" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("lower.status.cuont",), "lower.status.cuont: no such signal; nearest: lower.status.cou"),
+        (("lower.status.count[3]",), "lower.status.count[3]: no such index"),
+        (("lower.status.reason",), "lower.status.reason: is a text; only numbers can be plotted"),
+        ((COUNT, "--from", "3", "--to", "2"), "--from 3 --to 2: must be 0 <= FROM < TO <= 4 s"),
+        ((COUNT, "--from", "2", "--to", "2"), "--from 2 --to 2: must be 0 <= FROM < TO <= 4 s"),
+        ((COUNT, "--to", "5"), "--from 0 --to 5: must be 0 <= FROM < TO <= 4 s"),
+        ((COUNT, "--from", "nan"), "--from nan --to 4: must be 0 <= FROM < TO <= 4 s"),
+        ((COUNT, "--out", "plot.jpg"), "--out plot.jpg: the name of a picture must end in .png or"),
+        ((COUNT, "--out", "nowhere/plot.png"), '"nowhere/plot.png": No such file or directory'),
+        ((COUNT, "--against", "nowhere"), "nowhere: not a run: it has no config.toml"),
+        ((COUNT, "--against", "origin"), "--against origin: "),
+        ((COUNT, "--when", "count = 3"), '"count = 3" is not a condition; write one like'),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(
+    run: Path, tmp_path: Path, words: tuple[str, ...], message: str
+) -> None:
+    shown = rack("plot", run, *words, folder=tmp_path)
+    assert (shown.returncode, shown.stdout) == (2, "")
+    assert shown.stderr.startswith(message)
+    assert len(shown.stderr.splitlines()) == 1
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_a_condition_that_never_holds_is_named(run: Path) -> None:
+    shown = rack("plot", run, COUNT, "--when", f"{COUNT} < 0")
+    assert (shown.returncode, shown.stderr) == (1, f"{COUNT} < 0: does not hold from 0 to 4 s\n")
+
+
+def test_a_signal_without_messages_is_named(tmp_path: Path) -> None:
+    config = load("fig2")
+    recorded(tmp_path / "run", config, {"level": [cycle(0, 2000, 0, 0, 1, 3, 4)]})
+    shown = rack("plot", tmp_path / "run", "level.status.state")
+    assert (shown.returncode, shown.stderr) == (
+        2,
+        "level.status.state: no message of level.status is recorded\n",
+    )
+
+
+@pytest.mark.parametrize(
+    ("package", "words", "missing"),
+    [
+        ("plotext", (), "no curves without plotext: pip install 'nasrem-rack[live]'; --out FILE"),
+        ("matplotlib", ("--out", "a.png"), "no pictures: they need matplotlib: pip install 'nasr"),
+    ],
+)
+def test_without_a_package_the_line_that_installs_it_is_printed(
+    run: Path, monkeypatch: pytest.MonkeyPatch, package: str, words: tuple[str, ...], missing: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    shown = rack("plot", run, COUNT, *words)
+    assert (shown.returncode, shown.stdout) == (1, "")
+    assert shown.stderr.startswith(missing)
+
+
+@pytest.mark.slow
+def test_of_a_running_rack_the_recording_so_far_is_plotted(tmp_path: Path, rack_name: str) -> None:
+    with held_rack(tmp_path, rack_name, "--out", tmp_path / "run"):
+        assert rack("step", rack_name, "--ticks", "200").returncode == 0
+        shown = rack("plot", rack_name, "counter.status.row", "--json")
+    found = json.loads(shown.stdout)
+    assert found["curves"][0]["time_s"][:3] == pytest.approx([0.0, 0.01, 0.02])
+    assert found["title"] == rack_name
+
+
+@pytest.mark.slow
+def test_a_rack_that_is_not_recorded_is_refused(tmp_path: Path, rack_name: str) -> None:
+    with held_rack(tmp_path, rack_name):
+        shown = rack("plot", rack_name, "counter.status.row")
+    assert (shown.returncode, shown.stderr) == (
+        1,
+        f"{rack_name}: the rack is not recorded; 'rack record {rack_name}' records it\n",
+    )

@@ -1,0 +1,1 @@
+"""Plots of signals over simulated time, on the terminal and as pictures."""
