@@ -13,9 +13,11 @@ from rack.tools.console.tables import Blocks
 from rack.tools.recording.cycles import START_UP_S, Cycles, list_restarts
 from rack.tools.report.analysis import MOST_CYCLES_PERCENTILE, Analysis, EquationPair
 from rack.tools.report.task_times import MS_PER_NS, build_times_table, compute_task_times
-from rack.tools.timing.summary import find_tightest
+from rack.tools.timing.summary import find_tightest, format_margin
 from rack.tools.timing.tables import build_level_table, build_verdict_table
 
+MAX_SHOWN_FAILURES = 8
+"""Largest number of failed equations that the summary lists, worst first."""
 _Side = LevelTiming | EquationVerdict | None
 
 
@@ -156,21 +158,26 @@ def _format_percentile(percentile: float) -> str:
 
 def _format_summary(analysis: Analysis) -> Iterator[str]:
     """Yield the summary: how the run ended, failed equations, advice, and what was excluded."""
-    config = analysis.recording.rack_config
+    name = analysis.recording.rack_config.name
     pairs = [pair for pair in analysis.pairs if pair.measured is not None]
     failing = [pair for pair in pairs if pair.is_failed]
-    yield f"{config.name}: {_describe_end(analysis)}"
+    verdicts = [pair.measured for pair in pairs if pair.measured is not None]
+    end = _describe_end(analysis)
     if not failing:
-        yield f"all {len(pairs)} equations held"
+        yield f"{name}: all {len(pairs)} equations held; {end}"
+        yield from find_tightest(verdicts)
     else:
-        yield f"{len(pairs) - len(failing)} of {len(pairs)} equations held"
-        yield f"failed: {_join_equations(failing)}"
+        yield f"{name}: {len(failing)} of {len(pairs)} equations failed; {end}"
+        failed = [verdict for verdict in verdicts if not verdict.holds]
+        failed.sort(key=lambda verdict: verdict.margin / abs(verdict.right or 1.0))
+        yield from (f"  {format_margin(verdict)}" for verdict in failed[:MAX_SHOWN_FAILURES])
+        if len(failed) > MAX_SHOWN_FAILURES:
+            yield f"  {len(failed) - MAX_SHOWN_FAILURES} more"
         if analysis.percentile > MOST_CYCLES_PERCENTILE:
             mostly = [pair for pair in analysis.typical_pairs if pair.is_failed]
             yield f"failed in more than 1 of 100 cycles: {_join_equations(mostly) or 'none'}"
     if differing := [pair for pair in pairs if pair.is_contradicted]:
         yield f"not as predicted: {_join_equations(differing)}"
-    yield from find_tightest([pair.measured for pair in pairs if pair.measured is not None])
     yield _choose_advice(analysis, failing)
     if not analysis.predicted.levels:
         yield "no prediction: the config has no budgets (board.<name>.budget)"
@@ -203,14 +210,10 @@ def _list_unjudged(analysis: Analysis) -> Iterator[str]:
         if cycles.stalled_count
     ):
         yield f"stalled cycles are not judged: {stalled}"
-    for name, (traced, ran) in analysis.recording.count_traced_cycles().items():
-        yield f"{name}: judged by {traced:,} of {ran:,} cycles"
-    yield from (
-        f"{count} rows of {name} were lost"
-        for name, count in analysis.recording.lost_rows.items()
-        if count
-    )
-    yield from map(str, analysis.recording.find_gaps())
+    lost = analysis.recording.lost_rows
+    if rows := ", ".join(f"{name} {count}" for name, count in lost.items() if count):
+        gaps = "; ".join(map(str, analysis.recording.find_gaps()))
+        yield f"rows lost by the recorder are not judged: {rows}; {gaps}"
     if kept := analysis.recording.kept_text:
         yield kept
 
