@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 import sys
 from dataclasses import asdict
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,7 +19,7 @@ from rack.tools.console.tables import TextTable, print_blocks
 from rack.tools.launch.folder import choose_run_folder
 from rack.tools.timing.inventory import build_inventory, format_arm_lines, format_inventory
 from rack.tools.timing.judged_config import JudgedConfig
-from rack.tools.timing.repair import Fix, Repair, find_repair
+from rack.tools.timing.repair import Repair, find_repair
 from rack.tools.timing.summary import format_fixes, format_summary, format_verdict
 from rack.tools.timing.tables import format_forecast
 
@@ -111,11 +110,11 @@ def check(
     # Load each proposal as the user would, because a change was found on the loaded config.
     fixes = [
         fix
-        for fix in islice(fitting.list_fixes(), MAX_FIXES)
+        for fix in fitting.list_fixes()
         if not JudgedConfig.judge(
             load(config, [*settings, *fix.settings], faults), judged.budgets
         ).failures
-    ]
+    ][:MAX_FIXES]
     if as_json:
         fits = (None if forecast.uncounted else True) if forecast.holds else False
         repair = {**fitting.to_document(), "fixes": [fix.settings for fix in fixes]}
@@ -196,8 +195,7 @@ def _print_repaired_config(fitting: Repair, as_json: bool) -> None:
     if as_json:
         print_json(fitting.to_document() | {"config": config})
         return
-    fixes = [Fix(tuple(changes[0] for changes in fitting.steps))]
-    lines = format_fixes(fixes if fitting.steps and not failures else (), failures)
-    print(*([*lines] or ["nothing to change"]), sep="\n", file=sys.stderr)
+    lines = [changes[0].text for changes in fitting.steps] + [*format_fixes((), failures)]
+    print(*(lines or ["nothing to change"]), sep="\n", file=sys.stderr)
     if config is not None:
         print(config, end="")

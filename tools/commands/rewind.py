@@ -126,7 +126,7 @@ class RewindPrompt(cmd.Cmd):
         if self._as_json:
             print(encode_json(answer.document), flush=True)
         else:
-            print(*answer.lines, sep="\n", flush=True)
+            print_text(answer.lines)
 
     def emptyline(self) -> bool:
         """Do nothing on an empty line, so that a branch is not repeated by accident."""

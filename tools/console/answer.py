@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from textwrap import wrap
+from textwrap import fill
 from typing import Any, NoReturn
 
 from rack.backplane.json_text import encode_json
@@ -71,17 +71,16 @@ def print_text(lines: Iterable[str]) -> None:
     """Print lines of text. A pipe gets no wide lines, and wrapped commands remain executable."""
     for line in lines:
         if len(line) > PIPE_WIDTH and not sys.stdout.isatty():
-            indent = " " * (len(line) - len(line.lstrip()) + 2)
-            is_command = line.startswith(("  rack ", "  --set "))
-            parts = wrap(
+            line = fill(
                 line,
                 PIPE_WIDTH - 2,
-                subsequent_indent=indent,
+                subsequent_indent=" " * (len(line) - len(line.lstrip()) + 2),
                 break_long_words=False,
                 break_on_hyphens=False,
             )
-            line = (" \\\n" if is_command else "\n").join(parts)
-        print(line)
+            if line.startswith(("  rack ", "  --set ")):
+                line = line.replace("\n", " \\\n")
+        print(line, flush=True)
 
 
 def exit_with_failure(reason: str, status: int) -> NoReturn:

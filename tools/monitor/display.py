@@ -18,6 +18,7 @@ from rich.text import Text
 from rack.backplane.process import DEADLINE
 from rack.boards.events import NO_TORQUE, Event
 from rack.boards.exchange import PortAge
+from rack.tools.console.answer import print_text
 from rack.tools.console.tables import build_grid, create_console, format_decimal
 from rack.tools.monitor.holds import is_new_reason
 from rack.tools.monitor.snapshot import DEAD, LOST, Snapshot, TaskRow
@@ -67,9 +68,13 @@ STATE_STYLES = {
 }
 LOSSES = ("missed", "skipped")
 TROUBLES = ("restarts", "refused", "full", "missing", "late", "unknown_launch", "losses")
-COUNT_STYLES = {**dict.fromkeys(LOSSES, "red"), **dict.fromkeys(TROUBLES, "yellow")}
-"""Colours of counts above 0."""
 HOLD_STYLE = "bold yellow"
+COUNT_STYLES = {
+    **dict.fromkeys(LOSSES, "red"),
+    **dict.fromkeys(TROUBLES, "yellow"),
+    "why": HOLD_STYLE,
+}
+"""Colours of counts above 0, and of reasons."""
 WHY_LEAST_WIDTH = 75
 """Width of a terminal up to which reasons stand below the table."""
 NO_DEMAND = "none"
@@ -134,11 +139,11 @@ class PlainDisplay(Display):
         now = time.monotonic()
         if now >= self._next or snapshot.run == "stopped":
             self._next = now + self.period_s
-            print(format_line(snapshot), flush=True)
+            print_text([format_line(snapshot)])
 
     def print_event(self, text: Text) -> None:
         """Print the event."""
-        print(text, flush=True)
+        print_text([str(text)])
 
 
 @contextmanager
@@ -192,10 +197,10 @@ class RackView:
         sides: tuple[Sequence[Any], ...] = (snapshot.hosts, snapshot.entries)
         for rows in (*sides, snapshot.peers, snapshot.imports, snapshot.exports):
             if records := [asdict(row) for row in rows]:
-                cells = [[_format_cell(*pair) for pair in row.items()] for row in records]
+                texts = [[_format_cell(*pair) for pair in row.items()] for row in records]
                 yield Text()
                 yield build_grid(
-                    [key.replace("_", " ") for key in records[0]], cells, width, style=_choose_style
+                    [key.replace("_", " ") for key in records[0]], texts, width, style=_choose_style
                 )
         yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(inbox.line) for inbox in snapshot.inboxes)
@@ -270,7 +275,7 @@ def _list_reasons(snapshot: Snapshot) -> Iterator[str]:
         if row.reason and not (texts and row.state == "holding"):
             is_new = is_new_reason(row.reason, shown)
             texts.append(row.reason if is_new else row.reason.partition(":")[0])
-        yield "; ".join(texts)
+        yield "; ".join(texts).removeprefix("holding: ")
 
 
 def _format_exchange(board: str, ports: Mapping[str, PortAge]) -> str:
@@ -283,8 +288,6 @@ def _choose_style(column: str, text: str) -> str:
     """Return the style of a cell: for a state, or for a count above 0. Empty for other cells."""
     if column == "state":
         return STATE_STYLES.get(text.partition(" (")[0], "")
-    if column == "why":
-        return HOLD_STYLE
     return COUNT_STYLES.get(column, "") if text != "0" else ""
 
 

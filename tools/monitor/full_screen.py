@@ -149,9 +149,8 @@ class RackScreen(App[None]):
 
     def _build_board_view(self, snapshot: Snapshot) -> RenderableType:
         """Return the table of tasks with sparklines, and the newest events below it."""
-        heading = Text("\nevents, newest first:" if self._events else "\nno events", "dim")
-        events = [*self._events][:SHOWN_EVENTS]
-        return Group(display.RackView(snapshot, self._sparklines), heading, *events)
+        events = [Text("\nevents, newest first:"), *self._events][: SHOWN_EVENTS + 1]
+        return Group(display.RackView(snapshot, self._sparklines), *events)
 
     def _build_mailbox_table(self, snapshot: Snapshot) -> RenderableType:
         """Return the table of mailboxes."""

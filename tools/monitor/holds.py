@@ -51,13 +51,13 @@ class Hold:
     @property
     def text(self) -> str:
         """Why and since when, as a clause."""
-        return f"{self.why.removeprefix('holding: ')}, since {self.since_s:.2f} s"
+        return f"{self.why}, since {self.since_s:.2f} s"
 
     @property
     def line(self) -> str:
         """Description of the hold in one line."""
         release_text = f"; to release: {self.release}" if self.release else ""
-        return f"{self.level} {self.why}, since {self.since_s:.2f} s{release_text}"
+        return f"{self.level} {self.text}{release_text}"
 
 
 def format_resume_command(rack: str, level: str) -> str:

@@ -17,7 +17,7 @@ from rack.tools.timing.summary import find_tightest, format_margin
 from rack.tools.timing.tables import build_level_table, build_verdict_table
 
 MAX_SHOWN_FAILURES = 8
-"""Largest number of failed equations that the summary lists, worst first."""
+"""Largest number of failed equations in the summary, worst first. --verbose shows all."""
 _Side = LevelTiming | EquationVerdict | None
 
 
@@ -158,27 +158,22 @@ def _format_percentile(percentile: float) -> str:
 
 def _format_summary(analysis: Analysis) -> Iterator[str]:
     """Yield the summary: how the run ended, failed equations, advice, and what was excluded."""
+    verdicts = [pair.measured for pair in analysis.pairs if pair.measured is not None]
+    failed = [verdict for verdict in verdicts if not verdict.holds]
+    failed.sort(key=lambda verdict: verdict.margin / abs(verdict.right or 1.0))
+    count = f"{len(verdicts)} equations"
+    result = f"{len(failed)} of {count} failed" if failed else f"all {count} held"
     name = analysis.recording.rack_config.name
-    pairs = [pair for pair in analysis.pairs if pair.measured is not None]
-    failing = [pair for pair in pairs if pair.is_failed]
-    verdicts = [pair.measured for pair in pairs if pair.measured is not None]
-    end = _describe_end(analysis)
-    if not failing:
-        yield f"{name}: all {len(pairs)} equations held; {end}"
+    yield f"{name}: {result}; {_describe_end(analysis)}"
+    yield from (f"  {format_margin(verdict)}" for verdict in failed[:MAX_SHOWN_FAILURES])
+    if failed and analysis.percentile > MOST_CYCLES_PERCENTILE:
+        mostly = [pair for pair in analysis.typical_pairs if pair.is_failed]
+        yield f"failed in more than 1 of 100 cycles: {_join_equations(mostly) or 'none'}"
+    elif not failed:
         yield from find_tightest(verdicts)
-    else:
-        yield f"{name}: {len(failing)} of {len(pairs)} equations failed; {end}"
-        failed = [verdict for verdict in verdicts if not verdict.holds]
-        failed.sort(key=lambda verdict: verdict.margin / abs(verdict.right or 1.0))
-        yield from (f"  {format_margin(verdict)}" for verdict in failed[:MAX_SHOWN_FAILURES])
-        if len(failed) > MAX_SHOWN_FAILURES:
-            yield f"  {len(failed) - MAX_SHOWN_FAILURES} more"
-        if analysis.percentile > MOST_CYCLES_PERCENTILE:
-            mostly = [pair for pair in analysis.typical_pairs if pair.is_failed]
-            yield f"failed in more than 1 of 100 cycles: {_join_equations(mostly) or 'none'}"
-    if differing := [pair for pair in pairs if pair.is_contradicted]:
+    if differing := [pair for pair in analysis.pairs if pair.is_contradicted]:
         yield f"not as predicted: {_join_equations(differing)}"
-    yield _choose_advice(analysis, failing)
+    yield _choose_advice(analysis, bool(failed))
     if not analysis.predicted.levels:
         yield "no prediction: the config has no budgets (board.<name>.budget)"
     if analysis.predicted.is_lockstep:
@@ -230,10 +225,10 @@ def _describe_end(analysis: Analysis) -> str:
     return f"{cause}, {missed} cycles missed, {skipped} skipped"
 
 
-def _choose_advice(analysis: Analysis, failing: list[EquationPair]) -> str:
+def _choose_advice(analysis: Analysis, has_failed: bool) -> str:
     """Return a line that says what to do about failed equations, or about a failed run."""
     folder = analysis.recording.folder
-    if not failing:
+    if not has_failed:
         outcome = analysis.recording.end_counts.get("outcome", {"cause": "time over"})
         if outcome.get("faults") or outcome["cause"] not in ("task done", "time over"):
             return f"to do: rack report {folder} says why the run failed; its timing held"

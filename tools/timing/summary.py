@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 RESPONSES = "3.2", "3.3"
 """Equations of the response of the system."""
-BAR_WIDTH = 20
+BAR_WIDTH = 16
 """Number of characters of a bar that shows the load of a core."""
 
 
@@ -50,7 +50,9 @@ def format_summary(forecast: Forecast, arm: Abilities | None, joints: Sequence[s
         )
     if not forecast.holds:
         yield ""
-        yield build_verdict_table(("", verdict) for verdict in forecast.verdicts if not verdict.holds)
+        yield build_verdict_table(
+            ("", verdict) for verdict in forecast.verdicts if not verdict.holds
+        )
         yield ""
 
 
@@ -107,8 +109,7 @@ def format_verdict(forecast: Forecast, measuring: Sequence[str]) -> Iterator[str
     elif not forecast.rack.levels:
         yield "not known whether it fits: no board has a budget"
     elif left_out:
-        things = "thing is" if len(forecast.uncounted) == 1 else "things are"
-        yield f"fits, but {len(forecast.uncounted)} {things} not counted: {left_out}"
+        yield f"fits, but {len(forecast.uncounted)} not counted: {left_out}"
         yield hold_text
     else:
         yield f"fits: {hold_text}"
@@ -142,7 +143,9 @@ def format_margin(verdict: EquationVerdict) -> str:
     right_side = format_side(verdict.right, verdict.unit)
     unit = " ms" if verdict.unit == "ns" else ""
     if verdict.right <= 0.0:
-        return f"{verdict.subject}, {criterion}: {left_side} {verdict.sign} {right_side}{unit} fails"
+        return (
+            f"{verdict.subject}, {criterion}: {left_side} {verdict.sign} {right_side}{unit} fails"
+        )
     fraction = verdict.margin / verdict.right
     remainder = f"{fraction:.0%} left" if fraction >= 0.0 else f"{-fraction:.0%} too much"
     return f"{verdict.subject}, {criterion}: {left_side} of {right_side}{unit}, {remainder}"

@@ -35,21 +35,16 @@ def test_a_table_fits_its_width_with_long_cells_wrapped(width: int) -> None:
     assert " ".join(" ".join(lines).split()).count("12") == 1
 
 
-def test_optional_columns_are_dropped_before_cells_are_wrapped() -> None:
+def test_optional_columns_are_dropped_before_cells_become_narrow() -> None:
     assert list(format_table(HEAD, ROWS, 40, ("what it says of itself", "count"))) == [
         "task            count",
         "servo              12",
         "elemental_move      7",
     ]
     assert list(format_table(HEAD, ROWS, 56, ("count",))) == list(format_table(HEAD, ROWS))
-    assert next(format_table(HEAD, ROWS, 55, ("count",))).split() == [
-        "task",
-        "what",
-        "it",
-        "says",
-        "of",
-        "itself",
-    ]
+    # 30 columns are enough for a text.
+    assert next(format_table(HEAD, ROWS, 53, ("count",))).split()[:2] == ["task", "count"]
+    assert next(format_table(HEAD, ROWS, 52, ("count",))).split()[:2] == ["task", "what"]
 
 
 def test_in_a_pipe_a_table_is_neither_cut_nor_coloured_nor_read_as_markup() -> None:
