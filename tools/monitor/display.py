@@ -143,7 +143,7 @@ class PlainDisplay(Display):
 
     def print_event(self, text: Text) -> None:
         """Print the event."""
-        print_text([str(text)])
+        print(text, flush=True)
 
 
 @contextmanager

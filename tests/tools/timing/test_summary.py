@@ -39,7 +39,7 @@ def test_the_verdict_of_a_rack_that_fits_is_followed_by_a_bar_per_core() -> None
     starts = ("fits: all ", "rack nasrem: ", "core 0 ", "core 1 ", "tightest: ", "response: ")
     assert [line[: len(start)] for line, start in zip(found, starts, strict=False)] == [*starts]
     assert found[3] == (
-        "core 1  [###################.]  98.6%  servo 51%, task.planner 42%, servo.planner 5%"
+        "core 1  [###############.]  98.6%  servo 51%, task.planner 43%, servo.planner 5%"
     )
     assert found[5] == "response: a command down 1282.5 ms, a status up 2280 ms"
     assert found[-1] == MORE
@@ -50,7 +50,7 @@ def test_a_rack_that_does_not_fit_shows_failures_and_helpful_changes(small: Path
     found = check_lines(small, "--set", FAILS, *ALONE, status=1)
     assert found[0].startswith("does not fit: 3 of ")
     # A bar ends at 100 %.
-    assert "core 1  [####################] 149.6%  lower.planner 122%, lower 28%" in found
+    assert "core 1  [################] 150.0%  lower.planner 122%, lower 28%" in found
     assert any(line.endswith("% too much") for line in found)
     failing = [line for line in found if "FAILS" in line]
     assert [line.split()[0] for line in failing] == ["3.8", "response", "load"]
