@@ -205,10 +205,11 @@ def _list_unjudged(analysis: Analysis) -> Iterator[str]:
         if cycles.stalled_count
     ):
         yield f"stalled cycles are not judged: {stalled}"
-    lost = analysis.recording.lost_rows
-    if rows := ", ".join(f"{name} {count}" for name, count in lost.items() if count):
-        gaps = "; ".join(map(str, analysis.recording.find_gaps()))
-        yield f"rows lost by the recorder are not judged: {rows}; {gaps}"
+    lost = [*map(str, analysis.recording.find_gaps())]
+    for name, (traced, ran) in analysis.recording.count_traced_cycles().items():
+        lost.append(f"{name} is judged by {traced:,} of {ran:,} cycles")
+    if lost:
+        yield "; ".join(lost)
     if kept := analysis.recording.kept_text:
         yield kept
 

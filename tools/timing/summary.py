@@ -60,15 +60,15 @@ def format_fixes(fixes: Sequence[Fix], remaining: Sequence[EquationVerdict]) -> 
     """Yield the fixes as options to append to the command, or the failures without a fix."""
     if fixes:
         yield "to make it fit, append one of these to the command, cheapest first:"
-    for fix in fixes:
-        yield "  " + shlex.join(word for text in fix.settings for word in ("--set", text))
-        yield from (f"      {change.text}" for change in fix.changes)
-    if remaining:
+    elif remaining:
         names = dict.fromkeys(f"{verdict.equation} of {verdict.subject}" for verdict in remaining)
         yield (
             f"no change helps with {', '.join(names)}; tried: other priorities and cores, cycles"
             f" and plans up to {MAX_FACTOR} times as long, also for others"
         )
+    for fix in fixes:
+        yield "  " + shlex.join(word for text in fix.settings for word in ("--set", text))
+        yield from (f"      {change.text}" for change in fix.changes)
 
 
 def _format_cores(forecast: Forecast) -> Iterator[str]:
