@@ -18,7 +18,7 @@ from rack.tools.console.answer import PIPE_WIDTH, print_text
 
 GAP = 2
 """Number of spaces between columns."""
-WRAPPED_WIDTH = 30
+WRAPPED_WIDTH = 25
 """Width down to which a column is wrapped before other columns are left out."""
 UNLIMITED_WIDTH = 1_000_000
 """Width of a table that is neither cut nor wrapped."""
