@@ -38,8 +38,9 @@ def analyze(
     stall counts as processor time. Cycles with a detected stall are excluded. To exclude undetected
     stalls as well, --percentile 99 ignores the longest cycle in 100.
 
-    The output shows how the run ended, which equations held, which one had the smallest margin, and
-    what to do. --verbose adds all levels, tasks and equations. The command writes analysis.json.
+    The first line is the verdict. It is followed by the failed equations, worst first, with value,
+    bound and excess, or else by the smallest margin; then what to do, and what was not judged.
+    --verbose adds all levels, tasks and equations. The command writes analysis.json.
     `rack gantt RUN` shows when each task had its core.
 
     Exit status: 0 every equation held; 1 one failed; 2 the run cannot be analyzed.

@@ -20,11 +20,14 @@ from rack.tools.launch.folder import choose_run_folder
 from rack.tools.timing.inventory import build_inventory, format_arm_lines, format_inventory
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.repair import Repair, find_repair
-from rack.tools.timing.summary import format_summary
+from rack.tools.timing.summary import format_fixes, format_summary, format_verdict
 from rack.tools.timing.tables import format_forecast
 
 if TYPE_CHECKING:
     from rack.levels.robot.abilities import Abilities
+
+MAX_FIXES = 3
+"""Largest number of proposed fixes."""
 
 
 def check(
@@ -53,10 +56,11 @@ def check(
 ) -> None:
     """Validate a config, and predict whether its levels meet their cycles.
 
-    The command prints every mistake in the config, one per line. For a valid config it prints five
-    lines: whether the rack fits, its smallest margin, its response time, reach and payload of its
-    arm, and what to do. --verbose adds slots, cores, rates, mailboxes with their bus addresses, and
-    every equation. On a terminal the tables show as many columns as fit; --json has all.
+    The command prints every mistake in the config, one per line. For a valid config it prints
+    whether the rack fits, what is not counted, the load of each core with its busiest tasks, the
+    smallest margin, the response time, reach and payload of the arm, and at most three fixes.
+    --verbose adds slots, rates, mailboxes with their bus addresses, and every equation. The tables
+    show as many columns as fit; --json has all.
 
     The prediction uses budgets: the longest processor time of each part of a level's cycle. They
     are read from [board.<name>.budget] in the config, or measured in a run with --from RUN.
@@ -68,10 +72,10 @@ def check(
     both sides, the margin, and ok or FAILS. The command also computes the worst-case response time
     of every task and the load of every core, which the paper does not.
 
-    If an equation fails, the command lists changes that help, cheapest first. Each has been tried
-    on the whole rack: another priority or core, a separate board for the planner, a larger plan
-    age, or a longer cycle, for the failing board or for one that shares its core. Changes that need
-    more cores than this machine has come last. --fix prints the config with the first change.
+    If an equation fails, the command lists fixes, cheapest first, as options to append to it. The
+    rack fits with any of them: another priority or core, a separate board for the planner, a
+    larger plan age, or a longer cycle, for the failing board or for one that shares its core. Fixes
+    that need more cores than this machine has come last. --fix prints the config with the first.
 
     The verdict names every board, planner and host board that was not counted. If it names none,
     all were counted except the recorder. With --json, timing.fits is true, false, or null if the
@@ -103,9 +107,18 @@ def check(
     inventory_document = build_inventory(rack_config, judged.layout, core_warnings)
     forecast = Forecast.from_rack(judged.timing, not core_warnings, rack_config.host)
     arm = _compute_abilities(rack_config)
+    # Load each proposal as the user would, because a change was found on the loaded config.
+    fixes = [
+        fix
+        for fix in fitting.list_fixes()
+        if not JudgedConfig.judge(
+            load(config, [*settings, *fix.settings], faults), judged.budgets
+        ).failures
+    ][:MAX_FIXES]
     if as_json:
         fits = (None if forecast.uncounted else True) if forecast.holds else False
-        verdict = {"fits": fits, "uncounted": forecast.uncounted, "repair": fitting.to_document()}
+        repair = {**fitting.to_document(), "fixes": [fix.settings for fix in fixes]}
+        verdict = {"fits": fits, "uncounted": forecast.uncounted, "repair": repair}
         timing = forecast.to_document() | verdict
         arm_document = None if arm is None else asdict(arm)
         extra = {"changed": rack_config.format_notes, "arm": arm_document}
@@ -113,18 +126,19 @@ def check(
     else:
         arguments_text = shlex.join([config, *(f"--set={setting}" for setting in settings)])
         measured = choose_run_folder(None, rack_config.name)
-        measure_hint = (
-            f"rack run {arguments_text} --seconds 10 --out {measured};"
-            f" rack check {arguments_text} --from {measured}"
+        measuring = (
+            f"rack run {arguments_text} --seconds 10 --out {measured}",
+            f"rack check {arguments_text} --from {measured}",
         )
         head, *rest = format_inventory(inventory_document)
         lines: list[str | TextTable] = [
+            *format_verdict(forecast, () if run else measuring),
             head,
             *rack_config.format_notes,
             *core_warnings,
-            *format_summary(
-                forecast, fitting, arm, rack_config.joints, "" if run else measure_hint
-            ),
+            *format_summary(forecast, arm, rack_config.joints),
+            *format_fixes(fixes, fitting.remaining_failures),
+            *forecast.notes,
         ]
         if verbose:
             lines += [
@@ -176,10 +190,12 @@ def _compute_abilities(config: RackConfig) -> Abilities | None:
 
 def _print_repaired_config(fitting: Repair, as_json: bool) -> None:
     """Print the repaired config on stdout and its changes on stderr, or both as JSON."""
-    config = None if fitting.remaining_failures else fitting.end.config.to_toml_text()
+    failures = fitting.remaining_failures
+    config = None if failures else fitting.end.config.to_toml_text()
     if as_json:
         print_json(fitting.to_document() | {"config": config})
         return
-    print(*(fitting.format_lines() or ["nothing to change"]), sep="\n", file=sys.stderr)
+    lines = [changes[0].text for changes in fitting.steps] + [*format_fixes((), failures)]
+    print(*(lines or ["nothing to change"]), sep="\n", file=sys.stderr)
     if config is not None:
         print(config, end="")

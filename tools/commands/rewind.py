@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 from rack.backplane.json_text import encode_json
 from rack.boards.errors import to_one_line
 from rack.levels.tables import LAST_TICK
-from rack.tools.console.answer import MAX_LINE, Failure, convert_errors
+from rack.tools.console.answer import MAX_LINE, Failure, convert_errors, print_text
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Anyway, Json, RunFolder
 from rack.tools.monitor.display import open_display
@@ -126,7 +126,7 @@ class RewindPrompt(cmd.Cmd):
         if self._as_json:
             print(encode_json(answer.document), flush=True)
         else:
-            print(*answer.lines, sep="\n", flush=True)
+            print_text(answer.lines)
 
     def emptyline(self) -> bool:
         """Do nothing on an empty line, so that a branch is not repeated by accident."""

@@ -13,7 +13,7 @@ from rack.tools.console.tables import format_fitted_table
 if TYPE_CHECKING:
     from rack.boards.config.reference import KeyTable
 
-DROPPED = ("default", "permitted", "type")
+DROPPED = ("type", "permitted", "default")
 """Columns that a narrow terminal leaves out, in this order."""
 
 

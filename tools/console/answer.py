@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import fill
 from typing import Any, NoReturn
 
 from rack.backplane.json_text import encode_json
@@ -16,6 +17,8 @@ Document = dict[str, Any]
 """Plain data, as `--json` prints it and as the files of a run store it."""
 MAX_LINE = 1300
 """Maximum number of characters in one line of an error message."""
+PIPE_WIDTH = 100
+"""Maximum number of columns of text, unless stdout is a terminal. Longer words are not broken."""
 
 
 @contextmanager
@@ -60,10 +63,24 @@ def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> Non
     """
     if as_json:
         print_json(document)
-    elif isinstance(text, str):
-        print(text)
     else:
-        print("\n".join(text))
+        print_text(text.split("\n") if isinstance(text, str) else text)
+
+
+def print_text(lines: Iterable[str]) -> None:
+    """Print lines of text. A pipe gets no wide lines, and wrapped commands remain executable."""
+    for line in lines:
+        if len(line) > PIPE_WIDTH and not sys.stdout.isatty():
+            line = fill(
+                line,
+                PIPE_WIDTH - 2,
+                subsequent_indent=" " * (len(line) - len(line.lstrip()) + 2),
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+            if line.startswith(("  rack ", "  --set ")):
+                line = line.replace("\n", " \\\n")
+        print(line, flush=True)
 
 
 def exit_with_failure(reason: str, status: int) -> NoReturn:

@@ -1,6 +1,6 @@
 """Formats tables and their cells as text.
 
-On a terminal they fit its width. In a pipe, and as Markdown, they are neither cut nor coloured.
+On a terminal they fit its width, and in a pipe 100 columns. As Markdown they are not cut.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-PIPE_WIDTH = 120
-"""Width of fixed-width views, such as `rack status`, when stdout is not a terminal."""
+from rack.tools.console.answer import PIPE_WIDTH, print_text
+
 GAP = 2
 """Number of spaces between columns."""
+WRAPPED_WIDTH = 25
+"""Width down to which a column is wrapped before other columns are left out."""
 UNLIMITED_WIDTH = 1_000_000
 """Width of a table that is neither cut nor wrapped."""
 
@@ -61,14 +63,14 @@ def format_table(
 def format_fitted_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], dropped: Sequence[str] = ()
 ) -> Iterator[str]:
-    """Yield the lines of a table, fitted to the terminal if stdout is one.
+    """Yield the lines of a table, fitted to the terminal or to `PIPE_WIDTH`.
 
     Args:
         head: Names of the columns.
         rows: Cells of each row.
-        dropped: Columns that a narrow terminal leaves out, in this order.
+        dropped: Columns that a narrow output leaves out, in this order.
     """
-    return format_table(head, rows, terminal_width(), dropped)
+    return format_table(head, rows, create_console().width, dropped)
 
 
 def format_fitted_records(
@@ -101,7 +103,8 @@ def build_grid(
     """
     columns = list(zip(head, *rows, strict=True))
     for name in dropped:
-        if sum(max(map(len, column)) for column in columns) + GAP * (len(columns) - 1) <= width:
+        widths = [min(max(map(len, column)), WRAPPED_WIDTH) for column in columns]
+        if sum(widths) + GAP * (len(columns) - 1) <= width:
             break
         columns = [column for column in columns if column[0] != name]
     rich_table = Table(box=None, pad_edge=False, padding=(0, GAP, 0, 0), header_style="dim")
@@ -201,12 +204,12 @@ def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
 
 
 def print_blocks(blocks: Iterable[str | TextTable]) -> None:
-    """Print text and tables on stdout. Only a terminal limits the width of tables."""
+    """Print text and tables on stdout, fitted to the terminal or to `PIPE_WIDTH`."""
     terminal = create_console()
     if terminal.is_terminal:
         show_blocks(blocks, terminal)
     else:
-        print(*render_text(blocks), sep="\n")
+        print_text(render_text(blocks, terminal.width))
 
 
 def format_decimal(value: float | None, digits: int = 3) -> str:

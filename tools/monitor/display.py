@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -18,6 +18,7 @@ from rich.text import Text
 from rack.backplane.process import DEADLINE
 from rack.boards.events import NO_TORQUE, Event
 from rack.boards.exchange import PortAge
+from rack.tools.console.answer import print_text
 from rack.tools.console.tables import build_grid, create_console, format_decimal
 from rack.tools.monitor.holds import is_new_reason
 from rack.tools.monitor.snapshot import DEAD, LOST, Snapshot, TaskRow
@@ -49,6 +50,7 @@ DROPPED = (
     "slot",
     "cycles",
     "Hz",
+    "lateness",
     "restarts",
     "core",
     "exec ms",
@@ -66,9 +68,15 @@ STATE_STYLES = {
 }
 LOSSES = ("missed", "skipped")
 TROUBLES = ("restarts", "refused", "full", "missing", "late", "unknown_launch", "losses")
-COUNT_STYLES = {**dict.fromkeys(LOSSES, "red"), **dict.fromkeys(TROUBLES, "yellow")}
-"""Colours of counts above 0."""
 HOLD_STYLE = "bold yellow"
+COUNT_STYLES = {
+    **dict.fromkeys(LOSSES, "red"),
+    **dict.fromkeys(TROUBLES, "yellow"),
+    "why": HOLD_STYLE,
+}
+"""Colours of counts above 0, and of reasons."""
+WHY_LEAST_WIDTH = 75
+"""Width of a terminal up to which reasons stand below the table."""
 NO_DEMAND = "none"
 """Safety demand on an arm that is free to move."""
 EVENT_STYLES = {"fault": "magenta", "detection": "yellow", "reaction": "red", "recovery": "green"}
@@ -131,7 +139,7 @@ class PlainDisplay(Display):
         now = time.monotonic()
         if now >= self._next or snapshot.run == "stopped":
             self._next = now + self.period_s
-            print(format_line(snapshot), flush=True)
+            print_text([format_line(snapshot)])
 
     def print_event(self, text: Text) -> None:
         """Print the event."""
@@ -157,11 +165,14 @@ def open_display(silent: bool) -> Iterator[Display]:
 class RackView:
     """A snapshot that rich can draw.
 
-    It has a head line, tables of tasks, hosts and network, reasons, queues, faults, holds and
-    progress.
+    It has a head line, tables of tasks, hosts and network, queues, faults, holds and progress.
+
+    Attributes:
+        lateness: Dictionary from task to a sparkline of its lateness. Empty for no such column.
     """
 
     snapshot: Snapshot
+    lateness: Mapping[str, str] = field(default_factory=dict)
 
     def __rich_console__(
         self, terminal: Console, options: ConsoleOptions
@@ -170,29 +181,36 @@ class RackView:
         snapshot = self.snapshot
         width = options.max_width
         yield _format_head(snapshot)
-        cells = [[cell(row) for cell in COLUMNS.values()] for row in snapshot.tasks]
-        yield build_grid(list(COLUMNS), cells, width, DROPPED, _choose_style)
+        names = [row.task for row in snapshot.tasks]
+        columns = {name: [*map(cell, snapshot.tasks)] for name, cell in COLUMNS.items()}
+        if self.lateness:
+            columns["lateness"] = [self.lateness[name] for name in names]
+        reasons = dict(zip(names, _list_reasons(snapshot), strict=True))
+        has_space = width > WHY_LEAST_WIDTH
+        if has_space and any(reasons.values()):
+            columns["why"] = [*reasons.values()]
+        cells = [*zip(*columns.values(), strict=True)]
+        yield build_grid([*columns], cells, width, DROPPED, _choose_style)
         yield from (Text(f"{row.task}: {row.row}") for row in snapshot.tasks if row.row)
+        if not has_space:
+            yield from (Text(f"{name}: {why}", HOLD_STYLE) for name, why in reasons.items() if why)
         sides: tuple[Sequence[Any], ...] = (snapshot.hosts, snapshot.entries)
         for rows in (*sides, snapshot.peers, snapshot.imports, snapshot.exports):
             if records := [asdict(row) for row in rows]:
-                cells = [[_format_cell(*pair) for pair in row.items()] for row in records]
+                texts = [[_format_cell(*pair) for pair in row.items()] for row in records]
                 yield Text()
                 yield build_grid(
-                    [key.replace("_", " ") for key in records[0]], cells, width, style=_choose_style
+                    [key.replace("_", " ") for key in records[0]], texts, width, style=_choose_style
                 )
-        yield from (Text(line, style="red") for line in _list_reasons(snapshot))
         yield from (Text(queue.line) for queue in snapshot.queues)
         yield from (Text(inbox.line) for inbox in snapshot.inboxes)
         yield from (Text(_format_exchange(*ages)) for ages in snapshot.exchanges.items())
         yield from (Text(f"fault: {fault}", style="magenta") for fault in snapshot.faults)
         for hold in snapshot.holds:
-            # Split a long line in two, so that the command in it is not wrapped.
-            is_long = len(hold.line) > width
-            hold_text = (
-                hold.line.replace("; to release", "\n  to release") if is_long else hold.line
-            )
-            yield Text(hold_text, style=HOLD_STYLE)
+            if hold.task not in names:
+                yield Text(hold.line, HOLD_STYLE)
+            elif hold.release:
+                yield Text(f"to release {hold.level}: {hold.release}", HOLD_STYLE)
         if (at := snapshot.progress) is not None:
             actions = f"{at.actions_done}/{at.actions}"
             yield Text(f"task: action {actions}, move {at.moves_done}/{at.moves} {at.state}")
@@ -249,17 +267,15 @@ def _list_active_demand(snapshot: Snapshot) -> list[str]:
     return [f"arm: {snapshot.demand}"] if snapshot.demand != NO_DEMAND else []
 
 
-def _list_reasons(snapshot: Snapshot) -> list[str]:
-    """Return the reasons that tasks report, except those already shown by a hold."""
-    held_levels = {hold.level for hold in snapshot.holds}
-    shown_reasons = [hold.why for hold in snapshot.holds]
-    return [
-        f"{row.task}: {row.reason}"
-        for row in snapshot.tasks
-        if row.reason
-        and not (row.state == "holding" and row.task in held_levels)
-        and is_new_reason(row.reason, shown_reasons)
-    ]
+def _list_reasons(snapshot: Snapshot) -> Iterator[str]:
+    """Yield for each task why it holds, or what it reports. A relayed reason is shortened."""
+    shown: list[str] = []
+    for row in snapshot.tasks:
+        texts = [hold.text for hold in snapshot.holds if hold.task == row.task][:1]
+        if row.reason and not (texts and row.state == "holding"):
+            is_new = is_new_reason(row.reason, shown)
+            texts.append(row.reason if is_new else row.reason.partition(":")[0])
+        yield "; ".join(texts).removeprefix("holding: ")
 
 
 def _format_exchange(board: str, ports: Mapping[str, PortAge]) -> str:

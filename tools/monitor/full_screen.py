@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from rich.console import RenderableType
+from rich.console import Group, RenderableType
 from rich.text import Text
 from textual.app import App, ComposeResult
 from textual.binding import Binding
@@ -37,6 +37,11 @@ from rack.tools.monitor.snapshot import RackMonitor, Snapshot
 REFRESH_INTERVAL_S = 0.2
 LATENESS_BORDERS_US = (-np.inf, 20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, np.inf)
 """Borders, in us, of the lateness classes in which cycles are counted."""
+SPARKS = "▁▂▃▄▅▆▇█"
+"""Marks of a sparkline: the longest lateness between two refreshes, from below 50 us to 5 ms."""
+SPARKLINE_LENGTH = 24
+SHOWN_EVENTS = 10
+"""Number of events below the boards."""
 INJECT = "inject"
 """First word of a fault on the command line. Any other word is the level of a command."""
 CORE_FAULTS = [kind.name for kind in KINDS if kind.where == "core"]
@@ -86,8 +91,9 @@ class RackScreen(App[None]):
         self._hierarchy = [name for name in names if f"{name}.operator" in boxes] or names
         self._levels = deque(self._hierarchy)  # the first is the one that keys command
         self._late: dict[str, np.ndarray] = {}
+        self._sparklines = dict.fromkeys(names, "")
         self._panes: dict[str, Callable[[Snapshot], RenderableType]] = {
-            "boards": display.RackView,
+            "boards": self._build_board_view,
             "mailboxes": self._build_mailbox_table,
             "events": lambda snapshot: Text("\n").join(list(self._events)),
             "lateness": self._build_lateness_table,
@@ -117,8 +123,12 @@ class RackScreen(App[None]):
             return
         snapshot = self._monitor.take_snapshot()
         for task, rows in self._monitor.cycles.items():
-            counts, _ = np.histogram(compute_lateness_ns(rows) * 1e-3, LATENESS_BORDERS_US)
+            late_us = compute_lateness_ns(rows) * 1e-3
+            counts, _ = np.histogram(late_us, LATENESS_BORDERS_US)
             self._late[task] = self._late.get(task, 0) + counts
+            if len(rows):
+                mark = SPARKS[np.digitize(late_us.max(), LATENESS_BORDERS_US[2:-2])]
+                self._sparklines[task] = (self._sparklines[task] + mark)[-SPARKLINE_LENGTH:]
         for event in (alarm.event for alarm in self._alarms.read_alarms()):
             if display.is_worth_showing(event):
                 self._events.appendleft(display.format_event(event))
@@ -136,6 +146,11 @@ class RackScreen(App[None]):
             for name in self._hierarchy
         ]
         return Text(" > ").join(levels)
+
+    def _build_board_view(self, snapshot: Snapshot) -> RenderableType:
+        """Return the table of tasks with sparklines, and the newest events below it."""
+        events = [Text("\nevents, newest first:"), *self._events][: SHOWN_EVENTS + 1]
+        return Group(display.RackView(snapshot, self._sparklines), *events)
 
     def _build_mailbox_table(self, snapshot: Snapshot) -> RenderableType:
         """Return the table of mailboxes."""

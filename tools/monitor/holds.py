@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rack.backplane.lines import UtilityLines
 from rack.backplane.mailbox.history import MailboxRing
@@ -38,6 +38,7 @@ class Hold:
     Attributes:
         since_s: Simulated time at which the hold began.
         release: Command that ends the hold. Empty if it ends by itself.
+        task: Task whose state the hold explains. Empty for none.
     """
 
     level: str
@@ -45,12 +46,18 @@ class Hold:
     since_s: float
     why: str
     release: str
+    task: str = ""
+
+    @property
+    def text(self) -> str:
+        """Why and since when, as a clause."""
+        return f"{self.why}, since {self.since_s:.2f} s"
 
     @property
     def line(self) -> str:
         """Description of the hold in one line."""
         release_text = f"; to release: {self.release}" if self.release else ""
-        return f"{self.level} {self.why}, since {self.since_s:.2f} s{release_text}"
+        return f"{self.level} {self.text}{release_text}"
 
 
 def format_resume_command(rack: str, level: str) -> str:
@@ -81,7 +88,8 @@ def _list_holds(newest: NewestMessages) -> Iterator[Hold]:
 
     def hold(level: str, since: int, why: str, release: str = "") -> Hold:
         """Build a hold that began at tick `since`."""
-        return Hold(level, since, since * segment.layout.clock_ns * 1e-9, why, release)
+        since_s = since * segment.layout.clock_ns * 1e-9
+        return Hold(level, since, since_s, why, release, level)
 
     arm, driving = next(newest.list_statuses("demand"), ("", None))
     if UtilityLines(segment).emergency_stop:
@@ -89,7 +97,7 @@ def _list_holds(newest: NewestMessages) -> Iterator[Hold]:
         arm_name, state_text = ("arm", "braked") if is_arm else ("hand", "valves closed")
         since = segment.get_block(arm)[Block.LEVEL_SINCE] if arm else 0
         release = f"rack estop {segment.layout.rack} --reset"
-        yield hold(arm_name, since, f"{state_text}: emergency stop", release)
+        yield replace(hold(arm_name, since, f"{state_text}: emergency stop", release), task=arm)
     for board, why in find_waits(segment):
         yield hold(board, segment.get_block(board)[Block.RELEASED], why)
     tasks = {task.name for task in segment.layout.tasks}

@@ -13,9 +13,11 @@ from rack.tools.console.tables import Blocks
 from rack.tools.recording.cycles import START_UP_S, Cycles, list_restarts
 from rack.tools.report.analysis import MOST_CYCLES_PERCENTILE, Analysis, EquationPair
 from rack.tools.report.task_times import MS_PER_NS, build_times_table, compute_task_times
-from rack.tools.timing.summary import find_tightest
+from rack.tools.timing.summary import find_tightest, format_margin
 from rack.tools.timing.tables import build_level_table, build_verdict_table
 
+MAX_SHOWN_FAILURES = 8
+"""Largest number of failed equations in the summary, worst first. --verbose shows all."""
 _Side = LevelTiming | EquationVerdict | None
 
 
@@ -156,22 +158,22 @@ def _format_percentile(percentile: float) -> str:
 
 def _format_summary(analysis: Analysis) -> Iterator[str]:
     """Yield the summary: how the run ended, failed equations, advice, and what was excluded."""
-    config = analysis.recording.rack_config
-    pairs = [pair for pair in analysis.pairs if pair.measured is not None]
-    failing = [pair for pair in pairs if pair.is_failed]
-    yield f"{config.name}: {_describe_end(analysis)}"
-    if not failing:
-        yield f"all {len(pairs)} equations held"
-    else:
-        yield f"{len(pairs) - len(failing)} of {len(pairs)} equations held"
-        yield f"failed: {_join_equations(failing)}"
-        if analysis.percentile > MOST_CYCLES_PERCENTILE:
-            mostly = [pair for pair in analysis.typical_pairs if pair.is_failed]
-            yield f"failed in more than 1 of 100 cycles: {_join_equations(mostly) or 'none'}"
-    if differing := [pair for pair in pairs if pair.is_contradicted]:
+    verdicts = [pair.measured for pair in analysis.pairs if pair.measured is not None]
+    failed = [verdict for verdict in verdicts if not verdict.holds]
+    failed.sort(key=lambda verdict: verdict.margin / abs(verdict.right or 1.0))
+    count = f"{len(verdicts)} equations"
+    result = f"{len(failed)} of {count} failed" if failed else f"all {count} held"
+    name = analysis.recording.rack_config.name
+    yield f"{name}: {result}; {_describe_end(analysis)}"
+    yield from (f"  {format_margin(verdict)}" for verdict in failed[:MAX_SHOWN_FAILURES])
+    if failed and analysis.percentile > MOST_CYCLES_PERCENTILE:
+        mostly = [pair for pair in analysis.typical_pairs if pair.is_failed]
+        yield f"failed in more than 1 of 100 cycles: {_join_equations(mostly) or 'none'}"
+    elif not failed:
+        yield from find_tightest(verdicts)
+    if differing := [pair for pair in analysis.pairs if pair.is_contradicted]:
         yield f"not as predicted: {_join_equations(differing)}"
-    yield from find_tightest([pair.measured for pair in pairs if pair.measured is not None])
-    yield _choose_advice(analysis, failing)
+    yield _choose_advice(analysis, bool(failed))
     if not analysis.predicted.levels:
         yield "no prediction: the config has no budgets (board.<name>.budget)"
     if analysis.predicted.is_lockstep:
@@ -203,14 +205,11 @@ def _list_unjudged(analysis: Analysis) -> Iterator[str]:
         if cycles.stalled_count
     ):
         yield f"stalled cycles are not judged: {stalled}"
+    lost = [*map(str, analysis.recording.find_gaps())]
     for name, (traced, ran) in analysis.recording.count_traced_cycles().items():
-        yield f"{name}: judged by {traced:,} of {ran:,} cycles"
-    yield from (
-        f"{count} rows of {name} were lost"
-        for name, count in analysis.recording.lost_rows.items()
-        if count
-    )
-    yield from map(str, analysis.recording.find_gaps())
+        lost.append(f"{name} is judged by {traced:,} of {ran:,} cycles")
+    if lost:
+        yield "; ".join(lost)
     if kept := analysis.recording.kept_text:
         yield kept
 
@@ -227,10 +226,10 @@ def _describe_end(analysis: Analysis) -> str:
     return f"{cause}, {missed} cycles missed, {skipped} skipped"
 
 
-def _choose_advice(analysis: Analysis, failing: list[EquationPair]) -> str:
+def _choose_advice(analysis: Analysis, has_failed: bool) -> str:
     """Return a line that says what to do about failed equations, or about a failed run."""
     folder = analysis.recording.folder
-    if not failing:
+    if not has_failed:
         outcome = analysis.recording.end_counts.get("outcome", {"cause": "time over"})
         if outcome.get("faults") or outcome["cause"] not in ("task done", "time over"):
             return f"to do: rack report {folder} says why the run failed; its timing held"

@@ -36,10 +36,10 @@ TABLE_COLUMNS = {
     "min": "min_ms",
     "median": "median_ms",
     "max": "max_ms",
-    "longest on the grid": "longest_ms",
-    "max from reading": "max_from_reading_ms",
-    "sum, eq. 3.3": "sum_eq_3_3_ms",
-    "bound, eq. 3.2": "bound_eq_3_2_ms",
+    "on grid": "longest_ms",
+    "from reading": "max_from_reading_ms",
+    "eq. 3.3": "sum_eq_3_3_ms",
+    "eq. 3.2": "bound_eq_3_2_ms",
 }
 """Columns of the table, and the figure of a level that each of them shows."""
 HISTOGRAM_BARS = 20
@@ -186,11 +186,11 @@ class OperatorResponse:
                 "commands": row["commands"],
                 **{head: format_decimal(row[key], 1) for head, key in TABLE_COLUMNS.items()},
                 "beyond": row["beyond"],
-                "off prediction": row["off_prediction"],
+                "off": row["off_prediction"],
             }
             for row in self.build_rows()
         ]
-        yield TextTable(rows, ("min", "sum, eq. 3.3", "median"))
+        yield TextTable(rows, ("min", "eq. 3.3", "median"))
         if others := [command for command in self.commands if command.acts is None]:
             yield (
                 f"not measured: {', '.join(f'{c.serial} to {c.level} ({c.fate})' for c in others)}"

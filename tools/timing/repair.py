@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
 from rack.boards.timing.level import LevelTiming
@@ -35,6 +35,29 @@ R = TypeVar("R")
 
 
 @dataclass(frozen=True)
+class Fix:
+    """Changes that make a rack fit, each of which builds on the previous one."""
+
+    changes: tuple[Change, ...]
+
+    @property
+    def settings(self) -> list[str]:
+        """The changes as `key=value`, as `--set` takes them."""
+        config = self.changes[0].before.config
+        values: dict[str, Any] = {}
+        for change in self.changes:
+            for key, value in change.settings.items():
+                # A config must not give both.
+                if key == "every" and config.board[change.board].rate_hz is not None:
+                    key, value = "rate_hz", 1e9 / (value * config.clock_ns)
+                if value is not None:
+                    values[f"board.{change.board}.{key}"] = value
+            for mailbox, protocol in change.protocols.items():
+                values[f'protocol.mailbox."{mailbox}"'] = protocol
+        return [f"{key}={value}" for key, value in values.items()]
+
+
+@dataclass(frozen=True)
 class Repair:
     """Changes that make a rack fit.
 
@@ -52,27 +75,13 @@ class Repair:
         """Failures that remain after the last step."""
         return self.end.failures
 
-    def format_lines(self) -> list[str]:
-        """Format every step, with one line per change, and the failures that remain."""
-        lines: list[str] = []
-        for changes in self.steps:
-            start = "then, with the first of these" if lines else "to make it fit"
-            if len(changes) > 1:
-                start += ", one of these, cheapest first"
-            lines.append(f"{start}:")
-            lines += [f"  {change.text}" for change in changes]
-        if self.remaining_failures:
-            failing = ", ".join(
-                dict.fromkeys(
-                    f"{verdict.equation} of {verdict.subject}"
-                    for verdict in self.remaining_failures
-                )
+    def list_fixes(self) -> Iterator[Fix]:
+        """Yield sequences of changes after each of which the rack fits, shortest first."""
+        firsts = tuple(changes[0] for changes in self.steps)
+        for at, changes in enumerate(self.steps):
+            yield from (
+                Fix((*firsts[:at], change)) for change in changes if not change.after.failures
             )
-            lines.append(
-                f"no change helps with {failing}; tried: other priorities and cores, cycles and"
-                f" plans up to {MAX_FACTOR} times as long, also for others"
-            )
-        return lines
 
     def to_document(self) -> Document:
         """Convert the repair to plain data."""

@@ -84,11 +84,11 @@ def test_the_verdict_comes_first_and_tables_only_on_demand(
     assert (done.returncode, done.stderr) == (0, "")
     found = done.stdout.splitlines()
     lost = "3 cycles missed, 2 skipped" if missed else "no cycle missed or skipped"
-    assert found[0] == f"small: {outcome['cause']}, {lost}"
-    assert found[1].startswith("all ")
-    assert found[1].endswith(" equations held")
-    assert any(line.startswith("tightest: ") and line.endswith("% left") for line in found)
-    assert any(line.startswith(f"to do: {to_do.format(folder)}") for line in found)
+    assert found[0].startswith("small: all ")
+    assert found[0].endswith(f" equations held; {outcome['cause']}, {lost}")
+    assert found[1].startswith("tightest: ")
+    assert found[1].endswith("% left")
+    assert f"to do: {to_do.format(folder)}" in " ".join(line.strip() for line in found)
     assert found[-1] == f"{folder}/analysis.json"
     more = rack("analyze", folder, "--verbose").stdout.splitlines()
     assert more[:4] == found[:4]
@@ -108,6 +108,11 @@ def test_differences_between_prediction_and_measurement_are_marked(
     assert differing >= {"3.1", "3.6", "response time"}
     assert not analysis.is_fulfilled
     found = text(analysis)
+    first, *failed = found.partition("\nfailed in")[0].splitlines()
+    assert first.startswith(f"small: {len(failed)} of ")
+    # The worst is first, with value, bound and excess.
+    assert failed[0] == "  lower, eq. 3.6: 0 < -0.3 ms fails"
+    assert "  lower, eq. 3.1: 2.8 of 2.5 ms, 12% too much" in failed
     assert "not as predicted: lower 3.1" in found
     assert f"to do: rack check CONFIG --from {tmp_path / 'run'} lists changes" in found
     levels = [line.split()[:5] for line in found.splitlines() if line.startswith("lower  ")]

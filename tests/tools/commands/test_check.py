@@ -145,7 +145,8 @@ def test_a_static_schedule_is_a_table_of_its_distinct_frames() -> None:
 @pytest.mark.slow
 def test_verbose_shows_the_motion_of_the_arm_without_new_torques() -> None:
     words = ("nasrem", "--set", "robot.patience_ms=10")
-    (line,) = (line for line in check(*words).stdout.splitlines() if line.startswith("patience: "))
+    printed = check(*words).stdout.replace("\n  ", " ")
+    (line,) = (line for line in printed.splitlines() if line.startswith("patience: "))
     assert "'servo' keeps its last torque for 10 ms (4 cycles; at most 10.0 ms)" in line
     assert "turn [19.2, 15.1, 24.0, 53.4, 50.9, 57.4] mrad, and all motors at full torque" in line
     (found,) = json.loads(check(*words, "--json").stdout)["patience"]

@@ -48,7 +48,9 @@ def test_a_held_rack_is_stepped_by_cycles_and_ticks(
     assert (tick, level["row"]) == (41, "row 4 'turn', now in 'down', table saw")
     given = rack("command", rack_name, "counter", "table", "slow")
     held_at = f"the rack is held before tick 41; 'rack step {rack_name}' continues it"
-    assert given.stdout == f"command to 'counter', table slow: waits: {held_at}\n"
+    assert (
+        given.stdout.replace("\n ", "") == f"command to 'counter', table slow: waits: {held_at}\n"
+    )
     tick, level = stepped(rack_name, "--cycles", "2", "--until", "counter")
     assert (tick, level["row"]) == (49, "row 4 'rest', now in 'resting', table slow")
     text = rack("step", rack_name, "--ticks", "1").stdout
@@ -68,13 +70,13 @@ def test_requests_to_a_held_rack_wait_until_it_continues(
     }.items():
         done = rack(*words)
         assert (done.returncode, done.stderr) == (0, "")
-        assert done.stdout.startswith(before + waits)
+        assert done.stdout.replace("\n ", "").startswith(before + waits)
     segment = Segment.attach(rack_name)
     fault = FaultTable(segment).entries[0]
     assert (fault.stage, segment.words[System.DEMAND]) == (Stage.WAITING, Demand.NONE)
     assert stepped(rack_name, "--cycles", "2")[0] == 9
     assert (fault.stage, segment.words[System.DEMAND]) == (Stage.ACTIVE, Demand.BRAKE)
-    assert rack("estop", rack_name, "--reset").stdout == (
+    assert rack("estop", rack_name, "--reset").stdout.replace("\n ", "") == (
         f"rack '{rack_name}': emergency stop reset at tick 8; the arm"
         f" {waits.replace('tick 0', 'tick 9')}\n"
     )

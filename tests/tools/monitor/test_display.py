@@ -18,7 +18,9 @@ PLANNER = replace(ROW, task="servo.planner", priority=0, missed=0, skipped=0, la
 MOVE = replace(PLANNER, task="elemental_move.planner", exec_ms=1027.97, lateness_ms=1969.67)
 TROUBLED = replace(ROW, reason="joint 'j2': too far")
 OPERATED = replace(ROW, task="task", state="holding", reason="held by the operator")
-HOLD = Hold("task", 15268, 38.17, "diverted by the operator (goto)", "rack command a task resume")
+HOLD = Hold(
+    "task", 15268, 38.17, "diverted by the operator (goto)", "rack command a task resume", "task"
+)
 MUTE = "mute of servo (servo.status)"
 SNAPSHOT = Snapshot(
     "demo",
@@ -63,7 +65,7 @@ SHOWN: list[tuple[dict[str, Any], list[str], str]] = [
     ({}, [], "demo 3.00 s  tick 1200  missed 3  skipped 4  task executing 5/25"),
     (
         {"lines": ("EMERGENCY STOP",), "tasks": (TROUBLED,)},
-        [f"{HEAD}  EMERGENCY STOP", "servo: joint 'j2': too far"],
+        [f"{HEAD}  EMERGENCY STOP"],
         "task executing 5/25  EMERGENCY STOP",
     ),
     (
@@ -84,9 +86,8 @@ SHOWN: list[tuple[dict[str, Any], list[str], str]] = [
         [HOLD.line],
         "missed 3  skipped 4  holds 2  faults 1  NO REAL-TIME PRIORITY",
     ),
-    # A reason that a hold gives is not given twice.
     ({"holds": (HOLD,), "tasks": (OPERATED,)}, [], "holds 1  task executing 5/25"),
-    ({"tasks": (OPERATED,)}, ["task: held by the operator"], ""),
+    ({"tasks": (OPERATED,)}, [], ""),
 ]
 
 
@@ -103,6 +104,55 @@ def test_table_and_line_show_holds_and_problems_of_the_rack(
     assert format_line(snapshot).endswith(end)
     # It is short whatever holds the rack.
     assert not snapshot.holds or len(format_line(snapshot)) <= 90
+
+
+WAITING = replace(PLANNER, task="upper", reason="waiting for servo: joint 'j2': too far")
+BRAKED = replace(HOLD, level="arm", why="braked: emergency stop", release="", task="servo")
+
+
+@pytest.mark.parametrize(
+    ("changes", "reasons", "below"),
+    [
+        # A relayed reason is shortened.
+        (
+            {"tasks": (TROUBLED, WAITING)},
+            {"servo": "joint 'j2': too far", "upper": "waiting for servo"},
+            [],
+        ),
+        # A reason that a hold gives is not given twice, and a command is never wrapped.
+        (
+            {"tasks": (ROW, OPERATED), "holds": (HOLD,)},
+            {"task": "diverted by the operator (goto), since 38.17 s"},
+            ["to release task: rack command a task resume"],
+        ),
+        ({"holds": (BRAKED,)}, {"servo": "braked: emergency stop, since 38.17 s"}, []),
+        ({"tasks": (ROW,), "holds": (HOLD,)}, {}, [HOLD.line]),
+    ],
+)
+def test_a_reason_stands_in_the_row_of_its_task(
+    changes: dict[str, Any], reasons: dict[str, str], below: list[str]
+) -> None:
+    for width in (160, 40):
+        lines = shown(replace(SNAPSHOT, **changes), width)
+        assert max(map(len, lines)) <= width
+        printed = " ".join(" ".join(lines).split())
+        for task, reason in reasons.items():
+            if width > 100:
+                (line,) = (line for line in lines if line.endswith(f"  {reason}"))
+                assert line.split()[1] == task
+            else:
+                # It would leave no space for the table.
+                assert f"{task}: {reason}" in printed
+        assert all(line in (lines if width > 100 else printed) for line in below)
+
+
+def test_a_sparkline_is_left_out_where_counts_need_its_space() -> None:
+    view = RackView(SNAPSHOT, {ROW.task: "▁▂▃", PLANNER.task: "▇"})
+    for width, is_shown in ((160, True), (80, False)):
+        console = Console(width=width, force_terminal=True, color_system=None)
+        with console.capture() as capture:
+            console.print(view)
+        assert ("▁▂▃" in capture.get()) == is_shown
 
 
 def test_a_display_shows_the_events_of_a_fault_but_no_misses(

@@ -78,6 +78,16 @@ def test_the_panes_show_boards_mailboxes_events_and_lateness(running: str) -> No
         await write(pilot, "lower modify twice on")
         await pilot.press("3")
         await shows(pilot, "command: lower: modify twice on")
+        # At this width the boards have sparklines, and events below them.
+        await pilot.resize_terminal(160, 40)
+        await pilot.press("1")
+        await shows(pilot, "lateness", "▁", "events, newest first:", "lower: modify twice on")
+        lines = [line for line in seen(pilot).splitlines() if "<text" in line]
+        places = [
+            next(at for at, line in enumerate(lines) if word in line)
+            for word in ("restarts", "events, newest", "modify twice on")
+        ]
+        assert places == sorted(places)
 
     on_screen(running, act)
 
@@ -85,11 +95,11 @@ def test_the_panes_show_boards_mailboxes_events_and_lateness(running: str) -> No
 def test_keys_hold_a_level_and_let_it_resume(running: str) -> None:
     async def act(pilot: Pilot[None]) -> None:
         await pilot.press("h")
-        await shows(pilot, "upper held by the operator", f"rack command {running} upper resume")
+        await shows(pilot, "held by the operator", f"rack command {running} upper resume")
         await pilot.press("r")
         await shows(pilot, not_any_more="held by the operator")
         await pilot.press("l", "h")
-        await shows(pilot, "lower held by the operator")
+        await shows(pilot, "held by the operator", f"rack command {running} lower resume")
         await pilot.press("r")
         await shows(pilot, not_any_more="held by the operator")
 

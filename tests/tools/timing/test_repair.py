@@ -9,6 +9,7 @@ import pytest
 from rack.boards.config import load, load_text
 from rack.tools.timing.judged_config import Change, JudgedConfig
 from rack.tools.timing.repair import find_changes, find_repair, search_first
+from rack.tools.timing.summary import format_fixes
 from tests.tools.timing.conftest import Judge
 
 
@@ -147,24 +148,24 @@ def test_boards_are_repaired_one_after_another(judge: Judge) -> None:
     assert repaired.end.failures == ()
     # The second step builds on the first.
     assert repaired.end.config.board["lower"].within_cycles == 2
-    assert [line.split(":")[0] for line in repaired.format_lines() if not line.startswith(" ")] == [
-        "to make it fit, one of these, cheapest first",
-        "then, with the first of these",
-    ]
+    for fix in repaired.list_fixes():
+        assert not JudgedConfig.judge(fix.changes[-1].after.config).failures
+        assert {change.board for change in fix.changes} == {"lower", "upper"}
 
 
 def test_a_failure_that_no_change_removes_is_named(judge: Judge) -> None:
     hopeless = find_repair(judge("board.lower.budget.process_ms=200"))
     assert hopeless.steps == ()
     assert {verdict.equation for verdict in hopeless.remaining_failures} >= {"3.1", "3.4"}
-    assert hopeless.format_lines()[-1].startswith("no change helps with 3.1 of lower, ")
+    (line,) = format_fixes([*hopeless.list_fixes()], hopeless.remaining_failures)
+    assert line.startswith("no change helps with 3.1 of lower, ")
     assert hopeless.to_document() == {"steps": [], "fits": False}
 
 
 def test_a_rack_that_fits_needs_no_changes(judge: Judge) -> None:
     judged = judge()
     assert find_repair(judged).end is judged
-    assert find_repair(judged).format_lines() == []
+    assert [*find_repair(judged).list_fixes()] == []
 
 
 @pytest.fixture(autouse=True)

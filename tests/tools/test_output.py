@@ -1,0 +1,206 @@
+"""Tests what every command prints into a pipe, into a closed pipe, and on a narrow terminal."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import pty
+import re
+import struct
+import subprocess
+import termios
+from pathlib import Path
+
+import pytest
+
+from rack.tools.cli import COMMANDS
+from rack.tools.console.answer import PIPE_WIDTH
+from tests.processes import RACK
+from tests.shared_runs import small_run
+from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.tools.held_racks import held_rack
+
+NAMES = [name for commands in COMMANDS.values() for name in commands]
+IDLE = (
+    "list",
+    "clean",
+    "check nasrem",
+    "check nasrem --verbose",
+    "check fig3",
+    "check condor --verbose",
+    "check SMALL",
+    "analyze RUN",
+    "analyze RUN --verbose",
+    "gantt nasrem --out FOLDER/chart",
+    "export RUN --to mcap --out FOLDER/run.mcap",
+    "schema",
+    "schema board",
+    "schema robot",
+    "inject --help",
+    "robot check k1607 --out FOLDER/arm",
+    "new servo LAW",
+    "lan certificates FOLDER/certificates --for one",
+)
+"""Command lines that need no running rack. LAW, RUN and so on stand for what a test made."""
+LIVE = (
+    "status NAME",
+    "step NAME 2",
+    "mailbox NAME",
+    "mailbox NAME counter.status",
+    "command NAME --list",
+    "inject NAME watch mute for=1s",
+    "inject NAME --list",
+    "pause NAME",
+    "estop NAME",
+    "status NAME",
+)
+"""Command lines for a held rack, in this order."""
+COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short run of the small rack."""
+    return small_run(tmp_path_factory)
+
+
+@pytest.fixture
+def words_of(
+    small: Path, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> dict[str, str]:
+    """What the words of a command line stand for, relative to the folder of the test."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run").symlink_to(recorded)
+    (tmp_path / "rack.toml").write_text(small.read_text())
+    for path in small.parent.glob("*.py"):
+        (tmp_path / path.name).write_text(path.read_text())
+    return {"SMALL": "rack.toml", "RUN": "run", "FOLDER": ".", "LAW": "my_law"}
+
+
+def fill_in(line: str, words: dict[str, str]) -> list[str]:
+    """Return the arguments of a command line."""
+    return re.sub("|".join(words), lambda word: words[word[0]], line).split()
+
+
+def find_wide_lines(text: str) -> list[str]:
+    """Return the lines that are wider than a pipe permits. A word alone is not broken."""
+    return [line for line in text.splitlines() if len(line) > PIPE_WIDTH and " " in line.strip()]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_help_is_narrower_than_a_pipe(name: str) -> None:
+    assert find_wide_lines(rack(name, "--help").stdout) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", IDLE)
+def test_a_pipe_gets_no_wide_line(line: str, words_of: dict[str, str], tmp_path: Path) -> None:
+    done = rack(*fill_in(line, words_of), folder=tmp_path)
+    assert done.returncode == int(line == "check fig3"), done.stderr
+    assert done.stdout
+    assert find_wide_lines(done.stdout) == []
+    assert "\x1b" not in done.stdout
+
+
+@pytest.mark.slow
+def test_a_pipe_gets_no_wide_line_about_a_running_rack(tmp_path: Path, rack_name: str) -> None:
+    with held_rack(tmp_path, rack_name):
+        for line in LIVE:
+            done = rack(*fill_in(line, {"NAME": rack_name}))
+            assert done.returncode == 0, (line, done.stderr)
+            assert find_wide_lines(done.stdout) == [], line
+            assert "\x1b" not in done.stdout
+
+
+def print_into_closed_pipe(arguments: list[str]) -> subprocess.CompletedProcess[str]:
+    """Run a command whose reader closes the pipe after its first line, as `head -1` does."""
+    reader, writer = os.pipe()
+    with subprocess.Popen(
+        [*RACK, *arguments], stdout=writer, stderr=subprocess.PIPE, text=True
+    ) as process:
+        os.close(writer)
+        os.read(reader, 1)
+        os.close(reader)
+        _, errors = process.communicate(timeout=BOUND_S)
+    return subprocess.CompletedProcess(arguments, process.returncode, "", errors)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", [*IDLE, "report RUN", "check fig3 --json", "analyze RUN --json"])
+def test_a_reader_that_closes_the_pipe_causes_no_traceback(
+    line: str, words_of: dict[str, str]
+) -> None:
+    done = print_into_closed_pipe(fill_in(line, words_of))
+    # All may have been written before the pipe was closed.
+    assert done.returncode in (0, 1)
+    assert done.stderr == "" or "Traceback" not in done.stderr
+
+
+@pytest.mark.slow
+def test_a_closed_pipe_causes_no_traceback_while_a_rack_runs(
+    tmp_path: Path, rack_name: str
+) -> None:
+    with held_rack(tmp_path, rack_name):
+        # The rack is held, so that only the closed pipe ends the last two.
+        for line in (*LIVE, "top NAME", "mailbox NAME counter.status --watch"):
+            done = print_into_closed_pipe(fill_in(line, {"NAME": rack_name}))
+            assert done.returncode in (0, 1), (line, done.stderr)
+            assert "Traceback" not in done.stderr, line
+
+
+def show_on_terminal(arguments: list[str], columns: int) -> str:
+    """Return what a command prints on a terminal without colours."""
+    screen, terminal = pty.openpty()
+    fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    hidden = ("COLUMNS", "LINES")
+    environment = {name: value for name, value in os.environ.items() if name not in hidden}
+    with subprocess.Popen(
+        [*RACK, *arguments],
+        cwd=ROOT,
+        stdout=terminal,
+        stderr=subprocess.PIPE,
+        env=environment | {"NO_COLOR": "1", "TERM": "xterm"},
+    ) as process:
+        os.close(terminal)
+        printed = b""
+        try:
+            while block := os.read(screen, 1 << 16):
+                printed += block
+        except OSError:
+            # The command has closed the terminal.
+            pass
+        assert b"Traceback" not in process.communicate(timeout=BOUND_S)[1], arguments
+    os.close(screen)
+    return printed.decode().replace("\r\n", "\n")
+
+
+@pytest.mark.slow
+def test_a_terminal_of_40_columns_gets_a_narrower_layout_without_colours(
+    recorded: Path, tmp_path: Path, rack_name: str
+) -> None:
+    lines = ["check nasrem --verbose", "check fig3", "schema timing", "inject --help"]
+    with held_rack(tmp_path, rack_name):
+        for line in (*lines, f"analyze {recorded} --verbose", f"status {rack_name}"):
+            shown = show_on_terminal(line.split(), 40)
+            assert not re.findall(r"\x1b\[(?:3|4|9)[0-9]", shown), line
+            if line.startswith("check"):
+                wide = [each for each in shown.splitlines() if len(each) > 40]
+                assert not wide, line
+            assert COLOURS.sub("", shown).strip(), line
+
+
+def test_output_without_unicode_shows_bars_and_no_traceback() -> None:
+    environment = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0", "LC_ALL": "C"}
+    done = subprocess.run(
+        [*RACK, "check", "fig3"],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        timeout=BOUND_S,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (1, b"")
+    assert b"core 1  [################] 105.6%  level 67%, level.planner 39%" in done.stdout
+    document = json.loads(rack("check", "fig3", "--json").stdout)
+    assert document["timing"]["loads"]["1"] > 1.0
