@@ -133,6 +133,15 @@ def append_faults(tables: Tables, name_or_path: str | Path, folder: Path) -> Tab
     return {**tables, "fault": [*faults, *script.get("fault", [])]}
 
 
+def name_config(path: str) -> str:
+    """Return the name of a bundled config, given its path, or the path of any other."""
+    stem = Path(path).with_suffix("")
+    if not stem.is_relative_to(CONFIGS):
+        return path
+    parts = stem.relative_to(CONFIGS).parts
+    return "/".join(parts[:-1] if len(parts) > 1 and parts[-1] == parts[-2] else parts)
+
+
 def list_names(folder: Path = CONFIGS) -> list[str]:
     """Return the names of the configs in a folder. The default is the folder of bundled racks.
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import Any
 
 from rack.boards.timing.frames import CoreFrames, compute_core_frames
@@ -25,7 +26,7 @@ class Forecast:
         inboxes: Worst-case cost of interrupts for each inbox, as plain data.
         frames: Distinct frames of each core in a static schedule.
         notes: Limits of the prediction, one sentence each.
-        uncounted: Dictionary from each task or host board that is not included to the reason.
+        uncounted: Dictionary from everything that is not included to the reason.
     """
 
     rack: RackTiming
@@ -38,14 +39,17 @@ class Forecast:
 
     @classmethod
     def from_rack(
-        cls, rack: RackTiming, has_cores: bool = True, hosts: Iterable[str] = ()
+        cls,
+        rack: RackTiming,
+        has_cores: bool = True,
+        uncounted: Mapping[str, str] = MappingProxyType({}),
     ) -> Forecast:
         """Compute the forecast of a rack.
 
         Args:
             rack: Data of the rack.
             has_cores: False if this machine lacks cores that the config requests.
-            hosts: Names of host boards, which the timing model cannot include.
+            uncounted: Dictionary from what the timing model cannot include to the reason.
         """
         return cls(
             rack=rack,
@@ -57,7 +61,7 @@ class Forecast:
             ),
             frames=compute_core_frames(rack),
             notes=tuple(_list_notes(rack, has_cores)),
-            uncounted=_list_uncounted(rack) | dict.fromkeys(hosts, "a host board has no rate"),
+            uncounted={**_list_uncounted(rack), **uncounted},
         )
 
     @property

@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING
 
 from rack.boards.config import list_replaced_cores, load
 from rack.boards.config.cell import build_rack_cell
+from rack.boards.config.files import name_config
 from rack.boards.config.schema import RackConfig
 from rack.boards.config.timing import build_rack_timing, replace_budgets, subtract_interrupts
 from rack.boards.timing.forecast import Forecast
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.parameters import ConfigName, Faults, Json, Settings, option
+from rack.tools.console.parameters import ConfigName, Faults, Json, Settings, argument, option
 from rack.tools.console.tables import TextTable, print_blocks
 from rack.tools.launch.folder import choose_run_folder
 from rack.tools.timing.inventory import build_inventory, format_arm_lines, format_inventory
@@ -32,6 +33,9 @@ MAX_FIXES = 3
 
 def check(
     config: ConfigName,
+    others: list[str] = argument(
+        "OTHER...", "configs of racks on the same network, to check the response across all", []
+    ),
     settings: Settings = [],  # noqa: B006  typer copies it
     faults: Faults = None,
     run: Path | None = option(
@@ -62,6 +66,10 @@ def check(
     --verbose adds slots, rates, mailboxes with their bus addresses, and every equation. The tables
     show as many columns as fit; --json has all.
 
+    With several configs, the command checks each rack and the system response across all of them.
+    A link between two racks counts as a level: its budget is delay_ms and max_lost of the import
+    ([adapter.lan.import.<port>]). The options --from, --fix and --verbose take one config.
+
     The prediction uses budgets: the longest processor time of each part of a level's cycle. They
     are read from [board.<name>.budget] in the config, or measured in a run with --from RUN.
     [timing] contains the context switch time, the processor time of the clock, the limit of eq.
@@ -89,8 +97,14 @@ def check(
       rack check fig3
       rack check nasrem --verbose
       rack check fig3 --fix > fits.toml
+      rack check brown brown/servo
       rack check nasrem --from runs/nasrem-20250101-120000
     """
+    if others:
+        if run is not None or fix or verbose or faults is not None:
+            raise Failure("--from, --fix, --verbose and --faults take one config", 2)
+        _check_joined([load(name, settings) for name in (config, *others)], as_json)
+        return
     rack_config = load(config, settings, faults)
     if run is not None:
         rack_config = _use_measured_budgets(rack_config, run, percentile)
@@ -105,7 +119,9 @@ def check(
         return
     core_warnings = list_replaced_cores(rack_config)
     inventory_document = build_inventory(rack_config, judged.layout, core_warnings)
-    forecast = Forecast.from_rack(judged.timing, not core_warnings, rack_config.host)
+    forecast = Forecast.from_rack(
+        judged.timing, not core_warnings, _list_uncounted(config, rack_config)
+    )
     arm = _compute_abilities(rack_config)
     # Load each proposal as the user would, because a change was found on the loaded config.
     fixes = [
@@ -150,6 +166,46 @@ def check(
             lines.append("--verbose shows every task, mailbox and equation")
         print_blocks(lines)
     if not forecast.holds:
+        sys.exit(1)
+
+
+def _list_uncounted(name: str, config: RackConfig) -> dict[str, str]:
+    """Return a dictionary from what a check of one config cannot count to the reason."""
+    uncounted = dict.fromkeys(config.host, "a host board has no rate")
+    table = config.adapter.lan
+    if table is not None and table.imports:
+        partners = [name_config(path) for path in (*table.launch, *table.partners)]
+        command = shlex.join(["rack", "check", name, *(partners or ["OTHER"])])
+        uncounted["the response across racks"] = command
+    return uncounted
+
+
+def _check_joined(configs: list[RackConfig], as_json: bool) -> None:
+    """Check several racks, and print the verdict on each and on the response across them."""
+    # Import late, because most checks concern one rack.
+    from rack.boards.config.joined import join_racks
+    from rack.tools.timing.joined_check import format_joined_verdicts, judge_joined_racks
+
+    verdicts = judge_joined_racks(join_racks(configs))
+    forecasts = {
+        config.name: Forecast.from_rack(
+            JudgedConfig.judge(config).timing,
+            not list_replaced_cores(config),
+            dict.fromkeys(config.host, "a host board has no rate"),
+        )
+        for config in configs
+    }
+    if as_json:
+        racks = {name: forecast.to_document() for name, forecast in forecasts.items()}
+        print_json({"racks": racks, "across": [verdict.to_document() for verdict in verdicts]})
+    else:
+        lines = [
+            f"{name}: {next(iter(format_verdict(forecast, ())))}"
+            for name, forecast in forecasts.items()
+        ]
+        print_blocks([*format_joined_verdicts(verdicts), *lines])
+    holds = [one.holds for one in verdicts] + [one.holds for one in forecasts.values()]
+    if not all(holds):
         sys.exit(1)
 
 
