@@ -25,6 +25,8 @@ ANSWERS = re.split(r"^## ", (COURSE / "answers.md").read_text(), flags=re.MULTIL
 STEP = re.compile(r"```sh\n(.*?)```\n(?:\n```\n(.*?)```)?", re.DOTALL)
 """Commands, and lines that they print: "..." stands for anything, N for one number above 0."""
 MOST_LINES = 60
+BOUND_S = 100.0
+"""Longest time of a command of Python."""
 
 
 @pytest.fixture(autouse=True)
@@ -62,13 +64,14 @@ def run(line: str, folder: Path) -> tuple[int, str]:
             cwd=folder,
             capture_output=True,
             text=True,
-            timeout=55,
+            timeout=BOUND_S,
             check=False,
         )
     return done.returncode, done.stdout + done.stderr
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(4 * BOUND_S)
 @pytest.mark.parametrize("number", range(len(EXERCISES)), ids=EXERCISES)
 def test_exercise_and_its_answer_show_what_their_pages_say(number: int, tmp_path: Path) -> None:
     name = EXERCISES[number]
