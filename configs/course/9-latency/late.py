@@ -15,7 +15,6 @@ class LateServo(ServoExecutor):
     """Delays the samples on their way to the law."""
 
     params = LateParams
-    settings: LateParams
 
     def __init__(self, context):
         super().__init__(context)
