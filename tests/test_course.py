@@ -25,6 +25,8 @@ ANSWERS = re.split(r"^## ", (COURSE / "answers.md").read_text(), flags=re.MULTIL
 STEP = re.compile(r"```sh\n(.*?)```\n(?:\n```\n(.*?)```)?", re.DOTALL)
 """Commands, and lines that they print: "..." stands for anything, N for one number above 0."""
 MOST_LINES = 60
+BOUND_S = 150.0
+"""Longest time of a command of Python."""
 
 
 @pytest.fixture(autouse=True)
@@ -62,13 +64,14 @@ def run(line: str, folder: Path) -> tuple[int, str]:
             cwd=folder,
             capture_output=True,
             text=True,
-            timeout=55,
+            timeout=BOUND_S,
             check=False,
         )
     return done.returncode, done.stdout + done.stderr
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3 * BOUND_S)
 @pytest.mark.parametrize("number", range(len(EXERCISES)), ids=EXERCISES)
 def test_exercise_and_its_answer_show_what_their_pages_say(number: int, tmp_path: Path) -> None:
     name = EXERCISES[number]
@@ -104,6 +107,17 @@ def test_the_course_lists_its_exercises_and_answers_each() -> None:
         len((COURSE / name / "README.md").read_text().splitlines()) <= MOST_LINES
         for name in EXERCISES
     )
+
+
+def test_the_table_of_rates_has_the_errors_that_the_commands_print() -> None:
+    """Its other column, the load, has two decimal places of what `rack check` prints."""
+    answer = ANSWERS[EXERCISES.index("7-rate")]
+    page = (COURSE / "7-rate" / "README.md").read_text()
+    table = re.findall(r"^\| (\d+) \| ([\d.]*) ?\| ([\d.]*) ?\|", answer, re.MULTILINE)
+    for column, text in ((1, page), (2, answer)):
+        shown = re.findall(r"^(\d+) Hz: (\S+) mrad RMS", text, re.MULTILINE)
+        assert shown
+        assert sorted(shown) == sorted((row[0], row[column]) for row in table if row[column])
 
 
 def test_a_number_that_varies_is_above_zero_and_the_same_twice() -> None:

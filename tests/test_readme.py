@@ -127,6 +127,20 @@ def pages() -> list[Path]:
     return [*root.glob("*.md"), *PAGES[2:], *(root / "configs").rglob("*.md")]
 
 
+def test_the_page_of_each_historical_system_ends_with_what_is_not_modelled() -> None:
+    configs = README.parent / "configs"
+    table = (configs / "README.md").read_text().partition("## The systems of its time")[2]
+    links = re.findall(r"^\| \[`[\w-]+`\]\(([\w.-]+)\)", table, re.MULTILINE)
+    assert len(links) == 9
+    for link in links:
+        page = configs / link
+        text = (page / "README.md" if page.is_dir() else page).read_text()
+        title, _, items = text.rpartition("\n## ")[2].partition("\n")
+        assert title == "Not modelled", link
+        assert items.strip().startswith("- "), link
+        assert 2 <= len(re.findall(r"^- ", items, re.MULTILINE)) <= 6, link
+
+
 def test_every_file_that_the_pages_link_to_exists() -> None:
     links = [
         (page, link)
