@@ -210,10 +210,20 @@ class PoseWriter:
 
 
 class MarkWriter:
-    """Marks joints with red balls while the brakes are engaged or a fault is active."""
+    """Marks joints with red balls while the brakes are engaged or a fault is active.
 
-    def __init__(self, stream: Stream, cell: Cell, joints: Sequence[str]) -> None:
+    Args:
+        stream: Stream to write to.
+        cell: Cell of the arm.
+        joints: Names of the joints.
+        drivers: Tasks that drive the arm.
+    """
+
+    def __init__(
+        self, stream: Stream, cell: Cell, joints: Sequence[str], drivers: Sequence[str]
+    ) -> None:
         self._stream = stream
+        self._drivers = drivers
         self._braking_rows = build_change_finder()
         # Joint and text of each active fault, by its number in the fault table.
         self._faults: dict[int, tuple[str, str]] = {}
@@ -227,11 +237,20 @@ class MarkWriter:
     def write(self, block: RowBlock) -> None:
         """Mark all joints when the brakes engage, and clear the marks when they are released."""
         braked = block.messages["braked"]
-        for row in self._braking_rows(braked):
-            texts = dict.fromkeys(self._joints, "") if braked[row] else {}
-            if texts:
-                texts[list(texts)[-1]] = "brakes engaged"
-            self._write_marks(block.find_moment(row), BRAKES, texts)
+        for row in np.union1d(self._braking_rows(braked), np.flatnonzero(block.resumed)):
+            self._mark_brakes(block.find_moment(row), "brakes engaged" if braked[row] else "")
+
+    def mark_lost(self, when: Moment, task: str) -> None:
+        """Mark all joints if the lost task drives the arm: without torque, the brakes engage."""
+        if task in self._drivers:
+            self._mark_brakes(when, f"brakes engaged: {task} is lost")
+
+    def _mark_brakes(self, when: Moment, text: str) -> None:
+        """Mark all joints and label the last one, or clear the marks if the text is empty."""
+        texts = dict.fromkeys(self._joints, "") if text else {}
+        if texts:
+            texts[list(texts)[-1]] = text
+        self._write_marks(when, BRAKES, texts)
 
     def mark_fault(self, when: Moment, event: Event) -> None:
         """Mark a joint when a fault begins, and clear the mark when it ends.

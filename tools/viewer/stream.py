@@ -142,13 +142,17 @@ class RowBlock:
         rows: The rows, shape (rows,).
         ticks: Release ticks, shape (rows,).
         stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
+        resumed: True for each row before which the writer was silent, shape (rows,).
     """
 
-    def __init__(self, rows: np.ndarray, timelines: Timelines) -> None:
+    def __init__(
+        self, rows: np.ndarray, timelines: Timelines, resumed: np.ndarray | None = None
+    ) -> None:
         stamp = "stamp_ns" if "stamp_ns" in (rows.dtype.names or ()) else "start_ns"
         self.rows = rows  # (rows,)
         self.ticks: Ints = rows["tick"].astype(np.int64)  # (rows,)
         self.stamps_ns: Ints = rows[stamp].astype(np.int64)  # (rows,), CLOCK_MONOTONIC
+        self.resumed = np.zeros(len(rows), bool) if resumed is None else resumed  # (rows,)
         self._timelines = timelines
 
     @cached_property
