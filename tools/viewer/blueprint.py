@@ -44,18 +44,15 @@ from rack.tools.viewer.levels import (
     compute_positions,
     list_value_lanes,
     name_lanes,
-    order_boards,
 )
-from rack.tools.viewer.stream import LOG, SIM_TIME, TICK, Stream, build_path
+from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, build_path
 from rack.tools.viewer.style import GRID, LEGEND, build_lanes_view, build_legend_view
 from rack.tools.viewer.timing import BOARDS, MISSED
 
 CONFIG = "config"
 DIMMED = rr.SeriesLines(colors=[0x9A9A9AFF])
 """Style of the curves of the first run in a comparison of two runs."""
-LOG_COLUMNS = rrb.TextLogColumns(
-    timeline_columns=[SIM_TIME, TICK], text_log_columns=["loglevel", "body"]
-)
+LOG_COLUMNS = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
 MAX_LANES = 9
 """Largest number of lanes below each other, so that none is cut off on a screen of 1080 lines."""
 STATUS_FIELDS = [field.name for field in Status.message_type.fields]
@@ -180,8 +177,8 @@ class RackViews:
         self._hand = None if cell is None else cell.hand
         self._joints = config.robot.joints if config.robot is not None and has_arm else ()
         self._timing = build_rack_timing(config, layout)
-        self._boards = order_boards(layout, self._timing)
         self._names = name_lanes(layout, self._timing)
+        self._boards = [name for name in self._names if "." not in name]
 
     def build_path(self, *entity: str) -> str:
         """Return the path of an entity of this rack in the recording."""
@@ -217,7 +214,7 @@ class RackViews:
                 self._build_age_plots(),
                 self._build_legend(timing.LOAD, "tasks", self._boards),
                 self._build_log_tabs(),
-                column_shares=[4, 4, 2, 6],
+                column_shares=[4, 4, 2, 8],
             ),
             row_shares=[4, 5, 3],
         )
@@ -260,7 +257,7 @@ class RackViews:
 
     def _build_event_lanes(self) -> rrb.Container:
         """Return views of the events and of the missed cycles of all tasks in the whole run."""
-        names = sorted(self._names.values(), key=lambda name: int(name.partition("-")[0]))
+        names = [*self._names.values()]
         events = [*names, *self._config.host, "clock", RACK_LANE]
         columns = [
             _build_lane_columns(title, [([self.build_path(group, name)], 1) for name in shown])
@@ -462,14 +459,10 @@ class RackViews:
         ]
         return plots[0] if len(plots) == 1 else rrb.Grid(*plots, name=name)
 
-    def _build_signal_plot(self) -> rrb.View:
-        """Return a plot of the numeric fields of all messages. Its legend contains their units."""
-        return _build_plot("all signals", [self.build_query(SIGNALS)], True)
-
     def _build_load_plots(self) -> rrb.Container | rrb.View:
         """Return plots of the used parts of time slices, and of lateness and execution times."""
         is_lockstep = self._config.clock.mode == "lockstep"
-        titles = ("execution, part of the cycle, %", "execution, ms")
+        titles = ("execution, % of cycle", "execution, ms")
         if not is_lockstep:
             titles = ("use of the time slice, %", "late and execution, ms")
         queries = (self.build_query(timing.LOAD), self.build_query(timing.TIMES))
@@ -487,7 +480,7 @@ class RackViews:
         return rrb.Tabs(
             _build_plot("age of messages, ms", sampled),
             _build_plot("age of plans, ms", plans),
-            self._build_signal_plot(),
+            self._build_unit_plots("signals", self._layout.mailboxes),
         )
 
     def _build_log_tabs(self) -> rrb.Container:

@@ -114,7 +114,7 @@ class EventWriter:
             # The task stopped some cycles before this was detected.
             self._losses.mark_lost(self._stream.times.estimate_moment(event.since), event.subject)
         elif event.code == "rejoined":
-            self._losses.mark_returned(when, board)
+            self._losses.mark_returned(board)
 
     def _write_lane(self, when: Moment, board: str, event: Event) -> None:
         """Write an event as the new state of its board's lane."""

@@ -221,20 +221,16 @@ def _name_states(rows: np.ndarray) -> np.ndarray:
     return np.asarray(names[indices])
 
 
-def order_boards(layout: Layout, rack: RackTiming) -> list[str]:
-    """Return all boards: those of the hierarchy from the top down, then the others."""
-    ranked = [board for rank in rack.ranks for board in rank]
-    return list(dict.fromkeys([*ranked, *(task.board for task in layout.tasks)]))
-
-
 def name_lanes(layout: Layout, rack: RackTiming) -> dict[str, str]:
-    """Return a dictionary from task to its name in lanes.
+    """Return a dictionary from task to its name in lanes, in the order of the lanes.
 
-    The viewer sorts lanes by name. The number of the board in the hierarchy precedes the name, so
-    that higher boards are above lower ones, and each executor is above its planner.
+    The viewer sorts lanes by name, so the name begins with the number of the board: those of the
+    hierarchy from the top down, then the others. Each executor is above its planner.
     """
-    boards = order_boards(layout, rack)
-    return {task.name: f"{boards.index(task.board) + 1}-{task.name}" for task in layout.tasks}
+    ranked = [board for rank in rack.ranks for board in rank]
+    boards = list(dict.fromkeys([*ranked, *(task.board for task in layout.tasks)])).index
+    tasks = sorted(layout.tasks, key=lambda task: boards(task.board))
+    return {task.name: f"{boards(task.board) + 1}-{task.name}" for task in tasks}
 
 
 def compute_positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:

@@ -7,10 +7,8 @@ from collections.abc import Container, Mapping
 from rack.tools.viewer.cell import MarkWriter
 from rack.tools.viewer.levels import LEVELS, Hierarchy
 from rack.tools.viewer.stream import Moment, Stream
-from rack.tools.viewer.style import STATES, style_lane, write_span
+from rack.tools.viewer.style import write_span
 from rack.tools.viewer.timing import CycleLane
-
-LOST = "lost"
 
 
 class LossWriter:
@@ -50,24 +48,13 @@ class LossWriter:
         if task not in self._names or task in self._lost:
             return
         self._lost.add(task)
-        self._cycles[task].mark(when, LOST)
-        self._hierarchy.add_change(when, task, LOST)
-        if "." not in task:
-            style_lane(self._stream, self._state_lane(task), STATES)
-            write_span(self._stream, when, self._state_lane(task), LOST)
+        self._cycles[task].mark_lost(when)
+        self._hierarchy.add_change(when, task, "lost")
+        if task in self._with_states:
+            write_span(self._stream, when, (LEVELS, self._names[task], "state"), "lost")
         if self._marks is not None:
             self._marks.mark_lost(when, task)
 
-    def mark_returned(self, when: Moment, task: str) -> None:
-        """End the marks of a task that no message and no cycle ends."""
-        if task not in self._lost:
-            return
-        self._lost.remove(task)
-        if not self._cycles[task].has_cycle(when.tick):
-            self._cycles[task].mark(when, "wait")
-        if "." not in task and task not in self._with_states:
-            write_span(self._stream, when, self._state_lane(task), "")
-
-    def _state_lane(self, board: str) -> tuple[str, str, str]:
-        """Return the lane with the state of a board's level."""
-        return (LEVELS, self._names[board], "state")
+    def mark_returned(self, task: str) -> None:
+        """Note that a task has returned, so that it can be lost again."""
+        self._lost.discard(task)

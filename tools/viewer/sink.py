@@ -50,7 +50,6 @@ from rack.tools.viewer.levels import (
     has_state,
     list_value_lanes,
     name_lanes,
-    order_boards,
 )
 from rack.tools.viewer.losses import LossWriter
 from rack.tools.viewer.parts import find_next_file
@@ -129,11 +128,11 @@ class RackWriter:
         }
         marks = None
         if ran.cell is not None:
-            write_geometry(stream, ran.cell)
+            arm = write_geometry(stream, ran.cell)
             goals = GoalWriter(stream, config.scene.bodies)
             assert config.robot is not None, "there is an arm"
             drivers = [box.writer for box in layout.mailboxes if box.message in DRIVING]
-            marks = MarkWriter(stream, ran.cell, config.robot.joints, drivers)
+            marks = MarkWriter(stream, ran.cell, config.robot.joints, drivers, arm)
             for box in layout.mailboxes:
                 if box.message in DRIVING:
                     parts_by_mailbox[box.name].append(marks.write)
@@ -141,7 +140,7 @@ class RackWriter:
         lockstep = config.clock.mode == "lockstep"
         # Traces measure real time, in which a tick has no fixed length in lockstep.
         tick_ns = layout.clock_ns if lockstep else config.tick_ns
-        boards = order_boards(layout, rack)
+        boards = [name for name in names if "." not in name]
         colours = choose_task_colours(layout, boards)
         write_legend(stream, LOAD, boards, [colours[board] for board in boards])
         self._hierarchy = Hierarchy(stream, layout, rack)

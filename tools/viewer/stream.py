@@ -329,7 +329,7 @@ class Stream:
         self._recording.log(self._build_path(entity), archetype)
 
     def log_line(self, when: Moment, source: str, text: str, level: str) -> None:
-        """Write a line to the log. If the recording has several racks, the rack's name is prefixed.
+        """Write a line and its tick to the log, after the rack's name if there are several racks.
 
         Args:
             when: Time of the line.
@@ -337,7 +337,7 @@ class Stream:
             text: The line.
             level: Log level of rerun, for example "WARN".
         """
-        line = rr.TextLog(": ".join((*self._root, text)), level=level)
+        line = rr.TextLog(": ".join((*self._root, f"tick {when.tick}", text)), level=level)
         self.log_at(when, (LOG, source), line)
 
     def log_property(self, name: str, values: rr.AsComponents) -> None:

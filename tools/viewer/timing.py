@@ -86,26 +86,17 @@ class CycleLane:
         self._ticks = np.concatenate((self._ticks[-1:], block.ticks))
         self._ends = np.concatenate((self._ends[-1:], ends))
 
-    def has_cycle(self, tick: int) -> bool:
-        """Return whether the newest block has a cycle that was released at this tick."""
-        return tick in self._ticks
-
-    def mark(self, when: Moment, state: str) -> None:
-        """Write a state that begins at a moment, but not before the end of the previous cycle."""
+    def mark_lost(self, when: Moment) -> None:
+        """Write the state "lost", which the next cycle ends, but only after the previous cycle."""
         times = self._stream.times
         ended = self._ends[self._ticks <= when.tick]
         within = max(0, int(ended[-1]) + 1 - when.tick * times.clock_ns) if len(ended) else 0
         columns = times.build_columns(np.array([when.tick]), np.array([when.stamp_ns]), within)
-        write_spans(self._stream, self._lane, columns, [state])
+        write_spans(self._stream, self._lane, columns, ["lost"])
 
 
 def choose_task_colours(layout: Layout, boards: Sequence[str]) -> dict[str, Colour]:
-    """Return a dictionary from task to colour. A planner has the dimmed colour of its board.
-
-    Args:
-        layout: Layout of the rack.
-        boards: All boards, in the order of the legend.
-    """
+    """Return a dictionary from task to colour. A planner has the dimmed colour of its board."""
     by_task = {task.name: choose_joint_colour(boards.index(task.board)) for task in layout.tasks}
     return {name: dim_colour(colour) if "." in name else colour for name, colour in by_task.items()}
 
