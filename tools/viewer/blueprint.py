@@ -55,6 +55,8 @@ DIMMED = rr.SeriesLines(colors=[0x9A9A9AFF])
 LOG_COLUMNS = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
 MAX_LANES = 9
 """Largest number of lanes below each other, so that none is cut off on a screen of 1080 lines."""
+MAX_GRID = 4
+"""Largest number of plots of signals that are shown side by side. More are shown as tabs."""
 STATUS_FIELDS = [field.name for field in Status.message_type.fields]
 """Fields of every status, which are shown as lanes and log lines."""
 CYCLES = "boards, cycle by cycle: R read, X process, P plan, W write"
@@ -450,14 +452,16 @@ class RackViews:
         by_unit: dict[str, list[str]] = {}
         for box in mailboxes:
             for field in filter(has_curves, box.fields):
-                if field.name not in STATUS_FIELDS:
+                if field.name not in STATUS_FIELDS and not field.values:
                     paths = by_unit.setdefault(get_plotted_unit(field), [])
                     paths.append(self.build_path(SIGNALS, box.name, field.name))
         plots = [
             _build_plot(f"{name}, {unit}" if unit else name, paths, True)
             for unit, paths in by_unit.items()
         ]
-        return plots[0] if len(plots) == 1 else rrb.Grid(*plots, name=name)
+        if len(plots) == 1:
+            return plots[0]
+        return (rrb.Grid if len(plots) <= MAX_GRID else rrb.Tabs)(*plots, name=name)
 
     def _build_load_plots(self) -> rrb.Container | rrb.View:
         """Return plots of the used parts of time slices, and of lateness and execution times."""
