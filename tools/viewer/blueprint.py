@@ -468,7 +468,7 @@ class RackViews:
         is_lockstep = self._config.clock.mode == "lockstep"
         titles = ("execution, % of cycle", "execution, ms")
         if not is_lockstep:
-            titles = ("use of the time slice, %", "late and execution, ms")
+            titles = ("slice used, %", "late and execution, ms")
         queries = (self.build_query(timing.LOAD), self.build_query(timing.TIMES))
         plots = [_build_plot(*plot) for plot in zip(titles, ([q] for q in queries), strict=True)]
         return rrb.Tabs(*plots, active_tab=0)
@@ -482,8 +482,8 @@ class RackViews:
         plans = [self.build_path(timing.AGES, name) for name in boxes if name.endswith(".plan")]
         sampled = [self.build_query(timing.AGES), *(f"- {plan}" for plan in plans)]
         return rrb.Tabs(
-            _build_plot("age of messages, ms", sampled),
-            _build_plot("age of plans, ms", plans),
+            _build_plot("message age, ms", sampled),
+            _build_plot("plan age, ms", plans),
             self._build_unit_plots("signals", self._layout.mailboxes),
         )
 

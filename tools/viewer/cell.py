@@ -61,6 +61,7 @@ On a straight line in joint space the tool moves along a curve, so the path is d
 pieces.
 """
 POINT_M = 0.008
+LABEL = 0xFFFFFFFF
 LINE_M = 0.003
 BRAKES = (CELL, "brakes")
 FAULTS = (CELL, "faults")
@@ -272,25 +273,26 @@ class MarkWriter:
         for entity, name in ((BRAKES, joints[-1]), *(((*FAULTS, name), name) for name in joints)):
             body = int(cell.model.joint(name).bodyid[0])
             stream.log_static(entity, stream.build_frame(name_frame(cell.model, body)))
-        self._mark_brakes(stream.times.estimate_moment(0), "")
+        self.mark_brakes(stream.times.estimate_moment(0), "")
 
     def write(self, block: RowBlock) -> None:
         """Colour the arm red when the brakes engage, and as before when they are released."""
         braked = block.messages["braked"]
         for row in np.union1d(self._braking_rows(braked), np.flatnonzero(block.resumed)):
-            self._mark_brakes(block.find_moment(row), "brakes engaged" if braked[row] else "")
+            self.mark_brakes(block.find_moment(row), "brakes engaged" if braked[row] else "")
 
     def mark_lost(self, when: Moment, task: str) -> None:
         """Colour the arm red if the lost task drives it: without torque, the brakes engage."""
         if task in self._drivers:
-            self._mark_brakes(when, f"brakes engaged: {task} is lost")
+            self.mark_brakes(when, f"brakes engaged: {task} is lost")
 
-    def _mark_brakes(self, when: Moment, text: str) -> None:
+    def mark_brakes(self, when: Moment, text: str) -> None:
         """Colour the arm red and label its last joint, or undo both if the text is empty."""
         for entity, shape, colour in self._arm:
             self._stream.log_at(when, entity, colour_shape(shape, LOST if text else colour))
         place = [list(self._joints.values())[-1]] if text else []
-        label = rr.Points3D(place, radii=POINT_M, labels=[text] if text else None)
+        labels = [text] if text else None
+        label = rr.Points3D(place, radii=POINT_M, colors=[LABEL], labels=labels)
         self._stream.log_at(when, BRAKES, label)
 
     def mark_fault(self, when: Moment, event: Event) -> None:

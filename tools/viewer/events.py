@@ -16,7 +16,6 @@ import rerun as rr
 from rack.boards.events import Event
 from rack.tools.recording.checksums import parse_checked_line
 from rack.tools.viewer.cell import MarkWriter
-from rack.tools.viewer.losses import LossWriter
 from rack.tools.viewer.stream import Moment, Stream
 from rack.tools.viewer.style import EVENT_COLOURS, LOST, style_curves, style_lane, write_span
 
@@ -26,6 +25,8 @@ KINDS_WITHOUT_LANE = ("printed", "miss")
 """Kinds of events without a lane. Misses have a separate lane next to their board's level."""
 CAUSE_ORDER = ("command", "fault", "died", "miss", "detection", "reaction", "recovery")
 """Kinds of events of the same tick, in the order of cause and effect. Other kinds follow."""
+BRAKES = {"brakes_closed": "brakes engaged", "brakes_opened": ""}
+"""Label of the arm by code of an event."""
 RACK_LANE = "rack"
 """Lane of events that belong to no board."""
 LOG_LEVELS = {
@@ -43,13 +44,13 @@ LOG_LEVELS = {
 class EventWriter:
     """Follows events.jsonl during a run, and writes each new event to the view.
 
-    Lost tasks are also shown in other lanes, and with `marks` faults are also shown in 3D.
+    Faults, brakes and lost tasks are also shown in other views.
 
     Args:
         stream: Stream to write to.
         path: Path of events.jsonl.
         names: Dictionary from task to its name in lanes.
-        losses: Writer of lost tasks.
+        mark_lost: Function that shows the loss of a task, given when it was noticed.
         marks: Writer of marks in 3D, or None without an arm.
     """
 
@@ -58,13 +59,14 @@ class EventWriter:
         stream: Stream,
         path: Path,
         names: Mapping[str, str],
-        losses: LossWriter,
+        mark_lost: Callable[[Moment, str], None],
         marks: MarkWriter | None,
     ) -> None:
         self._stream = stream
         self._path = path
         self._names = names
-        self._losses = losses
+        self._mark_lost = mark_lost
+        self._lost: set[str] = set()
         self._marks = marks
         self._read = 0
         self._waiting: list[Event] = []
@@ -108,13 +110,15 @@ class EventWriter:
             self._write_lane(when, board, event)
         if event.kind == "fault" and self._marks is not None:
             self._marks.mark_fault(when, event)
-        if event.kind == "died":
-            self._losses.mark_lost(when, board)
-        elif event.code == "hang":
-            # The task stopped some cycles before this was detected.
-            self._losses.mark_lost(self._stream.times.estimate_moment(event.since), event.subject)
+        if event.code in BRAKES and self._marks is not None:
+            self._marks.mark_brakes(when, BRAKES[event.code])
+        lost = board if event.kind == "died" else event.subject if event.code == "hang" else ""
+        # A task that hangs is killed later, but is lost only once.
+        if lost in self._names.keys() - self._lost:
+            self._lost.add(lost)
+            self._mark_lost(when, lost)
         elif event.code == "rejoined":
-            self._losses.mark_returned(board)
+            self._lost.discard(board)
 
     def _write_lane(self, when: Moment, board: str, event: Event) -> None:
         """Write an event as the new state of its board's lane."""

@@ -43,6 +43,7 @@ from rack.tools.viewer.forces import (
 from rack.tools.viewer.hand import build_hand_curves
 from rack.tools.viewer.levels import (
     FIRED,
+    LEVELS,
     Hierarchy,
     build_error_lines,
     build_fired_lines,
@@ -51,10 +52,9 @@ from rack.tools.viewer.levels import (
     list_value_lanes,
     name_lanes,
 )
-from rack.tools.viewer.losses import LossWriter
 from rack.tools.viewer.parts import find_next_file
-from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, open_recording
-from rack.tools.viewer.style import write_legend
+from rack.tools.viewer.stream import Moment, RowBlock, Stream, Timelines, ViewPart, open_recording
+from rack.tools.viewer.style import write_legend, write_span
 from rack.tools.viewer.timing import (
     LOAD,
     AgeWriter,
@@ -172,8 +172,18 @@ class RackWriter:
         self._periods |= {box.name: box.every for box in layout.mailboxes}
         self._last_ticks: dict[str, int] = {}  # tick of the last row of each ring
         with_states = {box.writer for box in layout.mailboxes if has_state(box)}
-        losses = LossWriter(stream, names, cycles, self._hierarchy, marks, with_states)
-        self._events = EventWriter(stream, ran.events, names, losses, marks)
+
+        def mark_lost(noticed: Moment, task: str) -> None:
+            """Show a lost task in lanes, in the hierarchy and at the arm, until its next row."""
+            when = cycles[task].find_loss(noticed)
+            cycles[task].mark_lost(when)
+            self._hierarchy.add_change(when, task, "lost")
+            if task in with_states:
+                write_span(stream, when, (LEVELS, names[task], "state"), "lost")
+            if marks is not None:
+                marks.mark_lost(when, task)
+
+        self._events = EventWriter(stream, ran.events, names, mark_lost, marks)
         self._write_losses = build_loss_writer(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 

@@ -60,6 +60,7 @@ class CycleLane:
     ) -> None:
         self._stream = stream
         self._lane = (BOARDS, board, task.role)
+        self._every = task.every
         self._last_ns = task.slice * stream.times.clock_ns - len(MOMENTS)
         self._work = "process" if task.role == "executor" else "plan"
         self._speed = speed
@@ -85,6 +86,16 @@ class CycleLane:
         ends = block.ticks * self._stream.times.clock_ns + within[:, -1]
         self._ticks = np.concatenate((self._ticks[-1:], block.ticks))
         self._ends = np.concatenate((self._ends[-1:], ends))
+
+    def find_loss(self, when: Moment) -> Moment:
+        """Return when a task was lost, given when this was noticed.
+
+        If it was noticed late, the task was already lost at the release after its last cycle.
+        """
+        cycles = self._ticks[self._ticks <= when.tick]
+        if not len(cycles) or (missed := int(cycles[-1]) + self._every) >= when.tick:
+            return when
+        return self._stream.times.estimate_moment(missed)
 
     def mark_lost(self, when: Moment) -> None:
         """Write the state "lost", which the next cycle ends, but only after the previous cycle."""
