@@ -101,7 +101,7 @@ def list_corners(cell: Cell, data: mujoco.MjData, is_drawn: Array) -> Array:
         The corners in m, shape (n, 3).
     """
     model = cell.model
-    # What is fixed and much larger than the arm is a floor or a wall.
+    # A fixed geom that is much larger than the arm is a floor or a wall.
     size = np.linalg.norm(np.ptp(data.geom_xpos[cell.geoms.arm], axis=0))
     is_large = (model.body_weldid[model.geom_bodyid] == 0) & (model.geom_rbound > 1.5 * size)
     is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
