@@ -47,11 +47,11 @@ def test_the_report_counts_the_rows_that_fired(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_the_viewer_has_a_lane_of_rows_and_a_line_a_change(folder: Path) -> None:
-    states = read_component(folder / "run.rrd", "/levels/counter/row", "StateChange:state")
+    states = read_component(folder / "run.rrd", "/levels/1-counter/row", "StateChange:state")
     lines = read_component(folder / "run.rrd", "/log/rows", "TextLog:text")
     assert states.ticks.tolist() == [0, 40, 44, 60, 64]
     rows = ["3 count up", "4 turn", "5 count down", "3 settle", "4 rest"]
     assert [str(value) for value in states.values.ravel()] == rows
-    assert "counter: row 4 'turn', now in 'down', table saw" in {
+    assert "tick 40: counter: row 4 'turn', now in 'down', table saw" in {
         str(value) for value in lines.values.ravel()
     }

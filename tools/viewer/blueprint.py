@@ -12,6 +12,7 @@ from rerun.blueprint.components import PlayState
 from rerun.encodings import EntityPathLike
 
 from rack.backplane.layout import Layout, MailboxSpec
+from rack.backplane.message import Message, Status
 from rack.boards.config import RackConfig, build_rack_timing
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
@@ -29,19 +30,35 @@ from rack.tools.viewer.curves import (
     QUANTITIES,
     SIGNALS,
     find_gripper_units,
+    get_plotted_unit,
+    has_curves,
 )
-from rack.tools.viewer.events import EVENTS, RECORDER
+from rack.tools.viewer.events import EVENTS, RACK_LANE, RECORDER
 from rack.tools.viewer.forces import AXES, CONTACT, CONTACT_UNITS, FORCES, TASK
 from rack.tools.viewer.hand import BY_FINGER, HAND, TENSIONS, TIPS
-from rack.tools.viewer.levels import COLUMN, HIERARCHY, LEVELS, ROW, compute_positions
+from rack.tools.viewer.levels import (
+    COLUMN,
+    HIERARCHY,
+    LEVELS,
+    ROW,
+    compute_positions,
+    list_value_lanes,
+    name_lanes,
+)
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, build_path
 from rack.tools.viewer.style import GRID, LEGEND, build_lanes_view, build_legend_view
-from rack.tools.viewer.timing import BOARDS, list_boards
+from rack.tools.viewer.timing import BOARDS, MISSED
 
 CONFIG = "config"
 DIMMED = rr.SeriesLines(colors=[0x9A9A9AFF])
 """Style of the curves of the first run in a comparison of two runs."""
 LOG_COLUMNS = rrb.TextLogColumns(timeline_columns=[SIM_TIME], text_log_columns=["loglevel", "body"])
+MAX_LANES = 9
+"""Largest number of lanes below each other, so that none is cut off on a screen of 1080 lines."""
+MAX_GRID = 4
+"""Largest number of plots of signals that are shown side by side. More are shown as tabs."""
+STATUS_FIELDS = [field.name for field in Status.message_type.fields]
+"""Fields of every status, which are shown as lanes and log lines."""
 CYCLES = "boards, cycle by cycle: R read, X process, P plan, W write"
 CYCLES_S = 0.022
 """Time shown before and after the cursor in the lanes of cycles: several cycles of most boards."""
@@ -161,6 +178,9 @@ class RackViews:
         )
         self._hand = None if cell is None else cell.hand
         self._joints = config.robot.joints if config.robot is not None and has_arm else ()
+        self._timing = build_rack_timing(config, layout)
+        self._names = name_lanes(layout, self._timing)
+        self._boards = [name for name in self._names if "." not in name]
 
     def build_path(self, *entity: str) -> str:
         """Return the path of an entity of this rack in the recording."""
@@ -172,10 +192,12 @@ class RackViews:
 
     def build_all_views(self, name: str | None = None) -> rrb.Container:
         """Return a container, titled `name`, with all views of the rack."""
-        level_lanes = build_lanes_view(
-            "levels and events, whole run", [self.build_query(EVENTS), self.build_query(LEVELS)]
+        below = rrb.Tabs(
+            self._build_level_lanes("levels, whole run"),
+            self._build_event_lanes(),
+            self._build_graph(),
+            active_tab=0,
         )
-        below = rrb.Tabs(level_lanes, self._build_graph(), active_tab=0)
         left: rrb.Container = below
         if self._cell is not None:
             left = rrb.Vertical(self._build_scene(self._cell, "cell"), below, row_shares=[11, 9])
@@ -185,16 +207,16 @@ class RackViews:
         elif self._joints:
             curves = self._build_arm_plots()
         else:
-            curves = self._build_signal_plot()
+            curves = self._build_unit_plots("signals", self._layout.mailboxes)
         right = rrb.Vertical(
             curves,
-            build_lanes_view(CYCLES, [self.build_query(BOARDS)], CYCLES_S),
+            self._build_cycle_lanes(),
             rrb.Horizontal(
                 self._build_load_plots(),
                 self._build_age_plots(),
-                self._build_legend(timing.LOAD, "tasks", list_boards(self._layout)),
+                self._build_legend(timing.LOAD, "tasks", self._boards),
                 self._build_log_tabs(),
-                column_shares=[4, 4, 2, 6],
+                column_shares=[4, 4, 2, 8],
             ),
             row_shares=[4, 5, 3],
         )
@@ -220,10 +242,39 @@ class RackViews:
 
     def build_column(self, name: str) -> rrb.Container | rrb.View:
         """Return a column for a view of several racks: the cell, if any, above the level lanes."""
-        levels = build_lanes_view(f"{name}: levels", [self.build_query(LEVELS)])
+        levels = self._build_level_lanes(f"{name}: levels")
         if self._cell is None:
             return levels
         return rrb.Vertical(self._build_scene(self._cell, name), levels, row_shares=[5, 4])
+
+    def _build_level_lanes(self, name: str) -> rrb.Container | rrb.View:
+        """Return views of the states, moves and commands of all levels in the whole run."""
+        lanes: list[tuple[list[str], int]] = []
+        others = {box.name.partition(".")[0] for box in self._layout.mailboxes} - {*self._boards}
+        for board in (*self._boards, *sorted(others)):
+            boxes = [box for box in self._layout.mailboxes if box.name.startswith(f"{board}.")]
+            count = sum(len([*list_value_lanes(box)]) for box in boxes)
+            lanes.append(([self.build_query(LEVELS, self._names.get(board, board))], count))
+        return _build_lane_columns(name, lanes)
+
+    def _build_event_lanes(self) -> rrb.Container:
+        """Return views of the events and of the missed cycles of all tasks in the whole run."""
+        names = [*self._names.values()]
+        events = [*names, *self._config.host, "clock", RACK_LANE]
+        columns = [
+            _build_lane_columns(title, [([self.build_path(group, name)], 1) for name in shown])
+            for title, group, shown in (("events", EVENTS, events), ("missed", MISSED, names))
+        ]
+        return rrb.Horizontal(*columns, name="events and missed cycles")
+
+    def _build_cycle_lanes(self) -> rrb.Container | rrb.View:
+        """Return views of the cycles of all tasks around the time cursor."""
+        tasks = [task.board for task in self._layout.tasks]
+        lanes = [
+            ([self.build_query(BOARDS, self._names[board])], tasks.count(board))
+            for board in self._boards
+        ]
+        return _build_lane_columns(CYCLES, lanes, CYCLES_S)
 
     def _build_scene(self, cell: Cell, name: str) -> rrb.View:
         """Return the 3D view of the cell with the title `name`. Collision shapes are hidden."""
@@ -256,7 +307,9 @@ class RackViews:
             )
             for plot, quantity in zip(plots, QUANTITIES, strict=True)
         ]
+        own = self._list_own_mailboxes()
         other_plots = rrb.Tabs(
+            *([self._build_unit_plots("own signals", own)] if own else []),
             *self._build_request_plots(),
             *self._build_force_plots(),
             error,
@@ -370,17 +423,55 @@ class RackViews:
         ]
         return _build_plot(f"{name}, {QUANTITIES[quantity]}", entities)
 
-    def _build_signal_plot(self) -> rrb.View:
-        """Return a plot of the numeric fields of all messages. Its legend contains their units."""
-        return _build_plot("signals", [self.build_query(SIGNALS)], True)
+    def _list_own_mailboxes(self) -> list[MailboxSpec]:
+        """Return the mailboxes of the user's levels whose messages this package does not know."""
+        own = {
+            task.name for task in self._config.list_tasks() if not task.target.startswith("rack.")
+        }
+        classes: list[type[Message]] = [Message]
+        for message in classes:
+            classes += message.__subclasses__()  # the loop continues with them
+        known = {
+            message.message_type.name
+            for message in classes
+            if message.__module__.startswith("rack.")
+        }
+        return [
+            box for box in self._layout.mailboxes if box.writer in own and box.message not in known
+        ]
+
+    def _build_unit_plots(
+        self, name: str, mailboxes: Sequence[MailboxSpec]
+    ) -> rrb.Container | rrb.View:
+        """Return plots of the numbers in messages, one for each unit, with legends.
+
+        Args:
+            name: Title of the view, and beginning of the titles of plots.
+            mailboxes: The mailboxes.
+        """
+        by_unit: dict[str, list[str]] = {}
+        for box in mailboxes:
+            for field in filter(has_curves, box.fields):
+                if field.name not in STATUS_FIELDS and not field.values:
+                    paths = by_unit.setdefault(get_plotted_unit(field), [])
+                    paths.append(self.build_path(SIGNALS, box.name, field.name))
+        plots = [
+            _build_plot(f"{name}, {unit}" if unit else name, paths, True)
+            for unit, paths in by_unit.items()
+        ]
+        if len(plots) == 1:
+            return plots[0]
+        return (rrb.Grid if len(plots) <= MAX_GRID else rrb.Tabs)(*plots, name=name)
 
     def _build_load_plots(self) -> rrb.Container | rrb.View:
-        """Return plots of execution times and, in real time, of the used parts of time slices."""
-        times = self.build_query(timing.TIMES)
-        if self._config.clock.mode == "lockstep":
-            return _build_plot("execution, ms", [times])
-        use = _build_plot("use of the time slice, %", [self.build_query(timing.LOAD)])
-        return rrb.Tabs(use, _build_plot("late and execution, ms", [times]))
+        """Return plots of the used parts of time slices, and of lateness and execution times."""
+        is_lockstep = self._config.clock.mode == "lockstep"
+        titles = ("execution, % of cycle", "execution, ms")
+        if not is_lockstep:
+            titles = ("slice used, %", "late and execution, ms")
+        queries = (self.build_query(timing.LOAD), self.build_query(timing.TIMES))
+        plots = [_build_plot(*plot) for plot in zip(titles, ([q] for q in queries), strict=True)]
+        return rrb.Tabs(*plots, active_tab=0)
 
     def _build_age_plots(self) -> rrb.Container:
         """Return tabs with plots of message ages, plan ages and all signals.
@@ -391,9 +482,9 @@ class RackViews:
         plans = [self.build_path(timing.AGES, name) for name in boxes if name.endswith(".plan")]
         sampled = [self.build_query(timing.AGES), *(f"- {plan}" for plan in plans)]
         return rrb.Tabs(
-            _build_plot("age of messages, ms", sampled),
-            _build_plot("age of plans, ms", plans),
-            self._build_signal_plot(),
+            _build_plot("message age, ms", sampled),
+            _build_plot("plan age, ms", plans),
+            self._build_unit_plots("signals", self._layout.mailboxes),
         )
 
     def _build_log_tabs(self) -> rrb.Container:
@@ -406,9 +497,7 @@ class RackViews:
 
     def _build_graph(self) -> rrb.View:
         """Return the view of the hierarchy of levels as a graph."""
-        places = compute_positions(
-            self._layout, build_rack_timing(self._config, self._layout)
-        ).values()
+        places = compute_positions(self._layout, self._timing).values()
         columns, rows = zip(*places, strict=True)
         bounds = rrb.VisualBounds2D(
             x_range=(min(columns) - 0.6 * COLUMN, max(columns) + 0.6 * COLUMN),
@@ -417,6 +506,30 @@ class RackViews:
         return rrb.GraphView(
             origin=self.build_path(HIERARCHY), name="hierarchy", visual_bounds=bounds
         )
+
+
+def _build_lane_columns(
+    name: str, lanes: Sequence[tuple[list[str], int]], around_s: float | None = None
+) -> rrb.Container | rrb.View:
+    """Return a view of lanes, or several side by side if one could not show all of them.
+
+    Args:
+        name: Title of the views.
+        lanes: Queries and largest number of lanes of each board, in the order of the lanes.
+        around_s: See `build_lanes_view`.
+    """
+    total = sum(count for _, count in lanes)
+    columns = max(1, -(-total // MAX_LANES))
+    contents: list[list[str]] = [[]]
+    shown = 0
+    for queries, count in lanes:
+        # Begin a column where its share of the lanes is reached, but keep each board together.
+        if shown + count / 2 > len(contents) * total / columns:
+            contents.append([])
+        contents[-1] += queries
+        shown += count
+    views = [build_lanes_view(name, queries, around_s) for queries in contents]
+    return views[0] if len(views) == 1 else rrb.Horizontal(*views, name=name)
 
 
 def _build_plot(

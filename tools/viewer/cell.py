@@ -1,15 +1,18 @@
 """Writes the cell in 3D: geoms, poses of moving bodies, pushes, planned path and goals.
 
-Balls mark engaged brakes and faults. Each geom is written only once, in the frame of its body.
+The arm is red while its brakes are engaged, and balls mark faults. Each geom is written only once,
+in the frame of its body.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
 from rack.boards.events import Event
 from rack.levels.algebra import Array, Ints
@@ -18,7 +21,14 @@ from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import view_state
 from rack.tools.viewer.forces import list_contacts
 from rack.tools.viewer.levels import format_enum
-from rack.tools.viewer.shapes import build_shape, convert_to_xyzw
+from rack.tools.viewer.shapes import (
+    Shape,
+    build_shape,
+    colour_shape,
+    convert_to_xyzw,
+    read_colour,
+    remove_colour,
+)
 from rack.tools.viewer.stream import (
     Moment,
     RowBlock,
@@ -51,6 +61,7 @@ On a straight line in joint space the tool moves along a curve, so the path is d
 pieces.
 """
 POINT_M = 0.008
+LABEL = 0xFFFFFFFF
 LINE_M = 0.003
 BRAKES = (CELL, "brakes")
 FAULTS = (CELL, "faults")
@@ -92,8 +103,26 @@ def find_moving_bodies(model: mujoco.MjModel) -> Ints:
     return np.flatnonzero(moves)
 
 
-def write_geometry(stream: Stream, cell: Cell) -> None:
-    """Write everything that never changes: geoms, poses of fixed bodies, and the world's axes."""
+class ArmShape(NamedTuple):
+    """A shape of the arm.
+
+    Attributes:
+        entity: Its entity in the recording.
+        shape: The shape without its colour.
+        colour: Red, green, blue and alpha while the brakes are released.
+    """
+
+    entity: tuple[str, ...]
+    shape: Shape
+    colour: NDArray[np.uint8]
+
+
+def write_geometry(stream: Stream, cell: Cell) -> list[ArmShape]:
+    """Write everything that never changes: geoms, poses of fixed bodies, and the world's axes.
+
+    Returns:
+        The visible shapes of the arm, whose colours are still to be written.
+    """
     model = cell.model
     data = cell.build_start_data()
     stream.log_static((CELL,), stream.build_frame(WORLD))
@@ -111,6 +140,7 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
     is_shown = model.geom_group < SHOWN_GROUPS
     if not is_shown.any():
         is_shown[:] = True
+    arm = []
     for geom in range(model.ngeom):
         shape = build_shape(model, geom)
         if shape is not None:
@@ -118,6 +148,9 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
             name = model.geom(geom).name or f"geom {geom}"
             group = (CELL,) if is_shown[geom] else (CELL, COLLISION)
             entity = (*group, model.body(body).name or f"body {body}", name)
+            if geom in cell.geoms.arm:
+                remove_colour(shape)
+                arm.append(ArmShape(entity, shape, read_colour(model, geom)))
             stream.log_static(entity, shape, stream.build_frame(name_frame(model, body)))
     for body in set(range(1, model.nbody)) - set(find_moving_bodies(model).tolist()):
         name = name_frame(model, body)
@@ -128,6 +161,7 @@ def write_geometry(stream: Stream, cell: Cell) -> None:
             child_frame=stream.format_frame(name),
         )
         stream.log_static((FRAMES, name), pose)
+    return arm
 
 
 class PoseWriter:
@@ -210,28 +244,56 @@ class PoseWriter:
 
 
 class MarkWriter:
-    """Marks joints with red balls while the brakes are engaged or a fault is active."""
+    """Colours the arm red while its brakes are engaged, and marks faults with red balls at joints.
 
-    def __init__(self, stream: Stream, cell: Cell, joints: Sequence[str]) -> None:
+    Args:
+        stream: Stream to write to.
+        cell: Cell of the arm.
+        joints: Names of the joints.
+        drivers: Tasks that drive the arm.
+        arm: Shapes of the arm.
+    """
+
+    def __init__(
+        self,
+        stream: Stream,
+        cell: Cell,
+        joints: Sequence[str],
+        drivers: Sequence[str],
+        arm: Sequence[ArmShape],
+    ) -> None:
         self._stream = stream
+        self._drivers = drivers
+        self._arm = arm
         self._braking_rows = build_change_finder()
         # Joint and text of each active fault, by its number in the fault table.
         self._faults: dict[int, tuple[str, str]] = {}
         self._joints = {name: cell.model.joint(name).pos for name in joints}
         self._radius = MARK_PART * compute_extent(cell)[1]
-        for name in joints:
+        for entity, name in ((BRAKES, joints[-1]), *(((*FAULTS, name), name) for name in joints)):
             body = int(cell.model.joint(name).bodyid[0])
-            for group in (BRAKES, FAULTS):
-                stream.log_static((*group, name), stream.build_frame(name_frame(cell.model, body)))
+            stream.log_static(entity, stream.build_frame(name_frame(cell.model, body)))
+        self.mark_brakes(stream.times.estimate_moment(0), "")
 
     def write(self, block: RowBlock) -> None:
-        """Mark all joints when the brakes engage, and clear the marks when they are released."""
+        """Colour the arm red when the brakes engage, and as before when they are released."""
         braked = block.messages["braked"]
-        for row in self._braking_rows(braked):
-            texts = dict.fromkeys(self._joints, "") if braked[row] else {}
-            if texts:
-                texts[list(texts)[-1]] = "brakes engaged"
-            self._write_marks(block.find_moment(row), BRAKES, texts)
+        for row in np.union1d(self._braking_rows(braked), np.flatnonzero(block.resumed)):
+            self.mark_brakes(block.find_moment(row), "brakes engaged" if braked[row] else "")
+
+    def mark_lost(self, when: Moment, task: str) -> None:
+        """Colour the arm red if the lost task drives it: without torque, the brakes engage."""
+        if task in self._drivers:
+            self.mark_brakes(when, f"brakes engaged: {task} is lost")
+
+    def mark_brakes(self, when: Moment, text: str) -> None:
+        """Colour the arm red and label its last joint, or undo both if the text is empty."""
+        for entity, shape, colour in self._arm:
+            self._stream.log_at(when, entity, colour_shape(shape, LOST if text else colour))
+        place = [list(self._joints.values())[-1]] if text else []
+        labels = [text] if text else None
+        label = rr.Points3D(place, radii=POINT_M, colors=[LABEL], labels=labels)
+        self._stream.log_at(when, BRAKES, label)
 
     def mark_fault(self, when: Moment, event: Event) -> None:
         """Mark a joint when a fault begins, and clear the mark when it ends.
@@ -247,22 +309,12 @@ class MarkWriter:
             self._faults[event.fault] = joint, f"fault of {event.board}: {text}"
         else:
             self._faults.pop(event.fault, None)
-        self._write_marks(when, FAULTS, dict(self._faults.values()))
-
-    def _write_marks(self, when: Moment, group: tuple[str, str], texts: dict[str, str]) -> None:
-        """Write the current marks, and clear those of all other joints.
-
-        Args:
-            when: Time from which they are shown.
-            group: Parent entity of the marks, `BRAKES` or `FAULTS`.
-            texts: Dictionary from each marked joint to its label, "" for a mark without a label.
-        """
+        texts = dict(self._faults.values())
         for name, place in self._joints.items():
-            text = texts.get(name)
-            places = [] if text is None else [place]
-            labels = [text] if text else None
+            labels = [texts[name]] if name in texts else None
+            places = [place] if labels else []
             balls = rr.Points3D(places, radii=self._radius, colors=[LOST], labels=labels)
-            self._stream.log_at(when, (*group, name), balls)
+            self._stream.log_at(when, (*FAULTS, name), balls)
 
 
 def compute_extent(cell: Cell) -> tuple[Array, float]:

@@ -9,7 +9,7 @@ from math import prod
 import mujoco
 import numpy as np
 
-from rack.backplane.layout import MailboxSpec
+from rack.backplane.layout import FieldSpec, MailboxSpec
 from rack.levels.algebra import Array
 from rack.levels.robot.cell import Cell
 from rack.tools.viewer.stream import RowBlock, Stream, ViewPart
@@ -132,14 +132,23 @@ def build_field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPar
 
     This works for any message, so messages of the user's levels need no configuration.
     """
-    for field in mailbox.fields:
-        if field.fields or field.kind[1] not in "iufb" or not 0 < prod(field.shape) <= MAX_CURVES:
-            continue
-        unit = "" if field.unit in ("", "1") else f", {field.unit}"
+    for field in filter(has_curves, mailbox.fields):
+        unit = f", {unit}" if (unit := get_plotted_unit(field)) else ""
         places = [f"[{position}]" for position in range(prod(field.shape))] if field.shape else [""]
         names = [f"{mailbox.name}.{field.name}{place}{unit}" for place in places]
         entity = (SIGNALS, mailbox.name, field.name)
         yield build_curves(stream, entity, partial(_flatten_field, field.name), names)
+
+
+def has_curves(field: FieldSpec) -> bool:
+    """Return whether the numbers of a field are shown as curves."""
+    is_numeric = not field.fields and field.kind[1] in "iufb"
+    return is_numeric and 0 < prod(field.shape) <= MAX_CURVES
+
+
+def get_plotted_unit(field: FieldSpec) -> str:
+    """Return the unit of a field as text, empty for a number without a unit."""
+    return "" if field.unit == "1" else field.unit
 
 
 def _flatten_field(field: str, block: RowBlock) -> Array:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,6 @@ import rerun as rr
 from rack.boards.events import Event
 from rack.tools.recording.checksums import parse_checked_line
 from rack.tools.viewer.cell import MarkWriter
-from rack.tools.viewer.levels import Hierarchy
 from rack.tools.viewer.stream import Moment, Stream
 from rack.tools.viewer.style import EVENT_COLOURS, LOST, style_curves, style_lane, write_span
 
@@ -24,6 +23,10 @@ EVENTS = "events"
 RECORDER = "recorder"
 KINDS_WITHOUT_LANE = ("printed", "miss")
 """Kinds of events without a lane. Misses have a separate lane next to their board's level."""
+CAUSE_ORDER = ("command", "fault", "died", "miss", "detection", "reaction", "recovery")
+"""Kinds of events of the same tick, in the order of cause and effect. Other kinds follow."""
+BRAKES = {"brakes_closed": "brakes engaged", "brakes_opened": ""}
+"""Label of the arm by code of an event."""
 RACK_LANE = "rack"
 """Lane of events that belong to no board."""
 LOG_LEVELS = {
@@ -41,22 +44,48 @@ LOG_LEVELS = {
 class EventWriter:
     """Follows events.jsonl during a run, and writes each new event to the view.
 
-    Lost boards are also shown in the graph of the hierarchy, and with `marks` faults are also shown
-    in 3D.
+    Faults, brakes and lost tasks are also shown in other views.
+
+    Args:
+        stream: Stream to write to.
+        path: Path of events.jsonl.
+        names: Dictionary from task to its name in lanes.
+        mark_lost: Function that shows the loss of a task, given when it was noticed.
+        marks: Writer of marks in 3D, or None without an arm.
     """
 
     def __init__(
-        self, stream: Stream, path: Path, hierarchy: Hierarchy, marks: MarkWriter | None
+        self,
+        stream: Stream,
+        path: Path,
+        names: Mapping[str, str],
+        mark_lost: Callable[[Moment, str], None],
+        marks: MarkWriter | None,
     ) -> None:
         self._stream = stream
         self._path = path
-        self._hierarchy = hierarchy
+        self._names = names
+        self._mark_lost = mark_lost
+        self._lost: set[str] = set()
         self._marks = marks
         self._read = 0
+        self._waiting: list[Event] = []
         self._lanes: dict[str, str] = {}  # state that each board's lane shows
 
-    def write_new_events(self) -> None:
-        """Write the events that were added to the file since the last call."""
+    def write_events(self, tick: float) -> None:
+        """Write all new events before `tick`, causes before effects.
+
+        Args:
+            tick: Tick before which all rows have been written. Later events wait for their rows.
+        """
+        self._waiting += self._read_new_events()
+        due = [event for event in self._waiting if event.tick < tick]
+        self._waiting = [event for event in self._waiting if event.tick >= tick]
+        for event in sorted(due, key=get_cause_order):
+            self._write(event)
+
+    def _read_new_events(self) -> Iterator[Event]:
+        """Yield the events that were added to the file since the last call."""
         if not self._path.is_file() or self._path.stat().st_size == self._read:
             return
         with self._path.open("rb") as file:
@@ -69,7 +98,7 @@ class EventWriter:
             # The last line is the outcome, not an event. Leave out messages about waiting during
             # the launch, because the launch is over when the view is open.
             if "tick" in event and not (event["kind"] == "waiting" and event["tick"] < 0):
-                self._write(Event(**event))
+                yield Event(**event)
 
     def _write(self, event: Event) -> None:
         """Write an event to the log and its lane. Faults and lost boards go to other views too."""
@@ -81,17 +110,21 @@ class EventWriter:
             self._write_lane(when, board, event)
         if event.kind == "fault" and self._marks is not None:
             self._marks.mark_fault(when, event)
-        if event.kind == "died":
-            self._hierarchy.mark_lost(when, board)
-        elif event.code == "hang":
-            self._hierarchy.mark_lost(when, event.subject)
+        if event.code in BRAKES and self._marks is not None:
+            self._marks.mark_brakes(when, BRAKES[event.code])
+        lost = board if event.kind == "died" else event.subject if event.code == "hang" else ""
+        # A task that hangs is killed later, but is lost only once.
+        if lost in self._names.keys() - self._lost:
+            self._lost.add(lost)
+            self._mark_lost(when, lost)
         elif event.code == "rejoined":
-            self._hierarchy.mark_recovered(when, board)
+            self._lost.discard(board)
 
     def _write_lane(self, when: Moment, board: str, event: Event) -> None:
         """Write an event as the new state of its board's lane."""
+        lane = (EVENTS, self._names.get(board, board))
         if board not in self._lanes:
-            style_lane(self._stream, (EVENTS, board), EVENT_COLOURS)
+            style_lane(self._stream, lane, EVENT_COLOURS)
         state: str = event.kind
         if event.code == "ends":
             # The end of a fault ends the span of that fault, but not the span of a later event.
@@ -99,7 +132,17 @@ class EventWriter:
                 return
             state = ""
         self._lanes[board] = state
-        write_span(self._stream, when, (EVENTS, board), state)
+        write_span(self._stream, when, lane, state)
+
+
+def get_cause_order(event: Event) -> tuple[int, int]:
+    """Return a sort key that places events in the order of their ticks, and causes before effects.
+
+    Some events are reported late: a lost board that drives an arm reports only after it has
+    rejoined that the brakes had engaged.
+    """
+    is_effect = event.kind in CAUSE_ORDER and event.code != "ends"
+    return event.tick, CAUSE_ORDER.index(event.kind) - len(CAUSE_ORDER) if is_effect else 0
 
 
 def build_loss_writer(stream: Stream) -> Callable[[int, Mapping[str, int]], None]:

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from enum import IntEnum
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.message import State, decode_text
+from rack.backplane.message import Message, State, decode_text
 from rack.boards.timing.rack import RackTiming
 from rack.boards.timing.trace_times import find_missed_cycles
-from rack.levels.messages import Verb
-from rack.levels.systems.hand.messages import GraspKind
+from rack.levels.messages import ArmState, MoveStatus, Verb
+from rack.levels.systems.force.messages import Mode, ServerStatus
+from rack.levels.systems.hand.messages import STREAMED_DOWN, GraspKind, GraspStatus
+from rack.levels.systems.joint_boards.messages import STREAMED
+from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart, build_change_finder
 from rack.tools.viewer.style import STATES, pack_colours, style_lane, write_spans
 
@@ -30,26 +33,41 @@ FIRED = ["table", "row", "fired", "in_state"]
 """Fields of a status that say which row of a state table fires."""
 
 
-def build_value_lane(
-    stream: Stream, lane: tuple[str, str], fields: str | list[str], name: Callable[[Any], str]
-) -> ViewPart:
+class ValueLane(NamedTuple):
+    """A lane that shows a value in the messages of a level.
+
+    Attributes:
+        name: Name of the lane.
+        fields: Field with the value. For several fields, the value is a tuple.
+        format_value: Function that returns the text for a value.
+    """
+
+    name: str
+    fields: str | list[str]
+    format_value: Callable[[Any], str]
+
+
+def build_value_lane(stream: Stream, board: str, lane: ValueLane) -> ViewPart:
     """Return the view part that shows a value in a level's messages as a lane.
 
     Args:
         stream: Stream to write to.
-        lane: Name of the board, and name of the lane.
-        fields: Field with the value. For several fields, the value is a tuple.
-        name: Function that returns the text for a value.
+        board: Name of the board in lanes.
+        lane: The lane.
     """
+    entity = (LEVELS, board, lane.name)
+    if lane.fields == "state":
+        style_lane(stream, entity, STATES)
     changed_rows = build_change_finder()
 
     def write(block: RowBlock) -> None:
         """Write the text for the value at every row in which the value changes."""
-        values = block.messages[fields]
-        rows = changed_rows(values)
+        values = block.messages[lane.fields]
+        # After a silence, the value ends the span "lost" even if it is the same as before.
+        rows = np.union1d(changed_rows(values), np.flatnonzero(block.resumed))
         if len(rows):
-            names = [name(value) for value in values[rows].tolist()]
-            write_spans(stream, (LEVELS, *lane), block.build_time_columns(rows), names)
+            names = [lane.format_value(value) for value in values[rows].tolist()]
+            write_spans(stream, entity, block.build_time_columns(rows), names)
 
     return write
 
@@ -69,21 +87,54 @@ def format_move(move: tuple[int, int]) -> str:
     return format_enum(Verb, move[1]) if move[0] else ""
 
 
+def format_row(row: tuple[int, bytes]) -> str:
+    """Format a row of a state table, given as its number and its name."""
+    return f"{row[0]} {decode_text(row[1])}"
+
+
 def format_enum(kind: type[IntEnum], number: int) -> str:
     """Return the name of an enum member with this number, in lower case and with spaces."""
     return kind(number).name.lower().replace("_", " ")
 
 
-def build_state_lane(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
-    """Yield the view parts that show a level's states as a lane and its errors as log lines."""
-    board, _, port = mailbox.name.partition(".")
-    # An adapter also writes the statuses of other racks' levels, one port for each.
-    lane = board, "state" if port == "status" else port
-    style_lane(stream, (LEVELS, *lane), STATES)
-    yield build_value_lane(stream, lane, "state", partial(format_enum, State))
+VALUE_LANES: tuple[tuple[type[Message], ValueLane], ...] = (
+    (MoveStatus, ValueLane("move", ["current", "verb"], format_move)),
+    (MotionStatus, ValueLane("request", "current", format_serial)),
+    (ServerStatus, ValueLane("request", "current", format_serial)),
+    (GraspStatus, ValueLane("step", ["step", "kind"], format_step)),
+    (ServerStatus, ValueLane("mode", "mode", partial(format_enum, Mode))),
+)
+"""Lanes for messages of certain classes."""
+
+
+def list_value_lanes(mailbox: MailboxSpec) -> Iterator[ValueLane]:
+    """Yield the lanes that show values in the messages of a mailbox."""
+    names = {field.name for field in mailbox.fields}
+    port = mailbox.name.partition(".")[2]
+    kind = mailbox.message
+    if has_state(mailbox):
+        # An adapter also writes the statuses of other racks' levels, one port for each.
+        name = "state" if port == "status" else port
+        yield ValueLane(name, "state", partial(format_enum, State))
+    elif port == "command" and "id" in names and kind not in (*STREAMED, *STREAMED_DOWN):
+        yield ValueLane(port, "id", format_serial)
+    if names.issuperset(FIRED):
+        yield ValueLane("row", FIRED[1:3], format_row)
+    yield from (lane for message, lane in VALUE_LANES if kind == message.message_type.name)
+
+
+def has_state(mailbox: MailboxSpec) -> bool:
+    """Return whether the messages of a mailbox contain the state of a level."""
+    names = {field.name for field in mailbox.fields}
+    return {"state", "error", "reason"} <= names and mailbox.message != ArmState.message_type.name
+
+
+def build_error_lines(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
+    """Return the view part that writes a log line for each new error of a level."""
+    board = mailbox.name.partition(".")[0]
     changed_rows = build_change_finder()
 
-    def write_errors(block: RowBlock) -> None:
+    def write(block: RowBlock) -> None:
         """Write a log line for each new error in a block of messages."""
         messages = block.messages
         for row in changed_rows(messages["error"]):
@@ -92,28 +143,22 @@ def build_state_lane(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]
                 text = f"{board}: {reason or f'error {error}'}"
                 stream.log_line(block.find_moment(row), "levels", text, "ERROR")
 
-    yield write_errors
+    return write
 
 
-def build_fired_lane(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
-    """Return the view part that writes the fired row of a state table to a lane and the log."""
+def build_fired_lines(stream: Stream, mailbox: MailboxSpec) -> ViewPart:
+    """Return the view part that writes a log line for each row of a state table that fires."""
     board = mailbox.name.partition(".")[0]
     changed_rows = build_change_finder()
 
     def write(block: RowBlock) -> None:
-        """Write the fired row to the lane and to the log whenever it changes."""
-        changed = changed_rows(block.messages[FIRED])
-        names = []
-        for row_index in changed:
+        """Write a log line whenever the fired row changes."""
+        for row_index in changed_rows(block.messages[FIRED]):
             table, row, fired, state = block.messages[FIRED][row_index]
-            names.append(f"{row} {decode_text(fired)}")
             now = f"now in '{decode_text(state)}', table {decode_text(table)}"
-            text = f"row {row} '{decode_text(fired)}', {now}"
-            stream.log_line(
-                block.find_moment(row_index), "rows", f"{board}: {text}", "INFO" if row else "ERROR"
-            )
-        if names:
-            write_spans(stream, (LEVELS, board, "row"), block.build_time_columns(changed), names)
+            text = f"{board}: row {row} '{decode_text(fired)}', {now}"
+            level = "INFO" if row else "ERROR"
+            stream.log_line(block.find_moment(row_index), "rows", text, level)
 
     return write
 
@@ -142,20 +187,10 @@ class Hierarchy:
         """Collect the changes of a task's state from a block of its trace records."""
         names = _name_states(block.rows)
         before = np.concatenate(([self._states[task]], names[:-1]))
-        for row in np.flatnonzero(names != before):
-            self._add_change(block.find_moment(row), task, str(names[row]))
+        for row in np.flatnonzero((names != before) | block.resumed):
+            self.add_change(block.find_moment(row), task, str(names[row]))
 
-    def mark_lost(self, when: Moment, board: str) -> None:
-        """Set the state of a board that died or stopped responding to "lost"."""
-        if board in self._states:
-            self._add_change(when, board, "lost")
-
-    def mark_recovered(self, when: Moment, board: str) -> None:
-        """Set the state of a restarted board to "idle", until its next cycles show its state."""
-        if self._states.get(board) == "lost":
-            self._add_change(when, board, "idle")
-
-    def _add_change(self, when: Moment, task: str, state: str) -> None:
+    def add_change(self, when: Moment, task: str, state: str) -> None:
         """Add a change of state that `write_changes` will write."""
         self._changes.append((when, task, state))
         self._states[task] = state
@@ -184,6 +219,18 @@ def _name_states(rows: np.ndarray) -> np.ndarray:
     names = np.array([state.name.lower() for state in State] + ["missed"])
     indices = np.where(find_missed_cycles(rows), len(names) - 1, rows["state"])
     return np.asarray(names[indices])
+
+
+def name_lanes(layout: Layout, rack: RackTiming) -> dict[str, str]:
+    """Return a dictionary from task to its name in lanes, in the order of the lanes.
+
+    The viewer sorts lanes by name, so the name begins with the number of the board: those of the
+    hierarchy from the top down, then the others. Each executor is above its planner.
+    """
+    ranked = [board for rank in rack.ranks for board in rank]
+    boards = list(dict.fromkeys([*ranked, *(task.board for task in layout.tasks)])).index
+    tasks = sorted(layout.tasks, key=lambda task: boards(task.board))
+    return {task.name: f"{boards(task.board) + 1}-{task.name}" for task in tasks}
 
 
 def compute_positions(layout: Layout, rack: RackTiming) -> dict[str, tuple[float, float]]:

@@ -75,6 +75,7 @@ def write_merged(
             writer.write(rows, tick, lost)
             stream.flush()
             show_progress((index + tick / last) / len(placed))
+        writer.write_last_events()
     recording.disconnect()
 
 

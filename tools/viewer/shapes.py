@@ -12,9 +12,22 @@ from numpy.typing import NDArray
 from rack.levels.algebra import Array
 
 Geom = mujoco.mjtGeom
+Shape = rr.Boxes3D | rr.Ellipsoids3D | rr.Cylinders3D | rr.Capsules3D | rr.Mesh3D
 
 
-def build_shape(model: mujoco.MjModel, geom: int) -> rr.AsComponents | None:
+def colour_shape(shape: Shape, colour: Any) -> Shape:
+    """Return an archetype that changes only the colour of a shape, which must not be static."""
+    if isinstance(shape, rr.Mesh3D):
+        return rr.Mesh3D.from_fields(albedo_factor=colour)
+    return type(shape).from_fields(colors=[colour])
+
+
+def remove_colour(shape: Shape) -> None:
+    """Remove the colour of a shape, so that the rest of it can be static."""
+    setattr(shape, "albedo_factor" if isinstance(shape, rr.Mesh3D) else "colors", None)
+
+
+def build_shape(model: mujoco.MjModel, geom: int) -> Shape | None:
     """Return the shape of a geom. None if the geom is invisible or of an unknown type."""
     rgba = read_colour(model, geom)
     if rgba[3] == 0:
@@ -61,7 +74,7 @@ def convert_to_xyzw(quaternions: Array) -> Array:
     return np.roll(quaternions, -1, axis=-1)
 
 
-def _build_plane(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
+def _build_plane(model: mujoco.MjModel, geom: int) -> Shape:
     """Return the shape of a plane, which consists of two triangles."""
     # A half size of zero means an infinite plane. Draw it larger than the model.
     x, y = (half_size or 2 * model.stat.extent for half_size in model.geom_size[geom][:2])
@@ -69,7 +82,7 @@ def _build_plane(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     return _build_surface(model, geom, corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def _build_mesh(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
+def _build_mesh(model: mujoco.MjModel, geom: int) -> Shape:
     """Return the shape of a mesh or signed distance field, which consists of triangles."""
     mesh = model.geom_dataid[geom]
     vertices = slice(model.mesh_vertadr[mesh], model.mesh_vertadr[mesh] + model.mesh_vertnum[mesh])
@@ -79,7 +92,7 @@ def _build_mesh(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
     )
 
 
-def _build_height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
+def _build_height_field(model: mujoco.MjModel, geom: int) -> Shape:
     """Return the shape of a height field, which consists of triangles."""
     field = model.geom_dataid[geom]
     rows = model.hfield_nrow[field]
@@ -97,7 +110,7 @@ def _build_height_field(model: mujoco.MjModel, geom: int) -> rr.AsComponents:
 
 def _build_surface(
     model: mujoco.MjModel, geom: int, vertices: Array, triangles: NDArray[np.integer]
-) -> rr.AsComponents:
+) -> Shape:
     """Return triangles as a mesh with flat shading.
 
     Args:

@@ -5,33 +5,25 @@ View parts are functions that each show one aspect of a mailbox or task.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.message import Message
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, build_rack_timing, read_stored
-from rack.levels.messages import (
-    ArmState,
-    MovePlan,
-    MoveStatus,
-    Scene,
-    TaskPlan,
-    WorldState,
-)
+from rack.levels.messages import ArmState, MovePlan, MoveStatus, Scene, TaskPlan, WorldState
 from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.systems.force.messages import ForceStatus, Mode, ServerStatus, Wrench
-from rack.levels.systems.hand.messages import STREAMED_DOWN, GraspStatus, HandStatus
-from rack.levels.systems.joint_boards.messages import DRIVING, STREAMED, JointStatus, JointTorque
-from rack.levels.systems.trajectory.messages import MotionStatus
+from rack.levels.systems.force.messages import ForceStatus, Wrench
+from rack.levels.systems.hand.messages import HandStatus
+from rack.levels.systems.joint_boards.messages import DRIVING, JointStatus, JointTorque
 from rack.tools.recording.occasions import Retention
 from rack.tools.viewer.blueprint import RackViews, build_blueprint, write_document
 from rack.tools.viewer.cell import (
@@ -51,39 +43,30 @@ from rack.tools.viewer.forces import (
 from rack.tools.viewer.hand import build_hand_curves
 from rack.tools.viewer.levels import (
     FIRED,
+    LEVELS,
     Hierarchy,
-    build_fired_lane,
-    build_state_lane,
+    build_error_lines,
+    build_fired_lines,
     build_value_lane,
-    format_enum,
-    format_move,
-    format_serial,
-    format_step,
+    has_state,
+    list_value_lanes,
+    name_lanes,
 )
 from rack.tools.viewer.parts import find_next_file
-from rack.tools.viewer.stream import RowBlock, Stream, Timelines, ViewPart, open_recording
-from rack.tools.viewer.style import write_legend
+from rack.tools.viewer.stream import Moment, RowBlock, Stream, Timelines, ViewPart, open_recording
+from rack.tools.viewer.style import write_legend, write_span
 from rack.tools.viewer.timing import (
     LOAD,
     AgeWriter,
-    build_cycle_lane,
+    CycleLane,
     build_load_curves,
     build_miss_lane,
     choose_task_colours,
-    list_boards,
 )
 
 SHOWN_IN_OTHER_VIEWS = (ArmState, Scene, WorldState, JointTorque, JointStatus, HandStatus)
 NOT_AS_CURVES = {*DRIVING, *(message.message_type.name for message in SHOWN_IN_OTHER_VIEWS)}
 """Message types whose fields are not shown as separate curves."""
-LANES: tuple[tuple[type[Message], str, str | list[str], Callable[[Any], str]], ...] = (
-    (MoveStatus, "move", ["current", "verb"], format_move),
-    (MotionStatus, "request", "current", format_serial),
-    (ServerStatus, "request", "current", format_serial),
-    (GraspStatus, "step", ["step", "kind"], format_step),
-    (ServerStatus, "mode", "mode", partial(format_enum, Mode)),
-)
-"""Lanes for messages: message class, name of the lane, fields, and function that names values."""
 BLOCK_S = 1.0
 """Simulated duration of a block. Writing 4 rows takes as long as writing 400."""
 
@@ -138,15 +121,18 @@ class RackWriter:
         config = ran.config
         self._times = stream.times
         write_document(stream, ran.text, config, layout)
+        rack = build_rack_timing(config, layout)
+        names = name_lanes(layout, rack)
         parts_by_mailbox: dict[str, list[ViewPart]] = {
-            box.name: list(_build_mailbox_parts(stream, box)) for box in layout.mailboxes
+            box.name: list(_build_mailbox_parts(stream, box, names)) for box in layout.mailboxes
         }
         marks = None
         if ran.cell is not None:
-            write_geometry(stream, ran.cell)
+            arm = write_geometry(stream, ran.cell)
             goals = GoalWriter(stream, config.scene.bodies)
             assert config.robot is not None, "there is an arm"
-            marks = MarkWriter(stream, ran.cell, config.robot.joints)
+            drivers = [box.writer for box in layout.mailboxes if box.message in DRIVING]
+            marks = MarkWriter(stream, ran.cell, config.robot.joints, drivers, arm)
             for box in layout.mailboxes:
                 if box.message in DRIVING:
                     parts_by_mailbox[box.name].append(marks.write)
@@ -154,16 +140,21 @@ class RackWriter:
         lockstep = config.clock.mode == "lockstep"
         # Traces measure real time, in which a tick has no fixed length in lockstep.
         tick_ns = layout.clock_ns if lockstep else config.tick_ns
-        colours = choose_task_colours(layout)
-        boards = list_boards(layout)
+        boards = [name for name in names if "." not in name]
+        colours = choose_task_colours(layout, boards)
         write_legend(stream, LOAD, boards, [colours[board] for board in boards])
-        self._hierarchy = Hierarchy(stream, layout, build_rack_timing(config, layout))
+        self._hierarchy = Hierarchy(stream, layout, rack)
+        speed = layout.clock_ns / tick_ns
+        cycles = {
+            task.name: CycleLane(stream, task, names[task.board], speed, lockstep)
+            for task in layout.tasks
+        }
         parts_by_task: dict[str, list[ViewPart]] = {
             task.name: [
                 partial(self._hierarchy.write, task.name),
-                build_cycle_lane(stream, task, layout.clock_ns / tick_ns, lockstep),
+                cycles[task.name].write,
                 *build_load_curves(stream, task, colours[task.name], tick_ns, lockstep),
-                build_miss_lane(stream, task),
+                build_miss_lane(stream, task, names[task.name]),
             ]
             for task in layout.tasks
         }
@@ -177,7 +168,22 @@ class RackWriter:
         for mailbox, age in self._ages.items():
             parts_by_mailbox[mailbox].append(age.add_messages)
         self._parts = parts_by_task | parts_by_mailbox
-        self._events = EventWriter(stream, ran.events, self._hierarchy, marks)
+        self._periods: dict[str, int] = {task.name: task.every for task in layout.tasks}
+        self._periods |= {box.name: box.every for box in layout.mailboxes}
+        self._last_ticks: dict[str, int] = {}  # tick of the last row of each ring
+        with_states = {box.writer for box in layout.mailboxes if has_state(box)}
+
+        def mark_lost(noticed: Moment, task: str) -> None:
+            """Show a lost task in lanes, in the hierarchy and at the arm, until its next row."""
+            when = cycles[task].find_loss(noticed)
+            cycles[task].mark_lost(when)
+            self._hierarchy.add_change(when, task, "lost")
+            if task in with_states:
+                write_span(stream, when, (LEVELS, names[task], "state"), "lost")
+            if marks is not None:
+                marks.mark_lost(when, task)
+
+        self._events = EventWriter(stream, ran.events, names, mark_lost, marks)
         self._write_losses = build_loss_writer(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 
@@ -194,14 +200,22 @@ class RackWriter:
         if (fastest := rows_by_ring.get(self._fastest)) is not None:
             self._times.add_stamps(fastest["tick"], fastest["start_ns"])
         for ring, rows in rows_by_ring.items():
-            block = RowBlock(rows, self._times)
+            ticks = rows["tick"].astype(np.int64)
+            silent = np.diff(ticks, prepend=self._last_ticks.get(ring, ticks[0]))
+            self._last_ticks[ring] = int(ticks[-1])
+            block = RowBlock(rows, self._times, silent > self._periods[ring])
             for write in self._parts[ring]:
                 write(block)
         for age in self._ages.values():
             age.write_ages(tick)
-        self._events.write_new_events()
+        self._events.write_events(tick)
         self._hierarchy.write_changes()
         self._write_losses(tick, lost)
+
+    def write_last_events(self) -> None:
+        """Write the remaining events, after all rows have been written."""
+        self._events.write_events(math.inf)
+        self._hierarchy.write_changes()
 
     def skip_to(self, tick: int) -> None:
         """Continue at `tick` after a range of ticks that was not recorded."""
@@ -269,6 +283,7 @@ class ViewSink:
             RuntimeError: The file cannot be written.
         """
         self._write(tick, lost)
+        self._writer.write_last_events()
         self._stream.flush()
         self._stream.close()
 
@@ -288,21 +303,24 @@ def compute_block_ticks(layout: Layout) -> int:
     return max(1, round(BLOCK_S * 1e9 / layout.clock_ns))
 
 
-def _build_mailbox_parts(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPart]:
-    """Yield the view parts for a mailbox that do not depend on an arm: lanes and curves."""
-    names = {field.name for field in mailbox.fields}
-    board, _, port = mailbox.name.partition(".")
-    kind = mailbox.message
-    if {"state", "error", "reason"} <= names and kind != ArmState.message_type.name:
-        yield from build_state_lane(stream, mailbox)
-    elif port == "command" and "id" in names and kind not in (*STREAMED, *STREAMED_DOWN):
-        yield build_value_lane(stream, (board, port), "id", format_serial)
-    if names.issuperset(FIRED):
-        yield build_fired_lane(stream, mailbox)
-    for message, what, fields, name in LANES:
-        if kind == message.message_type.name:
-            yield build_value_lane(stream, (board, what), fields, name)
-    if kind not in NOT_AS_CURVES:
+def _build_mailbox_parts(
+    stream: Stream, mailbox: MailboxSpec, names: Mapping[str, str]
+) -> Iterator[ViewPart]:
+    """Yield the view parts for a mailbox that do not depend on an arm: lanes, lines and curves.
+
+    Args:
+        stream: Stream to write to.
+        mailbox: The mailbox.
+        names: Dictionary from task to its name in lanes.
+    """
+    board = mailbox.name.partition(".")[0]
+    for lane in list_value_lanes(mailbox):
+        yield build_value_lane(stream, names.get(board, board), lane)
+    if has_state(mailbox):
+        yield build_error_lines(stream, mailbox)
+    if {field.name for field in mailbox.fields}.issuperset(FIRED):
+        yield build_fired_lines(stream, mailbox)
+    if mailbox.message not in NOT_AS_CURVES:
         yield from build_field_curves(stream, mailbox)
 
 

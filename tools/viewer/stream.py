@@ -142,13 +142,17 @@ class RowBlock:
         rows: The rows, shape (rows,).
         ticks: Release ticks, shape (rows,).
         stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
+        resumed: True for each row before which the writer was silent, shape (rows,).
     """
 
-    def __init__(self, rows: np.ndarray, timelines: Timelines) -> None:
+    def __init__(
+        self, rows: np.ndarray, timelines: Timelines, resumed: np.ndarray | None = None
+    ) -> None:
         stamp = "stamp_ns" if "stamp_ns" in (rows.dtype.names or ()) else "start_ns"
         self.rows = rows  # (rows,)
         self.ticks: Ints = rows["tick"].astype(np.int64)  # (rows,)
         self.stamps_ns: Ints = rows[stamp].astype(np.int64)  # (rows,), CLOCK_MONOTONIC
+        self.resumed = np.zeros(len(rows), bool) if resumed is None else resumed  # (rows,)
         self._timelines = timelines
 
     @cached_property
@@ -325,7 +329,7 @@ class Stream:
         self._recording.log(self._build_path(entity), archetype)
 
     def log_line(self, when: Moment, source: str, text: str, level: str) -> None:
-        """Write a line to the log. If the recording has several racks, the rack's name is prefixed.
+        """Write a line and its tick to the log, after the rack's name if there are several racks.
 
         Args:
             when: Time of the line.
@@ -333,7 +337,7 @@ class Stream:
             text: The line.
             level: Log level of rerun, for example "WARN".
         """
-        line = rr.TextLog(": ".join((*self._root, text)), level=level)
+        line = rr.TextLog(": ".join((*self._root, f"tick {when.tick}", text)), level=level)
         self.log_at(when, (LOG, source), line)
 
     def log_property(self, name: str, values: rr.AsComponents) -> None:

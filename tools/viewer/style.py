@@ -55,7 +55,7 @@ STATES: dict[str, Colour] = {
     "holding": _YELLOW,
     "error": _RED,
     "missed": _ORANGE,
-    "lost": 0x781414FF,
+    "lost": LOST,
 }
 EVENT_COLOURS: dict[str, Colour] = {
     "launch": _GREY,
@@ -77,8 +77,17 @@ PHASES: dict[str, Colour] = {
     "plan": 0x966EDCFF,
     "write": _YELLOW,
     "missed": 0xE63232FF,
+    "lost": LOST,
 }
-LETTERS = {"wait": " ", "read": "R", "process": "X", "plan": "P", "write": "W", "missed": "!"}
+LETTERS = {
+    "wait": " ",
+    "read": "R",
+    "process": "X",
+    "plan": "P",
+    "write": "W",
+    "missed": "!",
+    "lost": "lost",
+}
 """Labels of phases, as in the paper's figures, because words would not fit into the spans."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -14,8 +14,7 @@ from rack.boards.timing.trace_times import (
     find_missed_cycles,
     find_newest_visible,
 )
-from rack.tools.viewer.levels import LEVELS
-from rack.tools.viewer.stream import Ints, RowBlock, Stream, ViewPart
+from rack.tools.viewer.stream import Ints, Moment, RowBlock, Stream, ViewPart
 from rack.tools.viewer.style import (
     COMMANDED,
     LETTERS,
@@ -40,50 +39,75 @@ SPAN_S = 0.25
 """Duration of the mark for a missed cycle. The cycle itself would be too narrow to see."""
 
 
-def build_cycle_lane(stream: Stream, task: TaskSpec, speed: float, lockstep: bool) -> ViewPart:
-    """Return the view part that shows each cycle as four spans: read, process or plan, write, wait.
+class CycleLane:
+    """Writes each cycle of a task as four spans: read, process or plan, write, wait.
 
-    Missed cycles are red. In real time, the spans are shown at their wall-clock times, scaled to
-    simulated time. In lockstep, simulated time does not pass during a cycle. The spans then begin
-    at the tick, and are cut off at the end of the time slice.
+    Missed cycles are red, and so is the time for which the task is lost. In real time, the spans
+    are shown at their wall-clock times, scaled to simulated time. In lockstep, simulated time does
+    not pass during a cycle. The spans then begin at the tick, and are cut off at the end of the
+    time slice.
 
     Args:
         stream: Stream to write to.
         task: The task.
+        board: Name of its board in lanes.
         speed: Ratio of simulated time to wall-clock time.
         lockstep: Whether the run is in lockstep.
     """
-    # The slot precedes the name of the board, so that lanes are in the order of slots.
-    lane = (BOARDS, f"{task.slot}-{task.board}", task.role)
-    last_ns = task.slice * stream.times.clock_ns - len(MOMENTS)
-    work = "process" if task.role == "executor" else "plan"
-    style_lane(stream, lane, PHASES, LETTERS)
 
-    def write(block: RowBlock) -> None:
+    def __init__(
+        self, stream: Stream, task: TaskSpec, board: str, speed: float, lockstep: bool
+    ) -> None:
+        self._stream = stream
+        self._lane = (BOARDS, board, task.role)
+        self._every = task.every
+        self._last_ns = task.slice * stream.times.clock_ns - len(MOMENTS)
+        self._work = "process" if task.role == "executor" else "plan"
+        self._speed = speed
+        self._lockstep = lockstep
+        # Ticks of the cycles in the newest block, and the last one before it; and their ends in ns.
+        self._ticks: Ints = np.empty(0, dtype=np.int64)
+        self._ends: Ints = np.empty(0, dtype=np.int64)
+        style_lane(stream, self._lane, PHASES, LETTERS)
+
+    def write(self, block: RowBlock) -> None:
         """Write the four spans of each cycle in a block."""
         rows = block.rows
         moments = np.stack([rows[name] for name in MOMENTS], axis=1)
-        within = ((moments - rows["release_ns"][:, None]) * speed).astype(np.int64)
-        if lockstep:
+        within = ((moments - rows["release_ns"][:, None]) * self._speed).astype(np.int64)
+        if self._lockstep:
             # Let cut-off spans begin at different times, in the right order.
-            within = np.minimum(within, last_ns + np.arange(len(MOMENTS)))
+            within = np.minimum(within, self._last_ns + np.arange(len(MOMENTS)))
         ticks = np.repeat(block.ticks, len(MOMENTS))
-        states = np.array([["read", work, "write", "wait"]] * len(rows))
+        states = np.array([["read", self._work, "write", "wait"]] * len(rows))
         states[find_missed_cycles(rows), :3] = MISSED
-        times = stream.times.build_columns(ticks, moments.ravel(), within.ravel())
-        write_spans(stream, lane, times, states.ravel().tolist())
+        times = self._stream.times.build_columns(ticks, moments.ravel(), within.ravel())
+        write_spans(self._stream, self._lane, times, states.ravel().tolist())
+        ends = block.ticks * self._stream.times.clock_ns + within[:, -1]
+        self._ticks = np.concatenate((self._ticks[-1:], block.ticks))
+        self._ends = np.concatenate((self._ends[-1:], ends))
 
-    return write
+    def find_loss(self, when: Moment) -> Moment:
+        """Return when a task was lost, given when this was noticed.
+
+        If it was noticed late, the task was already lost at the release after its last cycle.
+        """
+        cycles = self._ticks[self._ticks <= when.tick]
+        if not len(cycles) or (missed := int(cycles[-1]) + self._every) >= when.tick:
+            return when
+        return self._stream.times.estimate_moment(missed)
+
+    def mark_lost(self, when: Moment) -> None:
+        """Write the state "lost", which the next cycle ends, but only after the previous cycle."""
+        times = self._stream.times
+        ended = self._ends[self._ticks <= when.tick]
+        within = max(0, int(ended[-1]) + 1 - when.tick * times.clock_ns) if len(ended) else 0
+        columns = times.build_columns(np.array([when.tick]), np.array([when.stamp_ns]), within)
+        write_spans(self._stream, self._lane, columns, ["lost"])
 
 
-def list_boards(layout: Layout) -> list[str]:
-    """Return the names of the boards, in the order of their tasks in the layout."""
-    return list(dict.fromkeys(task.board for task in layout.tasks))
-
-
-def choose_task_colours(layout: Layout) -> dict[str, Colour]:
+def choose_task_colours(layout: Layout, boards: Sequence[str]) -> dict[str, Colour]:
     """Return a dictionary from task to colour. A planner has the dimmed colour of its board."""
-    boards = list_boards(layout)
     by_task = {task.name: choose_joint_colour(boards.index(task.board)) for task in layout.tasks}
     return {name: dim_colour(colour) if "." in name else colour for name, colour in by_task.items()}
 
@@ -95,7 +119,7 @@ def build_load_curves(
 
     These are lateness, execution time and deadline in ms, and the used part of the time slice in
     percent, where 100 % is the deadline. In lockstep a tick lasts as long as its tasks take, so
-    only the execution time is shown.
+    only the execution time is shown, in ms and in percent.
 
     Args:
         stream: Stream to write to.
@@ -118,23 +142,28 @@ def build_load_curves(
 
     names = [f"{task.name} {name}" for name in ("lateness, ms", "execution, ms", "deadline, ms")]
     yield build_curves(stream, (TIMES, task.name), times_ms, names, [COMMANDED, colour, LIMIT])
-    if not is_lockstep:
-        yield build_curves(
-            stream,
-            (LOAD, task.name),
-            lambda block: compute_response_ns(block.rows) * (100.0 / slice_ns),
-            [f"{task.name}, %"],
-            [colour],
-        )
+    compute_used_ns = compute_execution_ns if is_lockstep else compute_response_ns
+    yield build_curves(
+        stream,
+        (LOAD, task.name),
+        lambda block: compute_used_ns(block.rows) * (100.0 / slice_ns),
+        [f"{task.name}, %"],
+        [colour],
+    )
 
 
-def build_miss_lane(stream: Stream, task: TaskSpec) -> ViewPart:
+def build_miss_lane(stream: Stream, task: TaskSpec, name: str) -> ViewPart:
     """Return the view part that shows missed cycles as a lane, and as one log line per block.
 
     The marks in the lane are wide enough to be visible at any zoom. A task without missed cycles
     has no such lane.
+
+    Args:
+        stream: Stream to write to.
+        task: The task.
+        name: Name of the task in lanes.
     """
-    lane = (LEVELS, task.board, f"{task.role}_{MISSED}")
+    lane = (MISSED, name)
     span = max(1, round(SPAN_S * 1e9 / stream.times.clock_ns))
 
     def write(block: RowBlock) -> None:

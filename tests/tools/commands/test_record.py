@@ -235,7 +235,7 @@ def test_replay_writes_only_new_files_and_only_from_runs(tmp_path: Path) -> None
     # A folder of such runs stands for all of them.
     replay([tmp_path], tmp_path / "again.rrd", against=None)
     for name in "ab":
-        lane = f"/{name}/boards/2-pulse/executor"
+        lane = f"/{name}/boards/1-pulse/executor"
         again, first = (
             read_component(f, lane, "StateChange:state") for f in (tmp_path / "again.rrd", out)
         )

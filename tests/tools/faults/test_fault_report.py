@@ -93,7 +93,7 @@ def test_a_silent_board_is_recovered_from_only_when_it_is_heard_again(
 @pytest.mark.slow
 def test_the_viewer_shows_the_course_of_a_fault_in_the_lane_of_its_board(folder: Path) -> None:
     lane = (
-        read_component(folder / "run.rrd", "/events/upper", "StateChange:state")
+        read_component(folder / "run.rrd", "/events/1-upper", "StateChange:state")
         .values.ravel()
         .tolist()
     )
@@ -105,7 +105,7 @@ def test_the_viewer_shows_the_course_of_a_fault_in_the_lane_of_its_board(folder:
     levels = (
         read_component(folder / "run.rrd", "/log/events", "TextLog:level").values.ravel().tolist()
     )
-    level_of = {line.partition(":")[0]: level for line, level in zip(text, levels, strict=True)}
+    level_of = {line.split(": ")[1]: level for line, level in zip(text, levels, strict=True)}
     assert (level_of["fault"], level_of["detection"], level_of["recovery"]) == (
         "WARN",
         "ERROR",

@@ -7,20 +7,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun as rr
 import rerun.blueprint as rrb
 
 from rack.backplane.segment import Launch
-from rack.boards.config import load, resolve_layout
+from rack.boards.config import build_rack_timing, load, resolve_layout
 from rack.boards.events import Event
 from rack.levels.messages import ServoStatus
 from rack.levels.robot.cell import build_cell, compute_sizes
-from rack.tools.viewer.blueprint import RackViews
-from rack.tools.viewer.cell import MarkWriter
+from rack.tools.viewer.blueprint import CYCLES, MAX_LANES, RackViews
+from rack.tools.viewer.cell import MarkWriter, write_geometry
+from rack.tools.viewer.levels import name_lanes
 from rack.tools.viewer.reading import read_component
 from rack.tools.viewer.stream import Moment, RowBlock, Stream, Timelines, open_recording
 from rack.tools.viewer.style import LOST
 
 Part = rrb.Container | rrb.View
+COLOUR = {
+    rr.Boxes3D: "Boxes3D:colors",
+    rr.Cylinders3D: "Cylinders3D:colors",
+    rr.Capsules3D: "Capsules3D:colors",
+    rr.Ellipsoids3D: "Ellipsoids3D:colors",
+    rr.Mesh3D: "Mesh3D:albedo_factor",
+}
+OWN_LEVEL = Path(__file__).parents[3] / "configs/examples/own-level/metered.toml"
 
 
 def views(part: Part, first: bool = False) -> Iterator[rrb.View]:
@@ -41,7 +51,7 @@ def has_legend(view: rrb.TimeSeriesView) -> bool:
     return bool(legend.visible.as_arrow_array().to_pylist()[0])
 
 
-def plots(name: str, first: bool) -> list[rrb.TimeSeriesView]:
+def plots(name: str | Path, first: bool) -> list[rrb.TimeSeriesView]:
     """Return the plots of a rack."""
     config = load(name)
     robot = config.robot
@@ -54,14 +64,17 @@ def plots(name: str, first: bool) -> list[rrb.TimeSeriesView]:
 def test_every_plot_says_its_unit_and_only_signals_have_a_legend_over_their_curves(
     name: str,
 ) -> None:
-    units = ("rad", "rad/s", "N", "N m", "mrad", "mm", "m", "ms", "%", "% of a core")
+    units = ("rad", "rad/s", "N", "N m", "mrad", "mm", "m", "ms", "%", "% of cycle", "% of a core")
     unitless = {"signals", "rows lost", "taken and done"}
     found = plots(name, first=False)
-    titles = {str(view.name) for view in found} - unitless
+    own = {field.unit for box in resolve_layout(load(name)).mailboxes for field in box.fields}
+    signals = {f"signals, {unit}" for unit in own}
+    titles = {str(view.name) for view in found} - unitless - signals
     assert titles
     assert [title for title in titles if title.rpartition(", ")[2] not in units] == []
     covered = {str(view.name) for view in found if has_legend(view)}
-    assert covered == {"signals"}
+    assert "signals" in covered
+    assert covered <= {"signals", *signals}
 
 
 @pytest.mark.parametrize(
@@ -70,12 +83,48 @@ def test_every_plot_says_its_unit_and_only_signals_have_a_legend_over_their_curv
         ("rccl", ["/signals/trajectory.status/done", "/signals/trajectory.status/astray"]),
         ("penn", ["/forces/task_frame/z"]),
         ("hic", ["/signals/grasp.status/load", "/hand/thumb/tensions"]),
+        (OWN_LEVEL, ["/signals/power.status/power", "/signals/power.status/energy"]),
     ],
 )
-def test_the_first_view_shows_what_a_rack_is_about(name: str, contents: list[str]) -> None:
+def test_the_first_view_shows_what_a_rack_is_about(name: str | Path, contents: list[str]) -> None:
     shown = [list(view.contents) for view in plots(name, first=True)]
     found = {entity.replace("\\", "") for inner in shown for entity in inner}
     assert found.issuperset(contents)
+
+
+def test_own_signals_have_one_plot_for_each_unit() -> None:
+    titles = {str(view.name): view for view in plots(OWN_LEVEL, first=True)}
+    for unit, field in (("W", "power"), ("J", "energy")):
+        assert has_legend(titles[f"own signals, {unit}"])
+        assert list(titles[f"own signals, {unit}"].contents) == [f"/signals/power.status/{field}"]
+
+
+@pytest.mark.parametrize("name", ["nasrem", "hic", "ibm", "rccl", "penn", "condor", OWN_LEVEL])
+def test_no_lane_is_cut_off_and_higher_boards_are_above_lower_ones(name: str | Path) -> None:
+    config = load(name)
+    layout = resolve_layout(config)
+    names = name_lanes(layout, build_rack_timing(config, layout))
+    found = views(RackViews(layout, config, None).build_all_views())
+    lanes = [view for view in found if isinstance(view, rrb.StateTimelineView)]
+    by_title: dict[str, list[str]] = {}
+    for view in lanes:
+        by_title.setdefault(str(view.name), []).extend(view.contents)
+        boards = [query.split("/")[2] for query in view.contents]
+        if view.name == CYCLES:
+            tasks = [task for task in layout.tasks if names[task.board] in boards]
+            assert len(tasks) <= MAX_LANES
+        elif view.name in ("events", "missed"):
+            assert len(boards) <= MAX_LANES
+    numbered = [lane for lane in names.values() if "." not in lane]
+    assert by_title[CYCLES] == [f"/boards/{lane}/**" for lane in numbered]
+    assert by_title["levels, whole run"][: len(numbered)] == [
+        f"/levels/{lane}/**" for lane in numbered
+    ]
+    assert by_title["missed"] == [f"/missed/{lane}" for lane in names.values()]
+    ranks = build_rack_timing(config, layout).ranks
+    assert [lane.partition("-")[2] for lane in numbered][: sum(map(len, ranks))] == [
+        board for rank in ranks for board in rank
+    ]
 
 
 def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Path) -> None:
@@ -85,7 +134,8 @@ def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Pat
     times = Timelines(config.clock_ns, Launch(0, 0))
     recording = open_recording("run", "run", tmp_path / "run.rrd", rrb.Blueprint(rrb.TextLogView()))
     stream = Stream(recording, times)
-    marks = MarkWriter(stream, cell, config.robot.joints)
+    arm = write_geometry(stream, cell)
+    marks = MarkWriter(stream, cell, config.robot.joints, ["servo"], arm)
     dtype = [
         ("tick", "i8"),
         ("stamp_ns", "i8"),
@@ -100,12 +150,17 @@ def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Pat
         event = Event(0, tick, "fault", "servo", text, code, fault=0, subject="j3")
         marks.mark_fault(Moment(tick, 0), event)
     stream.close()
-    for joint in config.robot.joints:
-        brakes = read_component(tmp_path / "run.rrd", f"/cell/brakes/{joint}", "Points3D:positions")
-        assert [len(row) for row in brakes.values] == [0, 1, 0]
-        assert brakes.ticks.tolist() == [0, 3, 6]
-    colour = read_component(tmp_path / "run.rrd", "/cell/brakes/j6", "Points3D:colors").values
-    assert set(colour.ravel().tolist()) == {LOST}
+    assert len(arm) > len(config.robot.joints)
+    for part in arm:
+        entity, red = "/" + "/".join(part.entity), int(LOST)
+        own = int.from_bytes(part.colour.tobytes())
+        colours = read_component(tmp_path / "run.rrd", entity, COLOUR[type(part.shape)])
+        assert list(zip(colours.ticks, colours.values.ravel(), strict=True)) == [
+            *((0, own), (0, own)),
+            *((3, red), (6, own)),
+        ]
+    label = read_component(tmp_path / "run.rrd", "/cell/brakes", "Points3D:labels").values
+    assert [list(row) for row in label if len(row)] == [["brakes engaged"]]
     faults = read_component(tmp_path / "run.rrd", "/cell/faults/j3", "Points3D:labels")
     assert list(faults.values[0]) == ["fault of servo: sensor-nan (j3)"]
     places = read_component(tmp_path / "run.rrd", "/cell/faults/j3", "Points3D:positions")

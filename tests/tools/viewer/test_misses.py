@@ -25,7 +25,7 @@ def recorded(folder: Path, missed: list[list[int]]) -> Path:
     """Write blocks of 400 cycles with misses at these ticks."""
     times = Timelines(TICK_NS, Launch(time.time_ns(), 0))
     stream = Stream(open_recording("misses", "run", folder / "run.rrd", rrb.Blueprint()), times)
-    write = build_miss_lane(stream, TASK)
+    write = build_miss_lane(stream, TASK, "1-servo")
     for number, ticks in enumerate(missed):
         rows = np.zeros(400, dtype=RECORD)
         rows["tick"] = np.arange(400) + 400 * number
@@ -39,15 +39,16 @@ def recorded(folder: Path, missed: list[list[int]]) -> Path:
 
 def test_a_missed_cycle_marks_its_quarter_of_a_second_and_is_in_the_log(tmp_path: Path) -> None:
     file = recorded(tmp_path, [[5, 120, 130], [], [1199]])
-    lane = read_component(file, "/levels/servo/executor_missed", "StateChange:state")
+    lane = read_component(file, "/missed/1-servo", "StateChange:state")
     assert lane.ticks.tolist() == [0, SPAN, 2 * SPAN, 11 * SPAN, 12 * SPAN]
     assert lane.values.ravel().tolist() == ["missed", "missed", "", "missed", ""]
     log = read_component(file, "/log/misses", "TextLog:text").values.ravel().tolist()
-    assert log == ["missed: servo: 3 cycles, ticks 5 to 130", "missed: servo: tick 1199"]
+    assert log == [
+        "tick 5: missed: servo: 3 cycles, ticks 5 to 130",
+        "tick 1199: missed: servo: tick 1199",
+    ]
 
 
 def test_a_task_that_never_misses_has_no_lane(tmp_path: Path) -> None:
-    with pytest.raises(KeyError, match="executor_missed"):
-        read_component(
-            recorded(tmp_path, [[], []]), "/levels/servo/executor_missed", "StateChange:state"
-        )
+    with pytest.raises(KeyError, match="missed/1-servo"):
+        read_component(recorded(tmp_path, [[], []]), "/missed/1-servo", "StateChange:state")

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
 from matplotlib.ticker import NullFormatter
 
+from rack.boards.faults.kind import KINDS
 from rack.tools.console.pictures import open_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.gridspec import SubplotSpec
 
     from rack.tools.faults.campaigns.report import CampaignReport
     from rack.tools.faults.judge import Judgement
 
-SIZE_IN = (13.0, 8.0)
+WIDTH_IN = 11.0
+ROW_IN = 0.27
+"""Height of a row of the upper charts."""
+SIZES_IN = 2.6
+"""Height of the lower chart."""
+LABEL_SIZE = 9
 DOT = "#4477aa"
 MIDDLE = "#222222"
 BOUND = "#cc3311"
@@ -29,40 +32,28 @@ MAX_FRACTION = 1.5
 
 
 def plot_campaign(report: CampaignReport, path: Path) -> None:
-    """Draw the charts of a campaign into one image: delays, effects of size, recovery times."""
-    order = report.order
-    with open_figure([path], *SIZE_IN) as figure:
-        for position, draw in zip(
-            _list_positions(figure), (_draw_delays, _draw_sizes, _draw_recoveries), strict=True
-        ):
-            draw(figure.add_subplot(position), report)
-        title = f"Faults injected into {order.name}: {report.trials_text}, seed {order.seed}"
-        figure.suptitle(title, fontsize=11)
-
-
-def _list_positions(figure: Figure) -> Iterator[SubplotSpec]:
-    """Yield the positions of the three charts: one on the left, two on the right."""
-    # Fixed margins: the numbers beside the left chart and the names of kinds always need room.
-    grid = figure.add_gridspec(
-        2,
-        2,
-        width_ratios=(1.15, 1.0),
-        left=0.11,
-        right=0.98,
-        top=0.91,
-        bottom=0.08,
-        wspace=0.52,
-        hspace=0.28,
-    )
-    yield from (grid[:, 0], grid[0, 1], grid[1, 1])
+    """Draw the charts of a campaign into one image: delays, recovery times, effects of size."""
+    rows_in = ROW_IN * (len(report.by_kind) + 1)
+    heights = (rows_in + 1.7, SIZES_IN) if report.curves else (rows_in + 1.7,)
+    with open_figure([path], WIDTH_IN, sum(heights), layout="constrained") as figure:
+        upper, *lower = figure.subfigures(len(heights), height_ratios=heights, squeeze=False)[:, 0]
+        upper.suptitle(
+            f"Faults injected into the rack {report.order.name}: {report.trials_text}", fontsize=13
+        )
+        delays, recoveries = upper.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+        _draw_delays(delays, report)
+        _draw_recoveries(recoveries, report)
+        upper.legend(loc="outside lower center", ncols=4, fontsize=LABEL_SIZE)
+        for subfigure in lower:
+            _draw_sizes(subfigure.subplots(), report)
 
 
 def _draw_delays(axes: Axes, report: CampaignReport) -> None:
     """Draw the detection delay of each fault as a fraction of its bound.
 
-    The median and the maximum of each kind are written beside it, in cycles.
+    The numbers of detected and injected faults of each kind are written beside it.
     """
-    kinds = list(report.by_kind)[::-1]
+    kinds = list(report.by_kind)
     for row, kind in enumerate(kinds):
         detected = [fault for fault in report.list_faults(kind) if fault.seen == "detected"]
         fractions = [
@@ -79,33 +70,31 @@ def _draw_delays(axes: Axes, report: CampaignReport) -> None:
             clip_on=False,
         )
         if fractions:
-            axes.scatter(
-                [min(MAX_FRACTION, median(fractions))], [row], marker="|", s=180, color=MIDDLE
-            )
+            middle = min(MAX_FRACTION, median(fractions))
+            axes.scatter([middle], [row], marker="|", s=180, color=MIDDLE)
         figures = report.by_kind[kind]
         numbers = f"{figures.detected} of {figures.injected}"
-        if figures.cycles is not None:
-            numbers += f"; {figures.cycles.median:.3g}, {figures.cycles.max:.3g}"
         frame = ("axes fraction", "data")
-        axes.annotate(numbers, (1.02, row), xycoords=frame, fontsize=8, va="center")
-    axes.axvline(1.0, color=BOUND, linewidth=1.2)
+        axes.annotate(numbers, (1.02, row), xycoords=frame, fontsize=LABEL_SIZE, va="center")
+    axes.annotate("detected", (1.02, -1.0), xycoords=frame, fontsize=LABEL_SIZE)
+    axes.scatter([], [], color=DOT, alpha=0.5, label="one fault")
+    axes.scatter([], [], marker="|", s=180, color=MIDDLE, label="median of a kind")
+    axes.scatter([], [], marker=">", s=40, color=BOUND, label=f"later than {MAX_FRACTION:g}")
+    axes.axvline(1.0, color=BOUND, linewidth=1.2, label="longest permitted time")
     axes.set_xlim(-0.03, MAX_FRACTION)
-    _name_rows(axes, kinds)
-    axes.set_xlabel("time to detection as a part of its bound (red); the mark is the median")
-    axes.set_title("found of injected; median, longest, cycles", fontsize=9, loc="right")
+    labels = [f"{kind}: {KINDS[kind].means}" for kind in kinds]
+    axes.set_yticks(range(len(kinds)), labels, fontsize=LABEL_SIZE)
+    axes.set_ylim(len(kinds) - 0.4, -0.6)
+    axes.grid(axis="y", alpha=0.25)
+    axes.set_title("Time to detection", fontsize=11)
+    axes.set_xlabel("part of the longest permitted time")
 
 
 def _draw_row(axes: Axes, row: int, values: list[float]) -> None:
     """Draw values as dots on a horizontal line at height `row`."""
     axes.scatter(
-        values, [row] * len(values), s=26, color=DOT, alpha=0.4, linewidths=0, clip_on=False
+        values, [row] * len(values), s=26, color=DOT, alpha=0.5, linewidths=0, clip_on=False
     )
-
-
-def _name_rows(axes: Axes, names: list[str]) -> None:
-    """Label the rows with names, from the bottom up."""
-    axes.set_yticks(range(len(names)), names, fontsize=8)
-    axes.set_ylim(-0.7, max(0, len(names) - 1) + 0.7)
 
 
 def _compute_fraction(fault: Judgement) -> float | None:
@@ -127,33 +116,45 @@ def _draw_sizes(axes: Axes, report: CampaignReport) -> None:
         delays = [point.delay_ms for point in size_curve.curve if point.delay_ms is not None]
         unseen = [point.size for point in size_curve.curve if point.delay_ms is None]
         longest = max([longest, *delays])
-        (line,) = axes.plot(sizes, delays, marker, markersize=5, alpha=0.6, label=kind)
+        label = KINDS[kind].means
+        (line,) = axes.plot(sizes, delays, marker, markersize=6, alpha=0.6, label=label)
         color = line.get_color()
-        axes.plot(unseen, [1.0] * len(unseen), "x", color=color, transform=edge, clip_on=False)
-        axes.axvline(size_curve.judged_from, color=color, linewidth=0.9, linestyle=":")
-    if report.curves:
-        axes.set_xscale("log")
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        # Use a linear scale up to one tick, because most delays are 0.
-        axes.set_yscale("symlog", linthresh=report.clock_ms)
-        axes.set_ylim(-0.5 * report.clock_ms, 1.5 * longest)
-        axes.legend(fontsize=8)
-    else:
-        axes.text(0.5, 0.5, "no size was tried", ha="center", transform=axes.transAxes)
-    axes.set_xlabel(
-        "size of the error, rad (dotted: smallest that must be detected; x: not detected)"
-    )
+        absent = "not detected" if unseen else None
+        axes.plot(
+            unseen,
+            [1.0] * len(unseen),
+            "x",
+            color=color,
+            transform=edge,
+            clip_on=False,
+            label=absent,
+        )
+        axes.axvline(
+            size_curve.judged_from,
+            color=color,
+            linewidth=1.2,
+            linestyle=":",
+            label="smallest size that must be detected",
+        )
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    # Use a linear scale up to one tick, because most delays are 0.
+    axes.set_yscale("symlog", linthresh=report.clock_ms)
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.set_ylim(-0.5 * report.clock_ms, 1.5 * longest)
+    axes.legend(fontsize=LABEL_SIZE, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    axes.set_title("Time to detection of wrong joint positions", fontsize=11)
+    axes.set_xlabel("size of the error, rad")
     axes.set_ylabel("time to detection, ms")
 
 
 def _draw_recoveries(axes: Axes, report: CampaignReport) -> None:
-    """Draw the recovery time of each fault, in a row for each kind."""
-    kinds: list[str] = []
-    for kind in reversed(report.by_kind):
+    """Draw the recovery time of each fault, in the rows of the detection delays."""
+    for row, kind in enumerate(report.by_kind):
         ticks = [fault.recovery for fault in report.list_faults(kind) if fault.recovery is not None]
-        if ticks:
-            _draw_row(axes, len(kinds), [tick * report.clock_ms * 1e-3 for tick in ticks])
-            kinds.append(kind)
-    _name_rows(axes, kinds)
+        _draw_row(axes, row, [tick * report.clock_ms * 1e-3 for tick in ticks])
     axes.set_xlim(left=0.0)
-    axes.set_xlabel("from the strike until every reaction is undone, s of simulated time")
+    axes.grid(axis="y", alpha=0.25)
+    axes.set_title("Time to recovery", fontsize=11)
+    axes.set_xlabel("from the fault to the end of its effects, s")
