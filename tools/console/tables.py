@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-PIPE_WIDTH = 120
+PIPE_WIDTH = 100
 """Width of fixed-width views, such as `rack status`, when stdout is not a terminal."""
 GAP = 2
 """Number of spaces between columns."""

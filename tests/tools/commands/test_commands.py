@@ -34,8 +34,8 @@ def launched(small: Path, name: str, *arguments: str) -> Iterator[subprocess.Pop
         text=True,
     )
     try:
-        assert process.stdout is not None
-        for line in process.stdout:
+        assert process.stderr is not None
+        for line in process.stderr:
             if line.startswith(name) and "tick 0 " not in line:
                 break
         yield process

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -108,7 +109,7 @@ def test_table_and_line_show_holds_and_problems_of_the_rack(
 def test_a_display_shows_the_events_of_a_fault_but_no_misses(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    display = PlainDisplay()
+    display = PlainDisplay(sys.stdout)
     display.show_event(Event(0, 7, "fault", "servo", "kill begins", "begins", 0))
     display.show_event(Event(0, 8, "miss", "clock", "'servo' has not finished", "late"))
     display.show_event(Event(0, -1, "printed", "", "hello"))
