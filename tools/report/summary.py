@@ -222,7 +222,7 @@ def _list_fault_clauses(report: RunReport) -> list[str]:
 def _format_tasks(report: RunReport, width: int, max_lines: int) -> list[str]:
     """Return the table of tasks. Its last line is about the tasks that do not fit."""
     tasks = _sort_tasks(report)
-    shown = tasks if len(tasks) < max_lines else tasks[: max_lines - 2]
+    shown = tasks if len(tasks) < max_lines else tasks[: max_lines - 1 - ceil(WIDTH / width)]
     rows: list[dict[str, Cell]] = []
     for name, task in shown:
         times, late = task.get("processor_ms"), task.get("lateness_ms")
@@ -239,7 +239,8 @@ def _format_tasks(report: RunReport, width: int, max_lines: int) -> list[str]:
     if others := [task for _, task in tasks[len(shown) :]]:
         lossy = sum(_count_losses(task) > 0 for task in others) or "none"
         most = f"at most {max(map(_compute_use, others)):.0f} % used"
-        lines.append(f"  {len(others)} more: {lossy} missed or skipped, {most}")
+        rest = f"{len(others)} more: {lossy} missed or skipped, {most}"
+        lines += wrap(rest, width, initial_indent="  ", subsequent_indent="  ")
     return lines
 
 
@@ -252,7 +253,7 @@ def _list_causes(report: RunReport) -> list[Row]:
         causes[why] += miss["count"]
         longest_ms[why] = max(longest_ms.get(why, 0.0), miss["why_ms"] or 0.0)
     # The recording may lack rows.
-    causes[miss_causes.NOT_RECORDED] += report.missed + report.skipped - causes.total()
+    causes[miss_causes.NOT_RECORDED] += max(0, report.missed + report.skipped - causes.total())
     clauses = [
         f"{count:,}: {why}" + (f", up to {ms:.2g} ms" if (ms := longest_ms.get(why)) else "")
         for why, count in causes.most_common()
