@@ -164,15 +164,25 @@ def _list_reasons(report: RunReport) -> list[Row]:
         lost = [
             f"{count:,} rows of {name} lost" for name, count in (report.rows_lost or {}).items()
         ]
-        rows.append(("recording", [report.recording] * (report.recording != "complete") + lost))
+        rows.append(
+            (
+                "recording",
+                [report.recording] * (report.recording not in ("complete", "none")) + lost,
+            )
+        )
     return [*rows, ("recording", [report.kept] if report.kept else [])]
 
 
 def _list_facts(report: RunReport) -> list[Row]:
     """Return what happened in a run, the most important subjects first."""
-    brakings = [Braking(**braking) for braking in (report.outcome or {}).get("brakings", ())]
+    outcome = report.outcome or {"reason": "", "brakings": ()}
+    brakings = [Braking(**braking) for braking in outcome["brakings"]]
     braked = [format_brakings(brakings).removeprefix("brakes ")] if brakings else []
-    rows = [*list_outcome_rows(report), ("brakes", braked), ("faults", _list_fault_clauses(report))]
+    # A failure or the task's status may contain the reason already.
+    is_said = report.task or any(outcome["reason"] in why for why in report.failures)
+    rows: list[Row] = [("result", [outcome["reason"]] if outcome["reason"] and not is_said else [])]
+    rows += [*list_outcome_rows(report), ("brakes", braked)]
+    rows.append(("faults", _list_fault_clauses(report)))
     holds = [
         hold
         for hold in report.holds or ()

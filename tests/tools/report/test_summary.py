@@ -203,7 +203,7 @@ def test_each_lost_cycle_has_the_cause_that_the_recording_shows(
 UNJUDGED = "the system response: there are no bounds yet for a response across racks"
 GAP = "5 of 100 rows of lower are missing; ticks 3 to 7; the recorder was killed"
 CHANGES: dict[str, tuple[Document, str, str]] = {
-    "done": ({"cause": "task done"}, "DONE in 4 s", ""),
+    "done": ({"cause": "task done", "reason": "3 parts"}, "DONE in 4 s", "result 3 parts"),
     "failed": (
         {"worked": False, "failures": ["task failed: no way", "level 'x': stuck"]},
         "FAILED after 4 s",
@@ -247,7 +247,8 @@ CHANGES: dict[str, tuple[Document, str, str]] = {
 def test_a_verdict_is_done_only_if_nothing_was_left_out(case: str, small_report: Document) -> None:
     changes, headline, reason = CHANGES[case]
     changes = dict(changes)
-    outcome = small_report["outcome"] | {"cause": changes.pop("cause", "time over")}
+    outcome = small_report["outcome"] | {"cause": "time over"}
+    outcome |= {key: changes.pop(key) for key in ("cause", "reason") if key in changes}
     lines = summary(small_report | changes | {"outcome": outcome})
     assert flat(lines).startswith(f"{small_report['rack']}: {headline} (lockstep)")
     assert reason in flat(lines)
