@@ -42,6 +42,7 @@ from rack.tools.report import arm_outcome
 from rack.tools.report.miss_causes import add_causes
 from rack.tools.report.report_markdown import format_markdown
 from rack.tools.report.run_report import RunReport
+from rack.tools.report.summary import format_run_summary
 from rack.tools.report.task_times import compute_task_times
 from rack.tools.timing.measured_response import measure_system_response
 
@@ -82,6 +83,7 @@ def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Documen
     report |= measure_sizes(folder, report["simulated_s"])
     if against is not None:
         report["against"] = import_module(COMPARISON).compare_runs(recording, against)
+    report["summary"] = format_run_summary(report)
     text = format_markdown(report)
     write_json(folder / "report.json", report)
     write_file(folder / "report.md", text)

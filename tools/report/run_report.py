@@ -23,6 +23,7 @@ class RunReport:
         misses: Lost cycles, from `add_causes`.
         tasks: Dictionary from task to its times, from `compute_task_times`.
         system_response: Result of `measure_system_response`.
+        summary: Lines of the summary, which a command prints without computing them again.
         against: Comparison with another run.
     """
 
@@ -71,6 +72,7 @@ class RunReport:
     kept: Any = None
     bytes: Any = None
     bytes_per_s: Any = None
+    summary: Any = None
     against: Any = None
 
     @classmethod

@@ -6,6 +6,7 @@ A stored report is up to date if it is newer than the recording and than this pr
 from __future__ import annotations
 
 import json
+import sys
 from itertools import chain
 from pathlib import Path
 
@@ -72,6 +73,10 @@ def print_report(data: Document, as_json: bool, is_full: bool = False) -> None:
     """
     if as_json:
         print_json(data)
+        return
+    if data["summary"] and not (is_full or data["against"] or sys.stdout.isatty()):
+        # Printing stored lines needs no import of slow libraries.
+        print(*data["summary"], sep="\n")
         return
     from rack.tools.console.tables import create_console, show_blocks
 

@@ -89,7 +89,7 @@ RUNS: dict[Callable[[pytest.TempPathFactory], Path], tuple[str, tuple[str, ...]]
             "objects 0 of 3 at goal, worst ",
             "motion tracking 0.0",
             " peak; no contact, no limit reached",
-            "faults none",
+            "faults ",
             "cycle ms proc p99 used % missed skipped servo 2.5 ",
             "response command 1282.5 ms (bound 1282.5); status ",
         ),
@@ -106,7 +106,7 @@ RUNS: dict[Callable[[pytest.TempPathFactory], Path], tuple[str, tuple[str, ...]]
     ),
     armless_run: (
         "TIME OVER after 0.5 s (lockstep)",
-        ("timing: no deadlines in lockstep", "faults none", " level.planner 16 "),
+        ("timing: no deadlines in lockstep", "faults ", " level.planner 16 "),
     ),
 }
 
@@ -128,6 +128,8 @@ def test_the_summary_of_a_run_has_the_verdict_first_and_the_facts_in_order(
     places = [printed.find(part) for part in parts]
     assert -1 not in places, parts[places.index(-1)]
     assert places == sorted(places)
+    # A machine that is too busy may delay the clock by so much that it counts as hanging.
+    assert ("faults none " in printed) == (not report["faults"] and not report["unexplained"])
     assert not {"Digest", "alpha", "deviation"} & set(printed.split())
     assert report["digest"] in text
 
