@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from math import ceil
+from shlex import quote
 from textwrap import wrap
 
 from rich.console import Console
@@ -28,6 +29,7 @@ from rack.tools.report.run_report import RunReport
 
 WIDTH = 80
 """Width of the summary. A narrower terminal gets more lines."""
+MIN_WIDTH = 40
 MAX_LINES = 25
 MAX_PART_LINES = 5
 """Largest number of lines with reasons, and of lines with causes and responses."""
@@ -48,7 +50,7 @@ def show_summary(document: Document, console: Console) -> None:
     On a terminal the verdict and the tasks that lost cycles are coloured.
     """
     report = RunReport.from_document(document)
-    first, *lines = format_run_summary(document, min(WIDTH, console.width))
+    first, *lines = format_run_summary(document, max(MIN_WIDTH, min(WIDTH, console.width)))
     style = VERDICT_STYLES.get(_find_verdict(report), "red")
     console.print(Text(first, f"bold {style}"), soft_wrap=True)
     if report.against:
@@ -74,14 +76,10 @@ def format_run_summary(document: Document, width: int = WIDTH) -> list[str]:
     lines += [*_format_rows(_list_reasons(report), width, MAX_PART_LINES * folds), ""]
     rows = [*_list_causes(report), ("response", _list_responses(report))]
     end = ["", *_format_rows(rows, width, MAX_PART_LINES * folds), *_format_files(report, width)]
-    room = MAX_LINES * folds - len(lines) - len(end) - 1
-    lines += _format_rows(_list_facts(report), width, room - MIN_TABLE_LINES)
-    return [
-        *lines,
-        "",
-        *_format_tasks(report, width, MAX_LINES * folds - len(lines) - len(end) - 1),
-        *end,
-    ]
+    room = MAX_LINES * folds - len(lines) - len(end)
+    facts = _format_rows(_list_facts(report), width, room - MIN_TABLE_LINES - 1)
+    lines += [*facts, ""] if facts else []
+    return [*lines, *_format_tasks(report, width, MAX_LINES * folds - len(lines) - len(end)), *end]
 
 
 def _format_rows(rows: Sequence[Row], width: int, max_lines: int) -> list[str]:
@@ -306,13 +304,9 @@ def _format_files(report: RunReport, width: int) -> list[str]:
     """Return the folder of a run, and the commands that show more of it."""
     if (run := report.folder) is None:
         return [f"{'files':{INDENT}}none, not recorded"] if report.recording == "none" else []
-    commands = [f"rack report {run} --full", f"rack replay {run}", f"rack analyze {run}"]
-    on_one_line = "    ".join(commands)
-    lines = [on_one_line] if len(on_one_line) <= width - INDENT else commands
-    lines[0] = f"{'next':{INDENT}}{lines[0]}"
+    name = quote(str(run))
+    commands = [f"rack report {name} --full", f"rack replay {name}", f"rack analyze {name}"]
+    separator = "    " if len("    ".join(commands)) <= width - INDENT else f"\n{'':{INDENT}}"
     size = f"{(report.bytes or 0) * 1e-6:.1f} MB"
-    return [
-        f"{'files':{INDENT}}{run} ({size})",
-        lines[0],
-        *(" " * INDENT + line for line in lines[1:]),
-    ]
+    following = f"{'next':{INDENT}}{separator.join(commands)}"
+    return [f"{'files':{INDENT}}{run} ({size})", *following.splitlines()]
