@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-PIPE_WIDTH = 100
+PIPE_WIDTH = 120
 """Width of fixed-width views, such as `rack status`, when stdout is not a terminal."""
 GAP = 2
 """Number of spaces between columns."""
@@ -22,10 +22,10 @@ UNLIMITED_WIDTH = 1_000_000
 """Width of a table that is neither cut nor wrapped."""
 
 
-def create_console() -> Console:
+def create_console(pipe_width: int = PIPE_WIDTH) -> Console:
     """Return a rich console on stdout, with a fixed width if stdout is not a terminal."""
     stdout_console = Console()
-    return stdout_console if stdout_console.is_terminal else Console(width=PIPE_WIDTH)
+    return stdout_console if stdout_console.is_terminal else Console(width=pipe_width)
 
 
 def terminal_width() -> int | None:

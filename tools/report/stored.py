@@ -14,6 +14,8 @@ from rack.tools.console.answer import Document, Failure, print_json
 from rack.tools.recording.checksums import Checksums, read_file
 from rack.tools.recording.file_names import SPOOL
 
+FULL_WIDTH = 100
+"""Width of the whole report if stdout is not a terminal."""
 REPORT_FILES = ("report.json", "report.md")
 RECORDED_FILES = ("config.toml", "cycles.parquet", "signals", "events.jsonl")
 PROGRAM_FOLDER = Path(__file__).resolve().parents[2]
@@ -64,7 +66,7 @@ def load_report(folder: Path) -> Document:
 def print_report(data: Document, as_json: bool, is_full: bool = False) -> None:
     """Print a report as JSON, as a summary or as the whole text.
 
-    The width of a terminal, or `PIPE_WIDTH`, limits the columns of tables.
+    The width of a terminal, or `FULL_WIDTH`, limits the columns of tables.
 
     Args:
         data: The report as data.
@@ -80,7 +82,7 @@ def print_report(data: Document, as_json: bool, is_full: bool = False) -> None:
         return
     from rack.tools.console.tables import create_console, show_blocks
 
-    console = create_console()
+    console = create_console(FULL_WIDTH)
     if is_full:
         from rack.tools.report.report_markdown import format_for_terminal
 
