@@ -185,8 +185,8 @@ class Launched:
         """Wait until the servo rack is moving on."""
         names = [f"nasrem-rack.{self.name}{rack}" for rack in ("", "-servo")]
         wait_until(lambda: all((SHM_FOLDER / one).exists() for one in names), MOST_S)
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
             if "tick" in line and "command" in line:
                 return
         raise AssertionError(self.process.communicate())

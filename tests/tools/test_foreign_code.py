@@ -151,10 +151,11 @@ def spied(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Spied]:
 @contextmanager
 def _launched(name: str, command: Sequence[str]) -> Iterator[None]:
     """Run a rack that has begun to tick, and end it."""
-    process = subprocess.Popen([*command, "--no-record"], stdout=subprocess.PIPE)
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    process = subprocess.Popen([*command, "--no-record"], **pipes)
     try:
-        assert process.stdout is not None
-        for line in process.stdout:
+        assert process.stderr is not None
+        for line in process.stderr:
             if line.startswith(name.encode()) and b"tick 0 " not in line:
                 break
         yield

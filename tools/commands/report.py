@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 from rack.tools.console.answer import Failure
-from rack.tools.console.parameters import Json, RunFolder, option
-from rack.tools.report.stored import print_report, show_report
+from rack.tools.console.parameters import Full, Json, RunFolder, option
+from rack.tools.report.stored import load_report, print_report
 
 
 def report(
@@ -27,12 +27,19 @@ def report(
         " levels that their configs name",
         False,
     ),
+    full: Full = False,
     as_json: Json = False,
 ) -> None:
     """Report on a run from its recording.
 
-    The command writes report.json and report.md if they are missing or older than the recording or
-    this program. On a terminal the tables show as many columns as fit; report.md has all.
+    The summary has at most 25 lines: the verdict and its reasons, what happened, the tasks that
+    lost cycles ("!"), and the causes of these losses. 'proc p99' is the 99th percentile of the
+    processor time of a task's cycles. 'used' is its percentage of the cycle, or of a planner's time
+    slice. 'late' is the longest time from a release to the start of its cycle. A cause that the
+    recording does not show is "not recorded". --full prints all tables, with the columns that fit.
+
+    The command writes report.json and report.md, which have everything, if they are missing or
+    older than the recording or this program.
 
     With --against the report names the first message that differs, its fields, and whether its
     writer had read the same inputs in both runs. If not, the command follows the differing inputs
@@ -55,13 +62,13 @@ def report(
     if against is None:
         if of or repeat:
             raise Failure("--of and --repeat need --against", 2)
-        show_report(run, as_json)
+        print_report(load_report(run), as_json, full)
         return
     from rack.tools.recording.divergence import find_other_run
     from rack.tools.report.report import OtherRun, write_report
 
     other = find_other_run(run, against)
-    data, text = write_report(run, OtherRun(other, of, repeat))
-    print_report(data, text, as_json)
+    data, _ = write_report(run, OtherRun(other, of, repeat))
+    print_report(data, as_json, full)
     if not data["against"]["explained"]:
         sys.exit(1)

@@ -195,7 +195,7 @@ class RewindPrompt(cmd.Cmd):
         ends with its task.
         """
         arguments = _parse_arguments("branch", line)
-        with open_display(silent=self._as_json) as display:
+        with open_display(self._as_json, sys.stdout) as display:
             answer = self._run.run_branch(
                 arguments.set, arguments.faults, arguments.out, arguments.seconds, display
             )

@@ -18,6 +18,7 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import (
     Anyway,
     Faults,
+    Full,
     Json,
     Settings,
     View,
@@ -77,13 +78,15 @@ def run(
         "run even on cores of another rack's real-time boards, although both will be late",
         False,
     ),
+    full: Full = False,
     as_json: Json = False,
 ) -> None:
     """Run a rack until its task ends, and report on the run.
 
     A rack that names others in adapter.lan.launch also launches them, each by a separate 'rack
     run'. If one fails, all are stopped. On a terminal a live table shows every task and what holds
-    the rack; elsewhere one line a second is printed. --json prints the report as one document. With
+    the rack; elsewhere one line a second is printed on stderr. The end prints the summary that
+    'rack report' explains, --full the whole report, --json the report as one document. With
     --no-record it has the same keys; those that need a recording are null.
 
     With --from, the rack first runs again, unchanged, from the beginning to TIME. Commands of
@@ -130,6 +133,7 @@ def run(
     from rack.tools.launch.launch import UNFINISHED_HINT, Beginning, run_rack
     from rack.tools.launch.verdict import format_headline
     from rack.tools.monitor.display import open_display
+    from rack.tools.report.stored import print_report
 
     if entries is not None:
         from rack.tools.recording.entries import load_entries
@@ -147,7 +151,7 @@ def run(
         # during the launch, `run_rack` lets a signal end the command at once.
         unfinished = UNFINISHED_HINT.format(folder) if folder else ""
         stack.enter_context(INTERRUPT.stop_orderly(unfinished=unfinished))
-        with open_display(silent=as_json) as display:
+        with open_display(as_json, sys.stderr) as display:
             if entries is not None:
                 begins = Beginning(crate=crate, entries=load_entries(rack_config, entries))
             result = run_rack(
@@ -160,9 +164,10 @@ def run(
                 step=step,
                 beginning=begins,
             )
-        report = _report_run(rack_config, folder, result, as_json)
-    if not report["worked"]:
-        # Print the verdict last and on stderr, where the user sees it in any case.
+        report = _report_run(rack_config, folder, result)
+        print_report(report, as_json, full)
+    if not report["worked"] and not sys.stdout.isatty():
+        # Print the verdict on stderr as well, where the user sees it in any case.
         print(
             format_headline(rack_config.name, report["outcome"], report["failures"]),
             file=sys.stderr,
@@ -186,33 +191,15 @@ def _preload_levels(crate: CrateLine | None, tables: Tables) -> CrateLine | None
     return crate
 
 
-def _report_run(
-    config: RackConfig, folder: Path | None, result: RunResult, as_json: bool
-) -> Document:
-    """Write, print and return the report. The run counts as failed if it cannot be written."""
-    from rack.tools.recording.folder_size import format_recorded_line
+def _report_run(config: RackConfig, folder: Path | None, result: RunResult) -> Document:
+    """Write and return the report. The run counts as failed if it cannot be written."""
     from rack.tools.report.report import build_unrecorded_report, write_report
-    from rack.tools.report.report_markdown import format_summary
-    from rack.tools.report.stored import print_report
 
     data = build_unrecorded_report(config, asdict(result))
-    text = "\n".join(format_summary(data))
     try:
         if folder is not None:
-            data, text = write_report(folder)
+            data, _ = write_report(folder)
     except (Failure, OSError, MemoryError) as error:
         why = f"{folder}: no report: {error or 'out of memory'}"
         data |= {"worked": False, "failures": [*data["failures"], why]}
-        text = "\n".join(format_summary(data))
-    if result.others:
-        data["others"] = [asdict(other) for other in result.others]
-    print_report(data, text, as_json)
-    if as_json:
-        return data
-    if folder is not None:
-        lasted_s = result.outcome.ticks * config.clock_ns * 1e-9
-        print(format_recorded_line(folder, lasted_s))
-    for other in result.others:
-        ended = f"{other.rack}: {other.cause} after {other.ticks} ticks"
-        print(f"{ended}, digest {other.digest}, {other.folder or 'not recorded'}")
     return data

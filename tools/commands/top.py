@@ -59,7 +59,7 @@ def top(rack: OnlyRack = None) -> None:
                 "no full screen without textual: pip install 'nasrem-rack[live]'", file=sys.stderr
             )
         monitor = RackMonitor(segment)
-        with open_display(silent=False) as display:
+        with open_display(False, sys.stdout) as display:
             display.show(monitor.take_snapshot())
             while not segment.run_is_over and not ended.wait(SNAPSHOT_INTERVAL_S):
                 display.show(monitor.take_snapshot())

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 from rack.backplane.json_text import encode_json
 from rack.boards.errors import Failure as Failure
@@ -67,10 +67,16 @@ def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> Non
         print_text(text.split("\n") if isinstance(text, str) else text)
 
 
-def print_text(lines: Iterable[str]) -> None:
-    """Print lines of text. A pipe gets no wide lines, and wrapped commands remain executable."""
+def print_text(lines: Iterable[str], stream: TextIO | None = None) -> None:
+    """Print lines of text. A pipe gets no wide lines, and wrapped commands remain executable.
+
+    Args:
+        lines: The lines.
+        stream: Where to print them. None for stdout.
+    """
+    stream = stream or sys.stdout
     for line in lines:
-        if len(line) > PIPE_WIDTH and not sys.stdout.isatty():
+        if len(line) > PIPE_WIDTH and not stream.isatty():
             line = fill(
                 line,
                 PIPE_WIDTH - 2,
@@ -80,7 +86,7 @@ def print_text(lines: Iterable[str]) -> None:
             )
             if line.startswith(("  rack ", "  --set ")):
                 line = line.replace("\n", " \\\n")
-        print(line, flush=True)
+        print(line, file=stream, flush=True)
 
 
 def exit_with_failure(reason: str, status: int) -> NoReturn:

@@ -79,6 +79,7 @@ def check_local_rack_name(rack: str | None) -> str | None:
 Json = Annotated[
     bool, typer.Option("--json", help="print one JSON document on stdout, and nothing else")
 ]
+Full = Annotated[bool, typer.Option("--full", help="print the whole report, with all tables")]
 ConfigName = Annotated[
     str,
     typer.Argument(

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.text import Text
@@ -127,11 +127,12 @@ class LiveDisplay(Display):
 
 
 class PlainDisplay(Display):
-    """Shows a run as one line per second."""
+    """Shows a run as one line per second, on `stream`."""
 
     period_s = 1.0
 
-    def __init__(self) -> None:
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
         self._next = 0.0
 
     def show(self, snapshot: Snapshot) -> None:
@@ -139,16 +140,21 @@ class PlainDisplay(Display):
         now = time.monotonic()
         if now >= self._next or snapshot.run == "stopped":
             self._next = now + self.period_s
-            print_text([format_line(snapshot)])
+            print_text([format_line(snapshot)], self._stream)
 
     def print_event(self, text: Text) -> None:
         """Print the event."""
-        print(text, flush=True)
+        print(text, file=self._stream, flush=True)
 
 
 @contextmanager
-def open_display(silent: bool) -> Iterator[Display]:
-    """Provide the display that suits stdout, or a silent one."""
+def open_display(silent: bool, stream: TextIO) -> Iterator[Display]:
+    """Provide the display that suits stdout, or a silent one.
+
+    Args:
+        silent: Whether to show nothing.
+        stream: Output for the lines that are printed if stdout is not a terminal.
+    """
     terminal = create_console()
     if silent:
         yield Display()
@@ -158,7 +164,7 @@ def open_display(silent: bool) -> Iterator[Display]:
         with Live(console=terminal, auto_refresh=False) as live:
             yield LiveDisplay(live)
     else:
-        yield PlainDisplay()
+        yield PlainDisplay(stream)
 
 
 @dataclass(frozen=True)

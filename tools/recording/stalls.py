@@ -146,6 +146,8 @@ class _CycleTable:
         core: Core of the task.
         is_urgent: True if the task has a real-time priority.
         due_ns: Release of this cycle, or of the first cycle skipped before it.
+        ready_ns: Release from which the task waited for its core: that of this cycle if the
+            previous cycle ended after `due_ns`.
         resumed_ns: Time at which the cause of the lost cycles had ended: the end of a late cycle,
             or the start of a cycle after skipped ones.
         lost: Number of lost cycles: this one if late, and those skipped before it.
@@ -161,6 +163,10 @@ class _CycleTable:
         self.is_urgent = priority > 0
         self.grid_ns = recording.rack_config.tick_ns
         self.due_ns = rows["release_ns"] - count_skipped_releases(rows) * every * self.grid_ns
+        ended_ns = np.concatenate(
+            [np.append(0, trace["end_ns"][:-1])[: len(trace)] for trace in traces]
+        )
+        self.ready_ns = np.where(ended_ns > self.due_ns, rows["release_ns"], self.due_ns)
         # The cause of skipped releases had ended when the next cycle began. The cause of a late
         # cycle may have occurred during that cycle.
         self.resumed_ns = np.where(find_missed_cycles(rows), rows["end_ns"], rows["start_ns"])
@@ -217,7 +223,7 @@ class _CycleTable:
         """
         rows = self.rows[on_core]
         starts = rows["start_ns"]
-        due_ns = np.where(is_shown & self.is_urgent, self.due_ns, self.rows["start_ns"])[on_core]
+        due_ns = np.where(is_shown & self.is_urgent, self.ready_ns, self.rows["start_ns"])[on_core]
         stamps = np.sort(np.concatenate([rows[name] for name in STAMPS]))
         # A span begins no earlier than the last stamp on the core before the cycle. For the
         # first cycle, index -1 selects the last stamp of the run, so its span is empty.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -38,6 +38,14 @@ Tasks release objects up to 2 mm above the support, and opening pads can drag an
 """
 
 
+COUNT_TEXTS = {
+    "touches": "{} unintended contacts",
+    "violations": "limits exceeded in {} substeps",
+    "pushed": "pushed beyond them in {}",
+    "clipped_cycles": "commands refused or cut in {} cycles",
+}
+Row = tuple[str, Sequence[str]]
+"""A label, and clauses about its subject."""
 Signals = Callable[[str], np.ndarray]
 """Function from the name of a field to its values in all messages of a mailbox."""
 
@@ -202,65 +210,42 @@ def find_signals(recording: Recording, *messages: str) -> Signals | None:
     return partial(recording.read_signal, name) if name in recording.mailboxes else None
 
 
-def format_outcome(report: RunReport) -> Iterator[str]:
-    """Yield sentences about the task, the objects, and the arm or hand."""
+def list_outcome_rows(report: RunReport) -> list[Row]:
+    """Return clauses about the task, and about the arm or hand."""
+    rows: list[Row] = []
     if (task := report.task) is not None:
-        done = (
-            f"{task['action']} of {task['actions']} actions, {task['moves_done']} of"
-            f" {task['moves']} elemental moves"
-        )
-        yield ""
-        yield f"Task {task['state']}: {done}{'; ' + task['reason'] if task['reason'] else ''}."
-    for end in report.objects:
-        distance = f"{end['off_mm']:.1f} mm from its goal (tolerance {end['tolerance_mm']:g} mm)"
-        yield f"Object {end['object']} ended {distance}."
-        for drop in end.get("drops", ()):
-            yield f"Object {end['object']} fell {drop['mm']:.0f} mm at tick {drop['tick']}."
-    if report.motion is not None:
-        yield _format_motion(report.motion)
-    if report.hand is not None:
-        yield from _format_hand(report.hand)
-    if report.force is not None:
-        yield _format_force(report.force)
+        moves = f"{task['moves_done']} of {task['moves']} moves"
+        done = f"{task['state']}, {task['action']} of {task['actions']} actions, {moves}"
+        rows.append(("task", [done, *filter(None, [task["reason"]])]))
+    if ends := sorted(report.objects, key=lambda end: end["tolerance_mm"] - end["off_mm"]):
+        worst = f"worst {ends[0]['object']} {ends[0]['off_mm']:.1f} mm"
+        at_goal = sum(end["off_mm"] <= end["tolerance_mm"] for end in ends)
+        clauses = [f"{at_goal} of {len(ends)} at goal, {worst} ({ends[0]['tolerance_mm']:g} mm)"]
+        rows.append(("objects", clauses))
+    if (motion := report.motion) is not None:
+        tracking = []
+        if (rms := motion["tracking_rms_mrad"]) is not None:
+            tracking = [f"tracking {rms:.2g} mrad RMS, {motion['tracking_peak_mrad']:.2g} peak"]
+        rows.append(("motion", [*tracking, *_list_counts(motion)]))
+    if (hand := report.hand) is not None:
+        forces = ", ".join(f"{finger} {n:.2f}" for finger, n in hand["largest_force_n"].items())
+        clauses = [
+            f"tension error {hand['tension_rms_n']:.2f} N RMS, {hand['tension_peak_n']:.2f} peak",
+            f"tensions {hand['least_tension_n']:.2f} to {hand['largest_tension_n']:.2f} N",
+            *_list_counts(hand),
+            f"valves closed in {hand['closed_cycles']} cycles",
+            f"largest forces on the tips {forces} N",
+        ]
+        rows.append(("hand", clauses))
+    if (force := report.force) is not None:
+        rms_n = force["force_rms_n"]
+        largest = f"at most {force['largest_force_n']:.1f} N, {force['largest_torque_nm']:.2f} N m"
+        clauses = [largest, f"above the limits in {force['exceeded_cycles']} cycles"]
+        rows.append(("contact", clauses + ([] if rms_n is None else [f"error {rms_n:.2f} N RMS"])))
+    return rows
 
 
-def _format_motion(motion: Document) -> str:
-    """Return a sentence about the tracking error and the counts of an arm."""
-    tracking = ""
-    if motion["tracking_rms_mrad"] is not None:
-        tracking = (
-            f"Tracking error {motion['tracking_rms_mrad']:.3f} mrad RMS,"
-            f" {motion['tracking_peak_mrad']:.3f} peak; "
-        )
-    return f"{tracking}{_format_counts(motion)}"
-
-
-def _format_counts(report: Document) -> str:
-    """Return a sentence about the counts of an arm or hand."""
-    return (
-        f"{report['touches']} touches; commands refused or cut in {report['clipped_cycles']}"
-        f" cycles; limits exceeded in {report['violations']} substeps, of which an external push"
-        f" caused {report['pushed']}."
-    )
-
-
-def _format_hand(hand: Document) -> Iterator[str]:
-    """Yield sentences about the tensions and forces of a hand."""
-    yield (
-        f"Tension error {hand['tension_rms_n']:.2f} N RMS, {hand['tension_peak_n']:.2f} peak;"
-        f" tensions from {hand['least_tension_n']:.2f} to {hand['largest_tension_n']:.2f} N;"
-        f" valves closed in {hand['closed_cycles']} cycles;"
-        f" {_format_counts(hand)}"
-    )
-    forces = ", ".join(f"{finger} {force:.2f}" for finger, force in hand["largest_force_n"].items())
-    yield f"Largest force on each tip, N: {forces}."
-
-
-def _format_force(force: Document) -> str:
-    """Return a sentence about the contact forces of an arm."""
-    rms_n = force["force_rms_n"]
-    error = "" if rms_n is None else f"; force error {rms_n:.2f} N RMS"
-    return (
-        f"Contact: at most {force['largest_force_n']:.1f} N and {force['largest_torque_nm']:.2f} N"
-        f" m, above the arm's limits in {force['exceeded_cycles']} cycles{error}."
-    )
+def _list_counts(report: Document) -> list[str]:
+    """Return clauses about the counts of an arm or hand that are not zero."""
+    clauses = [text.format(report[key]) for key, text in COUNT_TEXTS.items() if report[key]]
+    return clauses or ["no contact, no limit reached"]

@@ -12,7 +12,11 @@ import numpy as np
 
 from rack.backplane.layout import Layout, TaskSpec
 from rack.boards.config import RackConfig, resolve_layout
-from rack.boards.timing.trace_times import compute_distribution, compute_plan_ages
+from rack.boards.timing.trace_times import (
+    compute_distribution,
+    compute_plan_ages,
+    count_misses_and_skips,
+)
 from rack.levels.peer import Presence, format_peer_port
 from rack.tools.console.answer import Document, write_file, write_json
 from rack.tools.faults.judge import report_faults
@@ -35,8 +39,10 @@ from rack.tools.recording.origin import Origin
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import analyze_stalls
 from rack.tools.report import arm_outcome
+from rack.tools.report.miss_causes import add_causes
 from rack.tools.report.report_markdown import format_markdown
 from rack.tools.report.run_report import RunReport
+from rack.tools.report.summary import format_run_summary
 from rack.tools.report.task_times import compute_task_times
 from rack.tools.timing.measured_response import measure_system_response
 
@@ -77,6 +83,7 @@ def write_report(folder: Path, against: OtherRun | None = None) -> tuple[Documen
     report |= measure_sizes(folder, report["simulated_s"])
     if against is not None:
         report["against"] = import_module(COMPARISON).compare_runs(recording, against)
+    report["summary"] = format_run_summary(report)
     text = format_markdown(report)
     write_json(folder / "report.json", report)
     write_file(folder / "report.md", text)
@@ -93,6 +100,7 @@ def build_report(recording: Recording) -> Document:
     origin = Origin.read_from(recording)
     missed_cycles = list_misses(recording)
     last_tick = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
+    stalls, absent = analyze_stalls(recording)
     response = measure_system_response(recording)
     report = _build_head(config, ended, last_tick + 1, response)
     if not ended:
@@ -103,9 +111,9 @@ def build_report(recording: Recording) -> Document:
         report,
         folder=str(recording.folder),
         continues=None if origin is None else origin.to_document(layout.clock_ns),
-        misses=missed_cycles,
+        misses=add_causes(recording, missed_cycles, absent),
         steal=summarize_steal(recording),
-        stalls=asdict(analyze_stalls(recording)[0]),
+        stalls=asdict(stalls),
         frequency_mhz=summarize_frequency(recording),
         notes=[event["text"] for event in recording.events if event["kind"] == "ready"],
         holds=list_holds(recording),
@@ -177,6 +185,7 @@ def _build_head(
         simulated_s=round(outcome.get("ticks", ticks) * config.clock_ns * 1e-9, 6),
         wall_s=round(ended.get("wall_s", 0.0), 6),
         clock_skipped=ended.get("clock_skipped", 0),
+        others=list(ended.get("others", ())),
         missed=sum(task["missed"] for task in counters),
         skipped=sum(task["skipped"] for task in counters),
     )
@@ -187,11 +196,14 @@ def _build_task_entry(recording: Recording, config: RackConfig, task: TaskSpec) 
     is_lockstep = config.clock.mode == "lockstep"
     layout = recording.layout
     cycles = recording.read_trace(task.name)
+    missed, skipped = count_misses_and_skips(cycles)
+    # If the end of the run was not recorded, the trace has the only counts.
+    counts = recording.find_task_counts(task.name) or {"missed": missed, "skipped": skipped}
     stretches = recording.find_stretches(cycles["tick"])
     period_ns = layout.clock_ns if is_lockstep else config.tick_ns
     entry = {
         **_describe_task(task, layout),
-        **recording.find_task_counts(task.name),
+        **counts,
         **compute_task_times(task, cycles, period_ns, is_lockstep, stretches=stretches),
     }
     if task.role == "executor" and f"{task.board}.plan" in recording.mailboxes:

@@ -19,7 +19,7 @@ from rack.tools.launch.verdict import format_headline
 from rack.tools.monitor.holds import format_resume_command
 from rack.tools.recording.history import count_misses
 from rack.tools.recording.recording import Gap
-from rack.tools.report.arm_outcome import format_outcome
+from rack.tools.report.arm_outcome import list_outcome_rows
 from rack.tools.report.run_report import RunReport
 from rack.tools.report.task_times import format_times
 
@@ -37,6 +37,9 @@ def format_markdown(report: Document) -> str:
 
 def format_for_terminal(report: Document) -> Blocks:
     """Yield a report for a terminal, and the names of the files that contain all data."""
+    if report["folder"] is None:
+        yield from format_summary(report)
+        return
     yield from format_report(report)
     yield ""
     yield f"all columns: {report['folder']}/report.md; all data: report.json"
@@ -53,6 +56,7 @@ def format_summary(document: Document) -> Iterator[str]:
         f"{f' Digest `{report.digest}`.' if report.digest else ''}"
     )
     yield from (f"- not judged: {line}" for line in report.unjudged)
+    yield from (f"- rack {format_other_rack(other)}" for other in report.others)
     if brakings := (report.outcome or {}).get("brakings"):
         yield f"- {format_brakings([Braking(**braking) for braking in brakings])}"
 
@@ -62,8 +66,15 @@ def format_report(document: Document) -> Blocks:
     report = RunReport.from_document(document)
     yield from format_summary(document)
     yield from _format_notes(report)
-    yield from format_outcome(report)
-    yield from _format_queues(report.queues)
+    yield ""
+    for label, clauses in list_outcome_rows(report):
+        yield f"{label.capitalize()}: {'; '.join(clauses)}."
+    for end in report.objects:
+        distance = f"{end['off_mm']:.1f} mm from its goal (tolerance {end['tolerance_mm']:g} mm)"
+        yield f"Object {end['object']} ended {distance}."
+        for drop in end.get("drops", ()):
+            yield f"Object {end['object']} fell {drop['mm']:.0f} mm at tick {drop['tick']}."
+    yield from (f"Queue {format_queue(queue)}." for queue in report.queues)
     yield from _format_interrupts(report.interrupts)
     if report.holds:
         yield from _format_holds(report.rack, report.holds)
@@ -89,15 +100,18 @@ def _format_notes(report: RunReport) -> Iterator[str]:
         yield f"- continues {origin['folder']} from {origin['time_s']:g} s"
     yield from (f"- {note}" for note in report.notes)
     yield from _format_machine(report)
-    if report.recording != "complete":
+    # A failure that names the missing rows has said this already.
+    is_named = any(report.recording in why for why in report.failures)
+    if report.recording != "complete" and not is_named:
         yield f"- recording: {report.recording}"
     if report.kept:
         yield f"- {report.kept}"
-    if lost := ", ".join(f"{name} {count}" for name, count in report.rows_lost.items()):
+    lost = ", ".join(f"{name} {count}" for name, count in report.rows_lost.items())
+    if lost and not is_named:
         yield f"- the recorder lost rows: {lost}"
         yield from (f"- {Gap(**gap)}" for gap in report.gaps)
     if report.against:
-        yield from _format_comparison(report.against)
+        yield from format_comparison(report.against)
 
 
 def _format_selection(rows: Sequence[Any], which: str) -> str:
@@ -194,7 +208,7 @@ def _format_machine(report: RunReport) -> Iterator[str]:
         yield f"- the processor changed its frequency: {cores}"
 
 
-def _format_comparison(against: Document) -> Iterator[str]:
+def format_comparison(against: Document) -> Iterator[str]:
     """Yield lines on where and why the run diverges from another run."""
     difference = against["first_difference"]
     if difference is None:
@@ -264,6 +278,7 @@ def _format_misses(report: RunReport) -> Blocks:
             "what": miss["what"] if miss["what"] == "late" else f"{miss['count']} skipped",
             "started late, ms": format_decimal(miss.get("started_ms")),
             "took, ms": format_decimal(miss.get("took_ms")),
+            "why": miss["why"] + (f", {miss['why_ms']:.3g} ms" if miss["why_ms"] else ""),
         }
         for miss in misses[:MAX_SHOWN_ROWS]
     ]
@@ -310,14 +325,13 @@ def _format_response(response: Document) -> Blocks:
             yield from ("", f"{direction}: {unseen} not measured, because messages are missing.")
 
 
-def _format_queues(queues: Sequence[Document]) -> Iterator[str]:
-    """Yield a sentence about the messages of each queue."""
-    for queue in queues:
-        refused = f", {queue['refused']} refused" if queue["refused"] else ""
-        yield (
-            f"Queue {queue['mailbox']}: {queue['sent']} messages, {queue['taken']} of them read, at"
-            f" most {queue['waiting']} waiting, room for {queue['capacity']}{refused}."
-        )
+def format_queue(queue: Document) -> str:
+    """Return a clause about the messages of a queue."""
+    refused = f", {queue['refused']} refused" if queue["refused"] else ""
+    return (
+        f"{queue['mailbox']}: {queue['sent']} messages, {queue['taken']} of them read, at"
+        f" most {queue['waiting']} waiting, room for {queue['capacity']}{refused}"
+    )
 
 
 def _format_interrupts(boards: Sequence[Document]) -> Iterator[str]:
@@ -363,8 +377,15 @@ def _format_network(network: Document | None) -> Blocks:
         yield _build_traffic_table(imports, ("disordered", "repeated", "superseded", "source"))
     for row in network["exports"]:
         yield f"- {row['entry']}: {row['source']} sent {row['sent']} times"
-    for row in network["peers"]:
-        times = (
-            f"lost {row['losses']} times, {row['lost_s']:g} s; restarted {row['restarts']} times"
-        )
-        yield f"- rack {row['peer']}: {row['state']}; {times}"
+    yield from (f"- rack {format_peer(peer)}" for peer in network["peers"])
+
+
+def format_peer(row: Document) -> str:
+    """Return a clause about the contact with another rack."""
+    times = f"lost {row['losses']} times, {row['lost_s']:g} s; restarted {row['restarts']} times"
+    return f"{row['peer']}: {row['state']}; {times}"
+
+
+def format_other_rack(end: Document) -> str:
+    """Return a clause about the end of a rack that was launched with this one."""
+    return f"{end['rack']}: {end['cause']} after {end['ticks']} ticks, {end['folder']}"

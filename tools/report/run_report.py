@@ -19,8 +19,11 @@ class RunReport:
         worked: The verdict: True if the run succeeded.
         failures: Reasons why the run failed. Empty if it succeeded.
         unjudged: Aspects that the verdict does not cover.
+        others: How the racks that were launched with this one ended.
+        misses: Lost cycles, from `add_causes`.
         tasks: Dictionary from task to its times, from `compute_task_times`.
         system_response: Result of `measure_system_response`.
+        summary: Lines of the summary, which a command prints without computing them again.
         against: Comparison with another run.
     """
 
@@ -39,6 +42,7 @@ class RunReport:
     clock_skipped: int
     missed: int
     skipped: int
+    others: list[Document]
     folder: str | None = None
     continues: Any = None
     misses: Any = None
@@ -68,6 +72,7 @@ class RunReport:
     kept: Any = None
     bytes: Any = None
     bytes_per_s: Any = None
+    summary: Any = None
     against: Any = None
 
     @classmethod

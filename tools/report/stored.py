@@ -1,4 +1,4 @@
-"""Loads the stored report of a run, or builds it again if it is out of date.
+"""Loads and prints the stored report of a run, or builds it again if it is out of date.
 
 A stored report is up to date if it is newer than the recording and than this program.
 """
@@ -6,6 +6,7 @@ A stored report is up to date if it is newer than the recording and than this pr
 from __future__ import annotations
 
 import json
+import sys
 from itertools import chain
 from pathlib import Path
 
@@ -13,14 +14,16 @@ from rack.tools.console.answer import Document, Failure, print_json
 from rack.tools.recording.checksums import Checksums, read_file
 from rack.tools.recording.file_names import SPOOL
 
+FULL_WIDTH = 100
+"""Width of the whole report if stdout is not a terminal."""
 REPORT_FILES = ("report.json", "report.md")
 RECORDED_FILES = ("config.toml", "cycles.parquet", "signals", "events.jsonl")
 PROGRAM_FOLDER = Path(__file__).resolve().parents[2]
 PROGRAM_PACKAGES = ("backplane", "levels", "boards", "tools")
 
 
-def read_stored_report(folder: Path) -> tuple[Document, str] | None:
-    """Return the stored report of a run as data and as text.
+def read_stored_report(folder: Path) -> Document | None:
+    """Return the stored report of a run as data.
 
     Returns:
         The report, or None if it must be built again: it is missing, out of date or damaged, or it
@@ -38,17 +41,16 @@ def read_stored_report(folder: Path) -> tuple[Document, str] | None:
         if (folder / SPOOL).exists() or any(made_ns <= path.stat().st_mtime_ns for path in basis):
             return None
         data = json.loads(read_file(folder / REPORT_FILES[0]))
-        text = read_file(folder / REPORT_FILES[1]).decode()
     except (OSError, ValueError, Failure):
         return None
     if not isinstance(data, dict) or data.get("against") or data.get("folder") != str(folder):
         # The report contains a comparison with another run, or the folder of the run has moved.
         return None
-    return data, text
+    return data
 
 
-def load_report(folder: Path) -> tuple[Document, str]:
-    """Return the report of a run as data and as text.
+def load_report(folder: Path) -> Document:
+    """Return the report of a run as data.
 
     A stored report that is up to date is reused. Otherwise the report is built and stored.
     """
@@ -57,34 +59,35 @@ def load_report(folder: Path) -> tuple[Document, str]:
         # Import this only if needed, because the import is slow.
         from rack.tools.report.report import write_report
 
-        report = write_report(folder)
+        report, _ = write_report(folder)
     return report
 
 
-def show_report(run: str | Path, as_json: bool) -> None:
-    """Print the report of a run, as JSON or as text. Builds it if necessary."""
-    print_report(*load_report(Path(run)), as_json)
+def print_report(data: Document, as_json: bool, is_full: bool = False) -> None:
+    """Print a report as JSON, as a summary or as the whole text.
 
-
-def print_report(data: Document, text: str, as_json: bool) -> None:
-    """Print a report as JSON or as text.
-
-    If the output is a terminal and the run was recorded, tables are limited to the columns that
-    fit. Otherwise `text` is printed.
+    The width of a terminal, or `FULL_WIDTH`, limits the columns of tables.
 
     Args:
         data: The report as data.
-        text: The report as text.
         as_json: Whether to print `data` as one JSON document.
+        is_full: Whether to print the whole text.
     """
     if as_json:
         print_json(data)
         return
-    from rack.tools.console.tables import print_blocks, terminal_width
+    if data["summary"] and not (is_full or data["against"] or sys.stdout.isatty()):
+        # Printing stored lines needs no import of slow libraries.
+        print(*data["summary"], sep="\n")
+        return
+    from rack.tools.console.tables import create_console, show_blocks
 
-    if terminal_width() is not None and data["folder"] is not None:
+    console = create_console(FULL_WIDTH)
+    if is_full:
         from rack.tools.report.report_markdown import format_for_terminal
 
-        print_blocks(format_for_terminal(data))
-    else:
-        print(text)
+        show_blocks(format_for_terminal(data), console)
+        return
+    from rack.tools.report.summary import show_summary
+
+    show_summary(data, console)

@@ -64,7 +64,7 @@ class RecordedRun:
     @cached_property
     def report(self) -> Document:
         """Content of report.json. The file is updated first if it is missing or out of date."""
-        return load_report(self.folder)[0]
+        return load_report(self.folder)
 
     def to_pandas(self, mailbox: str) -> DataFrame:
         """Return a table of all messages of a mailbox. See `RecordedSignal.to_pandas`."""

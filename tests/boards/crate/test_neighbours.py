@@ -134,6 +134,6 @@ def test_without_real_time_priority_every_view_of_a_rack_says_so(
         [*command, *words], cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert "SCHED_FIFO refused, ordinary scheduling for wave" in done.stdout
-    assert "@GROUP - rtprio 99" in done.stdout
-    assert "NO REAL-TIME PRIORITY" in done.stdout.splitlines()[-5]
+    assert "SCHED_FIFO refused, ordinary scheduling for wave" in done.stderr
+    assert "@GROUP - rtprio 99" in done.stderr
+    assert "NO REAL-TIME PRIORITY" in done.stderr.splitlines()[-1]

@@ -192,8 +192,8 @@ def launched(path: Path, name: str) -> Iterator[subprocess.Popen[str]]:
         text=True,
     )
     try:
-        assert process.stdout is not None
-        for line in process.stdout:
+        assert process.stderr is not None
+        for line in process.stderr:
             if line.startswith(name) and "tick 0 " not in line:
                 break
         yield process

@@ -39,7 +39,7 @@ def test_a_restart_that_the_system_refuses_is_reported_and_ends_the_run_properly
         done = subprocess.run(
             command, cwd=ROOT, capture_output=True, text=True, timeout=BOUND_S, check=False
         )
-        out.write_text(f"{done.returncode} {done.stdout}")
+        out.write_text(f"{done.returncode} {done.stderr}")
 
     def occupy() -> None:
         os.setuid(FIVE_MAY)

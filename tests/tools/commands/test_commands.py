@@ -34,8 +34,8 @@ def launched(small: Path, name: str, *arguments: str) -> Iterator[subprocess.Pop
         text=True,
     )
     try:
-        assert process.stdout is not None
-        for line in process.stdout:
+        assert process.stderr is not None
+        for line in process.stderr:
             if line.startswith(name) and "tick 0 " not in line:
                 break
         yield process
@@ -213,7 +213,7 @@ def test_ctrl_c_ends_a_run_in_order(small: Path, rack_name: str, tmp_path: Path)
         # On a busy machine the time for an end in order does not suffice: the run is whole.
         assert rack("report", str(folder)).stdout
         return
-    assert "stopped" in printed
+    assert f"{rack_name}: STOPPED after " in printed
     report = json.loads((folder / "report.json").read_text())
     assert (report["outcome"]["cause"], report["recording"]) == ("stopped", "complete")
 

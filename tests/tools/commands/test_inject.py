@@ -32,10 +32,11 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     command = [*RACK, "run", str(path), "--no-record", "--set", "clock.mode=realtime"]
     # A machine that is busy must not use the restarts up.
     settings = ["--set", f"name={name}", "--set", "supervision.restarts=1000"]
-    process = subprocess.Popen([*command, *settings], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    process = subprocess.Popen([*command, *settings], cwd=ROOT, **pipes, text=True)
     try:
-        assert process.stdout is not None
-        for line in process.stdout:
+        assert process.stderr is not None
+        for line in process.stderr:
             if line.startswith(name) and "tick 0 " not in line:
                 break
         yield name

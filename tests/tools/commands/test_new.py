@@ -70,7 +70,7 @@ def test_a_new_level_reports_its_own_event_once_its_live_limit_is_set(
     run = [name, "--lockstep", "--seconds", "6", "--set", setting, "--out", "recorded"]
     done = rack("run", *run, folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "a joint is faster than the limit" in done.stdout
+    assert "a joint is faster than the limit" in done.stderr
     report = json.loads((tmp_path / "recorded" / "report.json").read_text())
     (found,) = (one for one in report["unexplained"] if one["code"] == "fast")
     assert found["board"] == name

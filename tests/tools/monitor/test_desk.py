@@ -27,9 +27,10 @@ def start(path: Path, name: str, *settings: str) -> subprocess.Popen[str]:
     path.write_text(COMMANDED.replace("commanded_levels:Lower", "commanded_levels:Homing"))
     given = [word for setting in (f"name={name}", *settings) for word in ("--set", setting)]
     command = [*RACK, "run", str(path), "--no-record", *given]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    for line in process.stdout:
+    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(command, cwd=ROOT, **pipes, text=True)
+    assert process.stderr is not None
+    for line in process.stderr:
         if line.startswith(name) and "tick 0 " not in line:
             break
     return process

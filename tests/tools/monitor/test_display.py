@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from typing import Any
 
@@ -158,7 +159,7 @@ def test_a_sparkline_is_left_out_where_counts_need_its_space() -> None:
 def test_a_display_shows_the_events_of_a_fault_but_no_misses(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    display = PlainDisplay()
+    display = PlainDisplay(sys.stdout)
     display.show_event(Event(0, 7, "fault", "servo", "kill begins", "begins", 0))
     display.show_event(Event(0, 8, "miss", "clock", "'servo' has not finished", "late"))
     display.show_event(Event(0, -1, "printed", "", "hello"))

@@ -179,11 +179,16 @@ def test_the_section_of_misses_explains_why_it_lists_fewer_than_the_headline(fol
     late = {"task": "lower", "tick": 5, "what": "late", "count": 1} | {
         "started_ms": 0.1,
         "took_ms": 3.0,
+        "why": "own execution",
+        "why_ms": 2.9,
     }
     skipped = {"task": "lower", "tick": 10, "what": "skipped", "count": 3}
+    skipped |= {"why": "not recorded", "why_ms": None}
     report = write_report(folder)[0] | {"misses": [late, skipped], "missed": 1, "skipped": 3}
     lines = format_markdown(report).splitlines()
     assert "## Missed and skipped cycles: 1 and 3" in lines
+    whys = [line.split("|")[-2].strip() for line in lines if line.startswith(("| 5 ", "| 10 "))]
+    assert whys == ["own execution, 2.9 ms", "not recorded"]
     assert "The tasks counted" not in format_markdown(report)
     fewer = format_markdown({**report, "missed": 2, "skipped": 7})
     assert "The tasks counted 2 and 7; the recording does not contain all of them." in fewer

@@ -60,7 +60,7 @@ CHANGES: dict[str, tuple[Callable[[Path], object], tuple[str, ...]]] = {
 def test_a_stored_report_is_shown_until_a_file_changes(
     folder: Path, change: Callable[[Path], object], name: str
 ) -> None:
-    assert read_stored_report(folder) == write_report(folder)
+    assert read_stored_report(folder) == write_report(folder)[0]
     change(folder / name)
     assert read_stored_report(folder) is None
 
@@ -90,10 +90,9 @@ def test_a_report_is_rebuilt_in_another_folder_and_after_a_comparison(folder: Pa
 def test_the_command_rebuilds_a_report_only_when_necessary(folder: Path) -> None:
     report = json.loads((folder / "report.json").read_text())
     (folder / "report.json").write_text(json.dumps(report | {"digest": "as stored"}))
-    (folder / "report.md").write_text("as stored\n")
     Checksums(folder).store("report.*")
     assert json.loads(rack("report", folder, "--json").stdout)["digest"] == "as stored"
-    assert rack("report", folder).stdout == "as stored\n\n"
+    assert "Digest `as stored`." in rack("report", folder, "--full").stdout
     make_newer(folder / "events.jsonl")
     assert json.loads(rack("report", folder, "--json").stdout) == report
     assert json.loads((folder / "report.json").read_text()) == report
