@@ -27,10 +27,8 @@ GENERATED = "---\nsearch:\n  exclude: true\n---\n\n"
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Replace the files of mkdocs by the pages of the project and all that they link to."""
-    sources = [
-        *ROOT.glob("*.md"),
-        *(page for floor in FLOORS for page in (ROOT / floor).rglob("*.md")),
-    ]
+    beside_code = (page for floor in FLOORS for page in (ROOT / floor).rglob("*.md"))
+    sources = [*ROOT.glob("*.md"), *beside_code]
     uris = sorted(source.relative_to(ROOT).as_posix() for source in sources)
     pages = [File(uri, str(ROOT), config.site_dir, use_directory_urls=False) for uri in uris]
     linked = {path for source in sources for path in _linked_paths(source)}
@@ -48,9 +46,9 @@ def _linked_paths(source: Path) -> Iterator[Path]:
     """Yield the files and folders that a page links to and that need a page or a copy."""
     for link in LINK.findall(source.read_text()):
         path = (source.parent / link).resolve()
-        if path.is_relative_to(ROOT) and path.exists() and path.suffix != ".md":
-            if not (path / "README.md").exists():
-                yield path
+        is_page = path.suffix == ".md" or (path / "README.md").exists()
+        if path.is_relative_to(ROOT) and path.exists() and not is_page:
+            yield path
 
 
 def _suffix(path: Path) -> str:
