@@ -84,6 +84,7 @@ class PageShell:
         self.folder = folder
         self.own = own
         self.background: subprocess.Popen[str] | None = None
+        self.log = folder / "background.txt"
         binaries = Path(sys.executable).parent
         path = f"{binaries}:{os.environ['PATH']}"
         self.environment = {**os.environ, "PATH": path, "MPLBACKEND": "agg", "COLUMNS": "100"}
@@ -95,8 +96,8 @@ class PageShell:
             ["bash", "-c", f"exec {command}"],
             cwd=self.folder,
             env=self.environment,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
+            stdout=self.log.open("w"),
+            stderr=subprocess.STDOUT,
             text=True,
         )
         wait_until(lambda: rack("status", self.own).returncode == 0, LAUNCH_S)
@@ -163,7 +164,9 @@ def test_page_runs_as_it_stands_there(name: str, shell: PageShell) -> None:
                 status, answer = shell.run("bash", "-c", with_own_name(command, shell.own))
                 printed += answer
                 expected = re.search(r"# exit status (\d)", command)
-                assert status == int(expected[1] if expected else 0), f"{command}: {answer[-3000:]}"
+                other = shell.log.read_text()[-2000:] if shell.background else ""
+                wanted = int(expected[1] if expected else 0)
+                assert status == wanted, f"{command}: {answer[-3000:]}\n{other}"
         shown = (block["shown"] or "").splitlines() if printed else []
         missing = [line for line in shown if not is_shown(line, printed)]
         assert not missing, f"{missing} after {code}: {printed[-5000:]}"
@@ -204,5 +207,9 @@ def test_page_can_be_read_in_an_editor_and_to_its_end(name: str) -> None:
         if len(line) > MOST_COLUMNS and not re.match(r"\||!?\[[^]]*\]\(\S+\)$", line)
     ]
     assert not wide
-    long = [part for part in paragraphs if len(part) > MOST_PARAGRAPH_LINES and "|" not in part[0]]
+    long = [
+        part
+        for part in paragraphs
+        if len(part) > MOST_PARAGRAPH_LINES and not part[0].startswith(("|", ":::"))
+    ]
     assert not long
