@@ -13,6 +13,8 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
+from markdown import Extension, Markdown
+from markdown.preprocessors import Preprocessor
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files, InclusionLevel
 from mkdocs.structure.pages import Page
@@ -23,6 +25,29 @@ LINK = re.compile(r"(?<=\]\()(?!https?:)[^)#\s]+(?=[)#])")
 STATIC = (".gif", ".ipynb", ".png")
 LANGUAGES = {".py": "python", ".toml": "toml", ".xml": "xml", ".yml": "yaml"}
 GENERATED = "---\nsearch:\n  exclude: true\n---\n\n"
+
+
+class ListLines(Preprocessor):
+    """Puts an empty line before a list that follows a paragraph, as in many docstrings."""
+
+    def run(self, lines: list[str]) -> list[str]:
+        """Return the lines of a text without its code."""
+        text = "\n".join(lines)
+        return re.sub(r"^(?!- | |$)(.*)\n(?=- )", r"\1\n\n", text, flags=re.MULTILINE).split("\n")
+
+
+class ListExtension(Extension):
+    """Recognises lists as other readers of Markdown do."""
+
+    def extendMarkdown(self, md: Markdown) -> None:  # noqa: N802
+        """Run after the extension that takes out blocks of code."""
+        md.preprocessors.register(ListLines(md), "list_lines", 5)
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Add the extension, to pages and docstrings."""
+    config.markdown_extensions.append(ListExtension())  # type: ignore[arg-type]
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:

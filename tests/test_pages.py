@@ -83,7 +83,7 @@ class PageShell:
     def __init__(self, folder: Path, own: str) -> None:
         self.folder = folder
         self.own = own
-        self.background: subprocess.Popen[str] | None = None
+        self.background: subprocess.Popen[bytes] | None = None
         self.log = folder / "background.txt"
         binaries = Path(sys.executable).parent
         path = f"{binaries}:{os.environ['PATH']}"
@@ -92,14 +92,14 @@ class PageShell:
     def start(self, command: str) -> None:
         """Run a command as in another terminal, and wait until its rack runs."""
         self.end()
-        self.background = subprocess.Popen(
-            ["bash", "-c", f"exec {command}"],
-            cwd=self.folder,
-            env=self.environment,
-            stdout=self.log.open("w"),
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        with self.log.open("w") as log:
+            self.background = subprocess.Popen(
+                ["bash", "-c", f"exec {command}"],
+                cwd=self.folder,
+                env=self.environment,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
         wait_until(lambda: rack("status", self.own).returncode == 0, LAUNCH_S)
 
     def run(self, *words: str) -> tuple[int, str]:
