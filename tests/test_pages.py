@@ -72,6 +72,8 @@ def with_own_name(command: str, own: str) -> str:
         rf"rack \1 {own}",
         command,
     )
+    if command.startswith("rack stop"):
+        command += " --wait 60"
     if re.match(r"rack run (?!brown)", command):
         command += f" --set name={own} --set supervision.max_missed_fraction=1 --share"
     return command + hash_sign + remark
