@@ -13,7 +13,7 @@ ifdef EXHAUSTIVE
 export EXHAUSTIVE
 endif
 .DEFAULT_GOAL := help
-.PHONY: help run test thorough quick mutants golden reference lint dist lock clean
+.PHONY: help run test thorough quick mutants golden reference lint docs dist lock clean
 
 help: ## show this
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
@@ -45,6 +45,10 @@ lint: $(STAMP) ## check style and types
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+docs: $(STAMP) ## build the pages as a site in dist/site, without a network; a broken link is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "dist/site/index.html"
+
 dist: $(STAMP) ## build wheel and sdist of the version in pyproject.toml into dist/
 	rm -rf dist
 	$(BIN)/python -m build --no-isolation --outdir dist .
@@ -52,7 +56,7 @@ dist: $(STAMP) ## build wheel and sdist of the version in pyproject.toml into di
 lock: $(STAMP) ## pin the newest versions that pyproject.toml permits
 	$(BIN)/python -m pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --upgrade --universal --generate-hashes --no-emit-index-url --no-header \
-		--extra can --extra charts --extra dev --extra export --extra lab --extra lan --extra live --extra notebook pyproject.toml --output-file requirements.lock
+		--extra can --extra charts --extra dev --extra docs --extra export --extra lab --extra lan --extra live --extra notebook pyproject.toml --output-file requirements.lock
 
 clean: ## remove the environment and what tools have left; runs/ stays
 	rm -rf $(VENV) dist .mypy_cache .pytest_cache .ruff_cache

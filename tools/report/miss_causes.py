@@ -18,7 +18,7 @@ from rack.tools.console.answer import Document
 from rack.tools.faults.ending import Strike
 from rack.tools.faults.evidence import takes_cycles
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.measured_response import LOSS_CODES
+from rack.tools.timing.chain_response import LOSS_CODES
 
 HYPERVISOR = "hypervisor"
 CORE_TAKEN = "core taken from the rack"

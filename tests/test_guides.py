@@ -1,0 +1,217 @@
+"""Tutorial, how-to pages and troubleshooting: their commands run in order, as the pages have them,
+and print the lines that the pages show."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from textwrap import dedent
+
+import pytest
+
+from tests.processes import wait_until
+from tests.test_course import EXERCISES, is_shown
+from tests.test_examples import FOLDERS
+from tests.test_readme import PAGES as LAYERS
+from tests.tools.command_line import rack
+
+pytestmark = pytest.mark.thorough
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = (
+    "tools/TROUBLESHOOTING.md",
+    "boards/lan/TWO-MACHINES.md",
+    "configs/ANNOTATED.md",
+    "configs/TUTORIAL.md",
+    "levels/arm/HARDWARE.md",
+    "tools/faults/INJECT.md",
+    "tools/recording/EXPORT.md",
+    "tools/recording/REWIND.md",
+    "tools/recording/SIGNALS.md",
+    "tools/scripting/API.md",
+)
+ELSEWHERE = {"CONTRIBUTING.md": "the commands of make"}
+"""Pages with commands that no test runs, and the reason."""
+BLOCK = re.compile(
+    r"(?:^ *<!-- test: (?P<mark>[\w .-]+) -->\n)?"
+    r"^(?P<indent> *)```(?P<language>sh|python|toml)\n(?P<code>.*?)^ *```\n"
+    r"(?:\n```\n(?P<shown>.*?)```)?",
+    re.DOTALL | re.MULTILINE,
+)
+"""Commands, and lines that they print: "..." stands for anything."""
+BOUND_S = 100
+LAUNCH_S = 60
+NAMES = "nasrem|hardware"
+"""Racks that pages launch under a name that another test may use at the same time."""
+MOST_COLUMNS, MOST_PARAGRAPH_LINES, MOST_LINES = 100, 6, 430
+
+
+def commands(code: str) -> Iterator[str]:
+    """Yield the commands of a block, each with its here-document."""
+    lines = iter(code.splitlines())
+    for line in lines:
+        command = [line]
+        if end := re.search(r"<<'(\w+)'", line):
+            for text in lines:
+                command.append(text)
+                if text == end[1]:
+                    break
+        yield "\n".join(command)
+
+
+def with_own_name(command: str, own: str) -> str:
+    """Return a command for a rack of its own name, on a machine that may be too busy."""
+    command, hash_sign, remark = command.partition("  #")
+    command = re.sub(
+        rf"\brack (status|stop|inject|watch|mailbox|command) ({NAMES})\b",
+        rf"rack \1 {own}",
+        command,
+    )
+    if command.startswith("rack stop"):
+        command += " --wait 60"
+    if re.match(r"rack run (?!brown)", command):
+        command += f" --set name={own} --set supervision.max_missed_fraction=1 --share"
+    return command + hash_sign + remark
+
+
+class PageShell:
+    """Runs the blocks of a page in a folder, one after the other."""
+
+    def __init__(self, folder: Path, own: str) -> None:
+        self.folder = folder
+        self.own = own
+        self.background: subprocess.Popen[bytes] | None = None
+        self.log = folder / "background.txt"
+        binaries = Path(sys.executable).parent
+        path = f"{binaries}:{os.environ['PATH']}"
+        self.environment = {**os.environ, "PATH": path, "MPLBACKEND": "agg", "COLUMNS": "100"}
+
+    def start(self, command: str) -> None:
+        """Run a command as in another terminal, and wait until its rack runs."""
+        self.end()
+        with self.log.open("w") as log:
+            self.background = subprocess.Popen(
+                ["bash", "-c", f"exec {command}"],
+                cwd=self.folder,
+                env=self.environment,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+        wait_until(lambda: rack("status", self.own).returncode == 0, LAUNCH_S)
+
+    def run(self, *words: str) -> tuple[int, str]:
+        """Run a program; return its exit status and what it printed."""
+        done = subprocess.run(
+            words,
+            cwd=self.folder,
+            env=self.environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=BOUND_S,
+            check=False,
+        )
+        return done.returncode, (done.stdout + done.stderr).replace(self.own, "nasrem")
+
+    def end(self) -> None:
+        """Wait for the end of the command in the other terminal."""
+        if self.background is not None:
+            assert self.background.wait(BOUND_S) in (0, 1)
+            self.background = None
+
+    def close(self) -> None:
+        """Kill the command in the other terminal if the page has failed."""
+        if self.background is not None:
+            self.background.kill()
+            self.background.wait(BOUND_S)
+
+
+@pytest.fixture
+def shell(tmp_path: Path) -> Iterator[PageShell]:
+    # As in the project: the folder of a page's runs is two below that of the configs.
+    (tmp_path / "configs").symlink_to(ROOT / "configs")
+    folder = tmp_path / "runs" / "page"
+    shutil.copytree(ROOT / "configs" / "examples" / "own-hardware", folder)
+    made = PageShell(folder, f"page-{os.getpid()}")
+    yield made
+    made.close()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize("name", PAGES)
+def test_page_runs_as_it_stands_there(name: str, shell: PageShell) -> None:
+    blocks = list(BLOCK.finditer((ROOT / name).read_text()))
+    assert blocks
+    for block in blocks:
+        code, mark, language = dedent(block["code"]), block["mark"] or "", block["language"]
+        printed = ""
+        if mark.startswith("file "):
+            (shell.folder / mark.removeprefix("file ")).write_text(code)
+        elif mark == "background":
+            shell.start(with_own_name(code.strip(), shell.own))
+        elif language == "python":
+            named = code.replace(
+                'Rack("nasrem"', f'Rack("nasrem", settings={{"name": "{shell.own}"}}'
+            )
+            status, printed = shell.run(sys.executable, "-c", named)
+            assert status == 0, printed
+        elif language == "sh":
+            for command in commands(code):
+                status, answer = shell.run("bash", "-c", with_own_name(command, shell.own))
+                printed += answer
+                expected = re.search(r"# exit status (\d)", command)
+                other = shell.log.read_text()[-2000:] if shell.background else ""
+                wanted = int(expected[1] if expected else 0)
+                assert status == wanted, f"{command}: {answer[-3000:]}\n{other}"
+        shown = (block["shown"] or "").splitlines() if printed else []
+        missing = [line for line in shown if not is_shown(line, printed)]
+        assert not missing, f"{missing} after {code}: {printed[-5000:]}"
+    shell.end()
+
+
+def test_every_page_with_commands_has_a_test() -> None:
+    covered = {
+        *PAGES,
+        *ELSEWHERE,
+        *(str(page.relative_to(ROOT)) for page in LAYERS),
+        *(f"configs/course/{name}/README.md" for name in EXERCISES),
+        "configs/course/answers.md",
+        *(f"configs/examples/{name}/README.md" for name in FOLDERS),
+    }
+    listed = subprocess.run(
+        ["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert listed
+    assert not [
+        name
+        for name in listed
+        if name not in covered and re.search(r"^ *```sh$", (ROOT / name).read_text(), re.MULTILINE)
+    ]
+
+
+@pytest.mark.parametrize("name", [*PAGES, "tools/COMPARISON.md", "README.md", "levels/API.md"])
+def test_page_can_be_read_in_an_editor_and_to_its_end(name: str) -> None:
+    text = (ROOT / name).read_text()
+    assert len(text.splitlines()) <= MOST_LINES
+    # Tables, pictures, links, commands and their output are as wide as they are.
+    prose = re.sub(r"^ *```.*?^ *```$", "", text, flags=re.DOTALL | re.MULTILINE)
+    paragraphs = [part.splitlines() for part in re.split(r"\n\s*\n|\n(?=- |\d\. )", prose)]
+    wide = [
+        line
+        for part in paragraphs
+        for line in part
+        if len(line) > MOST_COLUMNS and not re.match(r"\||!?\[[^]]*\]\(\S+\)$", line)
+    ]
+    assert not wide
+    long = [
+        part
+        for part in paragraphs
+        if len(part) > MOST_PARAGRAPH_LINES and not part[0].startswith(("|", ":::"))
+    ]
+    assert not long

@@ -1,0 +1,84 @@
+"""`make docs` builds the pages as a site that needs no network, and a broken link is an error."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
+
+ROOT = Path(__file__).resolve().parent.parent
+LEFT_OUT = shutil.ignore_patterns(".git", ".venv", ".*_cache", "__pycache__", "dist", "runs")
+BOUND_S = 100
+
+
+def build(project: Path, site: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(site)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    return subprocess.run(
+        command,
+        cwd=project,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=BOUND_S,
+        check=False,
+    )
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    done = build(ROOT, folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_the_site_has_every_page_and_the_code_that_pages_link_to(site: Path) -> None:
+    listed = subprocess.run(
+        ["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()
+    made = [Path(name).with_suffix(".html") for name in listed]
+    made = [path.with_name("index.html") if path.stem == "README" else path for path in made]
+    assert not [str(path) for path in made if not (site / path).exists()]
+    assert "class VirtualControlLoop" in re.sub(
+        "<.*?>", "", (site / "boards" / "run" / "control_loop.py.html").read_text()
+    )
+
+
+def test_the_api_reference_is_made_from_docstrings(site: Path) -> None:
+    launched = (site / "tools" / "scripting" / "API.html").read_text()
+    assert "A rack launched by a program." in launched
+    assert 'id="rack.tools.scripting.attached.AttachedRack.wait_until"' in launched
+    levels = (site / "levels" / "API.html").read_text()
+    assert 'id="rack.levels.level.Executor.process"' in levels
+
+
+def test_the_site_needs_no_network(site: Path) -> None:
+    loads = re.compile(r"""<(?:script|img|iframe)[^>]*\ssrc=["']?(?:https?:)?//|<link[^>]*//""")
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 50
+    assert not [str(page) for page in pages if loads.search(page.read_text())]
+
+
+@pytest.mark.parametrize(
+    ("link", "error"),
+    [
+        ("[gone](levels/gone.md)", "levels/gone.md"),
+        ("[gone](tools/README.md#gone)", "#gone"),
+        ("[gone](tools/gone.py)", "tools/gone.py"),
+    ],
+)
+def test_a_broken_link_is_an_error(link: str, error: str, tmp_path: Path) -> None:
+    project = shutil.copytree(ROOT, tmp_path / "project", ignore=LEFT_OUT)
+    with (project / "README.md").open("a") as page:
+        page.write(f"\nSee {link}.\n")
+    done = build(project, tmp_path / "site")
+    assert done.returncode == 1
+    assert error in done.stderr
