@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
-from rack.backplane.message import AnyMessage, Message, field, make_message
+from rack.backplane.mailbox.mailbox import Verdict
+from rack.backplane.message import Message, field, make_message
 
 if TYPE_CHECKING:
     # A tool that inspects a running rack must not import the levels.
+    from rack.boards.run.port_tables import InputMailbox
     from rack.boards.wiring import Source
 
 EXCHANGE_PORT = "exchange"
@@ -77,21 +78,13 @@ def list_port_ages(exchange: Message) -> dict[str, PortAge]:
     return {label: port for label, port in ports.items() if port.taken != NEVER}
 
 
-class MonitoredPort(NamedTuple):
-    """Access to the last reading of one mailbox, which is `readings[key]`, and to its reader."""
-
-    readings: Mapping[str, Reading[AnyMessage]]
-    key: str
-    reader: Reader
-
-
 class ExchangeRecord:
     """Fills a board's exchange record from its inputs.
 
     The inputs must be in the order of the ports passed to `build_exchange_message`.
     """
 
-    def __init__(self, inputs: Sequence[MonitoredPort], message: Message) -> None:
+    def __init__(self, inputs: Sequence[InputMailbox], message: Message) -> None:
         self._inputs = tuple(inputs)
         # Age and arrival of each input alternate.
         self._values = message.raw.cast("q")
@@ -102,7 +95,8 @@ class ExchangeRecord:
         """Update ages and arrivals. Call this after the reads of the cycle released at `tick`."""
         values = self._values
         at = 0
-        for readings, key, reader in self._inputs:
+        for readings, key, watcher in self._inputs:
+            reader = watcher.reader
             if readings[key].verdict is _NEW:
                 values[at + 1] = tick
             values[at] = tick - reader.newest if reader.serial else 0

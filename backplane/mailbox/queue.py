@@ -34,7 +34,7 @@ from collections.abc import Iterator, Sequence
 from struct import Struct
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
+from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict, Writer
 from rack.backplane.mailbox.slots import get_pid
 from rack.backplane.message import AnyMessage, Message, copy_message, field
 from rack.backplane.segment import Segment
@@ -91,7 +91,7 @@ class QueueWriter(Writer):
     `write` once per cycle to publish these messages.
 
     Attributes:
-        taken: Position of the reader as of the writer's release tick, updated by the board.
+        position: Reader of the position of the queue's reader. The board reads it at every release.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -103,13 +103,13 @@ class QueueWriter(Writer):
         slots.box = memoryview(bytearray(slots.box)).cast("q")
         # A predecessor may have been killed just before it stored this word.
         self._shared[Box.SENT] = self.serial
-        self.taken = 0
+        self.position = Reader(segment, get_position_mailbox(name))
         self._pending: list[bytes] = []
         self._shown_at = 0
 
     def count_free_places(self) -> int:
         """Return the number of messages that can still be sent in this cycle."""
-        unread = self.serial - self.taken + self.held + len(self._pending)
+        unread: int = self.serial - self.position.message.taken + self.held + len(self._pending)
         return max(0, self.spec.capacity - unread)
 
     def send(self, basis: int | None = None) -> bool:
@@ -273,9 +273,8 @@ class QueueReader(Reader):
         position = self._position
         _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
         position.write(tick, now)
-        if not count:
-            return self._unchanged
-        return self._new._replace(earlier=tuple(earlier)) if earlier else self._new
+        reading = self.get_reading(Verdict.NEW if count else Verdict.OLD)
+        return reading._replace(earlier=tuple(earlier)) if earlier else reading
 
     def _can_take(self, serial: int, last: int, tick: int) -> bool:
         """Check whether the message with a given serial can be taken or skipped at `tick`.

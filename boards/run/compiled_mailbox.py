@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import GOOD_OFFSET, NO_MESSAGE_TICK
-from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_BITS, SIGNED_FROM, Slots
+from rack.backplane.mailbox.slots import CHECKED_FROM, SIGNED_FROM, Slots
 from rack.backplane.words import Slot
 from rack.boards.run.instructions import (
     copy,
@@ -65,7 +65,7 @@ PORT = _build_dtype(
     "every",
     "ahead",
     "delay",
-    # Result of the last read, or the process of an intruder found by the last write.
+    # Result of the last read, or the signature of an intruder found by the last write.
     "result",
 )
 """Record of a mailbox to read or to write."""
@@ -77,8 +77,6 @@ OLD_RESULT, NEW_RESULT, CHECK_MESSAGES, CHECK_SILENCE, READ_IN_PYTHON = 0, 1, 2,
 
 They request that Python check the messages, check the writer's silence, or make the whole read.
 """
-MAX_PORTS = 60
-"""Maximum number of ports in a table, because each has a bit in the 64-bit result of a call."""
 
 
 # Functions that return the record at an address, for compiled code.
@@ -170,14 +168,14 @@ def publish(port: Any, tick: int, stamp: int) -> int:
         stamp: Time stamp of the message, in ns of CLOCK_MONOTONIC.
 
     Returns:
-        Process id of an intruder, 0 for none.
+        Signature of an intruder, 0 for none.
     """
     record = slot_at(port.record)
     before = record.serial
     slot = slot_of(port, before + 1)
     intruder = 0
     if load(port.head) != before:
-        intruder = load(slot + _SIGNATURE) >> EPOCH_BITS
+        intruder = load(slot + _SIGNATURE)
     basis = NO_MESSAGE_TICK
     for at in range(port.source_count):
         state = state_at(load(port.sources + 8 * at))
@@ -200,7 +198,7 @@ def publish(port: Any, tick: int, stamp: int) -> int:
 
 
 @compiled_for("i8, i8, i8, i8")
-def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
+def access_ports(table: int, count: int, tick: int, stamp: int) -> bool:
     """Read mailboxes as of a tick, and write the messages that are due.
 
     Args:
@@ -210,10 +208,10 @@ def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
         stamp: Time stamp of written messages, in ns of CLOCK_MONOTONIC.
 
     Returns:
-        A bit for each port that Python must handle, because its result has changed or requests a
-            check.
+        True if Python must handle the results, because one has changed, requests a check or is the
+            signature of an intruder.
     """
-    touched = 0
+    must_handle = False
     for at in range(count):
         port = port_at(table + at * _PORT_SIZE)
         result = 0
@@ -222,9 +220,9 @@ def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
         elif (tick + port.ahead) % port.every == 0:
             result = publish(port, tick, stamp)
         if result > NEW_RESULT or result != port.result:
-            touched |= 1 << at
+            must_handle = True
         port.result = result
-    return touched
+    return must_handle
 
 
 @compiled

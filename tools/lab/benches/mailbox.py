@@ -202,7 +202,7 @@ def _build_reader(segment: Segment, box: MailboxSpec, task: str) -> Callable[[in
     read = watched_reader.reader.read
     delay = box.delay
     message = watched_reader.reader.message
-    line = InputMailbox({}, box.name, watched_reader.read, watched_reader)
+    line = InputMailbox({}, box.name, watched_reader)
     if can_read(line):
         read_table = ReadTable([line]).read
 
