@@ -35,7 +35,7 @@ from collections import deque
 from rack.backplane.address_map import compute_oldest_intact
 from rack.backplane.layout import InterruptSpec, MailboxSpec
 from rack.backplane.mailbox.inbox import Inbox
-from rack.backplane.mailbox.mailbox import MAX_STEP_BACK, Reader, Reading, Verdict, Writer
+from rack.backplane.mailbox.mailbox import MAX_STEP_BACK, Reader, Reading, Writer
 from rack.backplane.mailbox.slots import Slots
 from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
@@ -239,6 +239,6 @@ class InterruptReader(Reader):
         for older in reversed(self._line.served):
             if self.serial < older < serial:
                 if self._fetch_good(older):
-                    return self.get_reading(Verdict.NEW)
+                    return self._new
                 self._count_bad_message(older)
-        return self.get_reading()
+        return self._unchanged

@@ -278,14 +278,19 @@ class Reader:
         self.good = good.record
         """The last good message, with the head of its slot."""
         self.message = good.message
-        self._readings = [Reading(self.message, verdict) for verdict in Verdict]
+        self._readings = {verdict: Reading(self.message, verdict) for verdict in Verdict}
+        self._new = self._readings[Verdict.NEW]
+        self._unchanged = self._readings[Verdict.NONE]
         self.words = state[: GOOD_OFFSET + SLOT_HEAD_SIZE].cast("q")
         self.newest = NO_MESSAGE_TICK
         self.statistics = ReadStatistics()
 
-    def get_reading(self, verdict: Verdict = Verdict.OLD) -> Reading[AnyMessage]:
-        """Return the last good message with a verdict, or with NONE if there is no message yet."""
-        return self._readings[verdict if self.serial else Verdict.NONE]
+    def get_reading(self, is_new: bool) -> Reading[AnyMessage]:
+        """Return the last good message with verdict NEW if `is_new`, otherwise OLD.
+
+        Instead of OLD, the verdict is NONE if no message has been received yet.
+        """
+        return self._new if is_new else self._unchanged
 
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, with its verdict."""
@@ -310,10 +315,8 @@ class Reader:
         """
         self.found = serial
         if serial == self.serial:
-            return self.get_reading()
-        if self._fetch_good(serial):
-            return self.get_reading(Verdict.NEW)
-        return self._accept_older(serial, tick)
+            return self._unchanged
+        return self._new if self._fetch_good(serial) else self._accept_older(serial, tick)
 
     def _accept_older(self, serial: int, tick: int) -> Reading[AnyMessage]:
         """Count a bad message, and accept the newest unread good message before it.
@@ -332,8 +335,10 @@ class Reader:
         slots = self.slots
         if not slots.fetch_message(serial):
             return False
-        if slots.signature != self._signature and not slots.is_from_claimant(self._signature):
-            return False
+        if slots.signature != self._signature:
+            if not slots.is_from_claimant(self._signature):
+                return False
+            self._unchanged = self._readings[Verdict.OLD]
         self.good[:] = slots.record
         return True
 
@@ -352,12 +357,12 @@ class Reader:
         for older in range(serial - 1, max(self.serial, serial - slots.depth), -1):
             if slots.has_message(older) and slots.read_visible_tick(older) <= tick:
                 if self._fetch_good(older):
-                    return self.get_reading(Verdict.NEW)
+                    return self._new
                 self._count_bad_message(older)
                 tries -= 1
                 if not tries:
                     break
-        return self.get_reading()
+        return self._unchanged
 
     def _count_bad_message(self, serial: int) -> None:
         """Count the last fetched message as damaged or forged.
@@ -383,7 +388,8 @@ class Reader:
         """Count a read that timed out. Returns the last good message with verdict BUS_ERROR."""
         self.statistics.bus_errors += 1
         self.statistics.bad_reads += 1
-        return self.get_reading(Verdict.BUS_ERROR)
+        verdict = Verdict.BUS_ERROR if self.serial else Verdict.NONE
+        return self._readings[verdict]
 
     def add_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
         """Return the reading with all unread messages before its own in `earlier`, oldest first.

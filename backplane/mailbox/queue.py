@@ -34,7 +34,7 @@ from collections.abc import Iterator, Sequence
 from struct import Struct
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict, Writer
+from rack.backplane.mailbox.mailbox import Reader, Reading, Writer
 from rack.backplane.mailbox.slots import get_pid
 from rack.backplane.message import AnyMessage, Message, copy_message, field
 from rack.backplane.segment import Segment
@@ -273,8 +273,9 @@ class QueueReader(Reader):
         position = self._position
         _PUT_POSITION(position.message.raw, 0, self.taken, newest - self.taken)
         position.write(tick, now)
-        reading = self.get_reading(Verdict.NEW if count else Verdict.OLD)
-        return reading._replace(earlier=tuple(earlier)) if earlier else reading
+        if not count:
+            return self._unchanged
+        return self._new._replace(earlier=tuple(earlier)) if earlier else self._new
 
     def _can_take(self, serial: int, last: int, tick: int) -> bool:
         """Check whether the message with a given serial can be taken or skipped at `tick`.

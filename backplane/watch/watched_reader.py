@@ -210,5 +210,5 @@ class GridReader:
             self._was_lost = reading.is_lost
             return reading
         is_lost = self._was_lost or self._watched.is_writer_lost(tick)
-        reading = self.reader.get_reading()
+        reading = self.reader.get_reading(False)
         return reading._replace(is_lost=True) if is_lost else reading

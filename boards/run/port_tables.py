@@ -16,7 +16,7 @@ import numpy as np
 
 from rack.backplane.address_map import compute_slot_stride
 from rack.backplane.errors import MailboxError
-from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reader, Verdict, Writer
+from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reader, Writer
 from rack.backplane.mailbox.slots import Slots, get_pid
 from rack.backplane.message import AnyMessage
 from rack.backplane.watch.watched_reader import GridReader, MailboxWatcher, WatchedReader
@@ -96,8 +96,7 @@ class ReadTable(PortTable):
                 if result & READ_IN_PYTHON:
                     readings[key] = watcher.read(tick)
                     continue
-                verdict = Verdict.NEW if result & NEW_RESULT else Verdict.OLD
-                readings[key] = watcher.reader.get_reading(verdict)
+                readings[key] = watcher.reader.get_reading(bool(result & NEW_RESULT))
                 if result > NEW_RESULT and isinstance(watcher, WatchedReader):
                     readings[key] = watcher.check_reading(
                         tick, readings[key], result & CHECK_MESSAGES, result & CHECK_SILENCE

@@ -80,7 +80,7 @@ class InputPorts:
                     count_room=partial(level.max_messages, port),
                     asynchronous=rule is not None and rule.asynchronous,
                 )
-                values[key] = watcher.reader.get_reading()
+                values[key] = watcher.reader.get_reading(False)
                 line = InputMailbox(
                     values, key, watcher if rule is None else GridReader(watcher, rule.grid)
                 )
