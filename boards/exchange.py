@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rack.backplane.mailbox.mailbox import Verdict
-from rack.backplane.message import Message, field, make_message
+from rack.backplane.mailbox.mailbox import Reading, Verdict
+from rack.backplane.message import AnyMessage, Message, field, make_message
+from rack.backplane.watch.watched_reader import GridReader, MailboxWatcher
 
 if TYPE_CHECKING:
     # A tool that inspects a running rack must not import the levels.
-    from rack.boards.run.port_tables import InputMailbox
     from rack.boards.wiring import Source
 
 EXCHANGE_PORT = "exchange"
@@ -76,6 +76,20 @@ def list_port_ages(exchange: Message) -> dict[str, PortAge]:
         label: PortAge(age, taken) for label, age, taken in zip(labels, values, values, strict=True)
     }
     return {label: port for label, port in ports.items() if port.taken != NEVER}
+
+
+class InputMailbox(NamedTuple):
+    """One mailbox to read.
+
+    Attributes:
+        readings: Table that receives the reading.
+        key: Key of the reading in that table.
+        watcher: Reads the mailbox, and checks it.
+    """
+
+    readings: dict[str, Reading[AnyMessage]]
+    key: str
+    watcher: MailboxWatcher | GridReader
 
 
 class ExchangeRecord:

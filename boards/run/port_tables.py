@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from time import monotonic_ns
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,9 +17,9 @@ from rack.backplane.address_map import compute_slot_stride
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reader, Writer
 from rack.backplane.mailbox.slots import Slots, get_pid
-from rack.backplane.message import AnyMessage
-from rack.backplane.watch.watched_reader import GridReader, MailboxWatcher, WatchedReader
+from rack.backplane.watch.watched_reader import MailboxWatcher, WatchedReader
 from rack.backplane.words import Block
+from rack.boards.exchange import InputMailbox
 from rack.boards.run.compiled_mailbox import (
     CHECK_MESSAGES,
     CHECK_SILENCE,
@@ -29,24 +28,9 @@ from rack.boards.run.compiled_mailbox import (
     READ_IN_PYTHON,
     access_ports,
 )
-from rack.levels.level import Reading
 
 WORD_BYTES = 8
 """Size of a word in bytes, and required alignment of memory that compiled code accesses."""
-
-
-class InputMailbox(NamedTuple):
-    """One mailbox to read.
-
-    Attributes:
-        readings: Table that receives the reading.
-        key: Key of the reading in that table.
-        watcher: Reads the mailbox, and checks it.
-    """
-
-    readings: dict[str, Reading[AnyMessage]]
-    key: str
-    watcher: MailboxWatcher | GridReader
 
 
 class PortTable:

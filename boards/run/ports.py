@@ -16,9 +16,10 @@ from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import GridReader, WatchedReader, open_watched
+from rack.boards.exchange import InputMailbox
 from rack.boards.faults.kind import find_kind
 from rack.boards.faults.message_steps import FaultyWriter
-from rack.boards.run.port_tables import InputMailbox, ReadTable, WriteTable, can_write
+from rack.boards.run.port_tables import ReadTable, WriteTable, can_write
 from rack.boards.wiring import Source
 from rack.levels.level import LevelSection
 from rack.levels.ports import Sender

@@ -26,8 +26,9 @@ from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import open_watched
 from rack.boards.config.layout import build_field_specs
+from rack.boards.exchange import InputMailbox
 from rack.boards.faults.bounds import format_count
-from rack.boards.run.port_tables import InputMailbox, ReadTable, WriteTable, can_read, can_write
+from rack.boards.run.port_tables import ReadTable, WriteTable, can_read, can_write
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import (
