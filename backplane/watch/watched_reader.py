@@ -27,7 +27,7 @@ def open_watched(
     count_room: Callable[[], int] = lambda: UNLIMITED,
     asynchronous: bool = False,
 ) -> MailboxWatcher:
-    """Open a mailbox for a task, with checks of its messages.
+    """Open a mailbox that a task reads and checks.
 
     The silence of the writer is checked too, except for the clock, which writes operators' commands
     at irregular times.
@@ -65,7 +65,6 @@ class MailboxWatcher:
         self.reader = reader
         self._episodes = Episodes(segment, reader.spec.name, alarms)
         self._task = task
-        self._statistics = reader.statistics
         self._reported = copy(reader.statistics)
 
     def read(self, tick: int) -> Reading[AnyMessage]:
@@ -83,11 +82,11 @@ class MailboxWatcher:
     @property
     def _has_trouble(self) -> bool:
         """True if the last read failed or found a bad message."""
-        return self._statistics.bad_reads != self._reported.bad_reads
+        return self.reader.statistics.bad_reads != self._reported.bad_reads
 
     def _report_bad_read(self, tick: int) -> None:
         """Count a bad read for the task, and raise alarms for a damaged or forged message."""
-        statistics = self._statistics
+        statistics = self.reader.statistics
         accesses = self.reader.accesses
         self._task.troubles += 1
         if statistics.corrupt != self._reported.corrupt:
@@ -100,7 +99,7 @@ class MailboxWatcher:
 class WatchedReader(MailboxWatcher):
     """Reader of a mailbox that a task writes.
 
-    A read without findings costs only a few comparisons more than one without checks.
+    If a read finds nothing unusual, its checks cost only a few comparisons.
     """
 
     def __init__(
@@ -127,7 +126,7 @@ class WatchedReader(MailboxWatcher):
 
         Args:
             tick: Release tick of the reading cycle.
-            reading: Result of the reader itself.
+            reading: The reading to check.
             check_messages: Not 0 if there are messages to check.
             check_silence: Not 0 if the writer's silence must be checked.
 

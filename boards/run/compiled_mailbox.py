@@ -101,7 +101,7 @@ def take(port: Any, serial: int) -> bool:
         serial: Serial of the message.
 
     Returns:
-        False if Python must handle the message, because it is bad or its writer is a new one.
+        False if Python must handle the message, because it is bad or from a new writer.
     """
     slot = slot_of(port, serial)
     copy(port.record, slot, SIGNED_FROM)
@@ -111,8 +111,7 @@ def take(port: Any, serial: int) -> bool:
     state = state_at(port.state)
     if received.serial != serial or received.signature != state.signature:
         return False
-    check: int = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain)
-    if check != received.check:
+    if xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain) != received.check:
         return False
     copy(port.state + GOOD_OFFSET, port.record, port.size)
     state.transfers += 1
@@ -128,8 +127,8 @@ def read_port(port: Any, tick: int) -> int:
         tick: Release tick of the cycle.
 
     Returns:
-        `OLD_RESULT` or `NEW_RESULT`, combined with the bits that request checks, or
-            `READ_IN_PYTHON` alone.
+        `OLD_RESULT` or `NEW_RESULT`, combined with the bits that request checks. `READ_IN_PYTHON`
+            alone if Python must read the mailbox instead.
     """
     state = state_at(port.state)
     serial = load(port.head)
@@ -144,8 +143,8 @@ def read_port(port: Any, tick: int) -> int:
     state.accesses += 1
     state.found = serial
     if port.is_watched:
-        # In the usual case there is no new message, or exactly one, which is in time and belongs to
-        # a later release.
+        # In the usual case there is no new message, or exactly one, which is in time and from a
+        # later release than the message before it.
         if 0 <= state.judged == serial - 1 and (
             state.judged_tick < state.tick > state.visible - port.late_from
         ):
