@@ -113,7 +113,10 @@ class QueueWriter(Writer):
         return max(0, self.spec.capacity - unread)
 
     def send(self, basis: int | None = None) -> bool:
-        """Send a copy of `message` at the end of this cycle. Returns False if the queue is full."""
+        """Send a copy of `message` at the end of this cycle. Returns False if the queue is full.
+
+        `basis` is ignored: `write` states the basis of all messages of a cycle.
+        """
         if not self.count_free_places():
             self.refused += 1
             self._shared[Box.REFUSED] += 1
@@ -280,8 +283,8 @@ class QueueReader(Reader):
     def _can_take(self, serial: int, last: int, tick: int) -> bool:
         """Check whether the message with a given serial can be taken or skipped at `tick`.
 
-        A bad message is skipped if the visible tick in its slot is later than that of any valid
-        message can be.
+        A bad message is skipped if the visible tick in its slot is later than any that a valid
+        message can have.
 
         Args:
             serial: Serial of the message.

@@ -32,7 +32,7 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
         self._record = record
 
     def iterate_source(self) -> Iterator[bytes]:
-        """Yield what the code of a caller depends on: this file and the record type."""
+        """Yield what a caller's machine code depends on: this file and the record type."""
         yield Path(__file__).read_bytes()
         yield repr(self._record).encode()
 

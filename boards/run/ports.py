@@ -122,7 +122,7 @@ class InputPorts:
 
     @property
     def _readers(self) -> list[Reader]:
-        """Readers of all mailboxes, in an order that is always the same."""
+        """Readers of all mailboxes, the plan first."""
         return [line.watcher.reader for line in self._plans + self._rest]
 
     @property
@@ -148,8 +148,8 @@ class OutputPort:
     The basis of a message is the tick of the oldest information on which it depends: the oldest
     basis of the messages of `sources`. A mailbox with a `max_age` is written on demand, only in
     cycles in which the level has sent a message. Any other mailbox is written in every cycle that
-    is due. If `sends` is true, the level fills a queue by calling `send`. Otherwise its message is
-    sent once per due cycle.
+    is due. If `sends` is true, the level fills a queue by calling `send`. Otherwise the board sends
+    the level's message once per due cycle.
     """
 
     def __init__(
