@@ -131,8 +131,8 @@ def is_locked(fd: int, address: int) -> bool:
         fd: Descriptor of the segment.
         address: Bus address of the byte.
     """
-    asked = _pack_lock_request(fcntl.F_RDLCK, address)
-    kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, asked))[0]
+    request = _pack_lock_request(fcntl.F_RDLCK, address)
+    kind: int = _FLOCK.unpack(fcntl.fcntl(fd, fcntl.F_OFD_GETLK, request))[0]
     return kind != fcntl.F_UNLCK
 
 

@@ -15,7 +15,7 @@ def build_lazy_getattr(package: str, places: Mapping[str, Sequence[str]]) -> Cal
 
     Args:
         package: Name of the package, for error messages.
-        places: For each module, the exported names that it defines.
+        places: Dictionary from each module to the exported names that it defines.
     """
     module_of = {name: module for module, names in places.items() for name in names}
 

@@ -170,7 +170,7 @@ class OperatorTable:
         return entry.given_tick < 0
 
     def is_waiting(self, entry: RequestEntry) -> bool:
-        """Check whether a request waits for its tick and its client, if it has one, is alive."""
+        """Check whether a request is still waiting, and its client, if it has one, is alive."""
         if entry.stage != RequestStage.WAITING:
             return False
         return not entry.client or self.is_client_alive(entry)

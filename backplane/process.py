@@ -232,8 +232,8 @@ def describe_refusal(error: OSError) -> str:
     if error.errno not in limits:
         return str(error)
     resource, option, limit = limits[error.errno]
-    most = getrlimit(limit)[0]
-    return f"{error.strerror}: the limit is {most} {resource} (ulimit -{option})"
+    maximum = getrlimit(limit)[0]
+    return f"{error.strerror}: the limit is {maximum} {resource} (ulimit -{option})"
 
 
 def set_priority(priority: int) -> bool:

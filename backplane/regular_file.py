@@ -40,7 +40,7 @@ def read_regular_file(path: Path, limit_bytes: int) -> bytes:
 
     Raises:
         RefusedFileError: The file is not a regular file, or it is too large.
-        OSError: The file cannot be opened or read, as by `open`.
+        OSError: The file cannot be opened or read.
     """
     # Merely opening a device can have side effects, so the kind is checked first. It is checked
     # again once the file is open, because the path may name another file by that time.

@@ -52,8 +52,8 @@ class Semaphore:
     def __init__(self, memory: memoryview, address: int) -> None:
         """Access the semaphore at a bus address of a segment's memory."""
         # This view keeps the memory mapped for as long as the semaphore is in use.
-        self._place = ctypes.c_char.from_buffer(memory, address)
-        at = ctypes.addressof(self._place)
+        self._memory = ctypes.c_char.from_buffer(memory, address)
+        at = ctypes.addressof(self._memory)
         # A struct timespec, read by the C library in place.
         self._deadline = (ctypes.c_int64 * 2)()
         self.release: Callable[[], object] = partial(_sem_post, at)
@@ -64,13 +64,13 @@ class Semaphore:
 
     def initialize(self, value: int) -> None:
         """Create the semaphore with an initial value, shared by all processes that map it."""
-        _sem_init(ctypes.addressof(self._place), 1, value)
+        _sem_init(ctypes.addressof(self._memory), 1, value)
 
     @property
     def value(self) -> int:
         """Value of the semaphore: the number of waits that would succeed at once."""
         count = ctypes.c_int()
-        _sem_getvalue(ctypes.addressof(self._place), ctypes.addressof(count))
+        _sem_getvalue(ctypes.addressof(self._memory), ctypes.addressof(count))
         return count.value
 
     def set_deadline(self, deadline_ns: int) -> None:

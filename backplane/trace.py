@@ -94,7 +94,7 @@ def open_trace_ring(segment: Segment, task: str) -> Ring:
 
 
 class CycleRecord:
-    """Trace of a task, from which readers of its mailboxes learn which cycles have ended."""
+    """Reads the trace of a task, so that readers of its mailboxes know which cycles have ended."""
 
     def __init__(self, segment: Segment, task: str) -> None:
         self._block = segment.get_block(task)

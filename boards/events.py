@@ -290,7 +290,7 @@ class Ending:
     Args:
         segment: Memory of the rack.
         ends_run: Status mailbox of the level that ends the run, as in `ClockWiring`.
-        silent: Time without a status that ends the run, as in `ClockWiring`.
+        silent: Time without a status after which the run ends, as in `ClockWiring`.
     """
 
     def __init__(self, segment: Segment, ends_run: str | None, silent: int) -> None:

@@ -12,8 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
+from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.message import AnyMessage, Message, field, make_message
+from rack.backplane.watch.watched_reader import GridReader, MailboxWatcher
 
 if TYPE_CHECKING:
     # A tool that inspects a running rack must not import the levels.
@@ -77,12 +78,18 @@ def list_port_ages(exchange: Message) -> dict[str, PortAge]:
     return {label: port for label, port in ports.items() if port.taken != NEVER}
 
 
-class MonitoredPort(NamedTuple):
-    """Access to the last reading of one mailbox, which is `readings[key]`, and to its reader."""
+class InputMailbox(NamedTuple):
+    """One mailbox to read.
 
-    readings: Mapping[str, Reading[AnyMessage]]
+    Attributes:
+        readings: Table that receives the reading.
+        key: Key of the reading in that table.
+        watcher: Reads the mailbox, and checks it.
+    """
+
+    readings: dict[str, Reading[AnyMessage]]
     key: str
-    reader: Reader
+    watcher: MailboxWatcher | GridReader
 
 
 class ExchangeRecord:
@@ -91,7 +98,7 @@ class ExchangeRecord:
     The inputs must be in the order of the ports passed to `build_exchange_message`.
     """
 
-    def __init__(self, inputs: Sequence[MonitoredPort], message: Message) -> None:
+    def __init__(self, inputs: Sequence[InputMailbox], message: Message) -> None:
         self._inputs = tuple(inputs)
         # Age and arrival of each input alternate.
         self._values = message.raw.cast("q")
@@ -102,7 +109,8 @@ class ExchangeRecord:
         """Update ages and arrivals. Call this after the reads of the cycle released at `tick`."""
         values = self._values
         at = 0
-        for readings, key, reader in self._inputs:
+        for readings, key, watcher in self._inputs:
+            reader = watcher.reader
             if readings[key].verdict is _NEW:
                 values[at + 1] = tick
             values[at] = tick - reader.newest if reader.serial else 0

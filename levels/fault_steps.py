@@ -138,7 +138,7 @@ def add_position_noise(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool
 
 
 def repeat_last_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
-    """Return the fault's first sample, dated one cycle earlier, as if no new sample arrived."""
+    """Return the fault's first sample, dated one cycle back, as if no new one had arrived."""
     first = fault.recall_first_sample(sample)
     return first._replace(tick=first.tick - fault.every), True
 

@@ -68,7 +68,7 @@ MUTANTS = (
         "corrupt",
         (
             (SLOTS, "self.chain == xxh3(self.covered, self.words[_CHAIN])", "True"),
-            ("boards/run/compiled_mailbox.py", "if check != received.check:", "if False:"),
+            ("boards/run/compiled_mailbox.py", " != received.check:", " is None:"),
             (f"{WATCH}/message_watch.py", "self._record_finding(Alarm.DAMAGED, tick)", "pass"),
             (f"{WATCH}/watched_reader.py", DAMAGED, "pass"),
         ),
@@ -88,7 +88,9 @@ MUTANTS = (
     ),
     Mutant("brake", "sensor-nan", (first(ARM, "def brake(self) -> None:", "return"),)),
     Mutant(
-        "restart", "kill", (("boards/crate/recovery.py", "if len(recent) >= most:", "if True:"),)
+        "restart",
+        "kill",
+        (("boards/crate/recovery.py", "if len(recent) >= max_restarts:", "if True:"),),
     ),
     Mutant(
         "violation counter",

@@ -65,7 +65,7 @@ class ClockDriver(ABC):
     Attributes:
         controller: Other work of the system controller, set by the clock's board. None if there
             is no such work.
-        skip: Number of ticks that the clock has yet to skip because of a fault.
+        skip: Number of ticks that the clock still has to skip because of a fault.
         tasks: Tasks in the order of their release.
         processes: Tasks and host boards. The clock does not release host boards.
         is_flooded: True while a fault makes a task flood its mailboxes, so that messages are
@@ -242,7 +242,7 @@ class RealtimeDriver(ClockDriver):
     def _release_tasks(self, tick: int, last: int) -> None:
         """Release every task that has a release after tick `last` and up to `tick`.
 
-        Tasks that sleep by their own timer are released at once, ahead of the grid point. The
+        Tasks that wake themselves with a timer are released at once, ahead of the grid point. The
         others are released at the grid point.
         """
         due = self.list_due_tasks(tick, last)

@@ -130,7 +130,8 @@ class LockstepDriver(ClockDriver):
         if len(due) != 1 or controller is None or self._one_at_a_time:
             return tick + 1
         (alone,) = due
-        # A slower executor has several ticks in a cycle. They may begin while the cycle still runs.
+        # An executor with a longer period needs no batch, because further ticks may begin while its
+        # cycle is still running.
         if alone.spec.every > 1 or alone.spec.role != "executor" or alone.is_stopped:
             return tick + 1
         words = self.words

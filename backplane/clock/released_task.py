@@ -37,9 +37,9 @@ class ReleasedTask:
         done: Semaphore that it posts in lockstep to report a finished release.
         missed: Number of consecutive releases missed. It stays at 2 as long as the task still
             finishes its releases late.
-        deadline: Tick before which it must finish its release or plan, or send its messages if
-            that is earlier. This is the value last read from the control block, in which the
-            task postpones it when it begins a plan.
+        deadline: Tick before which it must finish its release or plan, or send its messages if that
+            is earlier. This is a copy of the word in the control block, which the task changes to a
+            later tick when it begins a plan.
         is_stopped: True if a signal has stopped its process, so that lockstep must not wait for
             it.
     """
@@ -143,7 +143,7 @@ class ReleasedTask:
         self.block[Block.LOST] = tick + 1
 
     def admit_new_process(self) -> None:
-        """Let the task's new process rejoin. Its first release is the task's next one."""
+        """Let the task's new process rejoin at the next release of the task."""
         block = self.block
         block[Block.DONE] = block[Block.RELEASED]
         block[Block.DEADLINE] = 0

@@ -44,10 +44,10 @@ POLLS_PER_CHECK = 100_000
 class NextCycle:
     """Waits for the releases of one task. A late task skips releases that have expired.
 
-    An executor's release expires at the task's next release, except that the releases of a batch in
-    lockstep are all taken, one after the other. A planner's release expires at the end of the
-    plan's time slice. A planner that takes its release late still reads as of the release tick, so
-    that the plan depends on ticks alone.
+    An executor's release expires at the task's next release. In lockstep, however, all releases of
+    a batch are taken, one after the other. A planner's release expires at the end of the plan's
+    time slice. A planner that takes its release late still reads as of the release tick, so that
+    the plan depends on ticks alone.
 
     Attributes:
         skipped: Number of releases skipped just before the last one taken.
@@ -115,7 +115,7 @@ class NextCycle:
             newest = block[Block.RELEASED]
             if self._sleeps and newest >= self._due and self._is_before_grid_point(newest):
                 # The clock gives releases ahead of their grid points. Do not take this one yet, but
-                # take the previous one if that is still open.
+                # take the previous one if that has not expired.
                 newest -= self._spec.every
             if newest >= self._due:
                 if is_posted and newest != self._newest:

@@ -392,7 +392,7 @@ class Reader:
         return self._readings[verdict]
 
     def add_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
-        """Return the reading with all unread messages before its own in `earlier`, oldest first.
+        """Return the reading with the unread messages before its own in `earlier`, oldest first.
 
         Bad messages and messages whose slots have been reused are left out.
 

@@ -91,7 +91,7 @@ class QueueWriter(Writer):
     `write` once per cycle to publish these messages.
 
     Attributes:
-        taken: Position of the reader as of the writer's release tick, updated by the board.
+        position: Reader of the position of the queue's reader. The board reads it at every release.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -103,17 +103,20 @@ class QueueWriter(Writer):
         slots.box = memoryview(bytearray(slots.box)).cast("q")
         # A predecessor may have been killed just before it stored this word.
         self._shared[Box.SENT] = self.serial
-        self.taken = 0
+        self.position = Reader(segment, get_position_mailbox(name))
         self._pending: list[bytes] = []
         self._shown_at = 0
 
     def count_free_places(self) -> int:
         """Return the number of messages that can still be sent in this cycle."""
-        unread = self.serial - self.taken + self.held + len(self._pending)
+        unread: int = self.serial - self.position.message.taken + self.held + len(self._pending)
         return max(0, self.spec.capacity - unread)
 
     def send(self, basis: int | None = None) -> bool:
-        """Send a copy of `message` at the end of this cycle. Returns False if the queue is full."""
+        """Send a copy of `message` at the end of this cycle. Returns False if the queue is full.
+
+        `basis` is ignored: `write` states the basis of all messages of a cycle.
+        """
         if not self.count_free_places():
             self.refused += 1
             self._shared[Box.REFUSED] += 1
@@ -280,8 +283,8 @@ class QueueReader(Reader):
     def _can_take(self, serial: int, last: int, tick: int) -> bool:
         """Check whether the message with a given serial can be taken or skipped at `tick`.
 
-        A bad message is skipped if the visible tick in its slot is later than that of any valid
-        message can be.
+        A bad message is skipped if the visible tick in its slot is later than any that a valid
+        message can have.
 
         Args:
             serial: Serial of the message.

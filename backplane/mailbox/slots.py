@@ -215,10 +215,8 @@ class Slots:
         # The order of stores is: the previous head, the message, its signature, this head.
         self.fence()
         self.places[at][SIGNED_FROM:] = self.record[SIGNED_FROM:]
-        if damage:
-            message = self.places[at][SLOT_HEAD_SIZE:]
-            for bit in damage:
-                message[bit >> 3] ^= 1 << (bit & 7)
+        for bit in damage:
+            self.places[at][SLOT_HEAD_SIZE + (bit >> 3)] ^= 1 << (bit & 7)
         self.fence()
         self.places[at][:SIGNED_FROM] = self.record[:SIGNED_FROM]
         self.fence()

@@ -27,7 +27,7 @@ LONG_AGO = -(1 << 62)
 class MessageWatch:
     """Checks the messages of one mailbox for one reader.
 
-    Checks begin with the message after the one that the reader's first read finds.
+    The message found by the reader's first read, and all earlier ones, are not checked.
 
     Attributes:
         seen: Serial of the newest message that was checked, -1 before the first read.

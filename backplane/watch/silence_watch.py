@@ -67,6 +67,7 @@ class SilenceWatch(MessageWatch):
 
     Attributes:
         quiet: Smallest age of the newest message, in ticks, at which `is_lost` must be called.
+        block: Control block of the mailbox's writer.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class SilenceWatch(MessageWatch):
         self._lost_after = self.quiet + spec.delay
         self._stale_after = STALE_CYCLES * spec.every
         self._task = task
-        self._block = segment.get_block(spec.writer)
+        self.block = segment.get_block(spec.writer)
         self._reported: dict[Alarm, int] = {}
 
     def is_lost(self, tick: int) -> bool:
@@ -100,7 +101,7 @@ class SilenceWatch(MessageWatch):
             pid = get_pid(self._slots.box[Box.CLAIMANT])
             # If the loss is already marked, `pid` may be a new process that has not written yet.
             if age >= self._stale_after and (
-                self._block[Block.LOST] or read_state(pid) in ENDED_STATES + STOPPED_STATES
+                self.block[Block.LOST] or read_state(pid) in ENDED_STATES + STOPPED_STATES
             ):
                 self._report_silence(Alarm.STALE, tick, age)
             elif self._is_mute(tick):
@@ -116,7 +117,7 @@ class SilenceWatch(MessageWatch):
         """
         # A loss counts from the tick after it was found. Within that tick, the result would depend
         # on which process is faster.
-        return self._reader.newest != NO_MESSAGE_TICK and 0 < self._block[Block.LOST] <= tick
+        return self._reader.newest != NO_MESSAGE_TICK and 0 < self.block[Block.LOST] <= tick
 
     def _is_mute(self, tick: int) -> bool:
         """Check whether the writer has finished a cycle without writing the message due in it."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import copy
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import TickGrid
-from rack.backplane.mailbox.mailbox import Reader, Reading, Verdict
+from rack.backplane.mailbox.mailbox import Reader, Reading
 from rack.backplane.mailbox.protocols import open_reader
 from rack.backplane.mailbox.queue import UNLIMITED, QueueReader
 from rack.backplane.message import AnyMessage
@@ -28,7 +27,7 @@ def open_watched(
     count_room: Callable[[], int] = lambda: UNLIMITED,
     asynchronous: bool = False,
 ) -> MailboxWatcher:
-    """Open a mailbox for a task, with checks of its messages.
+    """Open a mailbox that a task reads and checks.
 
     The silence of the writer is checked too, except for the clock, which writes operators' commands
     at irregular times.
@@ -47,12 +46,18 @@ def open_watched(
     if spec.protocol == "queue":
         return WatchedQueue(segment, QueueReader(segment, name), alarms, task, count_room)
     reader = open_reader(segment, name, asynchronous, task.inbox)
-    kind = SporadicReader if spec.writer == CLOCK else WatchedReader
+    kind = MailboxWatcher if spec.writer == CLOCK else WatchedReader
     return kind(segment, reader, alarms, task)
 
 
-class MailboxWatcher(ABC):
-    """Base of readers that check their mailbox and raise alarms about it in the task's ring."""
+class MailboxWatcher:
+    """Reader that raises alarms about damaged and forged messages in the task's ring.
+
+    It is used for operators' mailboxes, which the clock writes whenever a command is issued. A new
+    command need not cancel the effect of an earlier one, so none is skipped: a reading has the
+    newest command, and the unread ones before it in `earlier`. The first read returns all commands
+    that are still in the slots, because a restarted board must know them.
+    """
 
     def __init__(
         self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
@@ -60,94 +65,7 @@ class MailboxWatcher(ABC):
         self.reader = reader
         self._episodes = Episodes(segment, reader.spec.name, alarms)
         self._task = task
-        self._statistics = reader.statistics
         self._reported = copy(reader.statistics)
-
-    @abstractmethod
-    def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message visible at `tick`, with its verdict and `is_lost`."""
-
-    @abstractmethod
-    def is_writer_lost(self, tick: int) -> bool:
-        """Check whether the writer has been found lost, without reading the mailbox."""
-
-    @property
-    def _has_trouble(self) -> bool:
-        """True if the last read failed or found a bad message."""
-        return self._statistics.bad_reads != self._reported.bad_reads
-
-    def _report_bad_read(self, tick: int) -> None:
-        """Count a bad read for the task, and raise alarms for a damaged or forged message."""
-        statistics = self._statistics
-        accesses = self.reader.accesses
-        self._task.troubles += 1
-        if statistics.corrupt != self._reported.corrupt:
-            self._episodes.record_finding(Alarm.DAMAGED, accesses, tick)
-        if statistics.forged != self._reported.forged:
-            self._episodes.record_finding(Alarm.MASQUERADE, accesses, tick, statistics.forger)
-        self._reported = copy(statistics)
-
-
-class WatchedReader(MailboxWatcher):
-    """Reader of a mailbox that a task writes.
-
-    A read without findings costs only a few comparisons more than one without checks.
-    """
-
-    def __init__(
-        self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
-    ) -> None:
-        super().__init__(segment, reader, alarms, task)
-        self.watch = SilenceWatch(segment, reader, self._episodes, task)
-        self.writer = segment.get_block(reader.spec.writer)
-        """Control block of the mailbox's writer."""
-        self._lost = {verdict: Reading(reader.message, verdict, True) for verdict in Verdict}
-
-    def read(self, tick: int) -> Reading[AnyMessage]:
-        """Return the newest message visible at `tick`, with its verdict and `is_lost`."""
-        reader = self.reader
-        reading = reader.read(tick)
-        return self.check_reading(
-            tick,
-            reading,
-            is_odd=self._has_trouble or reader.found != self.watch.seen,
-            is_silent=tick - reader.newest >= self.watch.quiet or self.writer[Block.LOST] > 0,
-        )
-
-    def check_reading(
-        self, tick: int, reading: Reading[AnyMessage], *, is_odd: bool, is_silent: bool
-    ) -> Reading[AnyMessage]:
-        """Run the checks that are requested for a read, and return the reading for the level.
-
-        Args:
-            tick: Release tick of the reading cycle.
-            reading: Result of the reader itself.
-            is_odd: True if there are messages to check.
-            is_silent: True if the writer's silence must be checked.
-
-        Returns:
-            The given reading, with `is_lost` set if the writer is lost or silent for too long.
-        """
-        if is_odd:
-            self.watch.check_messages(tick)
-        if self._has_trouble:
-            self._report_bad_read(tick)
-        if is_silent and self.watch.is_lost(tick):
-            return self._lost[reading.verdict]
-        return reading
-
-    def is_writer_lost(self, tick: int) -> bool:
-        """Check whether the writer has been found lost, without reading the mailbox."""
-        return self.watch.is_writer_lost(tick)
-
-
-class SporadicReader(MailboxWatcher):
-    """Reader of an operator's mailbox, which the clock writes whenever a command is issued.
-
-    A new command need not cancel the effect of an earlier one, so none is skipped: a reading has
-    the newest command, and the unread ones before it in `earlier`. The first read returns all
-    commands that are still in the slots, because a restarted board must know them.
-    """
 
     def read(self, tick: int) -> Reading[AnyMessage]:
         """Return the newest message visible at `tick`, and unread ones before it in `earlier`."""
@@ -160,6 +78,72 @@ class SporadicReader(MailboxWatcher):
     def is_writer_lost(self, tick: int) -> bool:
         """Return False. If the clock is lost, no board is released, so no board can notice it."""
         return False
+
+    @property
+    def _has_trouble(self) -> bool:
+        """True if the last read failed or found a bad message."""
+        return self.reader.statistics.bad_reads != self._reported.bad_reads
+
+    def _report_bad_read(self, tick: int) -> None:
+        """Count a bad read for the task, and raise alarms for a damaged or forged message."""
+        statistics = self.reader.statistics
+        accesses = self.reader.accesses
+        self._task.troubles += 1
+        if statistics.corrupt != self._reported.corrupt:
+            self._episodes.record_finding(Alarm.DAMAGED, accesses, tick)
+        if statistics.forged != self._reported.forged:
+            self._episodes.record_finding(Alarm.MASQUERADE, accesses, tick, statistics.forger)
+        self._reported = copy(statistics)
+
+
+class WatchedReader(MailboxWatcher):
+    """Reader of a mailbox that a task writes.
+
+    If a read finds nothing unusual, its checks cost only a few comparisons.
+    """
+
+    def __init__(
+        self, segment: Segment, reader: Reader, alarms: AlarmWriter, task: ReadingTask
+    ) -> None:
+        super().__init__(segment, reader, alarms, task)
+        self.watch = SilenceWatch(segment, reader, self._episodes, task)
+
+    def read(self, tick: int) -> Reading[AnyMessage]:
+        """Return the newest message visible at `tick`, with its verdict and `is_lost`."""
+        reader = self.reader
+        reading = reader.read(tick)
+        return self.check_reading(
+            tick,
+            reading,
+            self._has_trouble or reader.found != self.watch.seen,
+            tick - reader.newest >= self.watch.quiet or self.watch.block[Block.LOST],
+        )
+
+    def check_reading(
+        self, tick: int, reading: Reading[AnyMessage], check_messages: int, check_silence: int
+    ) -> Reading[AnyMessage]:
+        """Run the checks that are requested for a read, and return the reading for the level.
+
+        Args:
+            tick: Release tick of the reading cycle.
+            reading: The reading to check.
+            check_messages: Not 0 if there are messages to check.
+            check_silence: Not 0 if the writer's silence must be checked.
+
+        Returns:
+            The given reading, with `is_lost` set if the writer is lost or silent for too long.
+        """
+        if check_messages:
+            self.watch.check_messages(tick)
+        if self._has_trouble:
+            self._report_bad_read(tick)
+        if check_silence and self.watch.is_lost(tick):
+            return reading._replace(is_lost=True)
+        return reading
+
+    def is_writer_lost(self, tick: int) -> bool:
+        """Check whether the writer has been found lost, without reading the mailbox."""
+        return self.watch.is_writer_lost(tick)
 
 
 class WatchedQueue(MailboxWatcher):
@@ -216,10 +200,6 @@ class GridReader:
     def __init__(self, watched: MailboxWatcher, grid: TickGrid) -> None:
         self.reader = watched.reader
         self._watched, self._every, self._phase = watched, *grid
-        repeated = [
-            Reading(self.reader.message, verdict) for verdict in (Verdict.NONE, Verdict.OLD)
-        ]
-        self._kept = [(reading, reading._replace(is_lost=True)) for reading in repeated]
         self._was_lost = False
 
     def read(self, tick: int) -> Reading[AnyMessage]:
@@ -229,4 +209,5 @@ class GridReader:
             self._was_lost = reading.is_lost
             return reading
         is_lost = self._was_lost or self._watched.is_writer_lost(tick)
-        return self._kept[self.reader.serial > 0][is_lost]
+        reading = self.reader.get_reading(False)
+        return reading._replace(is_lost=True) if is_lost else reading

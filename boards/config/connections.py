@@ -288,7 +288,7 @@ class Wiring:
 
     @cached_property
     def passed_mailboxes(self) -> dict[str, str]:
-        """Dictionary from each mailbox that a bus adapter writes to the mailbox that it copies."""
+        """Dictionary from copies that bus adapters write to the mailboxes that they copy."""
         return {
             f"{ports.place.board}.{port}": source
             for ports in self.tasks

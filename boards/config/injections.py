@@ -246,12 +246,12 @@ class FaultCheck:
 
 def _explain_invalid_value(parameter: Parameter, value: float, robot: RobotConfig | None) -> str:
     """Return the reason why a value of the parameter is invalid. Empty if it is valid."""
-    most = parameter.most
+    upper_bound = parameter.most
     if parameter.name == "joint" and robot is not None:
-        most = len(robot.joints) - 1
-    if not parameter.least <= value <= most or (parameter.is_whole and value != int(value)):
+        upper_bound = len(robot.joints) - 1
+    if not parameter.least <= value <= upper_bound or (parameter.is_whole and value != int(value)):
         whole = "whole numbers " if parameter.is_whole else ""
-        return f"out of range; valid: {whole}{parameter.least:g} to {most:g}; {parameter}"
+        return f"out of range; valid: {whole}{parameter.least:g} to {upper_bound:g}; {parameter}"
     return ""
 
 

@@ -79,7 +79,7 @@ def build_exchanges(wiring: Wiring, ports: TaskPorts) -> dict[str, ExchangeSpec]
 
 
 class LayoutBuilder:
-    """Computes the layout of a wiring that has no mistakes.
+    """Computes the layout of a wiring. Boards with mistakes are left out.
 
     Args:
         wiring: The wiring.
@@ -96,7 +96,7 @@ class LayoutBuilder:
 
     def build_layout(self) -> Layout:
         """Return the layout with all tasks, host boards and mailboxes of the segment."""
-        mailboxes = [box for name in self._wiring.writers for box in self._build_written(name)]
+        mailboxes = [box for name in self._wiring.writers for box in self._build_mailboxes(name)]
         # The clock writes the operator's commands to the levels.
         mailboxes += [
             self._build_mailbox(name, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
@@ -106,7 +106,7 @@ class LayoutBuilder:
         hosts = tuple(self._hosts.values())
         return Layout(self._config.name, self._config.clock_ns, tasks, tuple(mailboxes), hosts)
 
-    def _build_written(self, name: str) -> Iterator[MailboxSpec]:
+    def _build_mailboxes(self, name: str) -> Iterator[MailboxSpec]:
         """Yield the mailbox `name` and, if it is a queue, the mailbox for its reader's position."""
         ports, output = self._wiring.writers[name]
         capacity = self._config.protocol.depth.get(name, UNREAD)
@@ -162,10 +162,10 @@ class LayoutBuilder:
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
         # The writer learns after both delays which messages the reader has taken. During that time
         # it can send at most `capacity` messages.
-        most = capacity * (1 + self._retained_ticks // (box.delay + delay))
+        most_sent = capacity * (1 + self._retained_ticks // (box.delay + delay))
         # A deep queue retains fewer messages, to limit its memory.
         slots = compute_depth(
-            min(most, 2 * capacity + SUSTAINED * self._retained_ticks // box.every), 1
+            min(most_sent, 2 * capacity + SUSTAINED * self._retained_ticks // box.every), 1
         )
         yield replace(box, capacity=capacity, depth=slots)
         yield self._build_mailbox(

@@ -154,8 +154,8 @@ def _list_models(annotation: Any) -> Iterator[type[BaseModel]]:
     """Yield the models within a type annotation such as `tuple[Transfer | Goto, ...]`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
-    for part in get_args(annotation):
-        yield from _list_models(part)
+    for member in get_args(annotation):
+        yield from _list_models(member)
 
 
 def report_repeated_names(place: str, names: Iterable[str]) -> Iterator[Mistake]:

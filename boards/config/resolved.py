@@ -185,7 +185,10 @@ class Resolved:
 
 
 def _examine(config: RackConfig, further: Iterable[Mistake] = ()) -> Examination:
-    """Check a config. Raises `ConfigError` with its mistakes and those already in `further`."""
+    """Check a config and return the examination.
+
+    Raises `ConfigError` with all mistakes, including those in `further`, which were found earlier.
+    """
     commands = [(f"command[{at}]", command) for at, command in enumerate(config.command)]
     examination = Examination(config, list_faults(config), commands)
     if mistakes := [*examination.mistakes, *further]:

@@ -89,5 +89,5 @@ def _count_permitted(due: int, fraction: float, plan: int) -> int:
         fraction: Fraction of them that may be lost.
         plan: Number of cycles that count as lost for one late plan.
     """
-    most = plan * math.ceil(fraction * due / plan)
-    return most if fraction == 1 else max(0, min(most, due - 1))
+    permitted = plan * math.ceil(fraction * due / plan)
+    return permitted if fraction == 1 else max(0, min(permitted, due - 1))

@@ -53,18 +53,18 @@ class RestartPolicy:
             Text such as "restart 1 of at most 3 in 60 s". Empty if no restart is permitted.
         """
         common = self._config.supervision
-        most, within_s = common.restarts, common.within_s
+        max_restarts, within_s = common.restarts, common.within_s
         if task != CLOCK:
             board = self._config.get_table(self._layout.find_task(task))
-            most = most if board.restarts is None else board.restarts
+            max_restarts = max_restarts if board.restarts is None else board.restarts
             board_s = board.restarts_within_s
             within_s = within_s if board_s is None else board_s
         since = tick - within_s * 1e9 / self._layout.clock_ns
         recent = [at for at in self._restarts[task] if at > since]
-        if len(recent) >= most:
+        if len(recent) >= max_restarts:
             return ""
         self._restarts[task] = [*recent, tick]
-        return f"restart {len(recent) + 1} of at most {most} in {within_s:g} s"
+        return f"restart {len(recent) + 1} of at most {max_restarts} in {within_s:g} s"
 
     def sort_by_dependency(self, tasks: list[str]) -> list[str]:
         """Return the tasks in the order in which they must be restarted.

@@ -56,7 +56,8 @@ class WaitingCopy:
     def continue_as(self, wiring: Wiring, rack: str) -> int:
         """Let the copy continue as a board of a rack.
 
-        Before it continues, it forks a waiting copy in its place, whose id arrives as a message.
+        Before it continues, it forks another copy that waits in its place. The process id of that
+        copy arrives as a message.
 
         Args:
             wiring: Wiring that contains the new context of its level.
@@ -144,7 +145,7 @@ class SnapshotShelf:
     def receive_copy_message(self, wirings: Mapping[str, Wiring]) -> None:
         """Receive a board's message about its copy, and add the copy to its snapshot.
 
-        A copy that replaces one that has continued only reports its process id.
+        If the copy replaces one that has continued, the message only contains its process id.
 
         Args:
             wirings: Wirings of all processes that a complete snapshot contains, keyed by name.

@@ -232,7 +232,7 @@ class Import:
                 self._set_away(True, tick + self._delay if self._grid.is_lockstep else tick)
 
     def mark_present(self, tick: int) -> None:
-        """End the absence of the mailbox when the message of this cycle becomes visible."""
+        """Mark the mailbox as present once the message of this cycle becomes visible."""
         if self._is_away:
             self._set_away(False, tick + self._delay)
 

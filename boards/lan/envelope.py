@@ -100,7 +100,7 @@ class Sealer:
         if credentials and self._pair:
             # Identify once now: the first identification takes as long as a whole cycle.
             credentials.identify_sender(self._pair.chain)
-        self._most = most_bytes
+        self._most_bytes = most_bytes
         self.flaws = dict.fromkeys(Flaw, 0)
 
     def with_limit(self, most_bytes: int) -> Sealer:
@@ -137,7 +137,7 @@ class Sealer:
         Returns:
             The head, or the flaw for which the message must be rejected.
         """
-        if len(payload) > self._most:
+        if len(payload) > self._most_bytes:
             return self._count_flaw(Flaw.OVERSIZED)
         if (
             envelope is None

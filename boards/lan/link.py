@@ -107,7 +107,7 @@ class LanLink:
             ) from None
         except CredentialError as flaw:
             raise LevelError(f"adapter.lan: {flaw}") from None
-        self._kept: list[Any] = []
+        self._declared: list[Any] = []
 
     def publish(self, key: str, reliable: bool = False) -> Callable[[bytes, bytes], None]:
         """Return a function that sends a payload and its envelope under a key expression.
@@ -119,7 +119,7 @@ class LanLink:
         publisher = self.session.declare_publisher(
             key, congestion_control=control, priority=zenoh.Priority.REAL_TIME, express=True
         )
-        self._kept.append(publisher)
+        self._declared.append(publisher)
         put = publisher.put
         return lambda payload, envelope: put(payload, attachment=envelope)
 
@@ -138,7 +138,7 @@ class LanLink:
             A function that yields the samples since its last call, oldest first.
         """
         channel = declare(key, zenoh.handlers.RingChannel(unread), **options)
-        self._kept.append(channel)
+        self._declared.append(channel)
 
         def take_samples() -> Iterator[Any]:
             """Remove and yield the samples in the buffer, oldest first."""
@@ -164,7 +164,7 @@ class LanLink:
 
         # Indirect callbacks would add the wake-up of another thread and an unbounded queue.
         handler = zenoh.handlers.Callback(pass_sample, indirect=False)
-        self._kept.append(self.session.declare_subscriber(key, handler))
+        self._declared.append(self.session.declare_subscriber(key, handler))
 
     def open_questions(
         self, key: str, unread: int = MAX_UNREAD
@@ -194,7 +194,7 @@ class LanLink:
         Call this after all subscriptions, because a rack that sees the token may send at once. In
         lockstep, `cycle_ns` is the length of the adapter's cycle: see `alive_key`.
         """
-        self._kept.append(
+        self._declared.append(
             self.session.liveliness().declare_token(alive_key(self.rack, launch, cycle_ns))
         )
 

@@ -201,7 +201,7 @@ class Barrier:
         self._now_ns = NEVER
         self._sent = 0
         self._events: SimpleQueue[zenoh.Sample] = SimpleQueue()
-        self._kept: list[object] = []
+        self._subscribers: list[object] = []
 
     def open(self, link: LanLink, launch: int) -> None:
         """Start to receive steps. Call it before the token of this launch is declared."""
@@ -213,11 +213,13 @@ class Barrier:
         # Called in a thread of zenoh, so the handler only wakes the waiting cycle.
         handler = zenoh.handlers.Callback(self._events.put, indirect=False)
         for partner in self._partners.values():
-            self._kept.append(link.session.declare_subscriber(step_key(partner.rack), handler))
+            self._subscribers.append(
+                link.session.declare_subscriber(step_key(partner.rack), handler)
+            )
             if self._is_restarted:
                 # The other adapter may have ended while this one was restarted.
                 partner.gone_s = time.monotonic()
-        self._kept.append(
+        self._subscribers.append(
             link.session.liveliness().declare_subscriber(ALL_ALIVE, handler, history=True)
         )
 

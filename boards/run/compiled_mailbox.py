@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.mailbox.mailbox import GOOD_OFFSET, NO_MESSAGE_TICK
-from rack.backplane.mailbox.slots import CHECKED_FROM, EPOCH_BITS, SIGNED_FROM, Slots
+from rack.backplane.mailbox.slots import CHECKED_FROM, SIGNED_FROM, Slots
 from rack.backplane.words import Slot
 from rack.boards.run.instructions import (
     copy,
@@ -65,7 +65,7 @@ PORT = _build_dtype(
     "every",
     "ahead",
     "delay",
-    # Result of the last read, or the process of an intruder found by the last write.
+    # Result of the last read, or the signature of an intruder found by the last write.
     "result",
 )
 """Record of a mailbox to read or to write."""
@@ -77,8 +77,6 @@ OLD_RESULT, NEW_RESULT, CHECK_MESSAGES, CHECK_SILENCE, READ_IN_PYTHON = 0, 1, 2,
 
 They request that Python check the messages, check the writer's silence, or make the whole read.
 """
-MAX_PORTS = 60
-"""Maximum number of ports in a table, because each has a bit in the 64-bit result of a call."""
 
 
 # Functions that return the record at an address, for compiled code.
@@ -103,7 +101,7 @@ def take(port: Any, serial: int) -> bool:
         serial: Serial of the message.
 
     Returns:
-        False if Python must handle the message, because it is bad or its writer is a new one.
+        False if Python must handle the message, because it is bad or from a new writer.
     """
     slot = slot_of(port, serial)
     copy(port.record, slot, SIGNED_FROM)
@@ -113,8 +111,7 @@ def take(port: Any, serial: int) -> bool:
     state = state_at(port.state)
     if received.serial != serial or received.signature != state.signature:
         return False
-    check: int = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain)
-    if check != received.check:
+    if xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, received.chain) != received.check:
         return False
     copy(port.state + GOOD_OFFSET, port.record, port.size)
     state.transfers += 1
@@ -130,8 +127,8 @@ def read_port(port: Any, tick: int) -> int:
         tick: Release tick of the cycle.
 
     Returns:
-        `OLD_RESULT` or `NEW_RESULT`, combined with the bits that request checks, or
-            `READ_IN_PYTHON` alone.
+        `OLD_RESULT` or `NEW_RESULT`, combined with the bits that request checks. `READ_IN_PYTHON`
+            alone if Python must read the mailbox instead.
     """
     state = state_at(port.state)
     serial = load(port.head)
@@ -146,8 +143,8 @@ def read_port(port: Any, tick: int) -> int:
     state.accesses += 1
     state.found = serial
     if port.is_watched:
-        # In the usual case there is no new message, or exactly one, which is in time and belongs to
-        # a later release.
+        # In the usual case there is no new message, or exactly one, which is in time and from a
+        # later release than the message before it.
         if 0 <= state.judged == serial - 1 and (
             state.judged_tick < state.tick > state.visible - port.late_from
         ):
@@ -170,14 +167,14 @@ def publish(port: Any, tick: int, stamp: int) -> int:
         stamp: Time stamp of the message, in ns of CLOCK_MONOTONIC.
 
     Returns:
-        Process id of an intruder, 0 for none.
+        Signature of an intruder, 0 for none.
     """
     record = slot_at(port.record)
     before = record.serial
     slot = slot_of(port, before + 1)
     intruder = 0
     if load(port.head) != before:
-        intruder = load(slot + _SIGNATURE) >> EPOCH_BITS
+        intruder = load(slot + _SIGNATURE)
     basis = NO_MESSAGE_TICK
     for at in range(port.source_count):
         state = state_at(load(port.sources + 8 * at))
@@ -200,7 +197,7 @@ def publish(port: Any, tick: int, stamp: int) -> int:
 
 
 @compiled_for("i8, i8, i8, i8")
-def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
+def access_ports(table: int, count: int, tick: int, stamp: int) -> bool:
     """Read mailboxes as of a tick, and write the messages that are due.
 
     Args:
@@ -210,10 +207,10 @@ def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
         stamp: Time stamp of written messages, in ns of CLOCK_MONOTONIC.
 
     Returns:
-        A bit for each port that Python must handle, because its result has changed or requests a
-            check.
+        True if Python must handle the results, because one has changed, requests a check or is the
+            signature of an intruder.
     """
-    touched = 0
+    must_handle = False
     for at in range(count):
         port = port_at(table + at * _PORT_SIZE)
         result = 0
@@ -222,9 +219,9 @@ def access_ports(table: int, count: int, tick: int, stamp: int) -> int:
         elif (tick + port.ahead) % port.every == 0:
             result = publish(port, tick, stamp)
         if result > NEW_RESULT or result != port.result:
-            touched |= 1 << at
+            must_handle = True
         port.result = result
-    return touched
+    return must_handle
 
 
 @compiled

@@ -62,7 +62,7 @@ class VirtualControlLoop(Task):
         record = None
         if wiring.exchange:
             message = self.outputs.writers[EXCHANGE_PORT].message
-            record = ExchangeRecord(self.inputs.taken, message).fill_message
+            record = ExchangeRecord(self.inputs.mailboxes, message).fill_message
         reads = chain_accesses(self.inputs.read_command_and_status, record)
         settings = executor.take_settings if executor.is_set_by_board else None
         self.read_command_and_status = chain_accesses(

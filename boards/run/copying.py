@@ -47,7 +47,8 @@ class CopyMessage:
     """Message to the crate that a copy of a task or of the clock exists and waits for requests.
 
     The crate's end of the copy's pipe is sent with the message. The clock also sends the file with
-    the segment's memory. The successor of a copy uses the copy's pipe, so no pipe is sent.
+    the segment's memory. If the copy replaces one that has continued, it uses that copy's pipe, and
+    no pipe is sent.
 
     Attributes:
         tick: First tick that the copy will run.

@@ -1,9 +1,9 @@
-"""Instructions that Python does not have, for compiled code.
+"""Instructions and C functions that Python does not have, for compiled code.
 
-These are atomic loads and stores, fences, and copies between addresses. LLVM translates them for
-the processor at hand. On x86-64 they become ordinary loads and stores, which that processor does
-not reorder. On others LLVM adds barriers. Addresses must be aligned to 8 bytes. The functions work
-only in compiled code.
+The instructions are atomic loads and stores, and fences. LLVM translates them for the processor at
+hand. On x86-64 they become ordinary loads and stores, which that processor does not reorder. On
+others LLVM adds barriers. Addresses must be aligned to 8 bytes. The instructions work only in
+compiled code.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
         self._record = record
 
     def iterate_source(self) -> Iterator[bytes]:
-        """Yield what the code of a caller depends on: this file and the record type."""
+        """Yield what a caller's machine code depends on: this file and the record type."""
         yield Path(__file__).read_bytes()
         yield repr(self._record).encode()
 
@@ -84,15 +84,8 @@ def fence(builder: Any) -> None:
     builder.fence("acq_rel")
 
 
-@instruction
-def copy(builder: Any, target: Any, source: Any, size: Any) -> None:
-    """Copy `size` bytes from the address `source` to the address `target`."""
-    from numba.core.cgutils import raw_memcpy
-
-    ends = to_pointer(builder, target), to_pointer(builder, source)
-    raw_memcpy(builder, *ends, size, 1)  # type: ignore[no-untyped-call]
-
-
+copy = c_function("libc.so.6", "memcpy", 3)
+"""C function that copies memory. Its arguments are target, source and size in bytes."""
 xxh3 = c_function(_xxhash.__file__, "XXH3_64bits_withSeed", 3)
 """C function that computes a checksum from address, size in bytes and seed.
 

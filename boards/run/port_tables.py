@@ -10,46 +10,27 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from time import monotonic_ns
-from typing import NamedTuple
 
 import numpy as np
 
 from rack.backplane.address_map import compute_slot_stride
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.mailbox import DoubleBufferReader, Reader, Writer
-from rack.backplane.mailbox.slots import Slots
-from rack.backplane.message import AnyMessage
+from rack.backplane.mailbox.slots import Slots, get_pid
 from rack.backplane.watch.watched_reader import MailboxWatcher, WatchedReader
 from rack.backplane.words import Block
+from rack.boards.exchange import InputMailbox
 from rack.boards.run.compiled_mailbox import (
     CHECK_MESSAGES,
     CHECK_SILENCE,
-    MAX_PORTS,
     NEW_RESULT,
     PORT,
     READ_IN_PYTHON,
     access_ports,
 )
-from rack.levels.level import Reading
 
 WORD_BYTES = 8
 """Size of a word in bytes, and required alignment of memory that compiled code accesses."""
-
-
-class InputMailbox(NamedTuple):
-    """One mailbox to read.
-
-    Attributes:
-        values: Table that receives the reading.
-        key: Key of the reading in that table.
-        read: Reads the mailbox as of a tick.
-        watched: The watched reader behind `read`.
-    """
-
-    values: dict[str, Reading[AnyMessage]]
-    key: str
-    read: Callable[[int], Reading[AnyMessage]]
-    watched: MailboxWatcher
 
 
 class PortTable:
@@ -64,7 +45,7 @@ class PortTable:
             port["stride"] = compute_slot_stride(each.spec)
             port["depth"] = each.depth
             port["size"] = len(each.record)
-        self._access: Callable[..., int] = lambda *_: 0
+        self._access: Callable[..., bool] = lambda *_: False
         if slots:
             self._access = partial(
                 access_ports.load_machine_code(), self._ports.ctypes.data, len(slots)
@@ -78,43 +59,34 @@ class ReadTable(PortTable):
     """
 
     def __init__(self, lines: Sequence[InputMailbox]) -> None:
-        self._lines = [line for line in lines if can_read(line)][:MAX_PORTS]
-        self._others = [line for line in lines if line not in self._lines]
-        super().__init__([line.watched.reader.slots for line in self._lines])
-        for port, line in zip(self._ports, self._lines, strict=True):
-            watched = line.watched
-            port["state"] = get_address(watched.reader.words)
-            port["is_sliced"] = type(watched.reader) is Reader
+        self._compiled = [line for line in lines if can_read(line)]
+        self._others = [line for line in lines if not can_read(line)]
+        super().__init__([line.watcher.reader.slots for line in self._compiled])
+        for port, (_, _, watcher) in zip(self._ports, self._compiled, strict=True):
+            port["state"] = get_address(watcher.reader.words)
+            port["is_sliced"] = type(watcher.reader) is Reader
             port["result"] = -1
-            if isinstance(watched, WatchedReader):
+            if isinstance(watcher, WatchedReader):
                 port["is_watched"] = True
-                port["lost"] = get_address(watched.writer[Block.LOST : Block.LOST + 1])
-                port["late_from"] = watched.watch.late_from
-                port["quiet"] = watched.watch.quiet
+                port["lost"] = get_address(watcher.watch.block[Block.LOST : Block.LOST + 1])
+                port["late_from"] = watcher.watch.late_from
+                port["quiet"] = watcher.watch.quiet
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`, and store the readings for the level."""
-        touched = self._access(tick, 0)
-        if touched:
-            for at, line in enumerate(self._lines):
-                if not touched >> at & 1:
-                    continue
-                result = int(self._ports["result"][at])
-                watched = line.watched
+        if self._access(tick, 0):
+            results = self._ports["result"].tolist()
+            for result, (readings, key, watcher) in zip(results, self._compiled, strict=True):
                 if result & READ_IN_PYTHON:
-                    reading = line.read(tick)
-                else:
-                    reading = watched.reader.get_reading(bool(result & NEW_RESULT))
-                    if isinstance(watched, WatchedReader):
-                        reading = watched.check_reading(
-                            tick,
-                            reading,
-                            is_odd=bool(result & CHECK_MESSAGES),
-                            is_silent=bool(result & CHECK_SILENCE),
-                        )
-                line.values[line.key] = reading
-        for line in self._others:
-            line.values[line.key] = line.read(tick)
+                    readings[key] = watcher.read(tick)
+                    continue
+                readings[key] = watcher.reader.get_reading(bool(result & NEW_RESULT))
+                if result > NEW_RESULT and isinstance(watcher, WatchedReader):
+                    readings[key] = watcher.check_reading(
+                        tick, readings[key], result & CHECK_MESSAGES, result & CHECK_SILENCE
+                    )
+        for readings, key, watcher in self._others:
+            readings[key] = watcher.read(tick)
 
 
 def can_read(line: InputMailbox) -> bool:
@@ -122,8 +94,8 @@ def can_read(line: InputMailbox) -> bool:
 
     It must be read in every cycle, under a protocol without a lock, queue or interrupts.
     """
-    watched = line.watched
-    return line.read == watched.read and type(watched.reader) in (Reader, DoubleBufferReader)
+    kinds = Reader, DoubleBufferReader
+    return isinstance(line.watcher, MailboxWatcher) and type(line.watcher.reader) in kinds
 
 
 def get_address(memory: memoryview) -> int:
@@ -148,17 +120,16 @@ class WriteTable(PortTable):
         """Fill the table.
 
         Args:
-            writers: At most `MAX_PORTS` writers for which `can_write` is true, each with the
-                readers on whose messages its own message depends.
+            writers: Writers for which `can_write` is true, each with the readers on whose messages
+                its own message depends.
         """
-        self._writers = [writer for writer, _ in writers]
-        self._sources = [
-            np.array([get_address(reader.words) for reader in sources], np.int64)
-            for _, sources in writers
-        ]
-        super().__init__([writer.slots for writer in self._writers])
-        for port, writer, sources in zip(self._ports, self._writers, self._sources, strict=True):
+        super().__init__([writer.slots for writer, _ in writers])
+        self._writers = writers
+        self._sources: list[np.ndarray] = []
+        for port, (writer, readers) in zip(self._ports, writers, strict=True):
             spec = writer.spec
+            sources = np.array([get_address(reader.words) for reader in readers], np.int64)
+            self._sources.append(sources)
             port["sources"] = sources.ctypes.data
             port["source_count"] = len(sources)
             port["every"] = spec.every
@@ -171,11 +142,11 @@ class WriteTable(PortTable):
         Returns:
             True if the `intruder` of any writer may have changed.
         """
-        touched = self._access(tick, monotonic_ns())
-        if touched:
-            for writer, intruder in zip(self._writers, self._ports["result"], strict=True):
-                writer.intruder = int(intruder)
-        return touched > 0
+        must_handle = self._access(tick, monotonic_ns())
+        if must_handle:
+            for (writer, _), signature in zip(self._writers, self._ports["result"], strict=True):
+                writer.intruder = get_pid(int(signature))
+        return must_handle
 
 
 def can_write(writer: Writer) -> bool:

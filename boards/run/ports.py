@@ -10,19 +10,18 @@ from rack.backplane.layout import ExchangeSpec
 from rack.backplane.mailbox.interrupt import BoardInbox
 from rack.backplane.mailbox.mailbox import Reader, Writer
 from rack.backplane.mailbox.protocols import open_writer
-from rack.backplane.mailbox.queue import QueueWriter, get_position_mailbox
+from rack.backplane.mailbox.queue import QueueWriter
 from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, Episodes
 from rack.backplane.watch.silence_watch import ReadingTask
-from rack.backplane.watch.watched_reader import GridReader, open_watched
-from rack.boards.exchange import MonitoredPort
+from rack.backplane.watch.watched_reader import GridReader, WatchedReader, open_watched
+from rack.boards.exchange import InputMailbox
 from rack.boards.faults.kind import find_kind
 from rack.boards.faults.message_steps import FaultyWriter
-from rack.boards.run.compiled_mailbox import MAX_PORTS
-from rack.boards.run.port_tables import InputMailbox, ReadTable, WriteTable, can_write
+from rack.boards.run.port_tables import ReadTable, WriteTable, can_write
 from rack.boards.wiring import Source
-from rack.levels.level import LevelSection, Reading, Verdict
+from rack.levels.level import LevelSection
 from rack.levels.ports import Sender
 
 
@@ -32,7 +31,7 @@ class InputPorts:
     Attributes:
         task: State of the reading task.
         readers: Readers of the mailboxes, keyed by the name of the mailbox.
-        taken: Last reading and reader of each mailbox, in the order of the ports.
+        mailboxes: Mailboxes with their last readings, in the order of the ports.
         reads_plan: True if the task reads the plan of its level.
     """
 
@@ -59,11 +58,11 @@ class InputPorts:
             inbox: Inbox of the task's board. None if nothing interrupts it.
         """
         self.task = ReadingTask(inbox)
-        self.taken: list[MonitoredPort] = []
+        self.mailboxes: list[InputMailbox] = []
         self.readers: dict[str, Reader] = {}
         # A reading is stored under the name of its port. A port that reads several mailboxes has a
         # dictionary of readings there.
-        plans: list[InputMailbox] = []
+        self._plans: list[InputMailbox] = []
         self._rest: list[InputMailbox] = []
         for port, source in sources.items():
             boxes = {port: source} if isinstance(source, str) else source
@@ -71,59 +70,41 @@ class InputPorts:
             if not isinstance(source, str):
                 values[port] = values = {}
             rule = (exchange or {}).get(port)
-            open_port = partial(
-                open_watched,
-                segment,
-                alarms=alarms,
-                task=self.task,
-                count_room=partial(level.max_messages, port),
-            )
             for key, mailbox in boxes.items():
                 if port in level.inputs:
                     segment.message_classes[mailbox] = level.inputs[port].message
-                watched_reader = open_port(
-                    mailbox, asynchronous=rule is not None and rule.asynchronous
+                watcher = open_watched(
+                    segment,
+                    mailbox,
+                    alarms,
+                    self.task,
+                    count_room=partial(level.max_messages, port),
+                    asynchronous=rule is not None and rule.asynchronous,
                 )
-                read = (
-                    watched_reader.read
-                    if rule is None
-                    else GridReader(watched_reader, rule.grid).read
+                values[key] = watcher.reader.get_reading(False)
+                line = InputMailbox(
+                    values, key, watcher if rule is None else GridReader(watcher, rule.grid)
                 )
-                values[key] = Reading(watched_reader.reader.message, Verdict.NONE)
-                line = InputMailbox(values, key, read, watched_reader)
-                (plans if mailbox == plan else self._rest).append(line)
-                self.taken.append(MonitoredPort(values, key, watched_reader.reader))
-                self.readers[mailbox] = watched_reader.reader
-        self.reads_plan = bool(plans)
-        self._plan_table = ReadTable(plans)
+                (self._plans if mailbox == plan else self._rest).append(line)
+                self.mailboxes.append(line)
+                self.readers[mailbox] = watcher.reader
+        self.reads_plan = bool(self._plans)
+        self._plan_table = ReadTable(self._plans)
         self._table = ReadTable(self._rest)
-        self._readers = [entry.reader for entry in self.taken]
 
     def read_queue_position(
         self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter
     ) -> None:
         """Add the position of a queue's reader to the mailboxes that are read in every cycle.
 
-        Each read updates `queue.taken`.
-
         Args:
             segment: Memory of the rack.
             queue: Writer of the queue, which this task writes.
             alarms: Alarm ring of the task.
         """
-        position_reader = open_watched(
-            segment, get_position_mailbox(queue.spec.name), alarms, self.task
-        )
-
-        def read_position(tick: int) -> Reading[AnyMessage]:
-            """Read the position of the queue's reader, and store it in the queue's writer."""
-            reading = position_reader.read(tick)
-            queue.taken = reading.message.taken
-            return reading
-
-        self._rest.append(InputMailbox({}, "", read_position, position_reader))
+        watcher = WatchedReader(segment, queue.position, alarms, self.task)
+        self._rest.append(InputMailbox({}, "", watcher))
         self._table = ReadTable(self._rest)
-        self._readers.append(position_reader.reader)
 
     def read(self, tick: int) -> None:
         """Read every mailbox as of `tick`."""
@@ -138,6 +119,11 @@ class InputPorts:
     def read_command_and_status(self, tick: int) -> None:
         """Read every mailbox except the plan as of `tick`: commands, statuses and world model."""
         self._table.read(tick)
+
+    @property
+    def _readers(self) -> list[Reader]:
+        """Readers of all mailboxes, the plan first."""
+        return [line.watcher.reader for line in self._plans + self._rest]
 
     @property
     def bus_errors(self) -> int:
@@ -162,8 +148,8 @@ class OutputPort:
     The basis of a message is the tick of the oldest information on which it depends: the oldest
     basis of the messages of `sources`. A mailbox with a `max_age` is written on demand, only in
     cycles in which the level has sent a message. Any other mailbox is written in every cycle that
-    is due. If `sends` is true, the level fills a queue by calling `send`. Otherwise its message is
-    sent once per due cycle.
+    is due. If `sends` is true, the level fills a queue by calling `send`. Otherwise the board sends
+    the level's message once per due cycle.
     """
 
     def __init__(
@@ -323,9 +309,9 @@ class OutputPorts:
             level.store_output(port, output.value)
             if isinstance(writer, QueueWriter):
                 inputs.read_queue_position(segment, writer, alarms)
-        self._compiled = [port for port in self._ports if can_write(port.writer)][:MAX_PORTS]
+        self._compiled = [port for port in self._ports if can_write(port.writer)]
         self._table = WriteTable([(port.writer, port.sources) for port in self._compiled])
-        self._others = [port for port in self._ports if port not in self._compiled]
+        self._others = [port for port in self._ports if not can_write(port.writer)]
         self._is_faulty = False
 
     def apply_faults(self, faults: Sequence[FaultEntry]) -> None:

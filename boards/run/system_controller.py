@@ -105,14 +105,14 @@ class SystemController:
         # Read these words before acting on them. A later change is handled at the next tick.
         emergency = words[System.EMERGENCY_STOP]
         peer = words[System.PEER_STOP]
-        asked = [
+        demands = [
             (self._wiring.on_loss.get(task.spec.name, Demand.NONE), task.index) for task in lost
         ]
         if emergency:
-            asked.append((Demand.BRAKE, -1))
+            demands.append((Demand.BRAKE, -1))
         if is_switched_on(peer, tick):
-            asked.append((Demand.STOP, PEER))
-        demand, subject = max(asked, default=(Demand.NONE, -1))
+            demands.append((Demand.STOP, PEER))
+        demand, subject = max(demands, default=(Demand.NONE, -1))
         if demand != self._demand:
             self._driver.wait_until_settled()
             self._demand = demand

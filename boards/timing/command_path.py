@@ -83,7 +83,7 @@ class CommandPath:
 
     @property
     def longest(self) -> int:
-        """Longest response in ticks, of a command that just misses a release and always waits."""
+        """Longest response in ticks, if the command just misses a release and all messages wait."""
         waits = [
             compute_grid_wait(written, read)
             for written, read in zip(self.releases, self.reads[1:], strict=False)

@@ -10,7 +10,7 @@ from typing import Any
 from rack.boards.timing.frames import CoreFrames, compute_core_frames
 from rack.boards.timing.rack import RackTiming
 from rack.boards.timing.system_response import Prediction, predict_response
-from rack.boards.timing.verdicts import EquationVerdict, judge_rack
+from rack.boards.timing.verdicts import EquationVerdict, evaluate_rack
 
 NO_BUDGET = "no budget"
 
@@ -54,7 +54,7 @@ class Forecast:
         return cls(
             rack=rack,
             system=predict_response(rack),
-            verdicts=tuple(judge_rack(rack)),
+            verdicts=tuple(evaluate_rack(rack)),
             inboxes=tuple(
                 inbox.to_document(rack.find_slice_ticks(name) * rack.clock_ns)
                 for name, inbox in rack.inboxes.items()

@@ -50,9 +50,9 @@ def predict_response(rack: RackTiming) -> Prediction:
 def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
     """Return the mailboxes that carry information along a sequence of boards.
 
-    Each mailbox is based on the one before it. If this sequence does not begin at the first board,
-    its longest part that ends at the last board is returned. It does not contain queues, because
-    their writers determine how long messages wait in them.
+    Each mailbox is based on the one before it. If no such sequence begins at the first board, the
+    longest one that ends at the last board is returned. It does not contain queues, because their
+    writers determine how long messages wait in them.
 
     Args:
         layout: Layout of the rack.

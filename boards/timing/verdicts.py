@@ -91,31 +91,31 @@ class EquationVerdict:
         return {**asdict(self), "holds": self.holds, **finite}
 
 
-def judge_rack(rack: RackTiming) -> list[EquationVerdict]:
-    """Return all verdicts on a rack, in the order of the equations.
+def evaluate_rack(rack: RackTiming) -> list[EquationVerdict]:
+    """Return the verdicts of all equations on a rack, in the order of the equations.
 
     Levels and tasks without a budget have no verdicts. A response time without a bound is infinite.
     """
-    levels = (judge_level(rack, level) for level in rack.levels.values())
-    beyond = _judge_tasks(rack), _judge_cores(rack), _judge_frames(rack), _judge_inboxes(rack)
-    all_verdicts = chain(judge_system(rack), *levels, *beyond)
+    levels = (evaluate_level(rack, level) for level in rack.levels.values())
+    beyond = _check_tasks(rack), _check_cores(rack), _check_frames(rack), _check_inboxes(rack)
+    all_verdicts = chain(evaluate_response(rack), *levels, *beyond)
     return sorted(all_verdicts, key=lambda verdict: ORDER.index(verdict.equation))
 
 
-def judge_level(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVerdict]:
+def evaluate_level(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVerdict]:
     """Yield the verdicts on one level, as if it had its own processor."""
-    yield from _judge_cycle(level, rack.tick_ns)
-    yield from _judge_planner(level, rack.context_switch_ns, rack.small_share)
+    yield from _check_cycle(level, rack.tick_ns)
+    yield from _check_planner(level, rack.context_switch_ns, rack.small_share)
 
 
-def judge_system(rack: RackTiming) -> Iterator[EquationVerdict]:
+def evaluate_response(rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield the verdicts on the system response along each group of chains.
 
     If the config has a goal for the response, also yield a verdict on each board's cycle.
     """
     goal_ns = None if rack.response_goal_ns is None else rack.response_goal_ns / rack.speed
     for chains in rack.chain_groups:
-        yield from _judge_chains(rack, chains, goal_ns)
+        yield from _check_chains(rack, chains, goal_ns)
     if goal_ns is not None:
         for name in dict.fromkeys(chain(*rack.chains)):
             cycle_ns = rack.boards[name].every * rack.tick_ns
@@ -131,10 +131,10 @@ def name_response_subject(rack: RackTiming, chains: ParallelChains) -> str:
     return SYSTEM if len(rack.chain_groups) == 1 else f"{SYSTEM}, {chains.text}"
 
 
-def _judge_chains(
+def _check_chains(
     rack: RackTiming, chains: ParallelChains, goal_ns: float | None
 ) -> Iterator[EquationVerdict]:
-    """Yield the verdicts of eqs 3.2 and 3.3 on the response along a group of chains."""
+    """Yield whether the response along a group of chains satisfies eqs 3.2 and 3.3."""
     subject = name_response_subject(rack, chains)
     bound = goal_ns
     limit = "timing.response_ms"
@@ -143,15 +143,15 @@ def _judge_chains(
         limit = "n R_max"
     total = sum(chains.cycles) * rack.tick_ns
     yield EquationVerdict("3.3", subject, total, "<=", bound, f"R_s = sum of R_i <= {limit}")
-    for way, ticks in (
+    for direction, ticks in (
         ("command", rack.compute_command_ticks(chains)),
         ("status", rack.compute_status_ticks(chains)),
     ):
-        meaning = f"R_s of a {way} with its waits for the grid <= {limit}"
+        meaning = f"R_s of a {direction} with its waits for the grid <= {limit}"
         yield EquationVerdict("3.2", subject, ticks * rack.tick_ns, "<=", bound, meaning)
 
 
-def _judge_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
+def _check_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
     """Yield the verdicts of eqs 3.1 and 3.4 to 3.7 on the cycle of a level."""
     board = level.board
     cycle = level.cycle_ns
@@ -167,7 +167,7 @@ def _judge_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
     yield EquationVerdict("3.7", board, cycle, "=", on_grid, "R_i = k c, k whole")
 
 
-def _judge_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
+def _check_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
     """Yield the verdicts on a level's planner, or none if its planning time is unknown."""
     if level.planning_ns is None or level.within_cycles is None or level.slice_ns is None:
         return
@@ -196,7 +196,7 @@ def _judge_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator
     yield EquationVerdict("3.10", board, update, "<=", small, meaning, "1")
 
 
-def _judge_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
+def _check_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield a verdict on the worst-case response time of each task."""
     for task in rack.responses:
         response_ns: float | None = task.response_ns
@@ -220,14 +220,14 @@ def _judge_tasks(rack: RackTiming) -> Iterator[EquationVerdict]:
         )
 
 
-def _judge_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
+def _check_cores(rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield a verdict on the load of each core."""
     for core, load in rack.loads.items():
         meaning = "share of its time that its tasks compute"
         yield EquationVerdict(LOAD, f"core {core}", load, "<=", 1.0, meaning, "1")
 
 
-def _judge_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
+def _check_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield a verdict on each board in each distinct frame of a static schedule."""
     for equal_frames in compute_core_frames(rack):
         for place in equal_frames.places:
@@ -237,14 +237,14 @@ def _judge_frames(rack: RackTiming) -> Iterator[EquationVerdict]:
             yield EquationVerdict(FRAMES, place.board, end_ns, "<=", place.limit_ns, meaning)
 
 
-def _judge_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
+def _check_inboxes(rack: RackTiming) -> Iterator[EquationVerdict]:
     """Yield a verdict on the number of interrupts that wait at each inbox after a burst."""
     for name, inbox in rack.inboxes.items():
         burst = inbox.burst
-        most = inf
+        most_waiting = inf
         endless = f"interrupts of '{name}' come faster than it serves them (load {burst.load:.3g})"
         if burst.waiting is not None:
-            most = burst.waiting
+            most_waiting = burst.waiting
             endless = ""
         meaning = "interrupts that wait after a burst of all senders <= depth"
-        yield EquationVerdict(INBOX, name, most, "<=", inbox.depth, meaning, "1", endless)
+        yield EquationVerdict(INBOX, name, most_waiting, "<=", inbox.depth, meaning, "1", endless)

@@ -58,10 +58,7 @@ def copy_sample(sample: Sensed) -> Sensed:
 
 
 class Link(Protocol):
-    """The path between the servo level and an arm.
-
-    Samples come up, torques or set points go down.
-    """
+    """The connection between the servo level and an arm."""
 
     def sense(self) -> Sensed:
         """Return the newest sample. The arrays are valid until the next call."""

@@ -266,7 +266,7 @@ class SetPointGate:
         self._fastest = narrowed.velocity
         self._dynamics = Dynamics(cell)
         self._gate = LimitGate(narrowed, self._braking, span_s, self._dynamics)
-        self._most = MAX_ACCELERATION_FACTOR * self._braking * self._period_s  # rad/s
+        self._most_change = MAX_ACCELERATION_FACTOR * self._braking * self._period_s  # rad/s
         # No joint can reach a set point farther than this from its sensed position in a cycle.
         self._reach = self._fastest * self._period_s + cell.encoders.position_error
         self._last = last
@@ -297,7 +297,7 @@ class SetPointGate:
             arm.brake()
             return refused
         wanted_velocity, is_cut = self._compute_approach(target)
-        change = np.clip(wanted_velocity - velocity, -self._most, self._most)
+        change = np.clip(wanted_velocity - velocity, -self._most_change, self._most_change)
         inertia, resisting = self._compute_resistance()
         torque = mat_vec(inertia, change / self._period_s) + resisting
         passed, was_cut = self._gate.limit_torque(torque, position, velocity)
@@ -312,8 +312,8 @@ class SetPointGate:
     def _check_set_point(self, target: JointTarget, q: Array, qd: Array) -> Finding | None:
         """Return a finding if a set point is not finite, or too far away for a first set point.
 
-        While the arm is braked, and before the first set point, the sensed state becomes the last
-        set point, and the joints must be able to reach the set point from it in one cycle.
+        While the arm is braked, and before the first set point, the sensed state takes the place of
+        the last set point. The joints must be able to reach the new set point from it in one cycle.
 
         Returns:
             The finding. None if the set point is valid.

@@ -118,10 +118,10 @@ class FaultyLink:
     def _record_motor_faults(self) -> None:
         """Record which motor faults had an effect, and whether the effect was detectable."""
         if self._motors and not self._arm.braked:
-            asked = np.abs(self._arm.torque)
+            commanded = np.abs(self._arm.torque)
             hidden = self._hidden + self._compute_hidden_torque()
             for fraction, active in self._motors:
-                missing = (asked - fraction * self._limits)[active.joints]
+                missing = (commanded - fraction * self._limits)[active.joints]
                 if (missing > 0.0).any():
                     self._effects[active.place] = bool((missing > hidden[active.joints]).any())
 

@@ -49,9 +49,9 @@ class WristSensor:
 
     It measures force and torque between the flange and everything beyond it, due to contact, weight
     and inertia. MuJoCo reports them as force and torque of the parent on the child, in the frame of
-    the site. A tool at rest that touches nothing reads its weight upwards, and a tool that presses
-    down on a table reads less. The noise of a tick is always the same, even on a restarted board or
-    when sampled twice.
+    the site. For a tool at rest without contact, the measured force is its weight, directed
+    upwards. It is smaller while the tool presses down on a table. The noise of a tick is always the
+    same, even on a restarted board or when sampled twice.
     """
 
     def __init__(self, wrist: Wrist, data: mujoco.MjData, seed: int) -> None:

@@ -69,7 +69,7 @@ class SimulatedArm(Simulation, Arm):
         self._wrist = None if cell.wrist is None else WristSensor(cell.wrist, d, seed)
         # (joints,), N m: the last command, and the torque applied for it.
         self._command, self.torque = np.zeros((2, joints))
-        self._given = False  # True if the command for the coming tick has passed the gate
+        self._has_passed_gate = False  # True if the command for the coming tick has passed the gate
         self._drives: CascadedDrives | None = None  # None if drives take torques
         if cell.interface != "torque":
             rows = d.userdata[-SET_POINT_ROWS * joints :].reshape(SET_POINT_ROWS, joints)
@@ -179,9 +179,9 @@ class SimulatedArm(Simulation, Arm):
         for _ in range(ticks):
             if self.waited >= self.patience:
                 self._engage_brakes()
-            if not self._given:
+            if not self._has_passed_gate:
                 self._apply_command()
-            self._given = False
+            self._has_passed_gate = False
             self.waited += 1
             if not self.fault:
                 self._simulate_tick()
@@ -219,7 +219,7 @@ class SimulatedArm(Simulation, Arm):
             self.grip_force = float(d.ctrl[self._gripper.actuator])
         # Restored torques have passed the gate. Drives that follow a set point must compute a new
         # torque, unless the set point arrived in this tick.
-        self._given = self._drives is None or self.braked or self.waited == 0
+        self._has_passed_gate = self._drives is None or self.braked or self.waited == 0
 
     def _apply_command(self) -> None:
         """Apply torques to the joints, cut by the limit gate.
@@ -244,7 +244,7 @@ class SimulatedArm(Simulation, Arm):
         if self._weak_limits is not None:
             torque = np.clip(torque, -self._weak_limits, self._weak_limits)
         self._data.ctrl[cell.actuators] = torque
-        self._given = True
+        self._has_passed_gate = True
 
     def _compute_braking_torque(self, q: Array, qd: Array) -> Array:
         """Return the torques with which the brakes stop or hold the joints, (joints,), in N m.

@@ -87,8 +87,8 @@ def compute_speed_limits(piece: PathBounds, limits: Limits, share: float) -> Spe
     Args:
         piece: Bounds of the derivatives on the piece, (joints,) each.
         limits: Limits of the joints.
-        share: Fraction, 0 to 1, of the highest speed that the bend of a curve permits. A smaller
-            fraction leaves more of the limits for acceleration along the path.
+        share: Fraction, 0 to 1, of the highest speed that the curvature of the path permits. A
+            smaller fraction leaves more of the limits for acceleration along the path.
     """
     first, second, third = piece
     velocity = limits.velocity

@@ -69,7 +69,8 @@ class CollisionChecker:
 
     Attributes:
         held: Row of the object that is carried, or None.
-        longest_opening: Opening at which the gripper reaches farthest. None if it is the open one.
+        longest_opening: Opening at which the gripper reaches farthest. None if it does so when
+            fully open.
     """
 
     def __init__(self, cell: Cell, scene: SceneConfig, margin: float = 0.0) -> None:
@@ -209,7 +210,7 @@ class CollisionChecker:
         close = short > 0
         if np.any(close & (required <= 0)):
             return -1.0
-        # The distance of a close pair limits the clearance, even if the pair needs less.
+        # The distance of a close pair limits the clearance, even if less is required of the pair.
         lacking = short[close] + (self.clearance - required[close])
         return self.clearance - max(0.0, float(np.max(lacking, initial=0.0)))
 

@@ -72,7 +72,7 @@ class InverseKinematics:
     def find_configuration(
         self, target: Pose, start: Array, match_orientation: bool = True
     ) -> Array | None:
-        """Find a configuration that puts the tool at a pose, by one iteration from `start`.
+        """Find a configuration that puts the tool at a pose, by an iterative search from `start`.
 
         Args:
             target: Pose for the tool.

@@ -163,8 +163,8 @@ class PathPlanner:
             first_blocked: Finds the first configuration that is not free.
         """
         before, at, after = waypoints[corner - 1 : corner + 2]
-        for part in BLENDS:
-            b = part * largest
+        for fraction in BLENDS:
+            b = fraction * largest
             ends = [at + b * (end - at) / max(norm(end - at), b) for end in (before, after)]
             path = Path(np.array([ends[0], at, ends[1]]), np.array([0.0, b, 0.0]))
             if self.find_blocked_configuration(path, first_blocked) is None:
@@ -225,16 +225,16 @@ class PathPlanner:
             free: Checks scaled configurations.
         """
         least = ends.min(axis=0)
-        most = ends.max(axis=0)
+        highest = ends.max(axis=0)
         low, high = self._limits.position.T
         low = np.where(np.isfinite(low), low, least - ENDLESS_RAD)
-        high = np.where(np.isfinite(high), high, most + ENDLESS_RAD)
+        high = np.where(np.isfinite(high), high, highest + ENDLESS_RAD)
         space = base.RealVectorStateSpace(len(least))
         bounds = base.RealVectorBounds(len(least))
         # The arm may rest slightly beyond a limit, so the bounds include the start.
         for j, value in enumerate(np.minimum(low, least) * self._levers - BOUND_ROUNDING):
             bounds.setLow(j, value)
-        for j, value in enumerate(np.maximum(high, most) * self._levers + BOUND_ROUNDING):
+        for j, value in enumerate(np.maximum(high, highest) * self._levers + BOUND_ROUNDING):
             bounds.setHigh(j, value)
         space.setBounds(bounds)
         information = base.SpaceInformation(space)

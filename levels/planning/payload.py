@@ -128,7 +128,7 @@ class Payloads:
         normal = force * abs(wide.length - narrow.length) / (wide.gap - narrow.gap)
         parts = self._cell.list_geoms(row)
         return normal * sum(
-            max(_compute_friction(model, finger, int(part)) for part in parts)
+            max(_compute_friction(model, finger, int(geom)) for geom in parts)
             for finger in narrow.geoms
         )
 

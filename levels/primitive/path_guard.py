@@ -62,7 +62,7 @@ class PathGuard:
         self._cursor = 0.0
         self._obstructed: float | None = None
         self._least = self._clearance
-        self._ahead = np.zeros((self._rows, 3))
+        self._extrapolated = np.zeros((self._rows, 3))
         self.obstacle = ""
 
     def carry_object(self, row: int, q: Array, world: WorldState) -> None:
@@ -143,10 +143,10 @@ class PathGuard:
         for k in range(NEAR_CHECKS):
             ahead_s = (k + (self._phase + 1) / PHASES) * self._spacing_s
             if moving is not None:
-                np.multiply(self._by_themselves, ahead_s + self._delay_s, out=self._ahead)
-                self._ahead *= moving.velocity[: self._rows]
-                self._ahead += moving.position[: self._rows]
-                self._checker.place_bodies(self._ahead, moving.quaternion)
+                np.multiply(self._by_themselves, ahead_s + self._delay_s, out=self._extrapolated)
+                self._extrapolated *= moving.velocity[: self._rows]
+                self._extrapolated += moving.position[: self._rows]
+                self._checker.place_bodies(self._extrapolated, moving.quaternion)
             if not self._is_free(path, trajectory.evaluate_at(time_s + ahead_s).s):
                 return False
             if time_s + ahead_s > trajectory.duration:

@@ -37,7 +37,7 @@ class PathMotion:
         s: Path parameter of the set point, rad.
         trajectory: Trajectory along the path, or None while the set point does not move.
         time_s: Time since the trajectory began.
-        stopping: The trajectory is a ramp to rest.
+        stopping: True if the trajectory is a ramp to rest.
         set_point: Set point computed by the last `advance_by`.
     """
 

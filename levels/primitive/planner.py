@@ -37,7 +37,7 @@ class PrimitivePlanner(Planner):
         limits = build_level_cell(context).limits
         self._positions = limits.position
         self._rules = WorkRules(context.robot.joints, limits, self.settings, context.period_s)
-        self._made = (0, 0.0)
+        self._last_plan = (0, 0.0)
         self._answered_at = 0
 
     def wanted(self, tick: int) -> bool:
@@ -47,7 +47,7 @@ class PrimitivePlanner(Planner):
             return False
         # The status shows the effect of a plan one cycle later. If the plan is still wanted after
         # that, it was lost in a restart of the board.
-        return (status.wants, status.begin) != self._made or tick > self._answered_at
+        return (status.wants, status.begin) != self._last_plan or tick > self._answered_at
 
     def plan(self, tick: int) -> None:
         """Compute the trajectory of the requested segment, or write the reason for a refusal."""
@@ -57,7 +57,7 @@ class PrimitivePlanner(Planner):
         serial = status.wants
         begin = status.begin
         published = tick + context.within_cycles * context.every
-        self._made = (serial, begin)
+        self._last_plan = (serial, begin)
         self._answered_at = published + context.every
         plan.segment = serial
         plan.begin = begin

@@ -143,10 +143,11 @@ class PathWork:
         segment: The segment.
         motion: Motion of the set point along its path.
         fault: Why the segment cannot be done, or None.
-        blocked: An obstacle is on the path, or the arm is too far from the path.
-        astray: The arm is too far from the path.
+        blocked: True if an obstacle is on the path, or the arm is too far from the path.
+        astray: True if the arm is too far from the path.
         obstacle: Description of what blocked the motion last.
-        unplanned_cycles: Consecutive cycles in which the motion waits for a trajectory.
+        unplanned_cycles: Number of consecutive cycles in which the motion has waited for a
+            trajectory.
     """
 
     def __init__(

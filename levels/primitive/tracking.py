@@ -36,8 +36,8 @@ class Tracking:
     rest and is not stopped. Motion then continues from the position at which the arm is held.
 
     Attributes:
-        in_step: The servo follows set points.
-        silent_cycles: Consecutive cycles without a new status.
+        in_step: True if the servo follows set points.
+        silent_cycles: Number of consecutive cycles without a new status.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class Tracking:
         )
         if self.in_step or not heard or not servo.holding or servo.stopped:
             return False
-        # Written so that NaN does not count as rest.
+        # The comparison is written so that NaN does not count as rest.
         if (
             not np.abs(servo.target_velocity).max() <= MAX_REST_RAD_S
             or not np.isfinite(servo.target).all()

@@ -60,7 +60,7 @@ class CellGeoms(NamedTuple):
 
 @dataclass(frozen=True)
 class Cell:
-    """A compiled cell. Indices are addresses in `model`."""
+    """A compiled cell. Indices refer to the arrays of `model`."""
 
     model: mujoco.MjModel
     """Has torque motors on all joints of the arm and a force motor on the gripper. For a hand, it

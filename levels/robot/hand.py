@@ -273,10 +273,10 @@ def _find_moment_arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints
     arms = np.diagonal(moments, axis1=2, axis2=3) * np.array([[1.0], [-1.0]])
     for number, joint in enumerate(robot.joints):
         least = float(arms[:, :, number].min()) + 0.0  # avoids -0
-        most = float(arms[:, :, number].max())
-        if least < ARM_TOLERANCE or most - least > ARM_TOLERANCE * most:
+        peak = float(arms[:, :, number].max())
+        if least < ARM_TOLERANCE or peak - least > ARM_TOLERANCE * peak:
             raise RobotError(
-                f"robot.hand: arms of the tendons on joint '{joint}' are {least:g} to {most:g} m;"
+                f"robot.hand: arms of the tendons on joint '{joint}' are {least:g} to {peak:g} m;"
                 " the flexor must turn it in positive direction and the extensor in negative"
                 " direction, with equal arms that do not vary"
             )

@@ -113,7 +113,7 @@ class ActuatorMonitor:
         self._cycles = 0
         self._joint = -1
         # N m: torque commanded and given in the first of these cycles, and the most given since.
-        self._commanded = self._given = self._most = 0.0
+        self._commanded = self._exerted = self._most_exerted = 0.0
         self._alone = True  # it is the only motor that lacks torque
 
     def begin_cycle(self) -> None:
@@ -194,11 +194,11 @@ class ActuatorMonitor:
             self._joint = joint
             self._cycles = 0
             self._commanded = commanded[joint]
-            self._given = commanded[joint] - lacks[joint]
-            self._most = 0.0
+            self._exerted = commanded[joint] - lacks[joint]
+            self._most_exerted = 0.0
             self._alone = True
         self._cycles += 1
-        self._most = max(self._most, abs(commanded[joint] - lacks[joint]))
+        self._most_exerted = max(self._most_exerted, abs(commanded[joint] - lacks[joint]))
         self._alone &= not rests and np.count_nonzero(np.abs(residual) > noise) == 1
         predicted_speed = np.abs(velocity) + 2.0 * np.abs(velocity - motors["earlier_velocity"])
         if (predicted_speed > self._fastest).any() or self._is_certain(
@@ -225,11 +225,13 @@ class ActuatorMonitor:
         if self._pushed:
             return True
         more = commanded - self._commanded
-        rise = commanded - lacks - self._given
+        rise = commanded - lacks - self._exerted
         motor = self._motors[joint]
         certain = 2.0 * motor["noise"]
         hidden = 2.0 * motor["dry"] if self._alone and lacks >= DEAD_PART * commanded else 0.0
-        return bool(self._most <= certain + hidden or (more > certain and rise < RISE_PART * more))
+        return bool(
+            self._most_exerted <= certain + hidden or (more > certain and rise < RISE_PART * more)
+        )
 
 
 @compiled_for("f8[:,::1], f8, f8, f8[:,::1], f8[:,::1], f8[:,::1], f8[::1]", MOTORS)

@@ -211,7 +211,7 @@ class Grip:
         self._least, self._most = sorted((config.open, config.closed))
         self._opening = config.open
         self._limit = config.force
-        self._kept: float | None = None
+        self._constant_force: float | None = None
 
     def keep_force(self, force: float) -> None:
         """Apply a constant force until the first set point.
@@ -221,14 +221,14 @@ class Grip:
         Args:
             force: Force, N or N m.
         """
-        self._kept = force
+        self._constant_force = force
 
     def take_command(self, command: ArmSetPoint) -> None:
         """Adopt opening and force of a valid set point, limited to the range of the gripper."""
         if command.due != 0 and math.isfinite(command.opening) and math.isfinite(command.force):
             self._opening = min(max(command.opening, self._least), self._most)
             self._limit = min(max(command.force, 0.0), self._most_force)
-            self._kept = None
+            self._constant_force = None
 
     def compute_force(self, opening: float, velocity: float) -> float:
         """Return the force of the gripper, in N or N m.
@@ -237,7 +237,7 @@ class Grip:
             opening: Sensed opening, m or rad.
             velocity: Rate of the opening, m/s or rad/s.
         """
-        if self._kept is not None:
-            return self._kept
+        if self._constant_force is not None:
+            return self._constant_force
         force = self._stiffness * (self._opening - opening) - self._damping * velocity
         return min(max(force, -self._limit), self._limit)

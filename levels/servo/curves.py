@@ -109,7 +109,7 @@ def set_motion(
 
 
 class Bridge(Curve):
-    """The cubic curve from the motion on another curve to a position and a velocity."""
+    """A cubic curve from the state on another curve to a given position and velocity."""
 
     def __init__(
         self, before: Curve, begin_s: float, end: tuple[Array, Array], duration_s: float

@@ -64,7 +64,8 @@ class ArmDriver(Executor):
     Attributes:
         followed: Id of the newest command from the level above.
         rests_on: Serial of the operator's command on which that command is based.
-        abandoned: The arm was braked in the last cycle, so its set points were abandoned.
+        abandoned: True if the arm was braked in the last cycle, so that its set points were
+            abandoned.
         speed_scale: Permitted fraction of full speed, up to 1.
     """
 
@@ -168,7 +169,7 @@ class ArmDriver(Executor):
 
         Args:
             reaction: Reaction of this cycle, weaker than BRAKE.
-            missed: Cycles before this one were missed.
+            missed: True if cycles before this one were missed.
             tick: Tick of the cycle.
         """
 

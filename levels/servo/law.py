@@ -175,7 +175,7 @@ class ServoLaw(ArmDriver):
 
         Args:
             reaction: Reaction of this cycle.
-            missed: Cycles before this one were missed.
+            missed: True if cycles before this one were missed.
             tick: Tick of the cycle.
         """
         sensors = self.sensors

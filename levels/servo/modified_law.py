@@ -88,8 +88,8 @@ class ModifiedLaw:
     """Applies control modifications to one law.
 
     Attributes:
-        has_modifications: The config declares modifications, whether they are switched on or off.
-            Otherwise the law may be called directly.
+        has_modifications: True if the config declares modifications, switched on or off. Otherwise
+            the law may be called directly.
         reason: Names of the active modifications, and why others have failed.
     """
 

@@ -44,7 +44,7 @@ class Reference:
         speed_scale: Fraction of full speed, up to 1, for the motion of `move_to` and for joining
             the set points.
         goal: Goal of `move_to`, (joints,), rad, until another motion begins, else None.
-        holding: No set point is followed: the motion ramps to rest or is at rest.
+        holding: True if no set point is followed. The motion then ramps to rest or is at rest.
         refused: Number of set points cut at the bounds, and of cycles in which one is NaN or due
             too far ahead.
     """
@@ -138,7 +138,7 @@ class Reference:
         return self._evaluate_motion(tick)
 
     def ramp_to_rest(self, tick: int) -> Motion:
-        """Return the motion wanted at `tick` on a ramp to rest that ignores the level above."""
+        """Return the motion wanted at `tick` while the arm ramps to rest by itself."""
         self._next = None
         if not self.holding or self.goal is not None:
             now = self._evaluate_motion(tick)
@@ -146,7 +146,7 @@ class Reference:
         return self._evaluate_motion(tick)
 
     def move_to(self, goal: Array, tick: int) -> Motion:
-        """Return the motion wanted at `tick` for a move to a goal that ignores the level above.
+        """Return the motion wanted at `tick` while the arm moves to a goal by itself.
 
         The motion ramps to rest, then goes straight to the goal within the limits of every joint.
 

@@ -107,13 +107,13 @@ class SensorMonitor:
         doubt: (joints,), rad. Largest error of `position`.
         estimate: `position`, `velocity` and `doubt` as rows, (3, joints).
         state: `position` and `velocity` as rows, (2, joints).
-        fresh: There is a sample of this cycle.
+        fresh: True if there is a sample of this cycle.
         faulty: An episode of faults has not ended.
-        drivable: All velocities are known, so the arm could still be driven.
+        drivable: True if all velocities are known, so that the arm could still be driven.
         blamed: Joint at fault, its reading, rad, and its error, rad. If there are no samples: -1,
             the age of the newest sample in ticks, and 0.
         findings: New findings, one per alarm and episode. The reader clears the list.
-        missing: Why samples were missing the last time.
+        missing: Reason why samples were missing the last time.
     """
 
     def __init__(self, cell: Cell, params: ArmParams, tick_s: float, every: int) -> None:
@@ -200,7 +200,7 @@ class SensorMonitor:
             tick: Tick of the cycle.
             wanted: Motion that the arm was driven to follow: its first rows are rad and rad/s. None
                 if the arm was not driven.
-            struck: Something has touched the arm since the last cycle.
+            struck: True if something has touched the arm since the last cycle.
         """
         q, qd, _, _, sampled = sensed
         passed = self._every if self._tick is None else tick - self._tick
@@ -291,7 +291,7 @@ class SensorMonitor:
         self._unproven &= unchanged
         if begins:
             # A sensor whose value did not change may have been stuck while its joint crept. Its
-            # error may be as large as the motion after which that is detected.
+            # error may be as large as the motion at which a stuck sensor is detected.
             np.maximum(
                 self.doubt,
                 np.where(joints["unchanged"], STUCK_RAD, PLAUSIBLE_RAD),
@@ -411,7 +411,7 @@ class SensorMonitor:
         return True
 
     def _end_episode(self) -> None:
-        """End an episode: trust all sensors again."""
+        """End an episode, and trust all sensors again."""
         self.faulty = False
         self._streak = 0
         self._unproven[:] = False
@@ -438,14 +438,14 @@ def check(  # noqa: PLR0913  # flat, as `advance` in levels/arm/substeps.py
     Args:
         joints: State of the monitor.
         estimate: Positions, velocities and largest position errors.
-        coarse: The encoders are not exact.
+        coarse: True if the encoders are not exact.
         sensed: Positions of the sample.
         sensed_velocity: Velocities of the sample.
         wanted: Motion that the arm was driven to follow.
         passed_s: Time since the last sample.
         braked_s: Time for which the arm may have braked. 0 unless cycles were missed.
         blow: Multiple of the fastest velocity that a blow may have added.
-        driven: The arm was driven.
+        driven: True if the arm was driven.
         faulty: An episode of faults has not ended.
 
     Returns:

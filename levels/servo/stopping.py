@@ -70,13 +70,13 @@ class Stopping:
         self._on_motors = Reaction[params.on_actuator_fault.upper()]
         self._retry_ticks = round(params.retry / tick_s)
         self._good_ticks = params.good_cycles * every
-        self._most = max(round(params.patience / tick_s), every)
+        self._patience_ticks = max(round(params.patience / tick_s), every)
         self.refused: Finding | None = None
         self.error = Error.NONE
         self.cause = Error.NONE
         self.reason = ""
         self.findings: list[Finding] = []
-        self._kept = 0  # ticks for which faults have kept the arm from its set points
+        self._fault_ticks = 0  # ticks for which faults have kept the arm from its set points
         self._remembered: tuple[int, Error] | None = None  # values in the last state
         self._tick: int | None = None
         # Tick at which a failed motor is retried. None if no motor has failed.
@@ -89,7 +89,7 @@ class Stopping:
     def restore_state(self, state: ArmState) -> None:
         """Continue from an `ArmState` after a restart."""
         self._tick = state.tick
-        self._kept = state.kept
+        self._fault_ticks = state.kept
         if state.error != Error.DISABLED:
             self.error = Error(state.error)
             self.reason = state.reason
@@ -97,9 +97,9 @@ class Stopping:
     def save_state(self, state: ArmState) -> None:
         """Write the state that `restore_state` needs, if it has changed."""
         error = self.error or (Error.DISABLED if self.is_disabled else Error.NONE)
-        if (self._kept, error) != self._remembered:
-            self._remembered = self._kept, error
-            state.kept = self._kept
+        if (self._fault_ticks, error) != self._remembered:
+            self._remembered = self._fault_ticks, error
+            state.kept = self._fault_ticks
             state.error = error
             state.reason = self.reason if self.error else ""
 
@@ -189,16 +189,16 @@ class Stopping:
             return Reaction.BRAKE
         is_sound = self.refused is None and self._retry_at is None and self._struck_until is None
         if is_sound and not (sensors.faulty or demand):
-            self._kept = max(self._kept - passed, 0) if self._kept else 0
+            self._fault_ticks = max(self._fault_ticks - passed, 0) if self._fault_ticks else 0
             self.cause = Error.NONE
             self.reason = ""
             return Reaction.NONE
         reaction, cause = self._select_reaction(sensors, tick)
         if cause is None:
-            self._kept = max(self._kept - passed, 0)
+            self._fault_ticks = max(self._fault_ticks - passed, 0)
         elif not demand:
-            self._kept += passed
-            if self._kept >= self._most:
+            self._fault_ticks += passed
+            if self._fault_ticks >= self._patience_ticks:
                 # Latch the fault: the brakes stay engaged.
                 self.error = self.cause = cause.error
                 self.reason = f"{cause.text}; not over within {self._params.patience:g} s"
@@ -219,7 +219,8 @@ class Stopping:
     def _set_cause(self, cause: Cause, tick: int) -> None:
         """Set `cause` and `reason`, which contains the tick at which the fault will be latched."""
         self.cause = cause.error
-        self.reason = f"{cause.text}{cause.then}; latched at tick {tick + self._most - self._kept}"
+        latch_tick = tick + self._patience_ticks - self._fault_ticks
+        self.reason = f"{cause.text}{cause.then}; latched at tick {latch_tick}"
 
     def _select_reaction(self, sensors: SensorMonitor, tick: int) -> tuple[Reaction, Cause | None]:
         """Return the strongest reaction to the present faults, and the fault to report or None."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import time
 
 import pytest
 
-from rack.backplane.byte_lock import ByteLock, is_locked
+from rack.backplane.byte_lock import ByteLock, close_all_files, is_locked, reopen_all
 from tests.backplane.conftest import MakeBus
-from tests.processes import FORKS, descriptors, forked, wait_until
+from tests.processes import FORKS, descriptors, exit_status, fork, forked, wait_until
 
 pytestmark = pytest.mark.filterwarnings(FORKS)
 ADDRESS = 400
@@ -52,3 +53,23 @@ def test_a_query_concerns_one_byte_and_takes_no_lock(make_bus: MakeBus) -> None:
     lock.release()
     assert not is_locked(segment.fd, ADDRESS)
     assert lock.take()
+
+
+def test_a_fork_closes_its_locks_and_opens_them_on_another_file(make_bus: MakeBus) -> None:
+    segment = make_bus()
+    lock = ByteLock(segment.fd, ADDRESS)
+    other = os.memfd_create("other")
+
+    def switch() -> None:
+        before = descriptors()
+        close_all_files()
+        assert descriptors() < before
+        reopen_all(other)
+        assert descriptors() == before
+        assert lock.take()
+        assert [is_locked(fd, ADDRESS) for fd in (segment.fd, other)] == [False, True]
+
+    try:
+        assert exit_status(fork(switch)) == 0
+    finally:
+        os.close(other)

@@ -15,7 +15,7 @@ from rack.boards.config import build_rack_timing
 from rack.boards.config.timing import subtract_interrupts
 from rack.boards.timing import trace_times
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, EquationVerdict, judge_rack
+from rack.boards.timing.verdicts import LOAD, ORDER, RESPONSE_TIME, EquationVerdict, evaluate_rack
 from rack.tools.console.answer import Failure
 from rack.tools.recording.cycles import (
     WORST_PERCENTILE,
@@ -142,10 +142,10 @@ class Analysis:
             ]
             derived = [
                 verdict
-                for verdict in judge_rack(rack)
+                for verdict in evaluate_rack(rack)
                 if verdict.equation not in OBSERVED_EQUATIONS
             ]
-            return rack, tuple(_pair_verdicts(judge_rack(predicted), [*derived, *observed]))
+            return rack, tuple(_pair_verdicts(evaluate_rack(predicted), [*derived, *observed]))
 
         measured, pairs = judge_equations(percentile)
         progress(0.7)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from rack.boards.timing.level import LevelTiming
 from rack.boards.timing.rack import RackTiming
 from rack.boards.timing.trace_times import compute_distribution, count_misses_and_skips
-from rack.boards.timing.verdicts import EquationVerdict, judge_rack
+from rack.boards.timing.verdicts import EquationVerdict, evaluate_rack
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks
 from rack.tools.recording.cycles import START_UP_S, Cycles, list_restarts
@@ -235,7 +235,7 @@ def _choose_advice(analysis: Analysis, has_failed: bool) -> str:
             return f"to do: rack report {folder} says why the run failed; its timing held"
         return "to do: nothing"
     if any(pair.is_failed for pair in analysis.typical_pairs):
-        if all(verdict.holds for verdict in judge_rack(analysis.measured)):
+        if all(verdict.holds for verdict in evaluate_rack(analysis.measured)):
             return "to do: nothing about the config: its levels' own times fit; see --verbose"
         return (
             f"to do: rack check CONFIG --from {folder} lists changes that make it fit, if there are"

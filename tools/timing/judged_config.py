@@ -18,9 +18,9 @@ from rack.boards.timing.tasks import Budget
 from rack.boards.timing.verdicts import (
     LOAD,
     EquationVerdict,
-    judge_level,
-    judge_rack,
-    judge_system,
+    evaluate_level,
+    evaluate_rack,
+    evaluate_response,
 )
 from rack.tools.console.answer import Document
 
@@ -46,7 +46,7 @@ class JudgedConfig:
         """
         layout = resolve(config).layout
         timing = build_rack_timing(config, layout, budgets)
-        return cls(config, layout, timing, tuple(judge_rack(timing)))
+        return cls(config, layout, timing, tuple(evaluate_rack(timing)))
 
     @property
     def budgets(self) -> dict[str, Budget]:
@@ -110,10 +110,10 @@ class JudgedConfig:
         This check is quick and ignores the effect on other tasks of the core.
         """
         old = {verdict.key for verdict in self.failures}
-        system = (verdict for verdict in judge_system(changed) if verdict.key not in old)
+        system = (verdict for verdict in evaluate_response(changed) if verdict.key not in old)
         return all(
             verdict.holds
-            for verdict in chain(judge_level(changed, changed.build_level(board)), system)
+            for verdict in chain(evaluate_level(changed, changed.build_level(board)), system)
         )
 
 

@@ -289,7 +289,7 @@ class OrderedTaskExecutor(TaskExecutor):
             super()._check_progress(plan, waits, tick)
 
     def _list_progress_values(self) -> tuple[int, ...]:
-        """Return the values of the order. A change of any of them counts as progress."""
+        """Return the values of the order whose changes count as progress."""
         return self._taken.order, self._taken.response, self._begun, not self._absent
 
     def _write_status(self, plan: TaskPlan, waits: str) -> None:
@@ -398,7 +398,7 @@ class OrderedTaskPlanner(TaskPlanner):
         return max(super()._compute_visible_s(tick), self._begin_s + self.context.period_s)
 
     def _check_deadlines(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
-        """Check the times, and write the earliest end of the order in the coordinator's time."""
+        """Check deadlines, and write the earliest end of the order in the coordinator's time."""
         super()._check_deadlines(moves, visible_s)
         unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
         self.output.earliest = (

@@ -75,7 +75,7 @@ class SharedBody:
     Attributes:
         name: Name of the body.
         rack: Name of this rack.
-        claim: The claim that is valid as far as this rack knows.
+        claim: Newest claim that this rack knows.
         is_touched: Whether the gripper of this rack touches the body.
     """
 

@@ -32,7 +32,7 @@ class SharingArm(SimulatedArm):
     ) -> None:
         super().__init__(cell, scene, clock_ns, every, seed)
         # Pose of each fixed copy by row, (7,), m and quaternion.
-        self._kept: dict[int, Array] = {}
+        self._fixed_poses: dict[int, Array] = {}
 
     def is_touched(self, row: int) -> bool:
         """Return True if the gripper touches an object."""
@@ -55,18 +55,18 @@ class SharingArm(SimulatedArm):
         dof_index = model.body_dofadr[self.cell.bodies[row]]
         self._data.qpos[qpos_index : qpos_index + POSE] = pose
         self._data.qvel[dof_index : dof_index + MOTION] = 0.0
-        if row in self._kept:
-            self._kept[row] = pose
+        if row in self._fixed_poses:
+            self._fixed_poses[row] = pose
 
     def fix_object(self, row: int, is_fixed: bool) -> None:
         """Fix an object at its present pose, or let the simulation move it again."""
         if not is_fixed:
-            self._kept.pop(row, None)
-        elif row not in self._kept:
-            self._kept[row] = self.read_pose(row)
+            self._fixed_poses.pop(row, None)
+        elif row not in self._fixed_poses:
+            self._fixed_poses[row] = self.read_pose(row)
 
     def _simulate_tick(self) -> None:
         """Simulate a tick, then move the fixed copies back to their poses."""
         super()._simulate_tick()
-        for row, pose in self._kept.items():
+        for row, pose in self._fixed_poses.items():
             self.place_object(row, pose)

@@ -69,7 +69,7 @@ class ContactWrench:
             acceleration: Accelerations, (joints,), rad/s2.
         """
         self.raw[:] = raw
-        # Written so that NaN counts as saturated.
+        # The comparison is written so that NaN counts as saturated.
         self.saturated = not bool((np.abs(raw) < self._range).all())
         if not np.isfinite(raw).all():
             return
@@ -126,7 +126,7 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         assert self.cell.wrist is not None, "`find_mismatches` refuses an arm without a sensor"
-        self._most = self.cell.wrist.contact_limits
+        self._contact_limits = self.cell.wrist.contact_limits
         self._on_limit = Reaction[self.settings.on_force_limit.upper()]
         self.contact = ContactWrench(self.cell, self.cell.wrist, self.arm.dynamics)
         self._exact = self.cell.encoders.is_exact
@@ -187,7 +187,9 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
             text = "contact too strong: the wrist sensor is at the end of its range"
             self._stop_arm(finding, text, tick)
             return
-        for (half, name, unit), limit, alarm in zip(HALVES, self._most, ALARMS, strict=True):
+        for (half, name, unit), limit, alarm in zip(
+            HALVES, self._contact_limits, ALARMS, strict=True
+        ):
             strength = norm(contact.wrench[half])
             if strength > limit:
                 text = f"contact too strong: {name} of {strength:.3g} {unit}; permitted: {limit:g}"

@@ -173,7 +173,7 @@ class ForceMotions(Motions):
         super().__init__(bus, motion, requests, context)
 
     def comply(self, contact: str, **changes: Any) -> int:
-        """Request force control on those axes of a contact that have a wrench.
+        """Request force control on the axes for which a contact has a wrench.
 
         It begins once the arm is at rest. The request is done when the forces have settled at the
         wanted values.

@@ -151,7 +151,7 @@ def check_frame_and_wrenches(
         vectors: Wrenches, (6,) each.
         most: Largest permitted force, N, and torque, N m, of a contact.
     """
-    # Written so that NaN is rejected.
+    # The comparison is written so that NaN is rejected.
     if not abs(norm(frame) - 1.0) <= MAX_UNIT_ERROR:
         return f"the task frame's quaternion has length {norm(frame):.3g}; permitted: 1"
     for wrench in vectors:

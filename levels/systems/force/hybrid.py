@@ -58,7 +58,7 @@ class ComplianceWatch:
             most: Limits on a contact, N and N m.
             every: Ticks from cycle to cycle.
         """
-        self._most = most
+        self._wrench_limits = most
         self._oldest = MAX_WRENCH_AGE_CYCLES * every
         self.task: ForceTask | None = None
         self.struck = 0
@@ -146,7 +146,7 @@ class ComplianceWatch:
 
     def _limit_wrench(self, wanted: Array) -> Array:
         """Return the wanted wrench, reduced to the arm's limits. If reduced, set `reason`."""
-        for (half, name, unit), limit in zip(HALVES, self._most, strict=True):
+        for (half, name, unit), limit in zip(HALVES, self._wrench_limits, strict=True):
             size = norm(wanted[half])
             if size > limit:
                 wanted[half] *= limit / size

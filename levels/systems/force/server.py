@@ -64,8 +64,8 @@ class ServerParams(TrajectoryParams):
 class ServerWork(RequestWork):
     """Carries out requests, including COMPLY and GUARD, and checks contacts.
 
-    See `ServerRequest`. When present axes of force change or end, motion restarts from where the
-    arm is: the boards below come to rest and hold, and then get into step again.
+    See `ServerRequest`. When the set of force axes changes, motion restarts from the position of
+    the arm: the boards below come to rest, hold, and then follow set points again.
     """
 
     boards: JointBoards
@@ -170,7 +170,7 @@ class ServerWork(RequestWork):
             self.end_compliance()
 
     def _restart_motion(self, reason: str) -> None:
-        """Restart the motion, for `reason`, from where the boards below come to rest."""
+        """Restart the motion from where the boards below come to rest. `reason` is reported."""
         self.agenda.goal = None  # the arm is not at the goal of a request
         self.boards.leave_step(reason)
         self.interrupt_motion()
@@ -327,7 +327,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
                 self._enter_mode(Mode.RELEASED, "forces released, the position is held")
 
     def _enter_mode(self, mode: Mode, description: str) -> None:
-        """Enter a mode in which no client is served. The reason in the status has `description`."""
+        """Enter a mode without service. The reason in the status contains `description`."""
         self._without = mode
         self._since = self._now
         silent = f"no sign of life from the client for {self.settings.silence:g} s"

@@ -152,9 +152,9 @@ class HandExecutor(Executor):
         self._waiting = self.wanted_tensions.find_missing(self.tensions, tick, since or 0)
         if not self._waiting:
             self.wanted_tensions.merge_commands(self.tensions)
-            found, self._waiting = self.wanted_tensions.limit_tensions()
-            if found is not None:
-                self.hand.refuse_command(found)
+            finding, self._waiting = self.wanted_tensions.limit_tensions()
+            if finding is not None:
+                self.hand.refuse_command(finding)
         held = self.orders.is_holding
         if held and not self._waiting:
             self._waiting = HELD
@@ -284,7 +284,7 @@ class Tensions(CommandsAbove):
         tension = self.tension
         low = self._low
         high = self._high
-        found = None
+        finding = None
         within = (tension >= low - self._margin) & (tension <= high + self._margin)  # False for NaN
         if not within.all():
             finite = np.isfinite(tension)
@@ -293,6 +293,6 @@ class Tensions(CommandsAbove):
                 refused = f"rejected: tension of '{self._joints[joint]}', {TENDONS[row]} is NaN"
                 return Finding(Alarm.TENSION_INVALID, joint), refused
             row, joint = np.argwhere(~within)[0].tolist()
-            found = Finding(Alarm.TENSION_LIMIT, joint, float(tension[row, joint]))
+            finding = Finding(Alarm.TENSION_LIMIT, joint, float(tension[row, joint]))
         np.clip(tension, low, high, out=tension)
-        return found, ""
+        return finding, ""

@@ -80,7 +80,7 @@ class GraspExecutor(Executor):
             names=names,
             joints=context.robot.joints,
             postures={
-                name: self._join_posture(given) for name, given in self._program.posture.items()
+                name: self._join_posture(posture) for name, posture in self._program.posture.items()
             },
             period_s=context.period_s,
             fingers=FingersBelow(context, kinematics.joints),

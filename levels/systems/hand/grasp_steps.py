@@ -72,9 +72,9 @@ class FingersBelow:
                 self.awaited = f"{board}: {status.reason or 'it does not follow'}"
             self.error = self.error or Error(status.error)
             for finger in np.flatnonzero(status.driven).tolist():
-                own = self._joints[finger]
-                self.position[own] = status.position[own]
-                self.target[own] = status.target[own]
+                joints = self._joints[finger]
+                self.position[joints] = status.position[joints]
+                self.target[joints] = status.target[joints]
                 self.tip[finger] = status.tip[finger]
                 self.force[finger] = status.force[finger]
         self.rests_on = min(reading.message.operator for reading in statuses.values())
@@ -164,11 +164,11 @@ class StepWork(ABC):
 
     def find_progress(self, elapsed_s: float) -> tuple[float, float]:
         """Return the progress from `resumed_s` to the end, 0 to 1, and its rate in 1/s."""
-        part, rate = minimum_jerk(elapsed_s / self.step.seconds)
+        progress, rate = minimum_jerk(elapsed_s / self.step.seconds)
         before, _ = minimum_jerk(self.resumed_s / self.step.seconds)
         if before >= 1.0:
             return 1.0, 0.0
-        return (part - before) / (1.0 - before), rate / self.step.seconds / (1.0 - before)
+        return (progress - before) / (1.0 - before), rate / self.step.seconds / (1.0 - before)
 
 
 def minimum_jerk(time: float) -> tuple[float, float]:
@@ -194,13 +194,13 @@ class PreshapeWork(StepWork):
         """Move the joints towards the posture. Returns True when they have reached it."""
         grasp = self.grasp
         target = grasp.target
-        part, rate = self.find_progress(elapsed_s)
-        way = self._posture - self._start
+        progress, rate = self.find_progress(elapsed_s)
+        shift = self._posture - self._start
         target.mode[:] = FingerMode.JOINTS
         target.force[:] = 0.0
-        target.position = self._start + part * way
-        target.velocity = rate * way
-        if part < 1.0:
+        target.position = self._start + progress * shift
+        target.velocity = rate * shift
+        if progress < 1.0:
             return False
         away = np.abs(grasp.fingers.position - self._posture)
         if (away < grasp.params.astray).all():
@@ -228,13 +228,13 @@ class CloseWork(StepWork):
         grasp = self.grasp
         step = self.step
         self._start = grasp.fingers.tip.copy()
-        self._ways = np.zeros_like(self._start)  # (fingers, 3), m
+        self._displacements = np.zeros_like(self._start)  # (fingers, 3), m
         for name, point in step.points.items():
             finger = grasp.names.index(name)
             assert grasp.object is not None, "a step has begun without a world model"
             inside = grasp.object @ Pose(np.array(point), np.array([1.0, 0.0, 0.0, 0.0]))
-            self._ways[finger] = inside.position - self._start[finger]
-        self._seconds = max(norm(way) for way in self._ways) / step.speed
+            self._displacements[finger] = inside.position - self._start[finger]
+        self._seconds = max(norm(shift) for shift in self._displacements) / step.speed
         # N: force of the opposing finger at which every finger presses with `step.touch` or more.
         self._touch = step.touch / min(grasp.grip.shares[grasp.grip.fingers])
 
@@ -242,18 +242,18 @@ class CloseWork(StepWork):
         """Move the tips that do not touch the object yet. Returns True when all touch it."""
         grasp = self.grasp
         target = grasp.target
-        part = min((elapsed_s - self.resumed_s) / self._seconds, 1.0)
+        progress = min((elapsed_s - self.resumed_s) / self._seconds, 1.0)
         for finger in np.flatnonzero(grasp.grip.fingers & ~grasp.touching).tolist():
-            way = self._ways[finger]
+            shift = self._displacements[finger]
             if norm(grasp.fingers.force[finger]) >= self.step.touch:
                 grasp.touching[finger] = True
                 self._hold_contact(
-                    finger, grasp.grip.shares[finger] * self._touch * way / norm(way)
+                    finger, grasp.grip.shares[finger] * self._touch * shift / norm(shift)
                 )
             else:
                 target.mode[finger] = FingerMode.POINT
-                target.tip[finger] = self._start[finger] + part * way
-                target.tip_velocity[finger] = way / self._seconds if part < 1.0 else 0.0
+                target.tip[finger] = self._start[finger] + progress * shift
+                target.tip_velocity[finger] = shift / self._seconds if progress < 1.0 else 0.0
         missing = grasp.missing_fingers
         at_the_end = elapsed_s - self.resumed_s > self._seconds + grasp.params.patience
         if missing and (at_the_end or elapsed_s > self.step.seconds):
@@ -339,11 +339,11 @@ class SqueezeWork(GrippingWork):
     def run(self, elapsed_s: float) -> bool:
         """Set the grip force for `elapsed_s`. Returns True when it has reached `step.grip`."""
         grasp = self.grasp
-        part, _ = self.find_progress(elapsed_s)
+        progress, _ = self.find_progress(elapsed_s)
         grasp.anchor[:] = grasp.object_position
-        grasp.base = grasp.grip.force = self._from + part * (self.step.grip - self._from)
+        grasp.base = grasp.grip.force = self._from + progress * (self.step.grip - self._from)
         self.apply_grip()
-        return part >= 1.0
+        return progress >= 1.0
 
 
 class ShiftWork(GrippingWork):
@@ -355,21 +355,21 @@ class ShiftWork(GrippingWork):
         """Compute the remaining displacement, which is shorter than `step.by` after a restart."""
         super().set_start()
         done, _ = minimum_jerk(self.resumed_s / self.step.seconds)
-        self._way = (1.0 - done) * np.array(self.step.by)
-        self._part = 0.0
+        self._displacement = (1.0 - done) * np.array(self.step.by)
+        self._progress = 0.0
 
     def run(self, elapsed_s: float) -> bool:
         """Shift the anchor and the tips. Returns True when the shift is complete."""
         grasp = self.grasp
         target = grasp.target
-        part, rate = self.find_progress(elapsed_s)
-        gone = (part - self._part) * self._way
-        self._part = part
+        progress, rate = self.find_progress(elapsed_s)
+        gone = (progress - self._progress) * self._displacement
+        self._progress = progress
         grasp.anchor += gone
         target.tip[grasp.grip.fingers] += gone
-        target.tip_velocity[grasp.grip.fingers] = rate * self._way
+        target.tip_velocity[grasp.grip.fingers] = rate * self._displacement
         self.keep_grip()
-        return part >= 1.0
+        return progress >= 1.0
 
 
 class HoldWork(GrippingWork):
@@ -408,17 +408,17 @@ class ReleaseWork(StepWork):
             target.force = grasp.grip.find_forces(grasp.fingers.tip)
             self._start[:] = target.tip
             return False
-        part, rate = minimum_jerk(elapsed_s / half - 1.0)
+        progress, rate = minimum_jerk(elapsed_s / half - 1.0)
         grasp.grip.force = 0.0
         grasp.grip.load[:] = 0.0
         grasp.touching[:] = False
         for finger in np.flatnonzero(grasp.grip.fingers):
-            way = self.step.way * self._out[finger]
+            shift = self.step.way * self._out[finger]
             target.mode[finger] = FingerMode.POINT
             target.force[finger] = 0.0
-            target.tip[finger] = self._start[finger] + part * way
-            target.tip_velocity[finger] = rate / half * way
-        return part >= 1.0
+            target.tip[finger] = self._start[finger] + progress * shift
+            target.tip_velocity[finger] = rate / half * shift
+        return progress >= 1.0
 
 
 WORKS: dict[type[Table], type[StepWork]] = {

@@ -107,9 +107,11 @@ class HandGrip:
         """
         stiffness = self.stiffness[:, None]
         whole = float(self.stiffness.sum())
-        way = self._gains.creep * self._period_s * (stiffness * (tips - points)).sum(axis=0) / whole
-        points[self.fingers] += way
-        self.load -= whole * way
+        shift = (
+            self._gains.creep * self._period_s * (stiffness * (tips - points)).sum(axis=0) / whole
+        )
+        points[self.fingers] += shift
+        self.load -= whole * shift
 
     def find_forces(self, tips: Array) -> Array:
         """Return the forces of the fingers on the object, (fingers, 3), in N.

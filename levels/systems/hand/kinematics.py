@@ -61,9 +61,9 @@ class FingerKinematics:
         Its shape is (3, joints of the finger), its unit m/rad.
         """
         mujoco.mj_jacSite(self._cell.model, self._data, self._whole, None, self._tips[finger])
-        own = np.take(self._whole, self._cell.dof[self.joints[finger]], axis=1)
-        rotated = np.empty_like(own)
-        mujoco.mju_mulMatTMat(rotated, self.rotation, own)
+        finger_jacobian = np.take(self._whole, self._cell.dof[self.joints[finger]], axis=1)
+        rotated = np.empty_like(finger_jacobian)
+        mujoco.mju_mulMatTMat(rotated, self.rotation, finger_jacobian)
         return rotated
 
     def step_towards(self, finger: int, position: Array, way: Array, homing: Array) -> None:
@@ -78,7 +78,7 @@ class FingerKinematics:
             way: Displacement of the tip, (3,), m.
             homing: Preferred joint motion, (joints of the finger,), rad.
         """
-        own = self.joints[finger]
+        finger_joints = self.joints[finger]
         jacobian = self.find_jacobian(finger)
         square = np.empty((3, 3))
         mujoco.mju_mulMatMatT(square, jacobian, jacobian)
@@ -86,4 +86,6 @@ class FingerKinematics:
         moved = homing + transposed_mat_vec(
             jacobian, solve(square, way - mat_vec(jacobian, homing))
         )
-        position[own] = np.clip(position[own] + moved, self._low[own], self._high[own])
+        position[finger_joints] = np.clip(
+            position[finger_joints] + moved, self._low[finger_joints], self._high[finger_joints]
+        )

@@ -94,8 +94,8 @@ class FingertipLaw:
         self._posture = gains.posture
         self._period_s = period_s
         # (joints,), rad: largest change of a target in a cycle.
-        self._most = kinematics.limits.velocity * period_s
-        self.wanted = np.zeros(len(self._most))  # (joints,), rad: targets of the last cycle
+        self._most_motion = kinematics.limits.velocity * period_s
+        self.wanted = np.zeros(len(self._most_motion))  # (joints,), rad: targets of the last cycle
         # (joints,), rad: posture to which a redundant joint returns.
         self._rest = self.wanted.copy()
         self._tips = np.zeros((len(kinematics.joints), 3))  # (fingers, 3), m: sensed
@@ -130,29 +130,29 @@ class FingertipLaw:
         points = grasp.tip + ahead_s * grasp.tip_velocity
         reaching = []
         for finger in self._fingers:
-            own = self.kinematics.joints[finger]
+            joints = self.kinematics.joints[finger]
             mode = grasp.mode[finger]
-            out.stiff[own] = 1.0
-            out.torque[own] = 0.0
-            out.spring[own] = 0.0
+            out.stiff[joints] = 1.0
+            out.torque[joints] = 0.0
+            out.spring[joints] = 0.0
             if mode == FingerMode.JOINTS:
-                self.wanted[own] = grasp.position[own] + ahead_s * grasp.velocity[own]
-                self._rest[own] = self.wanted[own]
+                self.wanted[joints] = grasp.position[joints] + ahead_s * grasp.velocity[joints]
+                self._rest[joints] = self.wanted[joints]
             elif mode == FingerMode.FORCE:
                 jacobian = self.kinematics.find_jacobian(finger)
-                out.torque[own] = transposed_mat_vec(jacobian, grasp.force[finger])
-                out.spring[np.ix_(own, own)] = grasp.stiffness[finger] * gram(jacobian)
-                out.stiff[own] = self._posture
+                out.torque[joints] = transposed_mat_vec(jacobian, grasp.force[finger])
+                out.spring[np.ix_(joints, joints)] = grasp.stiffness[finger] * gram(jacobian)
+                out.stiff[joints] = self._posture
             if mode != FingerMode.JOINTS:
                 reaching.append(finger)
         if reaching:
             self._approach_points(reaching, points)
-        moved = np.clip(self.wanted - before, -self._most, self._most)
+        moved = np.clip(self.wanted - before, -self._most_motion, self._most_motion)
         self.wanted[:] = before + moved
         for finger in self._fingers:
-            own = self.kinematics.joints[finger]
-            out.position[own] = self.wanted[own]
-            out.velocity[own] = moved[own] / self._period_s
+            joints = self.kinematics.joints[finger]
+            out.position[joints] = self.wanted[joints]
+            out.velocity[joints] = moved[joints] / self._period_s
 
     def _approach_points(self, fingers: Sequence[int], points: Array) -> None:
         """Move the joint targets of `fingers` so that their tips approach the given points.
@@ -164,8 +164,8 @@ class FingertipLaw:
         for _ in range(STEPS):
             self.kinematics.set_position(self.wanted)
             for finger in fingers:
-                own = self.kinematics.joints[finger]
-                homing = HOMING * (self._rest[own] - self.wanted[own])
+                joints = self.kinematics.joints[finger]
+                homing = HOMING * (self._rest[joints] - self.wanted[joints])
                 self.kinematics.step_towards(
                     finger, self.wanted, points[finger] - self.kinematics.find_tip(finger), homing
                 )
@@ -389,7 +389,7 @@ def set_tensions(
     rest, lead, share, most_trim = numbers
     arm = constants[0]  # m
     least = constants[1]  # N
-    most = constants[2]  # N
+    highest = constants[2]  # N
     driven = constants[3]  # 1 for the joints of this board
     reached = valves[0]  # modelled tensions now
     expected = valves[1]  # modelled tensions at the sample
@@ -399,12 +399,12 @@ def set_tensions(
     for j in range(joints):
         if driven[j] == 0.0:
             continue
-        room = 0.5 * (most[j] - least[j])
+        room = 0.5 * (highest[j] - least[j])
         half = 0.5 * torque[j] / arm[j]
         if abs(half) > room:
             clipped = True
         half = np.minimum(np.maximum(half, -room), room)  # NaN stays
-        mean = min(max(rest, least[j] + abs(half)), most[j] - abs(half))
+        mean = min(max(rest, least[j] + abs(half)), highest[j] - abs(half))
         for row in range(2):
             wanted = mean + half if row == 0 else mean - half
             commanded = sensed[(2 + row) * joints + j] - trim[row, j]
@@ -413,7 +413,7 @@ def set_tensions(
             if abs(learned) < np.inf:  # ignore a sensed NaN
                 trim[row, j] = min(max(learned, -most_trim), most_trim)
             early = wanted + lead * (wanted - reached[row, j])
-            early = np.minimum(np.maximum(early, least[j]), most[j])
+            early = np.minimum(np.maximum(early, least[j]), highest[j])
             reached[row, j] += share * (early - reached[row, j])
-            tension[row, j] = np.minimum(np.maximum(early + trim[row, j], least[j]), most[j])
+            tension[row, j] = np.minimum(np.maximum(early + trim[row, j], least[j]), highest[j])
     return clipped

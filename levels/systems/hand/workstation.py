@@ -95,7 +95,7 @@ class GraspPlanner:
         self._kinematics = FingerKinematics(cell, cell.hand)
         self._data = cell.build_start_data()
         self._opposing = names.index(opposing)
-        first = [own[0] for own in self._kinematics.joints]
+        first = [joints[0] for joints in self._kinematics.joints]
         # (fingers, 3), m.
         self._bases = self._data.xanchor[cell.model.dof_jntid[cell.dof[first]]].copy()
 
@@ -128,12 +128,12 @@ class GraspPlanner:
         line = math.cos(angle) * across + math.sin(angle) * out
         contact, normal = np.zeros((2, len(self._bases), 3))
         for finger, base in enumerate(self._bases):
-            way = -line if finger != self._opposing else line
-            touched = self._find_contact(row, base, way)
+            direction = -line if finger != self._opposing else line
+            touched = self._find_contact(row, base, direction)
             if touched is None:
                 return None
             contact[finger] = touched
-            normal[finger] = way
+            normal[finger] = direction
         closed = self._find_joints(contact - self._rules.pad * normal, self._cell.home)
         if closed is None:
             return None
@@ -147,7 +147,7 @@ class GraspPlanner:
         origin = self._data.xpos[body]
         return PlannedGrasp(
             contact=np.array([transposed_mat_vec(turned, point - origin) for point in contact]),
-            normal=np.array([transposed_mat_vec(turned, way) for way in normal]),
+            normal=np.array([transposed_mat_vec(turned, direction) for direction in normal]),
             posture=posture,
             grip=self._find_grip_force(row),
             margin=margin,
@@ -200,13 +200,13 @@ class GraspPlanner:
         for _ in range(STEPS):
             kinematics.set_position(position)
             ways = [point - kinematics.find_tip(finger) for finger, point in enumerate(wanted)]
-            lengths = [norm(way) for way in ways]
+            lengths = [norm(direction) for direction in ways]
             if max(lengths) < REACHED_M:
                 return position
-            for finger, (way, length) in enumerate(zip(ways, lengths, strict=True)):
+            for finger, (direction, length) in enumerate(zip(ways, lengths, strict=True)):
                 homing = np.zeros(len(kinematics.joints[finger]))
                 kinematics.step_towards(
-                    finger, position, way * (STEP_M / max(length, STEP_M)), homing
+                    finger, position, direction * (STEP_M / max(length, STEP_M)), homing
                 )
         return None
 

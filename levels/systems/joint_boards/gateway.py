@@ -83,13 +83,14 @@ class JointGateway(Executor):
             self._frozen = False
         elif self._due and tick + LEAD_CYCLES * self.context.every > self._due:
             self._extrapolate_reference(self.command)
-        # Put the status of the boards below on the link, and write the one that arrives.
+        # Send the status of the boards below over the delayed link, and write the status that has
+        # arrived.
         self._merge_statuses(self.statuses)
         self._up.append((tick + self._delay, bytes(self._merged.raw)))
         deliver_arrived(self._up, self.status, tick)
 
     def _take_reference(self, command: Reading[JointReference], tick: int) -> None:
-        """Put a new reference on the delayed link, and accept the newest one that has arrived."""
+        """Send a new reference over the delayed link, and accept the newest that has arrived."""
         if command.is_new:
             self._down.append((tick + self._delay, bytes(command.message.raw)))
         deliver_arrived(self._down, self._newest, tick)
@@ -196,7 +197,7 @@ class NetworkGateway(JointGateway):
         self._tick_s = params.tick
         # Ticks before it is due at which a reference is passed down, because then the boards below
         # begin to interpolate to it.
-        self._ahead = self._period + LEAD_CYCLES * context.every
+        self._lead_ticks = self._period + LEAD_CYCLES * context.every
         self._above = "lan"
         self._arrived = JointReference.zeros(context.sizes)
         self._refused = ""  # why the newest reference was refused
@@ -257,6 +258,6 @@ class NetworkGateway(JointGateway):
                     self._refused = f"rejected: a reference due in {ahead_s:.3g} s"
                     return
                 arrived.due = round(due_s / self.context.tick_s)
-            begins = arrived.due + self.latency - self._ahead if arrived.due else tick
+            begins = arrived.due + self.latency - self._lead_ticks if arrived.due else tick
             self._down.append((begins, bytes(arrived.raw)))
         deliver_arrived(self._down, self._newest, tick)

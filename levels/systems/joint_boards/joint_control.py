@@ -35,9 +35,9 @@ class JointLoads:
         self._begin = self._due = 0  # tick
         self._payload = Payload(0.0, np.zeros(3))
         self._home = cell.home
-        self._most = cell.bounds.torque
+        self._torque_limits = cell.bounds.torque
         # Inertia that these torques just accelerate at the acceleration limits.
-        self._most_inertia = self._most / cell.limits.acceleration
+        self._most_inertia = self._torque_limits / cell.limits.acceleration
         low, high = cell.bounds.position.T
         self._low = low - MOVED_RAD
         self._high = high + MOVED_RAD
@@ -48,11 +48,11 @@ class JointLoads:
 
     def find_invalid_field(self, command: JointReference) -> str:
         """Return the name of the first field beyond the arm's limits, or an empty string."""
-        # Written so that NaN is rejected.
+        # The comparison is written so that NaN is rejected.
         within = {
             "position": (self._low <= command.position) & (command.position <= self._high),
             "inertia": (command.inertia > 0.0) & (command.inertia <= self._most_inertia),
-            "load": np.abs(command.load) <= self._most,
+            "load": np.abs(command.load) <= self._torque_limits,
             "payload_mass": self._can_hold(command),
         }
         return next((name for name, fits in within.items() if not np.all(fits)), "")
@@ -64,7 +64,7 @@ class JointLoads:
         if mass == self._payload.mass and (offset == self._payload.offset).all():
             return True
         bias = self._dynamics.terms(self._home, self._still, Payload(mass, offset)).bias
-        return bool(mass >= 0.0 and (np.abs(bias) <= self._most).all())
+        return bool(mass >= 0.0 and (np.abs(bias) <= self._torque_limits).all())
 
     def take_reference(self, command: JointReference, tick: int) -> None:
         """Interpolate from the present loads to the loads of a reference, which apply when due."""

@@ -116,14 +116,14 @@ class ModificationSender(Executor):
 
 
 class ModifiedFromAfar(JointServo):
-    """Servoes joints by a law that another rack, and an operator of this rack, may modify."""
+    """Controls joints by a law that another rack, and an operator of this rack, can modify."""
 
     asked = Input(Modifications, "lan.modifications")
     modified = Output(ModifiedAnswer, cycles=ANSWER_CYCLES)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._asked: set[str] = set()  # modifications of this board that must be active
+        self._requested: set[str] = set()  # modifications of this board that must be active
 
     def process(self, tick: int) -> None:
         """Switch modifications as the other rack requests, then run the cycle."""
@@ -136,12 +136,12 @@ class ModifiedFromAfar(JointServo):
             }
             refused = {
                 name: refusal
-                for name in sorted(wanted ^ self._asked)
+                for name in sorted(wanted ^ self._requested)
                 if (refusal := self._modified.switch_modification(name, name in wanted))
             }
             # A refused modification is tried again with every message, so that every answer reports
             # the refusal.
-            self._asked = wanted.difference(refused)
+            self._requested = wanted.difference(refused)
             self.modified.echo = self.asked.message.id
             self.modified.error = len(refused)
             self.modified.reason = "; ".join(refused.values())

@@ -287,7 +287,7 @@ def _format_validation_errors(error: ValidationError, place: str, kind: type[Tab
     known = ", ".join(field.alias or key for key, field in kind.model_fields.items())
     lines = []
     for entry in error.errors(include_url=False):
-        key = ".".join(str(part) for part in entry["loc"])
+        key = ".".join(str(key_part) for key_part in entry["loc"])
         message = entry["msg"]
         why = f"{str(entry['input'])[:40]!r}: {message[0].lower()}{message[1:]}"
         if entry["type"] == "missing":

@@ -265,12 +265,12 @@ class JointLeg:
 
     def __init__(self, start: Array, goal: Array, times: LegTimes, limits: Limits) -> None:
         self._start = start.copy()
-        self._way = goal - start
-        self.law = build_time_law(times, np.abs(self._way), np.zeros(len(goal)), limits)
+        self._displacement = goal - start
+        self.law = build_time_law(times, np.abs(self._displacement), np.zeros(len(goal)), limits)
 
     def compute_position(self, time_s: float) -> Array:
         """Return the joint positions, (joints,), in rad, at `time_s` after the start."""
-        return np.asarray(self._start + self.law.compute_progress(time_s) * self._way)
+        return np.asarray(self._start + self.law.compute_progress(time_s) * self._displacement)
 
 
 class ToolLeg:

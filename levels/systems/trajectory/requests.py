@@ -53,11 +53,11 @@ def find_request_error(request: MotionRequest, ranges: Array) -> str:
     is_pose = np.isfinite((*request.position, *quaternion)).all() and quaternion.any()
     if request.kind == MotionKind.POSE and not is_pose:
         return "the pose is not finite, or its quaternion is zero"
-    # Written such that NaN is refused.
+    # The comparison is written so that NaN is refused.
     if not request.touch >= 0.0:
         return f"a guard of {request.touch:g} N m; permitted: 0 or more"
     if request.kind == MotionKind.JOINTS:
-        # Written such that NaN is outside.
+        # The comparison is written so that NaN counts as outside.
         is_outside = ~((request.joints >= ranges[:, 0]) & (request.joints <= ranges[:, 1]))
         if is_outside.any():
             joint = int(is_outside.argmax())

@@ -83,7 +83,7 @@ def test_a_full_queue_refuses_messages_and_keeps_the_unread_ones(make_bus: MakeB
     assert open_observer(segment, NAME).slots.box[Box.REFUSED] == 1
     assert ids(reader.read(2)) == [1, 2, 3]
     assert send(writer, 2, 5) == [False]
-    writer.taken = 3
+    writer.position.message.taken = 3
     assert send(writer, 3, 6) == [True]
     assert ids(reader.read(4)) == [6]
 
@@ -150,7 +150,7 @@ def test_a_lost_message_is_found_at_its_tick_even_without_a_later_one(make_bus: 
     assert writer.count_free_places() == 0
     assert [reader.read(tick).is_new or reader.statistics.lost for tick in (0, 3, 4)] == [0, 0, 1]
     assert reader.taken == 1
-    writer.taken = reader.taken
+    writer.position.message.taken = reader.taken
     assert send(writer, 8, 2) == [True]
     assert ids(reader.read(12)) == [2]
 
@@ -168,7 +168,7 @@ def test_no_damage_to_a_slot_holds_up_the_queue(make_bus: MakeBus, word: int, at
     assert found == [serial for serial in (1, 2, 3) if serial != at or word == Slot.STAMP_NS]
     assert reader.statistics.bad_reads == (word != Slot.STAMP_NS)
     assert reader.taken == 3
-    writer.taken = reader.taken
+    writer.position.message.taken = reader.taken
     assert send(writer, 1, 4) == [True]
     assert ids(reader.read(2)) == [4]
 

@@ -12,7 +12,7 @@ from rack.backplane.mailbox.slots import build_signature
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm, AlarmWriter, open_alarm_ring
 from rack.backplane.watch.silence_watch import ReadingTask
-from rack.backplane.watch.watched_reader import SporadicReader, WatchedReader, open_watched
+from rack.backplane.watch.watched_reader import MailboxWatcher, open_watched
 from rack.backplane.words import Slot
 from tests.backplane.bus import mailbox, message_address
 from tests.backplane.conftest import MakeBus
@@ -32,7 +32,7 @@ def writer(segment: Segment) -> Iterator[Writer]:
     made.close()
 
 
-def open_reader(segment: Segment, name: str = BOX) -> WatchedReader | SporadicReader:
+def open_reader(segment: Segment, name: str = BOX) -> MailboxWatcher:
     return open_watched(segment, name, AlarmWriter(segment, "reader"), ReadingTask())
 
 

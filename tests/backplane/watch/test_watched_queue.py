@@ -38,7 +38,7 @@ class Site:
 
     def send(self, tick: int, *numbers: int) -> None:
         """Send messages in a cycle of the writer, which knows what has been taken."""
-        self.writer.taken = self.reader.reader.taken
+        self.writer.position.message.taken = self.reader.reader.taken
         for number in numbers:
             self.writer.message.id = number
             assert self.writer.send()

@@ -14,7 +14,7 @@ from rack.boards.config.loader import validate
 from rack.boards.config.timing import subtract_interrupts
 from rack.boards.config.toml import apply_settings, parse_tables
 from rack.boards.errors import ConfigError
-from rack.boards.timing.verdicts import INBOX, judge_rack
+from rack.boards.timing.verdicts import INBOX, evaluate_rack
 from tests.boards.run.test_interrupts import BOARDS, RACK
 
 INTERRUPT = "protocol.default=interrupt"
@@ -98,7 +98,7 @@ def test_an_inbox_that_a_burst_overflows_fails(depth: int, holds: bool) -> None:
     )
     found = [
         v
-        for v in judge_rack(build_rack_timing(config, resolve_layout(config)))
+        for v in evaluate_rack(build_rack_timing(config, resolve_layout(config)))
         if v.equation == INBOX
     ]
     assert [(v.subject, v.left, v.right, v.holds) for v in found] == [

@@ -209,8 +209,8 @@ PATTERNS = (
     (r"fence acq_rel", ("fence",)),
     (r"load atomic .* acquire", ("load head", "fence")),
     (r"store atomic .* release", ("fence", "store head")),
-    (r"@llvm\.memcpy.* dereferenceable\(16\)", ("copy signature",)),
-    (r"@llvm\.memcpy", ("copy message",)),
+    (r"call .*@memcpy\(.* 16\)", ("copy signature",)),
+    (r"call .*@memcpy", ("copy message",)),
     (r"@XXH3", ("check",)),
 )
 """Instructions, and what they do by the model's names."""
@@ -238,7 +238,8 @@ def of_machine_code() -> dict[str, tuple[str, ...]]:
     written = [one for one in written[written.index("check") + 1 :] if one != "branch"]
     read = instructions("read_port")
     # Before the first branch it loads the head, then looks, message by message, which is visible.
-    read = read[: read.index("branch")] + read[read.index("copy signature") : read.index("check")]
+    taken = instructions("take")
+    read = read[: read.index("branch")] + taken[: taken.index("check")]
     return {
         "publish": tuple(one.replace("copy", "store") for one in written),
         "read": tuple(one.replace("copy", "load") for one in read if one != "branch"),

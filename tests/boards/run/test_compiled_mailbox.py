@@ -19,7 +19,7 @@ from rack.backplane.layout import Protocol
 from rack.backplane.mailbox.mailbox import GOOD_OFFSET, Reader, ReadStatistics, Writer
 from rack.backplane.mailbox.slots import Slots, build_signature
 from rack.backplane.segment import Segment, unlink_segment
-from rack.backplane.watch.alarms import AlarmWriter
+from rack.backplane.watch.alarms import CLEAN_READS, Alarm, AlarmWriter
 from rack.backplane.words import Block, Box, Slot
 from rack.boards.run.port_tables import WriteTable, get_address
 from rack.boards.run.ports import OutputPorts
@@ -122,10 +122,10 @@ class End:
         self._link.reader = ReadingTask(self.segment, self._is_compiled)
         self._answers = self._open_answers()
 
-    def forge(self, ahead: int) -> None:
+    def forge(self, ahead: int, pid: int = STRANGER) -> None:
         """Publish in the writer's place, as another process."""
         slots = Slots(self.segment, self.segment.layout.find_mailbox(NAME))
-        slots.resume_writing(build_signature(slots.box[Box.EPOCH], STRANGER))
+        slots.resume_writing(build_signature(slots.box[Box.EPOCH], pid))
         slots.publish_message(self.tick, self.tick + ahead, self.tick)
 
     def lose_writer(self, is_lost: bool) -> None:
@@ -144,7 +144,7 @@ class End:
         """Flip a bit of the mailbox's head."""
         self.segment.bytes[self.segment.map.mailboxes[NAME] + bit // 8] ^= 1 << bit % 8
 
-    def state(self) -> dict[str, object]:
+    def state(self) -> dict[str, Any]:
         """Return all that both ends have left, but for times."""
         reader = self._link.reader.ports.readers[NAME]
         statistics = reader.statistics
@@ -202,8 +202,12 @@ PROTOCOLS = st.sampled_from(["time-slice", "double-buffer", "interrupt"])
 RATES = st.sampled_from([(1, 1), (4, 1), (1, 4), (2, 3)])
 
 
-def drive(protocol: Protocol, rates: tuple[int, int], operations: Sequence[Operation]) -> None:
-    """Do the operations on both buses, and compare them after each."""
+def drive(
+    protocol: Protocol, rates: tuple[int, int], operations: Sequence[Operation]
+) -> list[tuple[Any, ...]]:
+    """Do the operations on both buses, and compare them after each; return all alarms of the
+    writer."""
+    alarms: list[tuple[Any, ...]] = []
     ends = [End(protocol, rates, is_compiled) for is_compiled in (False, True)]
     try:
         for at, (method, *arguments) in enumerate([("cycle", 2), *operations, ("cycle", 3)]):
@@ -212,9 +216,11 @@ def drive(protocol: Protocol, rates: tuple[int, int], operations: Sequence[Opera
             python, compiled = (end.state() for end in ends)
             for part, expected in python.items():
                 assert compiled[part] == expected, (at, method, arguments, part)
+            alarms += python["alarms"][0]
     finally:
         for end in ends:
             end.close()
+    return alarms
 
 
 @pytest.mark.slow
@@ -234,6 +240,15 @@ def test_machine_code_leaves_every_byte_and_verdict_as_python_does_at_length(
     protocol: Protocol, rates: tuple[int, int], operations: list[Operation]
 ) -> None:
     drive(protocol, rates, operations)
+
+
+@pytest.mark.parametrize("pid", [1, 2, STRANGER])
+def test_an_intruder_of_any_process_id_is_reported_once_per_episode(pid: int) -> None:
+    intrusion = [("advance", 1), ("forge", 0, pid), ("write", 0)]
+    pause = [("advance", 1), ("write", 0)]
+    episode = [*intrusion * (CLEAN_READS + 2), *pause, *intrusion]
+    alarms = drive("time-slice", (1, 1), [*episode, *pause * (CLEAN_READS + 2), *episode])
+    assert [(alarm[1], alarm[3]) for alarm in alarms] == [(Alarm.MASQUERADE, pid)] * 2
 
 
 def test_a_message_rests_on_the_oldest_of_its_sources_that_have_come(make_bus: MakeBus) -> None:

@@ -7,7 +7,7 @@ from rack.boards.config import load, resolve_layout
 from rack.boards.config.timing import build_rack_timing
 from rack.boards.timing.frames import CoreFrames, compute_core_frames
 from rack.boards.timing.rack import RackTiming
-from rack.boards.timing.verdicts import FRAMES, judge_rack
+from rack.boards.timing.verdicts import FRAMES, evaluate_rack
 
 MS = 1_000_000
 
@@ -33,7 +33,7 @@ def test_a_board_still_running_when_the_next_begins_has_negative_slack_and_fails
     assert places(even)[0] == (*places(odd)[0][:3], "even") == ("fast", 0, -0.14, "even")
     failing = [
         (v.subject, v.left, v.right, v.meaning)
-        for v in judge_rack(rack)
+        for v in evaluate_rack(rack)
         if v.equation == FRAMES and not v.holds
     ]
     assert failing == [

@@ -12,7 +12,7 @@ from rack.boards.timing.forecast import NO_BUDGET, Forecast
 from rack.boards.timing.level import BoardTiming
 from rack.boards.timing.rack import RackTiming
 from rack.boards.timing.tasks import Budget, Part, TimedTask, Unit
-from rack.boards.timing.verdicts import judge_rack
+from rack.boards.timing.verdicts import evaluate_rack
 
 MS = 1_000_000
 CLOCK = TimedTask("clock", "clock", "clock", 0, 90, 2 * MS, ())
@@ -60,13 +60,13 @@ def board(name: str, every: int, above: str = "", below: str = "") -> BoardTimin
 def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
     failing = {
         (verdict.equation, verdict.subject)
-        for verdict in judge_rack(rack(FIGURE_3))
+        for verdict in evaluate_rack(rack(FIGURE_3))
         if not verdict.holds
     }
     assert failing == {("3.8", "level"), ("response time", "level.planner"), ("load", "core 1")}
     # The paper's own way out: cycles of 8 ms, figure 2.
     longer = rack(FIGURE_3).replace_board("level", every=4, within_cycles=2)
-    assert all(verdict.holds for verdict in judge_rack(longer))
+    assert all(verdict.holds for verdict in evaluate_rack(longer))
 
 
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
@@ -118,7 +118,7 @@ def test_one_board_per_joint_forms_one_group_of_parallel_chains() -> None:
     assert timing.ranks == (("plan",), ("path",), JOINTS, ("arm",))
     assert set(timing.longest_cycles.values()) == {200, 500}
     # 200 + 20 + 4 + 2 ticks of 2 ms, for all joints in one line.
-    (eq_3_3,) = [verdict for verdict in judge_rack(timing) if verdict.equation == "3.3"]
+    (eq_3_3,) = [verdict for verdict in evaluate_rack(timing) if verdict.equation == "3.3"]
     assert (eq_3_3.subject, eq_3_3.left) == ("system", 226 * 2 * MS)
 
 

@@ -10,7 +10,7 @@ from rack.backplane.layout import TickGrid
 from rack.boards.timing.level import LevelTiming
 from rack.boards.timing.rack import RackTiming, compute_grid_wait
 from rack.boards.timing.tasks import TimedTask
-from rack.boards.timing.verdicts import EquationVerdict, Sign, judge_level
+from rack.boards.timing.verdicts import EquationVerdict, Sign, evaluate_level
 
 MS = 1_000_000
 TIGHT = LevelTiming(
@@ -38,7 +38,7 @@ def judged(
     """Return both sides of an equation, ms or shares, and its sign; with ! if it fails."""
     clock = TimedTask("clock", "clock", "clock", 0, 90, tick_ns, ())
     rack = RackTiming(False, 1.0, tick_ns, clock, {}, switch_ns, 0.1, None, {}, None)
-    (found,) = [found for found in judge_level(rack, level) if found.equation == equation]
+    (found,) = [found for found in evaluate_level(rack, level) if found.equation == equation]
     unit = 1 if found.unit == "1" else MS
     return found.left / unit, found.sign + "!" * (not found.holds), found.right / unit
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -13,8 +14,8 @@ from rack.levels.planning import collision
 from rack.levels.planning.collision import MAX_HELD_DEPTH_M, CollisionChecker, find_first_blocked
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, build_pointing_quaternion, make_pose
-from rack.levels.robot.cell import Cell
-from tests.levels.arms import cell, config
+from rack.levels.robot.cell import Cell, build_cell
+from tests.levels.arms import CLOCK_NS, ROBOTS, cell, config
 
 DOWN = (0.0, 0.0, -1.0)
 BLOCK1, BLOCK2, PEG = 0, 1, 2
@@ -66,6 +67,24 @@ def test_clearance_decides_near_the_table_and_may_be_lowered(
     assert checker.is_free(q, clearance=0.009)
     assert not checker.is_free(q, clearance=0.011)
     assert checker.find_clearance(q) == pytest.approx(0.010, abs=1e-4)
+
+
+def test_pads_of_a_gripper_may_touch_each_other_even_if_the_model_names_them_as_a_pair(
+    tmp_path: Path,
+) -> None:
+    for file in ROBOTS.glob("puma560*.xml"):
+        text = file.read_text()
+        if file.name == "puma560.xml":
+            pair = '<contact><pair geom1="pad_left" geom2="pad_right"/></contact>'
+            text = text.replace("</mujoco>", f"{pair}</mujoco>")
+        (tmp_path / file.name).write_text(text)
+    robot, scene = config("puma560")
+    robot = robot.model_copy(update={"model": tmp_path / Path(robot.model).name})
+    puma = build_cell(robot, scene, CLOCK_NS)
+    assert puma.model.npair == 1
+    checker = CollisionChecker(puma, scene, margin=0.01)
+    checker.open_gripper(0.0)
+    assert checker.is_free(puma.home)
 
 
 def test_the_gripper_may_only_touch_the_intended_block(

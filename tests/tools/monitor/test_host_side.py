@@ -1,4 +1,4 @@
-"""Tests the host side on the command line: prompt, status, check, and replayed entries."""
+"""Tests the host side as tools show it: prompt, status, check, and replayed entries."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ from typing import Any
 
 import pytest
 
+from rack.backplane.mailbox.protocols import open_writer
+from rack.backplane.segment import Segment, unlink_segment
 from rack.boards import Rack
-from rack.boards.config import load
+from rack.boards.config import load, resolve_layout
+from rack.tools.monitor.host_side import EntryRow, list_entry_rows
+from rack.tools.monitor.newest_messages import NewestMessages
 from rack.tools.recording.recording import Recording
 from tests.boards.host.test_board import HOSTED
 from tests.processes import RACK
@@ -36,6 +40,34 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     settings = ["--set", f"name=entries-{os.getpid()}", "--set", "host.program.params.count=40"]
     done = rack("run", folder / "hosted.toml", *settings, "--out", folder / "run", "--json")
     return folder / "run", json.loads(done.stdout)
+
+
+def test_entries_are_listed_with_their_counts_once_the_bridge_has_reported(
+    hosted: Path, rack_name: str
+) -> None:
+    config = load(hosted, [f"name={rack_name}"])
+    layout = resolve_layout(config)
+    segment = Segment.create(layout, config.to_toml_text())
+    try:
+        newest = NewestMessages(segment)
+        assert list_entry_rows(newest) == ()
+        writer = open_writer(segment, "bridge.status")
+        for entry, counts in (
+            ("numbers", {"passed": 7, "refused": 2, "age": 4}),
+            ("sum", {"superseded": 3, "full": 5, "waiting": 1, "age": -1}),
+        ):
+            for name, value in counts.items():
+                getattr(writer.message, entry)[name] = value
+        writer.write(0)
+        writer.close()
+        age_ms = 4 * layout.clock_ns * 1e-6
+        assert list_entry_rows(newest) == (
+            EntryRow("bridge.numbers", "program.numbers", 7, 2, 0, 0, 0, age_ms),
+            EntryRow("bridge.sum", "adder.status", 0, 0, 3, 5, 1, None),
+        )
+    finally:
+        segment.close()
+        unlink_segment(rack_name)
 
 
 @pytest.mark.slow

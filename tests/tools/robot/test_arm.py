@@ -92,7 +92,7 @@ def test_the_arm_ends_at_its_last_driven_joint(
 def test_named_joints_are_driven(tmp_path: Path) -> None:
     arm = found(tmp_path, FLEXIBLE, joints=(*JOINTS, "flex1"))
     assert arm.joints == (*JOINTS, "flex1")
-    assert arm.passive == ("flex2",)
+    assert (arm.tip, arm.passive) == ("flex1 body", ("flex2",))
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from rack.backplane.mailbox.inbox import InterruptSource
 from rack.boards.config import load
 from rack.boards.timing.forecast import Forecast
 from rack.boards.timing.interrupts import InboxTiming
-from rack.boards.timing.verdicts import INBOX, judge_rack
+from rack.boards.timing.verdicts import INBOX, evaluate_rack
 from rack.tools.timing.judged_config import JudgedConfig
 from rack.tools.timing.summary import find_tightest
 from tests.tools.command_line import rack
@@ -145,7 +145,7 @@ def test_a_planner_that_never_finishes_is_described_in_a_sentence(small: Path) -
 def test_interrupts_that_never_end_are_described_in_a_sentence() -> None:
     inbox = InboxTiming("low", ("up.status",), (InterruptSource(1_000, 2_000),), 4)
     timing = replace(JudgedConfig.judge(load("fig2")).timing, inboxes={"low": inbox})
-    (found,) = [verdict for verdict in judge_rack(timing) if verdict.equation == INBOX]
+    (found,) = [verdict for verdict in evaluate_rack(timing) if verdict.equation == INBOX]
     assert list(find_tightest([found])) == [
         "tightest: interrupts of 'low' come faster than it serves them (load 2)"
     ]

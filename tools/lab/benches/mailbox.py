@@ -26,8 +26,9 @@ from rack.backplane.watch.alarms import AlarmWriter
 from rack.backplane.watch.silence_watch import ReadingTask
 from rack.backplane.watch.watched_reader import open_watched
 from rack.boards.config.layout import build_field_specs
+from rack.boards.exchange import InputMailbox
 from rack.boards.faults.bounds import format_count
-from rack.boards.run.port_tables import InputMailbox, ReadTable, WriteTable, can_read, can_write
+from rack.boards.run.port_tables import ReadTable, WriteTable, can_read, can_write
 from rack.tools.console.answer import Failure
 from rack.tools.console.progress import Progress
 from rack.tools.lab.benches.harness import (
@@ -202,7 +203,7 @@ def _build_reader(segment: Segment, box: MailboxSpec, task: str) -> Callable[[in
     read = watched_reader.reader.read
     delay = box.delay
     message = watched_reader.reader.message
-    line = InputMailbox({}, box.name, watched_reader.read, watched_reader)
+    line = InputMailbox({}, box.name, watched_reader)
     if can_read(line):
         read_table = ReadTable([line]).read
 
