@@ -28,7 +28,7 @@ UP_STATES = (TaskState.READY, TaskState.RUNNING)
 
 
 class RestartPolicy:
-    """Limits and order of restarts in a rack.
+    """Decides whether lost tasks of a rack are restarted, and in which order.
 
     Times are ticks, so that equal losses in lockstep have equal outcomes.
     """

@@ -103,7 +103,7 @@ def evaluate_rack(rack: RackTiming) -> list[EquationVerdict]:
 
 
 def evaluate_level(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on one level, as if it had its own processor."""
+    """Yield the verdicts on one level, as if it had a processor to itself."""
     yield from _check_cycle(level, rack.tick_ns)
     yield from _check_planner(level, rack.context_switch_ns, rack.small_share)
 

@@ -141,7 +141,7 @@ class TaskExecutor(Executor):
         return self._detour.step(plan, self._done, below)
 
     def _find_reason_to_wait(self, below: Reading[MoveStatus]) -> str:
-        """Return text that says why the level waits and what ends the wait.
+        """Return why the level waits, and what ends the wait, as text.
 
         Empty if it does not wait.
         """
