@@ -81,7 +81,7 @@ class EquationVerdict:
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """Key by which the verdict is found again after the rack's times have changed."""
+        """Key for finding the same verdict again after the rack's times have changed."""
         return self.equation, self.subject, self.meaning
 
     def to_document(self) -> dict[str, Any]:

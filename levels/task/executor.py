@@ -91,7 +91,7 @@ class TaskExecutor(Executor):
         self._answer_operator(below)
 
     def _read_first_actions(self) -> tuple[AnyAction, ...]:
-        """Return the actions with which the level starts, which are the whole program."""
+        """Return the actions with which the level starts: the whole program."""
         return read_program(self.context.task, self.context.robot, self.context.scene).action
 
     def _find_plan(self, tick: int) -> TaskPlan:
