@@ -202,7 +202,7 @@ class TaskSpec:
         every: Period in ticks.
         within_cycles: Number of cycles that one plan may take. 1 for an executor.
         depth: Number of records in its trace ring, a power of two.
-        wake: Method by which it waits for its next cycle in real time.
+        wake: How it waits for its next cycle in real time.
         phase: Tick of its first release.
         is_external: True for a host board that the rack does not start.
     """

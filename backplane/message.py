@@ -273,7 +273,8 @@ def format_state(state: int | None, otherwise: str = "") -> str:
     """Return the name of a level's state in lower case.
 
     Args:
-        state: Number of the state. None, for no state, counts as one that `State` does not define.
+        state: Number of the state. None, for no state, is treated like a state that `State` does
+            not define.
         otherwise: Result for a state that `State` does not define. If it is empty, the result is
             `state` itself as text.
     """

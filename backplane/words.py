@@ -33,8 +33,8 @@ class Word:
 def encode_switch(tick: int, is_on: bool) -> int:
     """Encode a change of state at `tick` in one word, which `is_switched_on` evaluates.
 
-    Before `tick` the word stands for the opposite state. The state therefore depends on the
-    reader's tick alone, not on the moment at which the word is read. Changes to on and to off must
+    Before `tick` the word means the opposite state. The state therefore depends on the reader's
+    tick alone, not on the moment at which the word is read. Changes to on and to off must
     alternate. The value 0 stands for a switch that was never on.
 
     Args:

@@ -82,8 +82,8 @@ class Bus(Protocol):
         """Return 8-byte words of the crate's memory, starting at a bus address.
 
         `rack check` prints the addresses. A program may read any word directly, without a message,
-        no matter which board writes it. Even in lockstep, another board may be writing it at the
-        same time.
+        whichever board writes it. Even in lockstep, another board may be writing it at the same
+        time.
 
         Raises:
             ValueError: The address is not aligned to a word, or the words extend beyond the memory.

@@ -330,8 +330,7 @@ class Orders:
     def find_basis(self, above: int) -> int:
         """Return the serial of the newest operator command on which this cycle is based.
 
-        `above` is the serial of the operator command on which the command from the level above is
-        based.
+        `above` is the same serial for the command from the level above.
         """
         return max(self.basis, above)
 

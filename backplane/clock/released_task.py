@@ -106,7 +106,7 @@ class ReleasedTask:
         return block[Block.DONE] == block[Block.RELEASED] or self.is_lost or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
-        """Check that `tick` need not wait for the task: it is settled, or its deadline is later."""
+        """Check that `tick` need not wait for the task, which is settled or due later."""
         self.deadline = self.block[Block.DEADLINE] - self._early
         return self.deadline > tick or self.is_settled()
 

@@ -299,8 +299,8 @@ class Reader:
         serial = slots.box[0]
         if serial != self.serial:
             slots.fence()
-            # Older messages are overwritten. If no slot has a visible message, the serial at which
-            # the loop ends fails when it is fetched.
+            # Older messages are overwritten. If no slot has a visible message, fetching the serial
+            # at which the loop ends will fail.
             oldest = max(self.serial, serial - slots.depth)
             while serial > oldest and slots.read_visible_tick(serial) > tick:
                 serial -= 1

@@ -52,7 +52,7 @@ class ReadingTask:
         self._step = NO_MESSAGE_TICK
 
     def record_read(self, tick: int) -> None:
-        """Record a read at `tick`. An interval longer than the usual one counts as a pause."""
+        """Record a read at `tick`. An interval that is longer than usual is treated as a pause."""
         step = tick - self._last
         if step != self._step:
             if step > self._step:

@@ -91,7 +91,7 @@ class TaskPorts:
         return {port: f"{self.place.board}.{port}" for port in self.outputs}
 
     def find_origin_mailboxes(self, output: str) -> tuple[str, ...]:
-        """Return the mailboxes that carry the information on which an output is based.
+        """Return the mailboxes whose information an output is based on.
 
         The result is empty if the output does not declare an input in `rests_on`.
         """
@@ -257,7 +257,7 @@ class Wiring:
 
     @cached_property
     def reading_ports(self) -> dict[str, list[tuple[TaskPorts, str]]]:
-        """For each mailbox, the tasks that read it and the ports through which they do so."""
+        """For each mailbox, the tasks that read it and their input ports."""
         reading: dict[str, list[tuple[TaskPorts, str]]] = {}
         for ports in self.ports.values():
             for port, mailbox in ports.sources:

@@ -257,7 +257,7 @@ def _read_config(
 
     Args:
         path: The file.
-        chain: The files through which it was reached, each of which extends the next.
+        chain: The files that led to it, each of which extends the next.
         known: Tables of the files read so far, because several files may extend the same one.
         mistakes: List to which mistakes are added.
     """

@@ -148,7 +148,8 @@ class Resolved:
         # faster than waking up another core. A polling board never yields its core.
         if config.is_lockstep and (yielding := [t for t in executors if t.wake != "poll"]):
             core = min(yielding, key=lambda task: (task.every, task.slot)).core
-        # The clock demands nothing from the arm if the level below a lost board holds by itself.
+        # The clock requires no stop of the arm if the level below a lost board holds without being
+        # told.
         demands = {"hold": Demand.NONE, "stop": Demand.STOP, "brake": Demand.BRAKE}
         return ClockWiring(
             lockstep=config.is_lockstep,

@@ -214,7 +214,7 @@ class Rack:
             desk.add_request(request_entry)
 
     def take_over_events(self, events: Iterable[Event]) -> None:
-        """Add events of the continued run, from before the snapshot, to those of this run.
+        """Add events of the continued run, from before the snapshot, to the events of this run.
 
         The outcome of this run includes them.
         """

@@ -28,7 +28,7 @@ UP_STATES = (TaskState.READY, TaskState.RUNNING)
 
 
 class RestartPolicy:
-    """Limits and order of restarts in a rack.
+    """Decides whether lost tasks of a rack are restarted, and in which order.
 
     Times are ticks, so that equal losses in lockstep have equal outcomes.
     """
@@ -181,7 +181,7 @@ class Recovery:
         self._journal.add_event("detection", "rack", text, "hang", subject=board)
 
     def kill_hanging(self, board: str) -> None:
-        """Kill a hanging board, which then counts as lost, unless it is already being restarted."""
+        """Kill a hanging board, so that it is lost, unless it is already being restarted."""
         if board not in (*self._waiting, *self._starting):
             self._crate.try_request(PowerOff(board))
 

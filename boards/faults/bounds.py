@@ -102,7 +102,7 @@ class BoundCase:
 
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
-        """Affected mailboxes that the reader reads. Without a reader, those that any task reads."""
+        """Affected mailboxes that the reader reads or, without a reader, that any task reads."""
         struck = list_affected_mailboxes(self.layout, self.injection.mailbox, self.board)
         if self.reader:
             return tuple(mailbox for mailbox in struck if self.reader in mailbox.readers)

@@ -160,8 +160,8 @@ class TaskFaults:
     def count_actions(self, acted: Mapping[int, bool], tick: int) -> None:
         """Record which faults of the arm acted in the cycle released at `tick`.
 
-        `acted` maps the index of a fault among those of the arm to True if its effect must be
-        detected: see `Executor.acted`.
+        `acted` maps the index of a fault in the list of the arm's faults to True if its effect must
+        be detected: see `Executor.acted`.
         """
         for index, shows in acted.items():
             self._arm[index].record_action(tick, shows)

@@ -201,7 +201,7 @@ class BusAdapter(Adapter):
 
 
 class HostTurn(ReleasedTask):
-    """Turns that an adapter gives to a host program in lockstep.
+    """Gives a host program its turns in lockstep, on behalf of an adapter.
 
     `rack.boards.host.bus.HostBus` is their implementation in the program's process.
     """

@@ -181,7 +181,7 @@ class PeerClock:
 
 
 class Clocks:
-    """Measures the clock offsets of all peers. Idle in lockstep, where racks share simulated time.
+    """Measures the clock offsets of all peers. Does nothing in lockstep, where time is shared.
 
     Pings of other racks are answered from zenoh's threads, at a bounded rate for each rack.
 

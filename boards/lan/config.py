@@ -132,5 +132,5 @@ class LanTable(Table):
 
     @property
     def racks(self) -> tuple[str, ...]:
-        """Names of the racks with which this rack works: the ones it imports from, and `peers`."""
+        """Names of the racks with which this rack works: the racks of its imports, and `peers`."""
         return tuple(dict.fromkeys([*(entry.rack for entry in self.imports.values()), *self.peers]))

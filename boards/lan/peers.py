@@ -37,7 +37,7 @@ class PeerRack:
 
     Attributes:
         rack: Name of the rack.
-        number: Index of the rack, by which alarms name it.
+        number: Index of the rack, used in alarms.
         keeps_messages: Whether levels keep the rack's last messages while it is lost.
         presence: Whether the rack is awaited, present or lost.
         launch: Number of the launch that is present or was last present. 0 if there was none.

@@ -59,7 +59,7 @@ def run_board(crate: int, name: str, segment: Segment, board: Callable[[Segment]
         board: Function that runs the board and returns its exit status.
 
     Returns:
-        The exit status of the process: that of the board, or one that stands for its error.
+        The exit status of the process, which is returned by the board or represents its error.
     """
     die_with_parent(crate)
     # Drop the crate's priority. The board takes another priority when it is ready.

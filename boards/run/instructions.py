@@ -24,7 +24,7 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
 
     The decorated function is called once, at compile time, with LLVM's builder and the arguments,
     which are 64-bit words. It returns the result: a word or, if `record` is given, a pointer to a
-    record of that type. None stands for the word 0.
+    record of that type. None represents the word 0.
     """
 
     def __init__(self, emit: Callable[..., Any], record: np.dtype | None = None) -> None:

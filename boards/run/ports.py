@@ -197,7 +197,7 @@ class OutputPort:
         return True
 
     def apply_faults(self, faults: Sequence[FaultEntry]) -> None:
-        """Set the active faults of this mailbox: those of `faults` that concern it.
+        """Activate the faults in `faults` that concern this mailbox, and no others.
 
         Args:
             faults: Message faults that are active in the task.

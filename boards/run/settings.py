@@ -23,7 +23,7 @@ _NUMBERS = "biufc"
 
 
 def change_settings(level: Executor | Planner, context: LevelContext) -> None:
-    """Change the settings of a live level to those of another context.
+    """Change the settings of a live level to the settings of another context.
 
     Exceptions of the level's constructor are passed on.
 
@@ -49,7 +49,7 @@ class _SettingsChange:
     def apply_to(self, live: object, before: object, after: object) -> None:
         """Apply the differences between `before` and `after` to the attributes of `live`.
 
-        Attributes that `live` has changed itself are left as they are.
+        Attributes that `live` has changed itself are not touched.
 
         Args:
             live: Object to change.

@@ -75,8 +75,8 @@ class CoreFrames:
 def compute_core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
     """Return the distinct frames of each core. Empty without a static schedule.
 
-    The frames are those of the second major frame, so that they show the effect of boards that are
-    late in the first one.
+    The minor frames of the second major frame are used, because they show the effect of boards that
+    are late in the first one.
     """
     if rack.schedule is None:
         return ()

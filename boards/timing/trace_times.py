@@ -66,7 +66,7 @@ def compute_execution_ns(rows: TraceRows) -> Values:
 
 
 def compute_communication_ns(rows: TraceRows) -> Values:
-    """Return t_comm of eq. 3.5: the duration in ns of each cycle without its execution."""
+    """Return t_comm of eq. 3.5: the duration of each cycle minus its execution, in ns."""
     return np.asarray(rows["read_ns"] - rows["start_ns"] + rows["end_ns"] - rows["process_ns"])
 
 

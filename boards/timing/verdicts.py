@@ -81,7 +81,7 @@ class EquationVerdict:
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """Key by which the verdict is found again after the rack's times have changed."""
+        """Key for finding the same verdict again after the rack's times have changed."""
         return self.equation, self.subject, self.meaning
 
     def to_document(self) -> dict[str, Any]:
@@ -103,7 +103,7 @@ def evaluate_rack(rack: RackTiming) -> list[EquationVerdict]:
 
 
 def evaluate_level(rack: RackTiming, level: LevelTiming) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on one level, as if it had its own processor."""
+    """Yield the verdicts on one level, as if it had a processor to itself."""
     yield from _check_cycle(level, rack.tick_ns)
     yield from _check_planner(level, rack.context_switch_ns, rack.small_share)
 

@@ -41,7 +41,7 @@ class CommandsAbove:
     def find_missing(
         self, commands: Mapping[str, Reading[SampledCommand]], tick: int, since: int
     ) -> str:
-        """Return the reason why a command is missing or stale, or an empty string if all are fresh.
+        """Return why a command is missing or stale, or an empty string if all are fresh.
 
         Args:
             commands: Readings of the commands, keyed by board.

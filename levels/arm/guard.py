@@ -47,7 +47,7 @@ def narrow_bounds_by_errors(cell: Cell, speed_fraction: float) -> Bounds:
 
 
 class GuardedArm:
-    """Implements `Link` around an arm, and protects the arm, using nothing but its samples.
+    """Implements `Link` around an arm, and protects it, using only its samples.
 
     A torque that is not finite, or beyond its limit, is refused and engages the brakes. Other
     torques are cut so that the arm stays within the limits and can still be stopped (`LimitGate`).

@@ -100,7 +100,7 @@ class SimulatedArm(Simulation, Arm):
         return self._samples[0] if self._samples else self._build_sample()
 
     def _build_sample(self) -> Sensed:
-        """Return a sample of the present state, with the errors of the encoders."""
+        """Return a sample of the present state, including the errors of the encoders."""
         position, velocity = self._state
         if self._coarse is not None:
             position, velocity = self._coarse.sample(position, velocity, self.tick)

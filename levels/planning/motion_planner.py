@@ -170,7 +170,7 @@ class MotionPlanner:
         return f"no path found around {obstacle}" if obstacle else "no path found"
 
     def _plan_line(self, move: Move, start: Array, goal: Array | None) -> Path:
-        """Plan a straight line of the tool. The arguments are those of `plan`.
+        """Plan a straight line of the tool. See `plan` for the arguments.
 
         Raises:
             Refused: The line leaves the reach of the arm, or is blocked.

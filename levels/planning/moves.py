@@ -72,7 +72,7 @@ def read_window(command: TaskCommand | TaskPlan) -> list[Move]:
 
 @dataclass(frozen=True)
 class Situation:
-    """Poses of the bodies and the object in the gripper, now or after future moves."""
+    """Poses of the bodies, and the object in the gripper, at present or after future moves."""
 
     positions: Array  # (bodies, 3), m, by row of the world model
     quaternions: Array  # (bodies, 4), as w, x, y, z

@@ -115,7 +115,7 @@ class Payloads:
         None if no two consecutive samples of the jaws enclose the width of the object.
         """
         width = self._measure_width(row, grip)
-        # Find the last jaws that are wider than the object, and the first that are not.
+        # Find the last sample whose gap is wider than the object, and the first whose gap is not.
         pairs = (pair for pair in pairwise(self.jaws) if pair[0].gap > width >= pair[1].gap)
         wide, narrow = next(pairs, (None, None))
         if wide is None or narrow is None:
@@ -155,7 +155,7 @@ class Payloads:
         )
 
     def _find_jaws(self) -> list[Jaws]:
-        """Return the jaws at openings from open to closed, as long as there is a gap."""
+        """Return samples of the jaws from open to closed, up to the last one with a gap."""
         cell = self._cell
         gripper = cell.gripper
         if gripper is None:

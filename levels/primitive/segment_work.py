@@ -315,7 +315,7 @@ class GripperWork:
         self.restart_wait()
 
     def restart_wait(self) -> None:
-        """Begin or restart the time in which the gripper must come to rest.
+        """Start, or restart, the time limit within which the gripper must come to rest.
 
         Called at the start of the segment, and again when the servo gets back into step.
         """

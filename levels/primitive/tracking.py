@@ -71,7 +71,7 @@ class Tracking:
         return True
 
     def describe_wait(self, servo: DrivenArm) -> str:
-        """Describe what a level waits for while the servo is out of step."""
+        """Describe what a level waits for while the servo does not follow its set points."""
         if self.silent_cycles > MAX_MISSED_STATUSES:
             return f"waiting for servo: no status for {self.silent_cycles} cycles"
         if servo.state == State.HOLDING and servo.reason:

@@ -69,7 +69,8 @@ class ActuatorMonitor:
     difference that weak motors cannot explain is attributed to a push, and so are all further ones
     until there is no difference. During a push, a motor only counts as failed if it lacks more than
     `MAX_CONTACT_FRACTION` of its torque limit. For a cycle or two, a load that pulls at the arm
-    looks like a weak motor. But a working motor gives more torque when more is commanded.
+    looks like a weak motor. Unlike a weak one, however, a working motor gives more torque when more
+    is commanded.
 
     A motor also counts as failed if its joint is farther than `following`, in rad, from its set
     point. That is the only criterion for drives that do not report the torque that they give.

@@ -37,7 +37,7 @@ class Enabling:
         self._goal: Collection[DriveState] = ()  # states in which the command is done
 
     def start(self, restarted: bool) -> None:
-        """Enable the arm, unless an operator must do so or the board was restarted."""
+        """Enable the arm, unless an operator must enable it or the board was restarted."""
         self._restarted = restarted
         if self._at_start and not (restarted or self._guessed):
             self._arm.enable()

@@ -144,7 +144,7 @@ class ServoLaw(ArmDriver):
         self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
 
     def _obey_command(self, command: OperatorCommand) -> str:
-        """Carry out a setting or a command to the drives. It does not end a HOLD or SETPOINT.
+        """Carry out a setting or a drive command, neither of which ends a HOLD or SETPOINT.
 
         Returns:
             Reason for the refusal, or an empty string.

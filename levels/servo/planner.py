@@ -13,7 +13,7 @@ from rack.levels.robot.dynamics import Dynamics, Payload
 
 
 class ServoPlanner(Planner):
-    """Computes the inertia at the next set point, held object included, at every release."""
+    """Computes the inertia, including a held object, at the next set point in every release."""
 
     above = Input(JointCommand, "above.command")
     status = Input(ServoStatus, "own.status")

@@ -91,7 +91,7 @@ class TaskExecutor(Executor):
         self._answer_operator(below)
 
     def _read_first_actions(self) -> tuple[AnyAction, ...]:
-        """Return the actions with which the level starts, which are the whole program."""
+        """Return the actions with which the level starts: the whole program."""
         return read_program(self.context.task, self.context.robot, self.context.scene).action
 
     def _find_plan(self, tick: int) -> TaskPlan:
@@ -141,7 +141,7 @@ class TaskExecutor(Executor):
         return self._detour.step(plan, self._done, below)
 
     def _find_reason_to_wait(self, below: Reading[MoveStatus]) -> str:
-        """Return text that says why the level waits and what ends the wait.
+        """Return why the level waits, and what ends the wait, as text.
 
         Empty if it does not wait.
         """

@@ -63,9 +63,9 @@ MAX_STANDING_GAP_M = 0.02
 def find_grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pose]]:
     """Yield groups of tool poses that grasp object `row`, in the order in which to try them.
 
-    The first groups point straight down, from the lowest height up. The following groups lean over
-    each side of the object. The fingers close along the tool's y axis, across the object's x or y
-    axis.
+    The first groups point straight down, from the lowest height up. In the following groups, the
+    tool leans over one side of the object. The fingers close along the tool's y axis, across the
+    object's x or y axis.
     """
     seen = situation.object_pose(row)
     yaws = [compute_yaw(seen.quaternion) + quarter * np.pi / 2.0 for quarter in QUARTER_TURNS]

@@ -138,7 +138,7 @@ def check_circles(wiring: Wiring) -> Mistakes:
 
 
 def _find_declarations(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
-    """Return the keys by which the config puts board `upper` above board `lower`.
+    """Return the keys of the config that put board `upper` above board `lower`.
 
     Returns:
         For each of them: the board that has it, the key ("above" or "below"), and the level

@@ -149,8 +149,8 @@ class CoordinatorParams(Table):
 class Coordinator(Executor):
     """Task level whose program is carried out by the arms of other racks.
 
-    A step is begun by all its arms or by none. While an arm is lost, or an operator holds this
-    level, the arms rest on their paths. The time `by` of an action counts from the moment when
+    Either all arms of a step begin it, or none does. While an arm is lost, or an operator holds
+    this level, the arms rest on their paths. The time `by` of an action counts from the moment when
     every arm has reported, and starts again with each launch of this rack.
     """
 

@@ -45,7 +45,7 @@ class SharingServoParams(ServoParams):
 class SharingServoExecutor(ServoExecutor):
     """Servo level that claims the shared objects that its gripper touches.
 
-    It fixes its copies of the objects that other racks move.
+    It fixes its own copies of objects that other racks move.
 
     After a restart of its board it continues from its own last message. See `SharedBody`.
     """

@@ -106,9 +106,9 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     """Writes the contact wrench in every cycle, and stops the arm when it is too strong.
 
     The limits are `most_force` and `most_torque` in `[robot.wrist]`. A contact beyond them stops
-    the arm while it lasts and for `retry` longer. After `patience` the fault is latched, as other
-    faults are. A braked arm springs back a little, whereas an arm that holds keeps pressing. A
-    sensor at the end of its range counts as beyond the limits, because the contact is unknown. A
+    the arm until `retry` after the contact has ended. After `patience` the fault is latched, as
+    other faults are. A braked arm springs back a little, whereas an arm that holds keeps pressing.
+    A sensor at the end of its range counts as beyond the limits, because the contact is unknown. A
     held object counts as contact.
 
     Weight and inertia of the tool are subtracted. The acceleration for this comes from the

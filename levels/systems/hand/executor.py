@@ -46,8 +46,8 @@ class HandExecutor(Executor):
     A hand has no brakes, and releasing its grip is not safe. The valves of all tendons therefore
     close on a safety demand (including an emergency stop), on an operator's HOLD, while a board
     above is lost or late, and while a tension is NaN. Closed valves keep the grip and bring moving
-    fingers to rest, see `SimulatedHand`. They open again, with the current commands, when all
-    boards above have seen that they were closed.
+    fingers to rest, see `SimulatedHand`. They open again, following the current commands, once all
+    boards above have received the status that reports them as closed.
     """
 
     tensions = Inputs(TensionCommand, "above.command")

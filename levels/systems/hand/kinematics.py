@@ -52,7 +52,7 @@ class FingerKinematics:
         return self.to_palm_frame(self._data.site_xpos[self._tips[finger]])
 
     def to_palm_frame(self, point: Array) -> Array:
-        """Convert a point, (3,), in m, from the frame of the world to that of the palm."""
+        """Convert a point, (3,), in m, from the frame of the world to the frame of the palm."""
         return transposed_mat_vec(self.rotation, point - self.palm.position)
 
     def find_jacobian(self, finger: int) -> Array:

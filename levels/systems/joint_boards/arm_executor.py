@@ -74,8 +74,8 @@ class ArmExecutor(ArmDriver):
 
     While it reports `stopped`, these boards must bring the joints to rest and hold them. If they do
     not do so in time, the arm is braked. It is also braked if a board is lost or late. The brakes
-    are released when all boards have received the status that reports them; from that cycle their
-    torques hold the arm at its position. See `ArmDriver`.
+    are released once all boards have received the status that reports them. From that cycle on, the
+    torques of the boards hold the arm. See `ArmDriver`.
     """
 
     joint_torques = Inputs(JointTorque, "above.command")

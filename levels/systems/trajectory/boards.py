@@ -69,7 +69,7 @@ class JointBoards:
         return True
 
     def leave_step(self, reason: str) -> None:
-        """Mark the boards as out of step. `reason` becomes `wait_reason`.
+        """Mark the boards as out of step, and set `wait_reason` to `reason`.
 
         The boards then bring the joints to rest, and motion later continues from those positions.
         """

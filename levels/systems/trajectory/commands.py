@@ -48,7 +48,7 @@ WORLD_BODY = -1
 
 
 class Motions:
-    """Motion requests as method calls, each of which returns the number of its request.
+    """Methods that request motions. Each returns the number of its request.
 
     Scripts and prompts use the public methods by name. Requests that an earlier process of the
     board left in the queue are cancelled first.
