@@ -168,7 +168,6 @@ class Rack:
         remove_dead_rack(self.config.name)
         segment = Segment.create(plan.layout, self.config.to_toml_text(), plan.published.to_json())
         self._journal.segment = segment
-        self._launched = supervisor = Supervisor(segment, plan, crate, self._journal)
         words = segment.words
         clock = self.config.clock
         # The emergency-stop latch is set first. The brakes stay engaged until it is reset.
@@ -180,6 +179,8 @@ class Rack:
             words[System.SNAPSHOT_EVERY] = policy.every
             words[System.SNAPSHOT_AT] = 0 if policy.at is None else policy.at + 1
         before = None if self._continues is None else self._continues.tick
+        # The supervisor reads the clock mode from the segment.
+        self._launched = supervisor = Supervisor(segment, plan, crate, self._journal)
         crate.send_request(Open(self.config.name, plan.crate_priority, before))
         self._journal.add_event(
             "launch", "", f"{len(plan.tasks)} tasks, segment of {len(segment.bytes)} bytes"

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
-from rack.boards.crate import patience
+from rack.boards.crate import heartbeat, patience
 from rack.levels.peer import Presence, format_peer_port
 from rack.tools.monitor.holds import find_holds
 from rack.tools.monitor.newest_messages import NewestMessages
@@ -168,6 +169,22 @@ def test_racks_wait_for_each_other_and_a_stop_ends_the_wait(
         watch([rack])
         assert ended(rack).outcome.cause == "stopped"
         assert ended(rack).outcome.ticks <= CYCLE
+
+
+def test_a_clock_that_waits_for_another_rack_does_not_count_as_hanging(
+    names: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # In real time a clock hangs after this time. In lockstep it may wait for any time.
+    monkeypatch.setattr(heartbeat, "LEAST_S", 0.05)
+    racks = configs(ring_texts(names[:2]), tmp_path, STEPPED)
+    with running(racks[:1]) as (rack,):
+        rack.start(1.0)
+        watch([rack], until=lambda: rack.segment.get_block("lan")[Block.AWAITS])
+        waited_s = time.monotonic() + 0.5
+        watch([rack], until=lambda: time.monotonic() > waited_s)
+        rack.stop("test")
+        watch([rack])
+        assert [event.text for event in rack.events if event.code == "hang"] == []
 
 
 @pytest.mark.parametrize(
