@@ -60,7 +60,7 @@ TRY_VARIABLE = "RACK_TRY_PROCESSOR"
 
 
 class Launch(NamedTuple):
-    """Time at which a segment was created, in ns: wall clock and CLOCK_MONOTONIC."""
+    """Time at which a segment was created, in ns of the wall clock and of CLOCK_MONOTONIC."""
 
     created_ns: int
     monotonic_ns: int
@@ -93,8 +93,8 @@ class CycleCounts(NamedTuple):
     def lost(self) -> int:
         """Number of cycles that were missed or skipped.
 
-        It is limited to `due`, because all cycles of a missed plan count, even if the plan ended
-        after the last cycle that was due.
+        Every cycle of a missed plan is counted. If the plan ends after the last cycle that was due,
+        the sum would exceed `due`, so it is limited to `due`.
         """
         return min(self.due, self.missed * self.plan + self.skipped)
 
@@ -405,7 +405,7 @@ class Segment:
         return os.path.samestat(named, os.fstat(self.fd))
 
     def release_launcher_lock(self) -> None:
-        """Release the launcher's lock, if this process holds it. The rack then counts as dead."""
+        """Release the launcher's lock, if this process holds it. Others then find the rack dead."""
         if self._life is not None:
             self._life.close()
 
@@ -466,7 +466,7 @@ def _pid_namespace() -> int:
 
 
 def _shm_name(rack: str) -> str:
-    """Return the name under which `posix_ipc` knows the segment of a rack."""
+    """Return the name of a rack's segment as `posix_ipc` expects it, with a leading slash."""
     return f"/{PREFIX}{rack}"
 
 

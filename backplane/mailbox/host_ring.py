@@ -32,7 +32,7 @@ class HostWriter(DoubleBufferWriter):
         self._box = self.slots.box
 
     def send_message(self, tick: int) -> bool:
-        """Publish `message`.
+        """Publish `message`, unless the ring is full.
 
         Args:
             tick: Current tick, stored with the message.

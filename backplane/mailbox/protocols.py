@@ -62,9 +62,9 @@ class MailboxLock:
                 and self._box[Box.OWNER] == holder
             ):
                 self.held_up += 1
-        # After a timeout, the kernel's lock is free if the holder of the semaphore is dead. One of
-        # the processes whose wait timed out then gets it. A process that has obtained the semaphore
-        # may therefore still find the kernel's lock taken.
+        # Try the kernel's lock even after a timeout: it is free if the holder of the semaphore is
+        # dead. It may be taken even if this process has obtained the semaphore, because another
+        # process may have got it after a timeout.
         if not self._owner.take():
             return False
         self._box[Box.OWNER] = os.getpid()
@@ -154,7 +154,7 @@ OBSERVERS: dict[Protocol, type[Reader]] = {**READERS, "lock": DoubleBufferReader
 
 
 def open_writer(segment: Segment, name: str) -> Writer:
-    """Claim a mailbox for writing under its protocol.
+    """Open and claim a mailbox for writing under its protocol.
 
     Raises:
         MailboxError: The mailbox has another writer.
@@ -182,7 +182,7 @@ def open_reader(
 
 
 def open_observer(segment: Segment, name: str) -> Reader:
-    """Open a mailbox for reading its newest message without any effect on other readers.
+    """Open a mailbox so that reading its newest message has no effect on other processes.
 
     The clock and processes on the host side, such as tools, use observers.
     """
