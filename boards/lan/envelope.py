@@ -88,7 +88,7 @@ class Sealer:
     """Seals outgoing messages and checks the seals of received ones.
 
     Attributes:
-        flaws: How often each flaw was found.
+        flaws: Number of messages rejected for each flaw.
 
     Raises:
         CredentialError: The files cannot be used.
@@ -110,7 +110,7 @@ class Sealer:
         return sealer
 
     def resume_counts(self, flaws: Iterable[int]) -> None:
-        """Continue from the counts of the previous adapter, in the order of `Flaw`."""
+        """Set the counts to those of the previous adapter, given in the order of `Flaw`."""
         self.flaws |= zip(Flaw, flaws, strict=False)
 
     def seal(self, key: str, head: Envelope, payload: bytes | memoryview) -> bytes:
@@ -127,7 +127,7 @@ class Sealer:
         return packed + (self._pair.sign_digest(digest) if self._pair else digest)
 
     def open_message(self, key: str, envelope: bytes | None, payload: bytes) -> Envelope | Flaw:
-        """Check length, format and seal of a received message. If one is wrong, count the flaw.
+        """Check length, format and seal of a received message. Count the first flaw found.
 
         Args:
             key: Key expression under which the message arrived.

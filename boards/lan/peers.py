@@ -75,7 +75,7 @@ class PeerRack:
         return self.presence is Presence.THERE
 
     def is_superseded(self, launch: int) -> bool:
-        """Return True if `launch` was replaced by another launch and its token has expired."""
+        """Return True if another launch has replaced `launch`, whose token has expired."""
         return launch in self._over
 
     def add_token(self, launch: int, tick: int) -> None:
@@ -85,7 +85,7 @@ class PeerRack:
         if launch not in self.tokens:
             self.tokens.append(launch)
         if self.is_present and self.launch in (NO_LAUNCH, launch):
-            # The launch is unknown if the state was restored from lockstep, which records none.
+            # The launch is unknown if the state was restored in lockstep, which records none.
             self.launch = launch
             self.confirm_by = -1
         else:
@@ -119,7 +119,7 @@ class PeerRack:
             self.findings.append(Finding(Alarm.PEER_LOST, self.number))
 
     def _mark_present(self, launch: int, tick: int) -> None:
-        """Make a launch the present one. Add a finding if the rack was restarted or is back."""
+        """Mark the rack as present with `launch`. Add a finding if it was restarted or is back."""
         self.mark_lost(tick)
         if launch != self.launch:
             self.offset_ns = None
@@ -140,8 +140,8 @@ class PeerRack:
     def join_lockstep(self, launch: int, tick: int) -> None:
         """Mark the rack as present in lockstep.
 
-        The rack joins at the start of the run, or is still present when this adapter has been
-        restarted.
+        Call this when the rack joins at the start of the run, and when it is still present after
+        this adapter was restarted.
         """
         if self.presence is Presence.AWAITED:
             self.presence = Presence.THERE

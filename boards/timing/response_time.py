@@ -225,7 +225,7 @@ def merge_parts(task: TimedTask, context_switch_ns: int) -> TimedTask:
 
 
 def compute_blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
-    """Return the longest time in ns for which a task waits for lower priorities on its core.
+    """Return the longest time in ns for which a task waits for tasks of lower priority.
 
     It is the time of one plan update that began before the task's release and whose ceiling is at
     least the task's priority (eq. 3.10).
