@@ -20,7 +20,7 @@ from rack.backplane.words import System, Word
 
 FAULT_WORDS = 16
 PARAMETERS = 8
-"""Number of parameters of one fault, float64, stored after its words."""
+"""Number of parameters of one fault. They are stored as float64 after the words of its entry."""
 NEVER = 1 << 62
 """Value of `until` for a fault that lasts until the end of the run."""
 

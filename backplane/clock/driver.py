@@ -224,7 +224,7 @@ class RealtimeDriver(ClockDriver):
         beat = max(1, int(CHECK_S * 1e9) // self._period_ns)
         for task in self.tasks:
             if task.sleeps:
-                # The grid is known now, so the task can sleep until its grid points.
+                # Wake the task once. The grid is known now, so it can sleep until its grid points.
                 task.wake()
         last = self.first_tick - 1
         # The grid point of tick 0 is a little after the clock's start, so wait for it too.

@@ -87,7 +87,7 @@ class NextCycle:
             else StoppedClockDetector(segment, clock_alarms)
         )
         # A restarted task skips the releases before its start. This process may write RELEASED
-        # here, because the clock does not until the task has rejoined.
+        # here, because the clock does not write it before the task has rejoined.
         self._block[Block.RELEASED] = self._block[Block.DONE]
         self._due = self._block[Block.DONE] + 1
         self.skip_until(self._due)

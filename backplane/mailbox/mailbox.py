@@ -231,7 +231,7 @@ class ReadStatistics:
     forged: int = 0  # messages of a process that does not hold the claim
     forger: int = 0  # process id of the last such process
     held_up: int = 0  # accesses that timed out because a dead or stopped process held the lock
-    lost: int = 0  # of a queue: serials without a message
+    lost: int = 0  # serials without a message; 0 except for queues
 
 
 # A reader's state is private memory that the reader shares with compiled code. It consists of five
@@ -272,7 +272,7 @@ class Reader:
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.find_mailbox(name)
         self.slots = slots = Slots(segment, self.spec)
-        # The last good message has a separate buffer, which a corrupt copy never reaches.
+        # The last good message has a separate buffer, so that a corrupt copy cannot overwrite it.
         state = memoryview(bytearray(GOOD_OFFSET + len(slots.record)))
         good = Slots(segment, self.spec, state[GOOD_OFFSET:])
         self.good = good.record

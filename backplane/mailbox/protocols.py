@@ -55,7 +55,7 @@ class MailboxLock:
         """Wait a bounded time for the lock. Returns False if another process still holds it."""
         if not self._semaphore.acquire(self._wait_s):
             holder = self._box[Box.OWNER]
-            # The holder may have released the lock and ended since the wait.
+            # Read the owner again, because it may have released the lock and ended after the wait.
             if (
                 holder
                 and read_state(holder) in ENDED_STATES + STOPPED_STATES

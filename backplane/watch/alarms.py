@@ -193,7 +193,10 @@ def open_alarm_ring(segment: Segment, task: str) -> Ring:
 
 
 CLEAN_READS = 20
-"""Number of accesses, and of cycles of the writer, without a finding that end an episode."""
+"""Number of accesses, and of cycles of the writer, without a finding after which an episode ends.
+
+It ends when both numbers are exceeded.
+"""
 
 
 class Episodes:

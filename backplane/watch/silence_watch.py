@@ -22,7 +22,7 @@ from rack.backplane.watch.message_watch import LONG_AGO, MessageWatch
 from rack.backplane.words import Block, Box, is_switched_on
 
 MUTE_CYCLES = 3
-"""Age of the newest message, in cycles of the writer, from which its silence is checked.
+"""Age of the newest message, in cycles of its writer, from which the writer may be mute.
 
 An age of two is normal.
 """
@@ -128,9 +128,10 @@ class SilenceWatch(MessageWatch):
             self._episodes.is_open(code, accesses, tick)
             for code in (Alarm.HELD_BACK, Alarm.DISORDER)
         ):
-            # The writer sends messages, but they come late.
+            # The writer is not mute: it sends messages, but they are late or out of order.
             return False
-        # The order matters, because a writer publishes before it reports the cycle as finished.
+        # Read the finished tick before the newest serial, because a writer publishes a message
+        # before it reports its cycle as finished.
         finished = self._cycles.finished_tick
         slots = self._slots
         head = slots.box[0]

@@ -189,9 +189,8 @@ class BusAdapter(Adapter):
         status.error = 0
         status.reason = ""
         if lost:
-            # Check for a loss before all else, because a loss is recorded at the same tick if the
-            # run is repeated. In lockstep the tick at which the Rack stops restarting a board is
-            # not.
+            # Check for a loss first, because it is recorded at the same tick if a lockstep run is
+            # repeated. The tick at which the Rack stops restarting a board may differ.
             status.state = State.HOLDING
             status.reason = f"host board '{lost[0]}' is lost: it is being restarted"
         elif gone:

@@ -253,8 +253,8 @@ class OutwardEntry:
         for block, semaphore in self._readers:
             # In lockstep this makes the program due for a turn.
             block[Block.WAITS_UNTIL] = 0
-            # Do not count above 1, or the semaphore of a host board that never waits would
-            # overflow.
+            # Post only if no post is pending, or the semaphore of a host board that never waits
+            # would overflow.
             if not semaphore.value:
                 semaphore.release()
 

@@ -98,7 +98,7 @@ class Sealer:
         self._credentials = credentials
         self._pair = credentials.key_pair if credentials else None
         if credentials and self._pair:
-            # Identify once now: the first identification takes as long as a whole cycle.
+            # Identify a sender once now, because the first identification takes as long as a cycle.
             credentials.identify_sender(self._pair.chain)
         self._most_bytes = most_bytes
         self.flaws = dict.fromkeys(Flaw, 0)
@@ -175,7 +175,7 @@ class Sealer:
 def _compute_digest(key: str, packed: bytes, payload: bytes | memoryview) -> bytes:
     """Return the SHA-256 of head, certificates, key expression and payload."""
     digest = sha256(packed)
-    # Include the length of the key, so that no bytes can move between key and payload.
+    # Include the length of the key, so that moving bytes between key and payload changes the hash.
     digest.update(f"{len(key)}:{key}".encode())
     digest.update(payload)
     return digest.digest()

@@ -68,7 +68,7 @@ class Step(NamedTuple):
 
 
 def pack_step(cycle_ns: int, racks: Iterable[str], exports: Sequence[ReceivedMessage]) -> bytes:
-    """Serialise a step.
+    """Serialise the content of a step.
 
     Args:
         cycle_ns: Length of the adapter's cycle in ns of simulated time.
@@ -88,7 +88,7 @@ def unpack_step(head: Envelope, content: bytes) -> Step | None:
     except ZDeserializeError:
         return None
     exports = [ReceivedMessage(*export) for export in export_tuples]
-    # The deserialiser ignores trailing bytes, so compare with what the step packs to.
+    # The deserialiser ignores trailing bytes. To detect them, pack the step again and compare.
     if pack_step(cycle_ns, racks, exports) != content:
         return None
     return Step(head, cycle_ns, racks, exports)
@@ -196,7 +196,7 @@ class Barrier:
         self._exports: list[ReceivedMessage] = []
         self._imports: dict[str, deque[ReceivedMessage]] = {}
         self._changes: list[tuple[str, int, bool]] = []
-        # Another rack lacks at most the newest two steps.
+        # Keep two steps: another rack can lack at most the newest two.
         self._steps: deque[tuple[int, bytes]] = deque(maxlen=2)
         self._now_ns = NEVER
         self._sent = 0

@@ -38,11 +38,11 @@ class PeerRack:
     Attributes:
         rack: Name of the rack.
         number: Index of the rack, used in alarms.
-        keeps_messages: Whether levels keep the rack's last messages while it is lost.
+        keeps_messages: Whether levels keep using the rack's last messages while the rack is lost.
         presence: Whether the rack is awaited, present or lost.
         launch: Number of the launch that is present or was last present. 0 if there was none.
         launches: Number of different launches seen.
-        losses: How often the rack was lost.
+        losses: Number of times the rack was lost.
         since: Tick of the last change of presence.
         offset_ns: CLOCK_MONOTONIC of the rack's machine minus that of this machine, in ns. None if
             not yet measured.

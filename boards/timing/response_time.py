@@ -35,7 +35,7 @@ TURN_NS = 4_000_000
 One tick of a 250 Hz kernel. The time slice of Linux is 3 ms.
 """
 MAX_DEADLINES = 10
-"""The search ends after this many deadlines, because it converges slowly near full load."""
+"""Number of deadlines after which the search ends, because it converges slowly near full load."""
 MAX_JOBS = 20_000
 """Largest number of jobs in a schedule that is simulated. Longer schedules use the bound."""
 MAX_STEPS = 10_000
