@@ -179,7 +179,7 @@ class MailboxSpec:
 
     @property
     def is_tick_based(self) -> bool:
-        """True if a message becomes visible at a tick that its writer's release tick determines.
+        """True if the release tick of the writing cycle determines when a message becomes visible.
 
         Under other protocols, the real time of the write matters too.
         """

@@ -162,7 +162,8 @@ class Segment:
         except OSError as error:
             raise SegmentError(f"rack '{layout.rack}': {SHM_FOLDER}: {error.strerror}") from None
         try:
-            # Without this, a full /dev/shm would raise SIGBUS at the first access to a page.
+            # Allocate all pages now. Otherwise, with a full /dev/shm, the first access to a page
+            # would raise SIGBUS.
             os.posix_fallocate(fd, 0, size)
             segment = cls(layout.rack, mmap.mmap(fd, size), fd)
             segment.layout = layout
@@ -405,7 +406,7 @@ class Segment:
         return os.path.samestat(named, os.fstat(self.fd))
 
     def release_launcher_lock(self) -> None:
-        """Release the launcher's lock, if this process holds it. Others then find the rack dead."""
+        """Release the launcher's lock if this process holds it. Others then find the rack dead."""
         if self._life is not None:
             self._life.close()
 

@@ -27,7 +27,7 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Run, System
 
 LEAD_NS = 300_000
-"""Time in ns from the clock's beginning of a tick until the tick's grid point.
+"""Time in ns by which the clock begins a tick ahead of the tick's grid point.
 
 It suffices for the clock's wake-up and its work in a tick.
 """
@@ -108,7 +108,7 @@ class ClockDriver(ABC):
         return False
 
     def count_skipped(self, first: int, ticks: int) -> None:
-        """Add `ticks` to the published number of skipped ticks, the first of which is `first`.
+        """Add `ticks` to the published number of skipped ticks. `first` is the first of them.
 
         `first` is stored before the number, which changes once for all these ticks. A late task
         therefore never reports only some of them, nor ticks that were skipped after its release.
@@ -141,8 +141,8 @@ class ClockDriver(ABC):
     def first_tick(self) -> int:
         """First tick that this process runs: 0, or after a restart of the clock the current tick.
 
-        That tick is repeated. Tasks that were already released at it are recognised by their
-        deadlines and are not released again.
+        That tick is repeated. Tasks that were released at that tick before the restart are
+        recognised by their deadlines and are not released again.
         """
         return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
 

@@ -223,8 +223,8 @@ class LockstepDriver(ClockDriver):
     def _wait_for_follower(self, tick: int) -> bool:
         """Wait for the recorder if its rings would otherwise overflow in `tick`.
 
-        The wait has no time limit, because no simulated time passes. Only if the recorder is
-        stopped or dead, the clock stops waiting for it after `MAX_RECORDER_WAIT_S`.
+        The wait has no time limit, because no simulated time passes. If the recorder is stopped or
+        dead, however, the clock stops waiting for it after `MAX_RECORDER_WAIT_S`.
 
         Returns:
             False if the host requests the end of the run or the launcher has ended.

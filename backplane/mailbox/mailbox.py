@@ -398,10 +398,10 @@ class Reader:
         return self._readings[verdict]
 
     def add_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
-        """Return a copy of a reading with the messages that it skipped in `earlier`.
+        """Return a copy of `reading` whose `earlier` contains the messages that the read skipped.
 
-        They are sorted from oldest to newest. Bad messages and messages whose slots have been
-        reused are left out.
+        The oldest message comes first. Bad messages and messages whose slots have been reused are
+        left out.
 
         Args:
             reading: Result of a read.

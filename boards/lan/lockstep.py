@@ -291,7 +291,7 @@ class Barrier:
         return True
 
     def close(self) -> None:
-        """If the run has ended, or lockstep is impossible, tell the other racks not to wait.
+        """If the run has ended or lockstep was refused, tell other racks not to wait for this one.
 
         Nothing is sent if only this board ends, because it may be restarted.
         """

@@ -219,7 +219,7 @@ class JoinedRacks:
         )
 
     def list_chain_links(self, stations: Sequence[Station]) -> list[Link] | None:
-        """Return the links that information crosses from the first to the last of some boards.
+        """Return the links that information crosses on its way along `stations`.
 
         Returns:
             The links, or None if information cannot pass between two consecutive racks.
@@ -314,7 +314,7 @@ LINK_BOARD = "lan"
 
 
 def _find_beginning(stations: Sequence[Station]) -> int:
-    """Return the index from which on all stations are in the rack of the last station."""
+    """Return the lowest index from which all stations belong to the rack of the last one."""
     last = stations[-1].rack
     return next(
         at + 1 for at in range(len(stations) - 2, -2, -1) if at < 0 or stations[at].rack != last
