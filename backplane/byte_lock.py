@@ -43,7 +43,7 @@ class ByteLock:
         self._fd = os.open(f"/proc/self/fd/{fd}", os.O_RDWR | os.O_CLOEXEC)
 
     def take(self) -> bool:
-        """Take the lock. Returns False if it is already held."""
+        """Take the lock without waiting. Returns False if it is already held."""
         try:
             fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._take)
         except (BlockingIOError, PermissionError):

@@ -46,7 +46,7 @@ class TickGrid(NamedTuple):
 
 @dataclass(frozen=True)
 class ExchangeSpec:
-    """Rule from a config for when an executor reads a mailbox.
+    """Config rule that states at which ticks an executor reads a mailbox.
 
     Attributes:
         task: Name of the executor.

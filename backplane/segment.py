@@ -105,7 +105,7 @@ class CycleCounts(NamedTuple):
 
 
 class Segment:
-    """An attached segment.
+    """Segment of a rack, mapped into this process.
 
     Attributes:
         layout: Mailboxes and tasks.
@@ -239,7 +239,7 @@ class Segment:
 
     @classmethod
     def attach(cls, rack: str) -> Self:
-        """Attach to a rack's segment.
+        """Map a rack's segment into this process, and read its layout and config.
 
         Raises:
             SegmentError: There is no such segment, or its owner, size or version is wrong.
@@ -329,7 +329,7 @@ class Segment:
     def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
         """Count the cycles of a task up to `tick`.
 
-        Releases that the task has not finished count as skipped once their time slice is over.
+        A release that the task has not finished is counted as skipped once its time slice is over.
         """
         block = self.get_block(task.name)
         skipped = block[Block.SKIPPED] + task.count_unfinished(block[Block.DONE], tick)
@@ -355,7 +355,7 @@ class Segment:
 
     @property
     def launch(self) -> Launch:
-        """Time at which the segment was created."""
+        """Time of the rack's launch, at which the segment was created."""
         return Launch(self.words[Head.CREATED_NS], self.words[Head.CREATED_MONOTONIC_NS])
 
     @property

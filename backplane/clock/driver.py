@@ -172,7 +172,7 @@ class ClockDriver(ABC):
 
     @abstractmethod
     def run(self) -> None:
-        """Run tick after tick until the run is over or the launcher has ended."""
+        """Run the clock until the run is over or the launcher has ended."""
 
     def is_over(self, tick: int) -> bool:
         """Return True if the run ends before `tick`. Publishes the end tick once it is known."""
@@ -219,7 +219,7 @@ class RealtimeDriver(ClockDriver):
         self._lead_ns = min(LEAD_NS, self._period_ns // LEAD_DIVISOR) if leads else 0
 
     def run(self) -> None:
-        """Run tick after tick until the run is over or the launcher has ended."""
+        """Run the clock until the run is over or the launcher has ended."""
         words = self.words
         beat = max(1, int(CHECK_S * 1e9) // self._period_ns)
         for task in self.tasks:

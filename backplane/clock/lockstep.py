@@ -91,7 +91,7 @@ class LockstepDriver(ClockDriver):
         return self._next
 
     def run(self) -> None:
-        """Run tick after tick until the run is over or the launcher has ended."""
+        """Run the clock until the run is over or the launcher has ended."""
         self.words[System.STATE] = Run.RUNNING
         # After a restart of the clock, tasks may still be working on a batch of the old process.
         self.wait_until_settled()

@@ -129,7 +129,7 @@ class ReleasedTask:
     def is_ready(self) -> bool:
         """True if a lost task has a new process that has completed its start-up.
 
-        The new process of a host board may already have ended again.
+        For a host board, the new process may also have ended already.
         """
         return self.block[Block.STATE] in (TaskState.READY, TaskState.RUNNING, TaskState.ENDED)
 
@@ -162,7 +162,7 @@ def sort_by_priority(layout: Layout) -> list[TaskSpec]:
 
 
 class Watchdog:
-    """Watchdog for tasks that miss releases. `losses` is the number of tasks found hanging."""
+    """Detects late, starved and hanging tasks. `losses` is the number of tasks found hanging."""
 
     def __init__(self, alarms: AlarmWriter, period_ns: int) -> None:
         self._alarms = alarms

@@ -247,7 +247,7 @@ GOOD_OFFSET = 40
 class Reader:
     """Reader of a mailbox, under protocol time-slice.
 
-    The work of a read is bounded by the mailbox's depth.
+    The number of slots that a read examines is limited by the mailbox's depth.
 
     Attributes:
         serial: Serial of the last good message, 0 before the first.
@@ -419,7 +419,7 @@ class Reader:
 
 
 class DoubleBufferWriter(Writer):
-    """Writer under protocol double-buffer, whose messages are visible as soon as complete."""
+    """Writer under protocol double-buffer. A message is visible as soon as it is complete."""
 
     def compute_visible_tick(self, tick: int, now: int | None) -> int:
         """Return `now`, or `tick` if `now` is None: a message is visible once it is written."""

@@ -37,7 +37,7 @@ A process holds it for one or two microseconds, or for some hundred if it is pre
 
 
 class MailboxLock:
-    """Mutual exclusion on one mailbox, with a bounded wait.
+    """Lock on one mailbox. A process waits for it only for a limited time.
 
     Attributes:
         held_up: Number of waits that timed out while a dead or stopped process held the lock.
@@ -52,7 +52,7 @@ class MailboxLock:
         self.held_up = 0
 
     def acquire(self) -> bool:
-        """Wait a bounded time for the lock. Returns False if another process still holds it."""
+        """Wait a limited time for the lock. Returns False if another process still holds it."""
         if not self._semaphore.acquire(self._wait_s):
             holder = self._box[Box.OWNER]
             # Read the owner again, because it may have released the lock and ended after the wait.

@@ -163,9 +163,9 @@ class QueueWriter(Writer):
         return self._shown_at
 
     def iterate_outgoing(self) -> Iterator[None]:
-        """Copy each message of this cycle into `message`, and yield for the caller to publish it.
+        """Yield once for each message sent in this cycle, after copying it into `message`.
 
-        At the end, the original content of `message` is restored.
+        The caller publishes it. At the end, the original content of `message` is restored.
         """
         slots = self.slots
         present = bytes(self.message.raw)
@@ -224,7 +224,7 @@ class QueueReader(Reader):
             self.transfers = 0
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Take all messages visible at `tick`, and return them as `take_messages` does."""
+        """Take all messages visible at `tick`. The result is that of `take_messages`."""
         return self.take_messages(tick, UNLIMITED)
 
     def take_messages(self, tick: int, most: int, now: int | None = None) -> Reading[AnyMessage]:

@@ -31,7 +31,7 @@ STALE_CYCLES = 4
 
 
 class ReadingTask:
-    """State of the reading task that its readers and watches share.
+    """State of a reading task, shared by its readers and watches.
 
     After a pause of this task or of the clock, all messages are old although no writer is silent.
     The watches must therefore know when the task has paused.
@@ -52,7 +52,7 @@ class ReadingTask:
         self._step = NO_MESSAGE_TICK
 
     def record_read(self, tick: int) -> None:
-        """Record a read at `tick`. An interval that is longer than usual is treated as a pause."""
+        """Record a read at `tick`. A longer interval than usual is treated as a pause of the task."""
         step = tick - self._last
         if step != self._step:
             if step > self._step:

@@ -76,7 +76,7 @@ class MailboxWatcher:
         return self.reader.add_earlier(reading, before)
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Return False. If the clock is lost, no board is released, so no board can notice it."""
+        """Return False: the writer is the clock, without which no board is released to read."""
         return False
 
     @property

@@ -44,8 +44,8 @@ class Adapter(Executor):
             layout: Layout of the rack.
 
         Returns:
-            A dictionary from each such port to whether its messages are sent one by one. Empty if
-            the adapter runs in a replay as in any other run.
+            A dictionary from each such port to True if its messages are sent one by one, otherwise
+            False. Empty if the adapter runs in a replay as in any other run.
         """
         return {}
 

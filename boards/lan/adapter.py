@@ -45,7 +45,7 @@ _LAUNCH_MASK = (1 << 62) - 1
 
 
 class LanAdapter(Adapter):
-    """Exchanges mailboxes with other racks.
+    """Adapter that exchanges mailboxes with other racks over a network.
 
     Besides the imported mailboxes it writes a status, with counters for every export and import,
     and one mailbox with the presence of each other rack.

@@ -262,7 +262,8 @@ def _is_p256(key: object) -> TypeGuard[EllipticCurvePublicKey]:
 def _identify_chain(chain: bytes, authorities: list[Certificate]) -> Identity | None:
     """Return the identity of the first certificate of a DER chain.
 
-    None if the chain is malformed or not signed by an authority, or if the key is not on P-256.
+    The result is None if the chain is malformed or not signed by an authority, or if the key is not
+    on P-256.
     """
     certificates = []
     try:

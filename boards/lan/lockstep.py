@@ -52,7 +52,7 @@ class StepFlag(IntFlag):
 
 
 class Step(NamedTuple):
-    """One step of a rack.
+    """Message that a rack sends to the others in each cycle in lockstep.
 
     Attributes:
         head: Envelope of the step.
@@ -322,7 +322,7 @@ class Barrier:
 
     @property
     def _is_over(self) -> bool:
-        """Whether the run is over or was asked to stop."""
+        """Whether the run is over, or its end has been requested."""
         return bool(self._segment.words[System.STOP_REQUEST]) or self._segment.run_is_over
 
     def _process_sample(self, sample: zenoh.Sample) -> None:
@@ -347,7 +347,7 @@ class Barrier:
         """Process a change of another rack's liveliness token.
 
         If the token has appeared, resend this rack's newest steps. If it has expired, start the
-        time-out after which the rack counts as lost.
+        time-out after which the rack is considered lost.
         """
         if is_present and partner.launch in (NO_LAUNCH, launch):
             self._check_cycle(partner, cycle_ns)
@@ -404,7 +404,7 @@ class Barrier:
         return True
 
     def _check_cycle(self, partner: Partner, cycle_ns: int) -> None:
-        """Raise `CannotGoOn` if the other rack is in real time or has another cycle length."""
+        """Raise `CannotGoOn` if the other rack runs in real time or with another cycle length."""
         if not cycle_ns:
             self._refuse_lockstep(f"rack '{partner.rack}' runs in real time, this one in lockstep")
         if cycle_ns != self.cycle_ns:

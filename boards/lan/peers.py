@@ -79,7 +79,7 @@ class PeerRack:
         return launch in self._over
 
     def add_token(self, launch: int, tick: int) -> None:
-        """Process a new token. Its launch becomes the present one unless it is superseded."""
+        """Process a new token. Make `launch` the present launch unless `is_superseded(launch)`."""
         if launch in self._over or (launch not in self.tokens and len(self.tokens) == MAX_LAUNCHES):
             return
         if launch not in self.tokens:
@@ -155,7 +155,7 @@ class PeerRack:
 
         Args:
             message: Last `rack.levels.peer.PeerPresence` that the previous adapter wrote.
-            confirm_by: Tick by which a rack that was present must show its token again.
+            confirm_by: Tick by which the token of a rack that was present must reappear.
         """
         self.presence = Presence(message.presence)
         self.launch = message.launch
@@ -182,7 +182,7 @@ class Peers:
     """The racks with which this rack works, indexed by name. Other racks are ignored.
 
     Attributes:
-        arrivals: How often a rack has appeared, including racks that are not peers.
+        arrivals: Number of times any rack has appeared, including racks that are not peers.
     """
 
     def __init__(self, racks: Iterable[str], keep_messages: bool = False) -> None:

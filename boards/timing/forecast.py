@@ -26,7 +26,7 @@ class Forecast:
         inboxes: Worst-case cost of interrupts for each inbox, as plain data.
         frames: Distinct frames of each core in a static schedule.
         notes: Limits of the prediction, one sentence each.
-        uncounted: Dictionary from everything that is not included to the reason.
+        uncounted: What the forecast does not include, each with the reason.
     """
 
     rack: RackTiming
@@ -49,7 +49,7 @@ class Forecast:
         Args:
             rack: Data of the rack.
             has_cores: False if this machine lacks cores that the config requests.
-            uncounted: Dictionary from what the timing model cannot include to the reason.
+            uncounted: What the timing model cannot include, each with the reason.
         """
         return cls(
             rack=rack,

@@ -61,7 +61,7 @@ def compute_duration_ns(rows: TraceRows) -> Values:
 
 
 def compute_execution_ns(rows: TraceRows) -> Values:
-    """Return t_exec of eq. 3.5, or the planning time of a planner, in ns with preemption."""
+    """Return t_exec of eq. 3.5, or a planner's planning time, in ns, including preemption."""
     return np.asarray(rows["process_ns"] - rows["read_ns"])
 
 
