@@ -52,7 +52,7 @@ class ReadingTask:
         self._step = NO_MESSAGE_TICK
 
     def record_read(self, tick: int) -> None:
-        """Record a read at `tick`. A longer interval than usual is treated as a pause of the task."""
+        """Record a read at `tick`. If more ticks than usual have passed, the task has paused."""
         step = tick - self._last
         if step != self._step:
             if step > self._step:
