@@ -224,7 +224,7 @@ class QueueReader(Reader):
             self.transfers = 0
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Take all messages visible at `tick`. The result is that of `take_messages`."""
+        """Take all messages visible at `tick`, and return the reading as `take_messages` does."""
         return self.take_messages(tick, UNLIMITED)
 
     def take_messages(self, tick: int, most: int, now: int | None = None) -> Reading[AnyMessage]:

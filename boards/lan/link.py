@@ -272,7 +272,7 @@ def _build_settings(
         # An answer inherits the congestion control of its question. Sending it must not make the
         # adapter wait.
         "qos/network": [NO_WAIT],
-        # In lockstep, sending waits for room in the queue, but only until the peer's lease ends.
+        # In lockstep, sending waits for room in the queue, but at most for the lease time.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(
             table.lease_ms * 1e3
         ),

@@ -392,8 +392,8 @@ class Barrier:
     def _is_partner_launch(self, partner: Partner, launch: int) -> bool:
         """Return True if a launch of another rack may take part.
 
-        Until the run begins, a new launch replaces the previous one. Later it cannot join, and the
-        rack no longer takes part.
+        Until the run begins, a new launch replaces the previous one. Later it cannot replace it,
+        and the rack no longer takes part.
         """
         if partner.launch != launch:
             if self._has_begun and partner.launch != NO_LAUNCH:

@@ -64,7 +64,7 @@ class EstopResponder:
             self._requests = link.open_questions(estop_key("*", self._rack), REQUESTS_A_CYCLE)
 
     def answer_requests(self, tick: int) -> None:
-        """Answer the requests of permitted senders, and latch the stop unless it is a check."""
+        """Answer each request of a permitted sender, and latch the stop unless it is a check."""
         for request, reply in self._requests():
             head = self._sealer.open_message(*request)
             asker = request.key.split("/")[1]
