@@ -1,4 +1,4 @@
-"""A task as the clock sees it, and the watchdog for tasks that do not respond to releases.
+"""The clock's access to a task, and the watchdog for tasks that do not respond to releases.
 
 A release is missed if the task has not finished the one before. That alone does not prove a fault,
 because on a busy machine any process may be preempted for a while. A task counts as hanging, and so

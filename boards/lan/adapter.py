@@ -1,4 +1,4 @@
-"""Network adapter: a bus adapter that connects the rack to a network through eclipse-zenoh.
+"""Network adapter, which connects the rack to other racks through eclipse-zenoh.
 
 It is an ordinary board with a rate and a higher priority than its neighbours. In each cycle it
 sends exports, receives imports, updates which racks are present, and sets the emergency stop on

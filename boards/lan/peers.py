@@ -1,4 +1,4 @@
-"""Presence of the other racks as an adapter sees it: present or lost, and in which launch.
+"""Presence of the other racks: whether each is awaited, present or lost, and in which launch.
 
 Each launch of a rack has a number, which is contained in its liveliness token and in all its
 messages. Tokens may appear and expire in any order. The token of a restarted rack may appear before

@@ -1,4 +1,4 @@
-"""Static cyclic schedules: positions of the boards in the minor frames of a major frame.
+"""Static cyclic schedules: when each board runs in the minor frames of a major frame.
 
 The terms are from T. P. Baker and A. Shaw, *The Cyclic Executive Model and Ada*, Real-Time
 Systems 1 (1989). A board's cycle is a whole number of minor frames and divides the major frame. Its
