@@ -13,7 +13,7 @@ from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
 
 PAGE = 4096
 CACHE_LINE = 64
-"""Bytes of a cache line. Blocks of two writers never share one."""
+"""Size of a cache line, in bytes. Blocks of different writers never share a cache line."""
 
 HEAD_SIZE = PAGE
 BLOCK_SIZE = 256

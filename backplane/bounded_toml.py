@@ -27,8 +27,8 @@ _KEYS = re.compile(r"[\w\-. \t]++")
 def load_toml(text: str) -> dict[str, Any]:
     """Parse TOML text into tables.
 
-    The limits of a config on nesting and on the size of integers are not applied here, but in
-    `rack.boards.config.toml.parse`.
+    The stricter limits of configs on nesting and on the size of integers are not checked here.
+    `rack.boards.config.toml.parse` checks them.
 
     Raises:
         tomllib.TOMLDecodeError: The text is not TOML.

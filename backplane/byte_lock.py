@@ -43,7 +43,7 @@ class ByteLock:
         self._fd = os.open(f"/proc/self/fd/{fd}", os.O_RDWR | os.O_CLOEXEC)
 
     def take(self) -> bool:
-        """Take the lock. Returns False if it is already held."""
+        """Take the lock without waiting. Returns False if it is already held."""
         try:
             fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, self._take)
         except (BlockingIOError, PermissionError):
@@ -62,8 +62,8 @@ class ByteLock:
     def close_file(self) -> None:
         """Close the descriptor. `reopen` opens one again.
 
-        The lock is released unless another process, such as the parent of a fork, also has the file
-        description open.
+        This releases the lock, unless another process, such as the parent of a fork, shares the
+        file description.
         """
         if self._fd >= 0:
             os.close(self._fd)
@@ -99,8 +99,9 @@ class ProcessLock(ByteLock):
 
 
 def _close_inherited() -> None:
-    """Close the process locks in a forked child. The parent still holds them."""
-    # The kernel keeps a lock while any process has its file description open.
+    """Close the descriptors of the process locks in a forked child. The parent keeps the locks."""
+    # Otherwise the locks would outlast the parent: the kernel keeps a lock as long as any process
+    # has its file description open.
     for lock in [*_HELD]:
         lock.close()
 
@@ -109,7 +110,7 @@ os.register_at_fork(after_in_child=_close_inherited)
 
 
 def close_all_files() -> None:
-    """Close the descriptors of all locks in a forked process. `reopen_all` opens them again."""
+    """Close the descriptors of all byte locks of this process. `reopen_all` opens them again."""
     for lock in _OPEN:
         lock.close_file()
 

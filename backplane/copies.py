@@ -58,8 +58,8 @@ def copy_memory(segment: Segment) -> int:
 def restore_memory(segment: Segment, fd: int, tick: int) -> None:
     """Restore a copy into the segment of a rack that is being launched.
 
-    Call this before any of the rack's tasks has started. Records and messages from before the copy
-    count as read, so a recorder gets only those that the new rack writes.
+    Call this before any of the rack's tasks has started. A recorder gets only the records and
+    messages that the new rack writes: all that are in the copy are marked as read.
 
     Args:
         segment: Segment of the new rack.
@@ -80,7 +80,8 @@ def restore_memory(segment: Segment, fd: int, tick: int) -> None:
     for mailbox in segment.layout.mailboxes:
         box = segment.get_box(mailbox.name)
         box[Box.FIRST] = box[Box.HEAD]
-    # A post that was pending at the time of the copy has no meaning between two ticks.
+    # Discard the posts that were pending at the time of the copy. No task of the new rack waits
+    # for them.
     segment.initialize_semaphores()
 
 
@@ -93,7 +94,7 @@ def detach_segment(segment: Segment) -> None:
     _map_memory(segment, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, 0, -1)
     file = os.fstat(segment.fd)
     nothing = os.open(os.devnull, os.O_RDONLY)
-    # Python's `mmap` object has a descriptor of the segment, too.
+    # Besides `segment.fd`, Python's `mmap` object has a descriptor of the segment.
     for fd in [int(entry.name) for entry in Path("/proc/self/fd").iterdir()]:
         with suppress(OSError):
             if os.path.samestat(os.fstat(fd), file):

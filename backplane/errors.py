@@ -15,7 +15,7 @@ from __future__ import annotations
 
 
 class BackplaneError(Exception):
-    """Root of all errors of this package. Its text is one line for the user."""
+    """Base class of all errors of this package. The error text is one line for the user."""
 
 
 class SegmentError(BackplaneError):

@@ -20,7 +20,7 @@ from rack.backplane.words import System, Word
 
 FAULT_WORDS = 16
 PARAMETERS = 8
-"""Number of parameters of one fault, float64, stored after its words."""
+"""Number of parameters of one fault. They are stored as float64 after the words of its entry."""
 NEVER = 1 << 62
 """Value of `until` for a fault that lasts until the end of the run."""
 
@@ -122,7 +122,7 @@ class FaultTable:
     def add_fault(self, injection: Injection) -> FaultEntry:
         """Enter a fault into the table and return its entry.
 
-        The clock begins the fault once its tick has come and its condition holds.
+        The clock begins the fault once its tick is reached and its condition is true.
 
         Raises:
             FaultTableError: The table is full.
@@ -140,18 +140,18 @@ class FaultTable:
             entry.struck_tick = -1
             for place, parameter in enumerate(injection.parameters):
                 entry.parameters[place] = parameter
-            # Store the stage last, because the clock may begin the fault from then on.
+            # Store the stage last, because the clock may begin the fault as soon as it is stored.
             entry.stage = Stage.WAITING
             self._words[System.INJECTED] += 1
         return entry
 
     def disarm_fault(self, entry: FaultEntry) -> None:
-        """Prevent a waiting fault from beginning.
+        """Change a waiting fault so that it never begins.
 
         Call `free_entry` after the next tick, when the clock is certain to have read the change.
         """
-        # The order matters: without a condition and with a tick in the past, the fault would begin
-        # at once.
+        # Set the tick first: if the clock saw a fault without a condition and with a tick in the
+        # past, it would begin the fault at once.
         entry.tick = NEVER
         entry.when_box = -1
 

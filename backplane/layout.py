@@ -46,7 +46,7 @@ class TickGrid(NamedTuple):
 
 @dataclass(frozen=True)
 class ExchangeSpec:
-    """Rule from a config for when an executor reads a mailbox.
+    """Config rule that states at which ticks an executor reads a mailbox.
 
     Attributes:
         task: Name of the executor.
@@ -171,15 +171,18 @@ class MailboxSpec:
 
     @property
     def lead_ticks(self) -> int:
-        """Ticks by which the release of a writing cycle precedes a tick of the mailbox's grid.
+        """Number of ticks from the release of a writing cycle to a tick of the mailbox's grid.
 
-        A cycle writes the mailbox if its release tick plus this number is on the grid.
+        A cycle writes the mailbox if its release tick plus this number is on the mailbox's grid.
         """
         return self.delay if self.interrupt is None else self.interrupt.ahead
 
     @property
     def is_tick_based(self) -> bool:
-        """True if the tick at which a message becomes visible depends on ticks alone."""
+        """True if the release tick of the writing cycle determines when a message becomes visible.
+
+        Under other protocols, the real time of the write matters too.
+        """
         return self.protocol in TICK_PROTOCOLS
 
     @property
@@ -265,7 +268,7 @@ class Layout:
 
     @property
     def timed(self) -> tuple[MailboxSpec, ...]:
-        """Mailboxes written by tasks and by the clock. Host boards write theirs at any time."""
+        """All mailboxes except those written by host boards, which may write at any time."""
         hosts = {host.name for host in self.hosts}
         return tuple(mailbox for mailbox in self.mailboxes if mailbox.writer not in hosts)
 

@@ -45,7 +45,10 @@ class UtilityLines:
 
     @property
     def reset_obstacles(self) -> list[str]:
-        """Reasons why the emergency stop must not be reset: SYSFAIL, ACFAIL and lost boards."""
+        """Texts that state why the emergency stop must not be reset. Empty if it may be reset.
+
+        The possible reasons are an asserted SYSFAIL, an asserted ACFAIL and lost boards.
+        """
         reasons = [f"SYSFAIL of slot {slot}" for slot in self.sysfail]
         reasons += ["ACFAIL"] if self.acfail else []
         return reasons + [

@@ -76,7 +76,7 @@ def record_used_files() -> None:
 
 
 def touch_memory() -> None:
-    """Touch every page that a cycle may need, and stop the C library from returning memory.
+    """Touch every page that a cycle may need, and have the C library keep freed memory.
 
     This takes about a tenth of a second, mostly to copy pages that are shared with the crate.
     """

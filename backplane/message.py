@@ -273,10 +273,9 @@ def format_state(state: int | None, otherwise: str = "") -> str:
     """Return the name of a level's state in lower case.
 
     Args:
-        state: Number of the state. None, for no state, is treated like a state that `State` does
-            not define.
-        otherwise: Result for a state that `State` does not define. If it is empty, the result is
-            `state` itself as text.
+        state: Number of the state. None is treated like a number that `State` does not define.
+        otherwise: Result for a number that `State` does not define. If it is empty, the result is
+            the number as text.
     """
     return State(state).name.lower() if state in set(State) else otherwise or str(state)
 

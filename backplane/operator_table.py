@@ -32,7 +32,7 @@ from rack.backplane.words import System, Word
 _CLAIMS = 1 << 40
 """Address of the byte that the client of ticket 0 locks.
 
-It lies beyond any segment, because a lock needs no memory.
+It lies beyond the end of any segment. This is possible because a lock needs no memory.
 """
 
 
@@ -47,7 +47,7 @@ class RequestStage(IntEnum):
 class Client(IntEnum):
     """Values of `RequestEntry.client`."""
 
-    NONE = 0  # the request belongs to the run
+    NONE = 0  # issued whether or not the process that added it is alive
     WAITS = 1  # issued only if its client is alive
     LEASES = 2  # the same; once issued, the level holds if the client ends or sends no heartbeats
 
@@ -118,7 +118,7 @@ class OperatorTable:
         self.entries = [RequestEntry(segment, index) for index in range(OPERATOR_ENTRIES)]
 
     def add_request(self, request: Request) -> RequestEntry:
-        """Add a request that belongs to the run. The clock issues its command when it is due.
+        """Add a request without a client. The clock issues its command at the requested tick.
 
         If no entry is free, the entry of the command that was issued longest ago is reused.
 
@@ -170,13 +170,13 @@ class OperatorTable:
         return entry.given_tick < 0
 
     def is_waiting(self, entry: RequestEntry) -> bool:
-        """Check whether a request is still waiting, and its client, if it has one, is alive."""
+        """Check that a request is still waiting, and that its client, if any, is alive."""
         if entry.stage != RequestStage.WAITING:
             return False
         return not entry.client or self.is_client_alive(entry)
 
     def is_client_alive(self, entry: RequestEntry) -> bool:
-        """Check whether the client of a request is alive, which means that it holds its lock."""
+        """Check whether the client of a request is alive and so holds the request's lock."""
         return self._segment.is_locked(_CLAIMS + entry.ticket)
 
     def list_leased(self) -> list[RequestEntry]:

@@ -224,7 +224,7 @@ def read_memory_sizes(pid: int) -> tuple[int, int]:
 
 
 def describe_refusal(error: OSError) -> str:
-    """Describe an error, including the limit on processes or open files if one was reached."""
+    """Return the text of an OS error, with the limit if too many processes or files caused it."""
     limits = {
         errno.EAGAIN: ("processes", "u", RLIMIT_NPROC),
         errno.EMFILE: ("open files", "n", RLIMIT_NOFILE),

@@ -60,7 +60,7 @@ TRY_VARIABLE = "RACK_TRY_PROCESSOR"
 
 
 class Launch(NamedTuple):
-    """Time at which a segment was created, in ns: wall clock and CLOCK_MONOTONIC."""
+    """Time at which a segment was created, in ns of the wall clock and of CLOCK_MONOTONIC."""
 
     created_ns: int
     monotonic_ns: int
@@ -93,8 +93,8 @@ class CycleCounts(NamedTuple):
     def lost(self) -> int:
         """Number of cycles that were missed or skipped.
 
-        It is limited to `due`, because all cycles of a missed plan count, even if the plan ended
-        after the last cycle that was due.
+        Every cycle of a missed plan is counted. If the plan ends after the last cycle that was due,
+        the sum would exceed `due`, so it is limited to `due`.
         """
         return min(self.due, self.missed * self.plan + self.skipped)
 
@@ -105,7 +105,7 @@ class CycleCounts(NamedTuple):
 
 
 class Segment:
-    """An attached segment.
+    """Segment of a rack, mapped into this process.
 
     Attributes:
         layout: Mailboxes and tasks.
@@ -162,7 +162,8 @@ class Segment:
         except OSError as error:
             raise SegmentError(f"rack '{layout.rack}': {SHM_FOLDER}: {error.strerror}") from None
         try:
-            # Without this, a full /dev/shm would raise SIGBUS at the first access to a page.
+            # Allocate all pages now. Otherwise, with a full /dev/shm, the first access to a page
+            # would raise SIGBUS.
             os.posix_fallocate(fd, 0, size)
             segment = cls(layout.rack, mmap.mmap(fd, size), fd)
             segment.layout = layout
@@ -238,7 +239,7 @@ class Segment:
 
     @classmethod
     def attach(cls, rack: str) -> Self:
-        """Attach to a rack's segment.
+        """Map a rack's segment into this process, and read its layout and config.
 
         Raises:
             SegmentError: There is no such segment, or its owner, size or version is wrong.
@@ -328,7 +329,7 @@ class Segment:
     def count_cycles(self, task: TaskSpec, tick: int) -> CycleCounts:
         """Count the cycles of a task up to `tick`.
 
-        Releases that the task has not finished count as skipped once their time slice is over.
+        A release that the task has not finished is counted as skipped once its time slice is over.
         """
         block = self.get_block(task.name)
         skipped = block[Block.SKIPPED] + task.count_unfinished(block[Block.DONE], tick)
@@ -354,7 +355,7 @@ class Segment:
 
     @property
     def launch(self) -> Launch:
-        """Time at which the segment was created."""
+        """Time of the rack's launch, at which the segment was created."""
         return Launch(self.words[Head.CREATED_NS], self.words[Head.CREATED_MONOTONIC_NS])
 
     @property
@@ -405,7 +406,7 @@ class Segment:
         return os.path.samestat(named, os.fstat(self.fd))
 
     def release_launcher_lock(self) -> None:
-        """Release the launcher's lock, if this process holds it. The rack then counts as dead."""
+        """Release the launcher's lock if this process holds it. Others then find the rack dead."""
         if self._life is not None:
             self._life.close()
 
@@ -466,7 +467,7 @@ def _pid_namespace() -> int:
 
 
 def _shm_name(rack: str) -> str:
-    """Return the name under which `posix_ipc` knows the segment of a rack."""
+    """Return the name of a rack's segment as `posix_ipc` expects it, with a leading slash."""
     return f"/{PREFIX}{rack}"
 
 

@@ -94,7 +94,7 @@ def open_trace_ring(segment: Segment, task: str) -> Ring:
 
 
 class CycleRecord:
-    """Reads the trace of a task, so that readers of its mailboxes know which cycles have ended."""
+    """Read access to a task's trace, to find which of its cycles have ended and when."""
 
     def __init__(self, segment: Segment, task: str) -> None:
         self._block = segment.get_block(task)

@@ -31,7 +31,7 @@ class Word:
 
 
 def encode_switch(tick: int, is_on: bool) -> int:
-    """Encode a change of state at `tick` in one word, which `is_switched_on` evaluates.
+    """Encode in one word that a state changes at `tick`. `is_switched_on` decodes it.
 
     Before `tick` the word means the opposite state. The state therefore depends on the reader's
     tick alone, not on the moment at which the word is read. Changes to on and to off must

@@ -27,9 +27,9 @@ from rack.backplane.watch.alarms import Alarm, AlarmWriter
 from rack.backplane.words import Block, Run, System
 
 LEAD_NS = 300_000
-"""The clock begins a tick this long before its grid point.
+"""Time in ns by which the clock begins a tick ahead of the tick's grid point.
 
-The time covers the clock's wake-up and its work in a tick.
+It suffices for the clock's wake-up and its work in a tick.
 """
 LATE_DIVISOR = 2
 """A delay of more than one tick divided by this number shows that a core was taken away.
@@ -108,10 +108,10 @@ class ClockDriver(ABC):
         return False
 
     def count_skipped(self, first: int, ticks: int) -> None:
-        """Publish that the clock skips `ticks` ticks, beginning with `first`.
+        """Add `ticks` to the published number of skipped ticks. `first` is the first of them.
 
-        The count is increased last, once for all these ticks. A late task therefore never reports
-        only some of them, nor ticks that were skipped after its release.
+        `first` is stored before the number, which changes once for all these ticks. A late task
+        therefore never reports only some of them, nor ticks that were skipped after its release.
         """
         self.words[System.SKIPPED_FROM] = first
         self.words[System.CLOCK_SKIPPED] += ticks
@@ -130,7 +130,7 @@ class ClockDriver(ABC):
         return due_tasks
 
     def check_tasks(self, released: list[ReleasedTask], tick: int) -> None:
-        """Pass tasks that missed releases to the watchdog, and let the controller finish `tick`."""
+        """Pass each released task that missed a release to the watchdog. Call `finish_release`."""
         for task in released:
             if task.missed:
                 self.watchdog.check(task, tick)
@@ -139,23 +139,23 @@ class ClockDriver(ABC):
 
     @property
     def first_tick(self) -> int:
-        """First tick of this clock process: 0, or after a restart the last tick, which is repeated.
+        """First tick that this process runs: 0, or after a restart of the clock the current tick.
 
-        Tasks that were already released at that tick are recognised by their deadlines and are not
-        released again.
+        That tick is repeated. Tasks that were released at that tick before the restart are
+        recognised by their deadlines and are not released again.
         """
         return self.words[System.TICK] if self.words[System.STATE] == Run.RUNNING else 0
 
     @property
     def first_end_tick(self) -> int:
-        """Earliest tick at which the run can end. A run ends before its end tick is executed."""
+        """Earliest possible end tick of the run. The end tick itself is not executed."""
         return 0
 
     def wait_until_settled(self) -> None:
         """In lockstep, wait until every task has finished its last release, including plans.
 
-        Call this before changing data that tasks read during a cycle. In real time this function
-        does not wait, so such a change may take effect in the middle of a cycle.
+        Call this before changing data that tasks read during a cycle. In real time it returns at
+        once, so such a change may take effect in the middle of a cycle.
         """
 
     def await_state(self, task: ReleasedTask, condition: Callable[[], bool]) -> bool:
@@ -166,24 +166,24 @@ class ClockDriver(ABC):
             condition: Function that evaluates the condition, called after each report of the task.
 
         Returns:
-            False if the launcher has ended.
+            False if the launcher has ended or the host requests the end of the run.
         """
         return True
 
     @abstractmethod
     def run(self) -> None:
-        """Run tick after tick until the run is over or the launcher has ended."""
+        """Run the clock until the run is over or the launcher has ended."""
 
     def is_over(self, tick: int) -> bool:
-        """Return True if the run ends before `tick`. Publishes the end once it is known."""
+        """Return True if the run ends before `tick`. Publishes the end tick once it is known."""
         words = self.words
         stop = words[System.STOP_TICK]
         if words[System.STOP_REQUEST] and (not stop or stop > tick):
             stop = words[System.STOP_TICK] = max(tick, 1)
         if stop and tick >= stop:
             return True
-        # Call this function even if the end of this run is known. It also determines the end of
-        # the robot's task, at which a run that continues this one may end.
+        # Call `_ended` even if the end tick of this run is known. It also determines when the
+        # robot's task ends, and a run that continues this one may end at that tick.
         end_tick = self._ended(tick)
         if not stop and end_tick is not None:
             stop = words[System.STOP_TICK] = max(end_tick, self.first_end_tick, 1)
@@ -202,9 +202,10 @@ class ClockDriver(ABC):
 
 
 class RealtimeDriver(ClockDriver):
-    """Clock in real time. Tick T has its grid point at a fixed time of CLOCK_MONOTONIC.
+    """Driver of the clock in real time.
 
-    A clock that wakes up too late skips the ticks that have passed, and counts them.
+    Tick T has its grid point at a fixed time of CLOCK_MONOTONIC. If the clock wakes up too late,
+    it skips the ticks whose time has passed, and counts them.
     """
 
     def __init__(
@@ -218,15 +219,15 @@ class RealtimeDriver(ClockDriver):
         self._lead_ns = min(LEAD_NS, self._period_ns // LEAD_DIVISOR) if leads else 0
 
     def run(self) -> None:
-        """Run tick after tick until the run is over or the launcher has ended."""
+        """Run the clock until the run is over or the launcher has ended."""
         words = self.words
         beat = max(1, int(CHECK_S * 1e9) // self._period_ns)
         for task in self.tasks:
             if task.sleeps:
-                # The grid is known now, so the task can sleep until its grid points.
+                # Wake the task once. The grid is known now, so it can sleep until its grid points.
                 task.wake()
         last = self.first_tick - 1
-        # The grid begins a little after the clock's start, so that tick 0 has a grid point too.
+        # The grid point of tick 0 is a little after the clock's start, so wait for it too.
         tick = self._sleep_until_next(last)
         words[System.STATE] = Run.RUNNING
         while not self.is_over(tick):
@@ -253,8 +254,8 @@ class RealtimeDriver(ClockDriver):
         now = self.words[System.TICK_NS] = time.monotonic_ns()
         if now >= point or tick > last + 1:
             for task in sleeping:
-                # At its grid point the task found no release, because the clock was late, and went
-                # back to sleep.
+                # The task woke up at its grid point, found no release because the clock was late,
+                # and went back to sleep.
                 if now >= self._compute_grid_point(task.block[Block.RELEASED]):
                     task.wake()
         if len(sleeping) < len(due):
@@ -277,10 +278,10 @@ class RealtimeDriver(ClockDriver):
             time.sleep(wait * 1e-9)
 
     def _sleep_until_next(self, tick: int) -> int:
-        """Sleep until the next tick after `tick` begins.
+        """Sleep until the clock must begin the tick after `tick`.
 
-        The clock has the highest priority on its core. If it wakes up late, the core was taken away
-        from the rack, and an alarm is raised.
+        An alarm is raised if the clock wakes up late. It has the highest priority on its core, so
+        a late wake-up shows that the core was taken away from the rack.
 
         Returns:
             The newest tick that is due: `tick` + 1, or a later tick if ticks were skipped.
@@ -291,7 +292,7 @@ class RealtimeDriver(ClockDriver):
         self._woke_ns = time.monotonic_ns()
         now = (self._woke_ns + self._lead_ns - self._epoch_ns) // self._period_ns
         if stop := self.words[System.STOP_TICK]:
-            # Even a late clock begins the run's last tick, so that tasks late for it are noticed.
+            # Never skip the run's last tick, so that tasks that are late for it are noticed.
             now = min(now, stop - 1)
         next_tick = max(tick + 1, now)
         skipped = next_tick - tick - 1

@@ -83,15 +83,15 @@ class LockstepDriver(ClockDriver):
 
     @property
     def first_end_tick(self) -> int:
-        """Earliest tick at which the run can end: the next tick.
+        """Earliest possible end tick of the run: the next tick.
 
-        A run that continues another may have a configured end before its own first tick. It then
+        The configured end of a run that continues another may be before its first tick. Such a run
         ends at once.
         """
         return self._next
 
     def run(self) -> None:
-        """Run tick after tick until the run is over or the launcher has ended."""
+        """Run the clock until the run is over or the launcher has ended."""
         self.words[System.STATE] = Run.RUNNING
         # After a restart of the clock, tasks may still be working on a batch of the old process.
         self.wait_until_settled()
@@ -123,8 +123,8 @@ class LockstepDriver(ClockDriver):
     def _find_batch_end(self, due: list[ReleasedTask], tick: int) -> int:
         """Return the first tick after the batch that begins at `tick`.
 
-        During a batch nothing is due except the cycles of one executor. If anything else is due,
-        the batch consists of `tick` alone.
+        At the ticks of a batch, nothing is due except the cycles of one executor. If no batch can
+        begin at `tick`, the result is `tick` + 1.
         """
         controller = self.controller
         if len(due) != 1 or controller is None or self._one_at_a_time:
@@ -148,10 +148,15 @@ class LockstepDriver(ClockDriver):
         return max(end, tick + 1)
 
     def _run_ticks(self, due: list[ReleasedTask], tick: int, end: int) -> bool:
-        """Run one tick, or a batch that ends before `end`.
+        """Release the due tasks, and wait until tick `end` may begin.
+
+        Args:
+            due: Tasks to be released at `tick`.
+            tick: Current tick.
+            end: First tick after the batch, or `tick` + 1 without a batch.
 
         Returns:
-            False if the launcher has ended.
+            False if the launcher has ended or the host requests the end of the run.
         """
         one_at_a_time = self._one_at_a_time or self.is_flooded
         for task in due:
@@ -161,14 +166,14 @@ class LockstepDriver(ClockDriver):
             if one_at_a_time and not self.await_state(task, task.is_settled):
                 return False
         self.check_tasks(due, tick)
-        # Wait until the next tick may begin.
         order = self._last_first
         slowest = None
         for task in order:
             if task.deadline > end:
                 continue
             if task.is_finished(end):
-                # Consume the post of its report, because the semaphore would eventually overflow.
+                # The task has already posted its report. Consume the post, because the semaphore
+                # would eventually overflow.
                 task.done.try_acquire()
             else:
                 slowest = task
@@ -192,7 +197,7 @@ class LockstepDriver(ClockDriver):
             condition: Function that evaluates the condition, called after each report of the task.
 
         Returns:
-            False if the launcher has ended.
+            False if the launcher has ended or the host requests the end of the run.
         """
         wait = task.done.wait
         while not condition():
@@ -203,11 +208,10 @@ class LockstepDriver(ClockDriver):
         return True
 
     def _check_after_timeout(self, task: ReleasedTask) -> bool:
-        """After a wait without a report, update `is_stopped` of the task.
+        """After a wait without a report, decide whether to wait longer, and update `is_stopped`.
 
         Returns:
-            False if the wait must end, because the host requests the end of the run or the launcher
-                has ended.
+            False if the launcher has ended or the host requests the end of the run.
         """
         if not self.launcher_is_alive or self.words[System.STOP_REQUEST]:
             return False
@@ -219,8 +223,8 @@ class LockstepDriver(ClockDriver):
     def _wait_for_follower(self, tick: int) -> bool:
         """Wait for the recorder if its rings would otherwise overflow in `tick`.
 
-        The wait has no time limit, because no simulated time passes. Only a recorder that is
-        stopped or dead is abandoned after `MAX_RECORDER_WAIT_S`.
+        The wait has no time limit, because no simulated time passes. If the recorder is stopped or
+        dead, however, the clock stops waiting for it after `MAX_RECORDER_WAIT_S`.
 
         Returns:
             False if the host requests the end of the run or the launcher has ended.
@@ -240,7 +244,7 @@ class LockstepDriver(ClockDriver):
     def _is_recorder_behind(self, tick: int) -> bool:
         """Check whether the rings would overflow if `tick` began before the recorder catches up.
 
-        While a mailbox is flooded, its ring has room for the messages of little more than one tick.
+        While a mailbox is flooded, its ring can hold the messages of little more than one tick.
         """
         if self.is_flooded and self.words[System.FOLLOWER_DRAINED] < tick - 1:
             return True

@@ -1,4 +1,4 @@
-"""A task as the clock sees it, and the watchdog for tasks that do not respond to releases.
+"""The clock's access to a task, and the watchdog for tasks that do not respond to releases.
 
 A release is missed if the task has not finished the one before. That alone does not prove a fault,
 because on a busy machine any process may be preempted for a while. A task counts as hanging, and so
@@ -24,7 +24,7 @@ RELEASES_MISSED = 4
 Three gave one false alarm in 24,000 cycles at 400 Hz.
 """
 MIN_HANG_NS = 1_000_000_000
-"""Minimum time that a task must wait or compute without finishing before it counts as hanging."""
+"""Minimum time that a task must wait or compute without finishing before it is found hanging."""
 
 
 class ReleasedTask:
@@ -33,15 +33,16 @@ class ReleasedTask:
     Attributes:
         index: Index of the task in the layout.
         sleeps: True if in real time the task wakes itself at its grid points with a timer.
-        is_posted: True if it waits for its semaphore, which `wake()` posts.
-        done: Semaphore that it posts in lockstep to report a finished release.
-        missed: Number of consecutive releases missed. It stays at 2 as long as the task still
-            finishes its releases late.
-        deadline: Tick before which it must finish its release or plan, or send its messages if that
-            is earlier. This is a copy of the word in the control block, which the task changes to a
-            later tick when it begins a plan.
-        is_stopped: True if a signal has stopped its process, so that lockstep must not wait for
-            it.
+        is_posted: True if the task waits for its semaphore, which `wake()` posts. False if it
+            polls.
+        done: Semaphore that the task posts in lockstep to report a finished release.
+        missed: Number of consecutive releases missed. At most 2 as long as the task still finishes
+            releases, however late.
+        deadline: Tick before which the task must finish its release or plan, or send its messages
+            if these are due earlier. It is computed from a word of the control block, which the
+            task changes to a later tick when it begins a plan.
+        is_stopped: True if a signal has stopped the task's process, so that lockstep must not wait
+            for it.
     """
 
     def __init__(self, segment: Segment, spec: TaskSpec) -> None:
@@ -61,10 +62,7 @@ class ReleasedTask:
         self.done = get_done_semaphore(segment, spec.name)
 
     def can_take_release(self, release: int) -> bool:
-        """Check whether the task can be released at tick `release`.
-
-        It cannot while it works on a plan or is lost.
-        """
+        """Check that at tick `release` the task is neither lost nor still working on a plan."""
         block = self.block
         return block[Block.DEADLINE] <= release and not self.is_lost
 
@@ -72,8 +70,8 @@ class ReleasedTask:
         """Release the task, and update `missed` and its deadline.
 
         Args:
-            tick: Current tick. The release tick is the task's last one up to this tick.
-            more: Number of further releases given at once, as a batch in lockstep.
+            tick: Current tick. The task gets its newest release that is not after this tick.
+            more: Number of further releases that it gets at once, for a batch in lockstep.
         """
         block = self.block
         every = self._every
@@ -106,7 +104,10 @@ class ReleasedTask:
         return block[Block.DONE] == block[Block.RELEASED] or self.is_lost or self.is_stopped
 
     def is_finished(self, tick: int) -> bool:
-        """Check that `tick` need not wait for the task, which is settled or due later."""
+        """Return True if the task is settled or its deadline is after `tick`.
+
+        The clock may then begin `tick` without waiting for the task.
+        """
         self.deadline = self.block[Block.DEADLINE] - self._early
         return self.deadline > tick or self.is_settled()
 
@@ -128,7 +129,7 @@ class ReleasedTask:
     def is_ready(self) -> bool:
         """True if a lost task has a new process that has completed its start-up.
 
-        The new process of a host board may already have ended again.
+        For a host board, the new process may also have ended already.
         """
         return self.block[Block.STATE] in (TaskState.READY, TaskState.RUNNING, TaskState.ENDED)
 
@@ -143,7 +144,7 @@ class ReleasedTask:
         self.block[Block.LOST] = tick + 1
 
     def admit_new_process(self) -> None:
-        """Let the task's new process rejoin at the next release of the task."""
+        """Mark the task as no longer lost, so that its new process gets the task's next release."""
         block = self.block
         block[Block.DONE] = block[Block.RELEASED]
         block[Block.DEADLINE] = 0
@@ -161,7 +162,7 @@ def sort_by_priority(layout: Layout) -> list[TaskSpec]:
 
 
 class Watchdog:
-    """Watchdog for tasks that miss releases. `losses` is the number of tasks found hanging."""
+    """Detects late, starved and hanging tasks. `losses` is the number of tasks found hanging."""
 
     def __init__(self, alarms: AlarmWriter, period_ns: int) -> None:
         self._alarms = alarms
@@ -172,8 +173,8 @@ class Watchdog:
     def check(self, task: ReleasedTask, tick: int) -> None:
         """Check a task that has missed releases, and raise alarms about it.
 
-        The first missed release raises an alarm. After `RELEASES_MISSED` of them, a task that hangs
-        is marked as lost, and any other task is reported once as starved.
+        The first missed release raises an alarm. Once `RELEASES_MISSED` are missed, the task is
+        marked as lost if it hangs. Otherwise it is reported once as starved.
         """
         missed = task.missed
         spec = task.spec

@@ -58,9 +58,9 @@ def compute_period_ticks(
 
     Args:
         rate_hz: Rate, rounded to four digits or more, such as 57.14 Hz for 400 Hz / 7.
-        clock_ns: Length of a tick.
-        subject: Beginning of the error message, which names what has this rate.
-        of: Nouns for the error message: what is divided, and one of its periods.
+        clock_ns: Length of a tick, in ns.
+        subject: Words with which the error message begins, such as the name of the board.
+        of: Nouns for the clock and for its tick in the error message.
         fastest_hz: Highest rate that the error message may suggest.
 
     Raises:
@@ -76,7 +76,7 @@ def compute_period_ticks(
             f"{subject}: {rate_hz:g} Hz is not a rate; valid rates are {clock_hz:g} Hz divided by a"
             " whole number"
         )
-    # A rate above the clock's rate has only one neighbour.
+    # For a rate above the clock's rate, there is only one nearest valid rate.
     nearest = {n: format_rate(clock_hz / n) for n in (int(ticks) + 1, int(ticks)) if n >= 1}
     for every in sorted(nearest, key=lambda n: abs(n - ticks)):
         if abs(ticks - every) <= 1e-6 * ticks or rate_hz == float(nearest[every]):

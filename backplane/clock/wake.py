@@ -46,8 +46,8 @@ class NextCycle:
 
     An executor's release expires at the task's next release. In lockstep, however, all releases of
     a batch are taken, one after the other. A planner's release expires at the end of the plan's
-    time slice. A planner that takes its release late still reads as of the release tick, so that
-    the plan depends on ticks alone.
+    time slice. A planner that takes its release late still reads mailboxes as of the release tick,
+    so that the plan depends on ticks alone.
 
     Attributes:
         skipped: Number of releases skipped just before the last one taken.
@@ -87,7 +87,7 @@ class NextCycle:
             else StoppedClockDetector(segment, clock_alarms)
         )
         # A restarted task skips the releases before its start. This process may write RELEASED
-        # here, because the clock does not until the task has rejoined.
+        # here, because the clock does not write it before the task has rejoined.
         self._block[Block.RELEASED] = self._block[Block.DONE]
         self._due = self._block[Block.DONE] + 1
         self.skip_until(self._due)
@@ -97,21 +97,21 @@ class NextCycle:
         """Function called between two cycles to fork a copy of the task for a snapshot."""
 
     def wait(self) -> int | None:
-        """Wait for the next release, and set `skipped`.
+        """Wait for the task's next release, take it, and set `skipped`.
 
         Returns:
-            The release tick. None if every release has been taken and the run is over, or if the
-                launcher has ended.
+            The tick of this release. None if the run is over and no release is left to take, or if
+                the launcher has ended.
         """
         words = self._words
         block = self._block
         is_posted = self._is_posted
         while True:
-            # Read this before RELEASED, so that a task that is late for the run's last release
-            # still takes it and the miss is noticed.
+            # Read the state before RELEASED, so that a task that is late for the run's last
+            # release still takes it and the miss is noticed.
             is_over = words[System.STATE] == _STOPPED
-            # Read the task's release, not the clock's tick, because in lockstep the task may be
-            # released later in a tick.
+            # Read the newest release of the task, not the clock's tick, because in lockstep the
+            # clock may begin a tick some time before it releases the task.
             newest = block[Block.RELEASED]
             if self._sleeps and newest >= self._due and self._is_before_grid_point(newest):
                 # The clock gives releases ahead of their grid points. Do not take this one yet, but
@@ -166,7 +166,7 @@ class NextCycle:
         now = monotonic_ns()
         deadline = bound = now + int(CHECK_S * 1e9)
         is_due = False
-        # The grid is unknown until the clock starts. The clock then wakes every task once.
+        # The grid is unknown until the clock starts. When it starts, it wakes every task once.
         if epoch := words[System.EPOCH_NS]:
             point = epoch + self._due * words[System.PERIOD_NS]
             step = self._spec.every * words[System.PERIOD_NS]
@@ -210,7 +210,7 @@ class NextCycle:
         return self._segment.launcher_is_alive
 
     def _check_after_timeout(self) -> bool:
-        """After a wait without a release, check whether the clock has stopped.
+        """After a wait without a release, raise an alarm if the clock has stopped.
 
         Returns:
             False if the launcher has ended.
@@ -221,7 +221,7 @@ class NextCycle:
 
     @property
     def _has_begun(self) -> bool:
-        """True if the task is past its first release. Before that, the clock may not run yet."""
+        """True if the task's first release is past. Before it, the clock may not have started."""
         return self._due > self._spec.phase
 
     def skip_until(self, tick: int) -> None:
@@ -232,16 +232,16 @@ class NextCycle:
 CLOCK_PATIENCE_TICKS = 2
 """Number of ticks to wait for a missing release before the clock is checked."""
 CLOCK_SILENT_S = 0.5
-"""Time without a tick after which a clock whose process is blocked counts as stopped.
+"""Time without a tick after which a clock with a blocked process is considered stopped.
 
 This is longer than a clock ever waits for its next tick.
 """
 
 
 class StoppedClockDetector:
-    """Detects, on behalf of one task, that the clock has stopped.
+    """Raises an alarm in one task's ring if the clock has stopped.
 
-    An alarm is raised once each time the clock stops, and never for a clock that is merely late.
+    The alarm is raised once each time the clock stops, and never if the clock is merely late.
     """
 
     def __init__(self, segment: Segment, alarms: AlarmWriter) -> None:
@@ -252,7 +252,7 @@ class StoppedClockDetector:
         self._waited_at = -1
 
     def record_release(self) -> None:
-        """Record that a release was received, so that the next stop of the clock is reported."""
+        """Record that the clock has released the task. The clock's next stop raises an alarm."""
         self._is_reported = False
 
     def compute_patience_ns(self, expected: int) -> int:
@@ -265,7 +265,7 @@ class StoppedClockDetector:
         return late if late > 0 else CLOCK_PATIENCE_TICKS * self._clock.period_ns
 
     def check(self) -> None:
-        """Raise an alarm if the clock's process is stopped, dead or blocked.
+        """Raise an alarm if ticks are overdue and the clock's process is stopped, dead or blocked.
 
         The alarm is raised once each time the clock stops.
         """
@@ -284,7 +284,7 @@ class StoppedClockDetector:
             waits and self._waited_at == newest
         )
         self._waited_at = newest if waits else -1
-        # A new tick, or the end of the run, would show that the clock was running.
+        # If a new tick has begun meanwhile, or the run has ended, the clock is running.
         if (
             has_stopped
             and not self._is_reported

@@ -1,1 +1,1 @@
-"""Mailboxes: slots, readers, writers and the protocols that decide visibility."""
+"""Mailboxes: slots, readers, writers and protocols that determine when messages become visible."""

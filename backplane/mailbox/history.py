@@ -99,15 +99,16 @@ def build_row_dtype(spec: MailboxSpec) -> np.dtype:
 
 
 def find_chains(segment: Segment, until: int) -> dict[str, tuple[int, int]]:
-    """Find the newest good message of every mailbox that is not written by a host board.
+    """Return serial and chained checksum of the newest good message of each mailbox.
+
+    Mailboxes written by host boards are left out.
 
     Args:
         segment: Memory of the rack.
-        until: Only messages that were visible before this tick count.
+        until: Messages that became visible at this tick or later are ignored.
 
     Returns:
-        A dictionary from mailbox to serial and chained checksum of that message. Both are 0 if
-            there is no such message.
+        A dictionary from mailbox to the pair. Both values are 0 if there is no such message.
     """
     chain_by_mailbox = {}
     for spec in segment.layout.timed:
@@ -131,8 +132,8 @@ def compute_digest(segment: Segment, until: int | None = None) -> str:
 
     Args:
         segment: Memory of the rack.
-        until: Only messages that were visible before this tick count. None for the tick at which
-            the run stopped.
+        until: Messages that became visible at this tick or later are ignored. None for the tick at
+            which the run stopped.
     """
     stop = segment.words[System.STOP_TICK] if until is None else until
     total = blake2b(digest_size=16)

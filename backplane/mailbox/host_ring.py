@@ -25,14 +25,14 @@ from rack.backplane.words import Box
 
 
 class HostWriter(DoubleBufferWriter):
-    """Writing end of a ring, for the host board. Like any writer, it claims the mailbox."""
+    """Writer of a host board's ring. Like any writer, it claims the mailbox."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         super().__init__(segment, name)
         self._box = self.slots.box
 
     def send_message(self, tick: int) -> bool:
-        """Publish `message`.
+        """Publish `message`, unless the ring is full.
 
         Args:
             tick: Current tick, stored with the message.
@@ -47,7 +47,7 @@ class HostWriter(DoubleBufferWriter):
 
 
 class HostReader:
-    """Reading end of a ring, for the bus adapter."""
+    """Reader of a host board's ring, used by the bus adapter."""
 
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = spec = segment.layout.find_mailbox(name)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 
 class Inbox:
-    """First-in-first-out server with a bounded waiting room.
+    """Model of a first-in-first-out server with room for a limited number of waiting messages.
 
     Attributes:
         depth: Maximum number of waiting messages.
@@ -56,7 +56,7 @@ class Inbox:
 
 
 FULL_LOAD = 0.999
-"""Smallest load of a handler at which its inbox counts as overloaded.
+"""Load of a handler from which its inbox is considered overloaded.
 
 It is below 1, so that the simulation of a burst stays short.
 """
@@ -72,8 +72,8 @@ class InterruptSource(NamedTuple):
 class Burst(NamedTuple):
     """Worst case of an inbox: all sources send at the same time, and then once in each period.
 
-    The burst ends when no message waits. At a load of `FULL_LOAD` or more it may never end, and
-    `waiting` and `longest_ns` are None.
+    The burst ends when no message waits. At a load of `FULL_LOAD` or more it may never end, so
+    `waiting` and `longest_ns` are not computed and are None.
 
     Attributes:
         load: Share of the processor time that the handler uses.
@@ -86,7 +86,7 @@ class Burst(NamedTuple):
     longest_ns: int | None
 
     def fits_depth(self, depth: int) -> bool:
-        """Check whether an inbox with room for `depth` waiting messages never loses one."""
+        """Return True if an inbox with room for `depth` waiting messages never loses a message."""
         return self.waiting is not None and self.waiting <= depth
 
 

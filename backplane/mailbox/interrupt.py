@@ -43,15 +43,15 @@ from rack.backplane.words import Slot
 
 
 def get_interrupt_spec(spec: MailboxSpec) -> InterruptSpec:
-    """Return the times of sending and service of a mailbox, which must have protocol interrupt."""
+    """Return `spec.interrupt` of a mailbox, which must have protocol interrupt."""
     assert spec.interrupt is not None, f"mailbox '{spec.name}' is of protocol {spec.protocol}"
     return spec.interrupt
 
 
 def compute_send_offset_ns(spec: MailboxSpec, clock_ns: int) -> int:
-    """Return the time of sending relative to the earliest tick at which a message is visible.
+    """Return when a message is sent, in ns relative to the earliest tick at which it is visible.
 
-    The result is in ns. It is negative, because a message is sent before it is visible.
+    The result is negative, because a message is sent before it is visible.
     """
     return get_interrupt_spec(spec).sent_ns - spec.delay * clock_ns
 
@@ -69,7 +69,7 @@ class InterruptWriter(Writer):
     def compute_visible_tick(self, tick: int, now: int | None) -> int:
         """Return the earliest tick at which a message is visible.
 
-        A message written too late counts as sent in the tick in which it is written.
+        A message that is written too late is treated as sent in the tick in which it is written.
 
         Args:
             tick: Release tick of the cycle that writes.
@@ -80,7 +80,7 @@ class InterruptWriter(Writer):
 
 
 class InterruptLine:
-    """Mailbox that interrupts a board. A task of the board computes when its messages arrive."""
+    """Messages of one mailbox that interrupt a board, as collected by one task of the board."""
 
     def __init__(self, segment: Segment, spec: MailboxSpec) -> None:
         self.service_ns = get_interrupt_spec(spec).service_ns
@@ -176,7 +176,7 @@ class BoardInbox:
         self._in_service: deque[tuple[int, InterruptLine, int]] = deque()
 
     def advance_to(self, tick: int) -> None:
-        """Process all arrivals and services up to the release at `tick`."""
+        """Process all arrivals and ends of service up to `tick` that were not processed before."""
         if tick <= self._tick:
             return
         self._tick = tick
@@ -196,8 +196,9 @@ class BoardInbox:
             self.service_ns += line.service_ns
 
     def _add_arrival(self, at_ns: int, line: InterruptLine, serial: int) -> None:
-        """Add the arrival of a message to the inbox. If too many wait, the message is lost."""
-        # A late message cannot be inserted before messages that have already been added.
+        """Add the arrival of a message to the inbox, or count it as lost if too many wait."""
+        # A late message cannot be inserted before messages that have already been added, so it
+        # arrives at the same time as the last of them.
         self._newest_ns = max(self._newest_ns, at_ns)
         end_ns = self.inbox.add_message(self._newest_ns, line.service_ns)
         if end_ns is None:
@@ -227,14 +228,14 @@ class InterruptReader(Reader):
         return self._accept(self._line.newest_serial, tick)
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Accept the newest unread good message that was served before a bad one.
+        """Return the newest unread good message that was served before a bad one.
 
         Args:
             serial: Serial of the bad message.
             tick: Release tick of the reading cycle.
 
         Returns:
-            The reading with this message or, if there is none, with the last good one again.
+            The reading with this message. If there is none, the last good message again.
         """
         for older in reversed(self._line.served):
             if self.serial < older < serial:

@@ -30,9 +30,9 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Word
 
 NO_MESSAGE_TICK = 1 << 62
-"""Release tick that stands for the newest message while there is none yet.
+"""Value of a reader's `newest` before the first message.
 
-The age computed from it is negative, so a missing first message never counts as too old.
+The age computed from it is negative, so a missing first message is never too old.
 """
 MAX_STEP_BACK = 4
 """Maximum number of older messages that a read tries in place of a bad one."""
@@ -68,12 +68,12 @@ class Reading(NamedTuple, Generic[M]):
 
     @property
     def is_new(self) -> bool:
-        """True if this is the first cycle that reads the message."""
+        """True if no earlier read has returned this message."""
         return self.verdict is Verdict.NEW
 
     @property
     def has_message(self) -> bool:
-        """True if any message has been received yet."""
+        """True if at least one message has been received."""
         return self.verdict is not Verdict.NONE
 
 
@@ -191,14 +191,14 @@ class Writer:
         self.slots.publish_gap()
 
     def iterate_outgoing(self) -> Iterator[None]:
-        """Copy each message of this cycle into `message`, and yield for the caller to publish it.
+        """Yield once for each message of this cycle. The caller publishes `message` each time.
 
-        Only a queue can have more than one message in a cycle.
+        A queue may have any number of messages in a cycle. Other mailboxes have one.
         """
         yield
 
     def show_published(self) -> None:
-        """Make published messages visible to readers. Only queues need this step."""
+        """Make published messages visible to readers. Does nothing except in a queue."""
 
     @property
     def serial(self) -> int:
@@ -231,7 +231,7 @@ class ReadStatistics:
     forged: int = 0  # messages of a process that does not hold the claim
     forger: int = 0  # process id of the last such process
     held_up: int = 0  # accesses that timed out because a dead or stopped process held the lock
-    lost: int = 0  # of a queue: serials without a message
+    lost: int = 0  # serials without a message; 0 except for queues
 
 
 # A reader's state is private memory that the reader shares with compiled code. It consists of five
@@ -247,7 +247,7 @@ GOOD_OFFSET = 40
 class Reader:
     """Reader of a mailbox, under protocol time-slice.
 
-    The work of a read is bounded by the mailbox's depth.
+    The number of slots that a read examines is limited by the mailbox's depth.
 
     Attributes:
         serial: Serial of the last good message, 0 before the first.
@@ -272,7 +272,7 @@ class Reader:
     def __init__(self, segment: Segment, name: str) -> None:
         self.spec = segment.layout.find_mailbox(name)
         self.slots = slots = Slots(segment, self.spec)
-        # The last good message has a separate buffer, which a corrupt copy never reaches.
+        # The last good message has a separate buffer, so that a corrupt copy cannot overwrite it.
         state = memoryview(bytearray(GOOD_OFFSET + len(slots.record)))
         good = Slots(segment, self.spec, state[GOOD_OFFSET:])
         self.good = good.record
@@ -286,9 +286,9 @@ class Reader:
         self.statistics = ReadStatistics()
 
     def get_reading(self, is_new: bool) -> Reading[AnyMessage]:
-        """Return the last good message with verdict NEW if `is_new`, otherwise OLD.
+        """Return the last good message with verdict NEW if `is_new`, otherwise OLD or NONE.
 
-        Instead of OLD, the verdict is NONE if no message has been received yet.
+        The verdict is NONE if no message has been received yet.
         """
         return self._new if is_new else self._unchanged
 
@@ -307,10 +307,11 @@ class Reader:
         return self._accept(serial, tick)
 
     def _accept(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Accept the message found by a read or, if it is bad, an older one. Returns the reading.
+        """Return the reading of a message or, if it is bad, of an older one.
 
         Args:
-            serial: Serial of the message.
+            serial: Serial of the message found by the read. If it is the serial of the last good
+                message, this message is returned again with verdict OLD or NONE.
             tick: Release tick of the cycle that reads.
         """
         self.found = serial
@@ -319,9 +320,10 @@ class Reader:
         return self._new if self._fetch_good(serial) else self._accept_older(serial, tick)
 
     def _accept_older(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Count a bad message, and accept the newest unread good message before it.
+        """Count message `serial` as bad, and return an older one as `_step_back` does.
 
-        If the slot of the message is being overwritten, the read counts as timed out.
+        If the slot of the bad message is being overwritten, the read is counted as timed out, and
+        the result is the last good message with verdict BUS_ERROR.
         """
         if not self.slots.is_intact(serial):
             return self._count_timeout()
@@ -330,7 +332,11 @@ class Reader:
         return self._step_back(serial, tick)
 
     def _fetch_good(self, serial: int) -> bool:
-        """Fetch a message, and make it the last good one. Returns False if it is bad."""
+        """Fetch a message and, if it is good, make it the last good one.
+
+        Returns:
+            False if the message is bad.
+        """
         self.transfers += 1
         slots = self.slots
         if not slots.fetch_message(serial):
@@ -343,14 +349,14 @@ class Reader:
         return True
 
     def _step_back(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Accept the newest unread good message before a bad one.
+        """Return the newest unread good message before a bad one.
 
         Args:
             serial: Serial of the bad message.
             tick: Release tick of the reading cycle.
 
         Returns:
-            The reading with this message or, if there is none, with the last good one again.
+            The reading with this message. If there is none, the last good message again.
         """
         slots = self.slots
         tries = MAX_STEP_BACK
@@ -392,9 +398,10 @@ class Reader:
         return self._readings[verdict]
 
     def add_earlier(self, reading: Reading[AnyMessage], before: int) -> Reading[AnyMessage]:
-        """Return the reading with the unread messages before its own in `earlier`, oldest first.
+        """Return a copy of `reading` whose `earlier` contains the messages that the read skipped.
 
-        Bad messages and messages whose slots have been reused are left out.
+        The oldest message comes first. Bad messages and messages whose slots have been reused are
+        left out.
 
         Args:
             reading: Result of a read.
@@ -405,17 +412,17 @@ class Reader:
         return reading._replace(earlier=tuple(self.slots.iterate_between(before, self.serial)))
 
     def peek(self) -> Reading[AnyMessage]:
-        """Return the newest complete message, even if it is not visible yet."""
+        """Return the newest complete message with its verdict, even if it is not visible yet."""
         head = self.slots.box[0]
         self.slots.fence()
         return self._accept(head, NO_MESSAGE_TICK)
 
 
 class DoubleBufferWriter(Writer):
-    """Writer under protocol double-buffer, whose messages are visible as soon as complete."""
+    """Writer under protocol double-buffer. A message is visible as soon as it is complete."""
 
     def compute_visible_tick(self, tick: int, now: int | None) -> int:
-        """Return the tick at which a message is written, because it is visible at once."""
+        """Return `now`, or `tick` if `now` is None: a message is visible once it is written."""
         return tick if now is None else now
 
 

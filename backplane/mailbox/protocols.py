@@ -37,7 +37,7 @@ A process holds it for one or two microseconds, or for some hundred if it is pre
 
 
 class MailboxLock:
-    """Mutual exclusion on one mailbox, with a bounded wait.
+    """Lock on one mailbox. A process waits for it only for a limited time.
 
     Attributes:
         held_up: Number of waits that timed out while a dead or stopped process held the lock.
@@ -52,19 +52,19 @@ class MailboxLock:
         self.held_up = 0
 
     def acquire(self) -> bool:
-        """Wait a bounded time for the lock. Returns False if another process still holds it."""
+        """Wait a limited time for the lock. Returns False if another process still holds it."""
         if not self._semaphore.acquire(self._wait_s):
             holder = self._box[Box.OWNER]
-            # The holder may have released the lock and ended since the wait.
+            # Read the owner again, because it may have released the lock and ended after the wait.
             if (
                 holder
                 and read_state(holder) in ENDED_STATES + STOPPED_STATES
                 and self._box[Box.OWNER] == holder
             ):
                 self.held_up += 1
-        # After a timeout, the kernel's lock is free if the holder of the semaphore is dead. One of
-        # the processes whose wait timed out then gets it. A process that has obtained the semaphore
-        # may therefore still find the kernel's lock taken.
+        # Try the kernel's lock even after a timeout: it is free if the holder of the semaphore is
+        # dead. It may be taken even if this process has obtained the semaphore, because another
+        # process may have got it after a timeout.
         if not self._owner.take():
             return False
         self._box[Box.OWNER] = os.getpid()
@@ -154,7 +154,7 @@ OBSERVERS: dict[Protocol, type[Reader]] = {**READERS, "lock": DoubleBufferReader
 
 
 def open_writer(segment: Segment, name: str) -> Writer:
-    """Claim a mailbox for writing under its protocol.
+    """Open and claim a mailbox for writing under its protocol.
 
     Raises:
         MailboxError: The mailbox has another writer.
@@ -182,7 +182,7 @@ def open_reader(
 
 
 def open_observer(segment: Segment, name: str) -> Reader:
-    """Open a mailbox for reading its newest message without any effect on other readers.
+    """Open a mailbox so that reading its newest message has no effect on other processes.
 
     The clock and processes on the host side, such as tools, use observers.
     """

@@ -91,7 +91,8 @@ class QueueWriter(Writer):
     `write` once per cycle to publish these messages.
 
     Attributes:
-        position: Reader of the position of the queue's reader. The board reads it at every release.
+        position: Reader of the mailbox with the position of the queue's reader. The board reads it
+            at every release.
     """
 
     def __init__(self, segment: Segment, name: str) -> None:
@@ -113,9 +114,12 @@ class QueueWriter(Writer):
         return max(0, self.spec.capacity - unread)
 
     def send(self, basis: int | None = None) -> bool:
-        """Send a copy of `message` at the end of this cycle. Returns False if the queue is full.
+        """Store a copy of `message`, to be published at the end of this cycle.
 
-        `basis` is ignored: `write` states the basis of all messages of a cycle.
+        `basis` is ignored, because `write` gets the basis of all messages of a cycle.
+
+        Returns:
+            False if the queue is full. The message is counted as refused.
         """
         if not self.count_free_places():
             self.refused += 1
@@ -159,9 +163,9 @@ class QueueWriter(Writer):
         return self._shown_at
 
     def iterate_outgoing(self) -> Iterator[None]:
-        """Copy each message of this cycle into `message`, and yield for the caller to publish it.
+        """Yield once for each message sent in this cycle, after copying it into `message`.
 
-        At the end, the original content of `message` is restored.
+        The caller publishes it. At the end, the original content of `message` is restored.
         """
         slots = self.slots
         present = bytes(self.message.raw)
@@ -194,7 +198,7 @@ class QueueWriter(Writer):
         slots.publish_gap()
 
     def show_published(self) -> None:
-        """Publish all messages written to the slots, first to observers and then to the reader."""
+        """Make the messages in the slots visible, first to observers and then to the reader."""
         self._shared[Box.HEAD] = serial = self.serial
         self._shared[Box.SENT] = serial
 
@@ -220,7 +224,7 @@ class QueueReader(Reader):
             self.transfers = 0
 
     def read(self, tick: int) -> Reading[AnyMessage]:
-        """Take all messages visible at `tick`, and return them as `take_messages` does."""
+        """Take all messages visible at `tick`, and return the reading as `take_messages` does."""
         return self.take_messages(tick, UNLIMITED)
 
     def take_messages(self, tick: int, most: int, now: int | None = None) -> Reading[AnyMessage]:
@@ -232,8 +236,8 @@ class QueueReader(Reader):
             now: Current tick, as in `Writer.write`.
 
         Returns:
-            The newest message taken, with the others of this read in `earlier`. If none was taken,
-                the last message again with verdict OLD or NONE.
+            The newest message taken, with the others taken by this call in `earlier`. If none was
+                taken, the last message again with verdict OLD or NONE.
         """
         self.accesses += 1
         slots = self.slots

@@ -193,14 +193,18 @@ def open_alarm_ring(segment: Segment, task: str) -> Ring:
 
 
 CLEAN_READS = 20
-"""Number of accesses, and of cycles of the writer, without a finding that end an episode."""
+"""Number of accesses, and of cycles of the writer, without a finding after which an episode ends.
+
+It ends when both numbers are exceeded.
+"""
 
 
 class Episodes:
-    """Raises the alarms about one mailbox, once per episode, however long a fault lasts.
+    """Raises alarms about one mailbox: one per episode, however long a fault lasts.
 
-    An episode begins with the first finding of a kind, such as a damaged message, and ends after a
-    time without another one (`CLEAN_READS`).
+    Each kind of finding, such as a damaged message, has separate episodes. An episode begins with a
+    finding and ends once no other has followed for `CLEAN_READS` accesses and as many cycles of the
+    writer.
     """
 
     def __init__(self, segment: Segment, name: str, alarms: AlarmWriter) -> None:

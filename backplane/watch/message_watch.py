@@ -121,7 +121,7 @@ class MessageWatch:
         ):
             head = slots.heads[serial & mask]
             released = head[Slot.TICK]
-            # The reader has verified the checksum only of the message that it took.
+            # The reader has verified the checksum of the message that it took, but of no other.
             if (
                 head[Slot.SERIAL] == serial
                 and self.newest < released > head[Slot.VISIBLE_AT] - late
@@ -138,7 +138,7 @@ class MessageWatch:
             self.seen = serial
 
     def _check_unusual(self, serial: int, tick: int) -> bool:
-        """Record whether a message is lost, damaged, late or out of order.
+        """Record a finding if a message is lost, damaged, late or out of order.
 
         Returns:
             False if it is too early to decide. The message must then be checked again later.
@@ -151,8 +151,8 @@ class MessageWatch:
         if slots.serial == serial and slots.passes_check:
             self._check_timing(slots.tick, slots.visible, tick)
         elif slots.serial == 0 or slots.passes_check:
-            # The slot is empty or contains another complete message, so this message is lost. That
-            # is not reported before the first tick at which the message would have been visible.
+            # The slot is empty or contains another complete message, so this message is lost. Do
+            # not report that before the first tick at which the message would have been visible.
             if self._is_sliced and expected + self._spec.delay > tick:
                 return False
             self.newest = expected

@@ -22,7 +22,7 @@ from rack.backplane.watch.message_watch import LONG_AGO, MessageWatch
 from rack.backplane.words import Block, Box, is_switched_on
 
 MUTE_CYCLES = 3
-"""Age of the newest message, in cycles of the writer, from which its silence is checked.
+"""Age of the newest message, in cycles of its writer, from which the writer may be mute.
 
 An age of two is normal.
 """
@@ -31,7 +31,7 @@ STALE_CYCLES = 4
 
 
 class ReadingTask:
-    """State of the reading task that its readers and watches share.
+    """State of a reading task, shared by its readers and watches.
 
     After a pause of this task or of the clock, all messages are old although no writer is silent.
     The watches must therefore know when the task has paused.
@@ -52,7 +52,7 @@ class ReadingTask:
         self._step = NO_MESSAGE_TICK
 
     def record_read(self, tick: int) -> None:
-        """Record a read at `tick`. An interval that is longer than usual is treated as a pause."""
+        """Record a read at `tick`. If more ticks than usual have passed, the task has paused."""
         step = tick - self._last
         if step != self._step:
             if step > self._step:
@@ -89,7 +89,8 @@ class SilenceWatch(MessageWatch):
     def is_lost(self, tick: int) -> bool:
         """Check whether the writer is lost or has been silent for too long.
 
-        An alarm is raised if the writer is proved to be dead, stopped or mute.
+        If the mailbox is written in every period, an alarm is raised if the writer is dead, stopped
+        or mute.
         """
         if max_age := self._reader.spec.max_age:
             box = self._slots.box
@@ -99,7 +100,8 @@ class SilenceWatch(MessageWatch):
         age = tick - newest
         if age >= self.quiet:
             pid = get_pid(self._slots.box[Box.CLAIMANT])
-            # If the loss is already marked, `pid` may be a new process that has not written yet.
+            # If the writer is already marked as lost, `pid` may be its new process, which is alive
+            # but has not written yet.
             if age >= self._stale_after and (
                 self.block[Block.LOST] or read_state(pid) in ENDED_STATES + STOPPED_STATES
             ):
@@ -115,7 +117,7 @@ class SilenceWatch(MessageWatch):
 
         A lack of messages alone does not make it lost.
         """
-        # A loss counts from the tick after it was found. Within that tick, the result would depend
+        # A loss takes effect one tick after it was found. In the same tick, the result would depend
         # on which process is faster.
         return self._reader.newest != NO_MESSAGE_TICK and 0 < self.block[Block.LOST] <= tick
 
@@ -126,16 +128,18 @@ class SilenceWatch(MessageWatch):
             self._episodes.is_open(code, accesses, tick)
             for code in (Alarm.HELD_BACK, Alarm.DISORDER)
         ):
-            # The writer sends messages, but they come late.
+            # The writer is not mute: it sends messages, but they are late or out of order.
             return False
-        # The order matters, because a writer publishes before it reports the cycle as finished.
+        # Read the finished tick before the newest serial, because a writer publishes a message
+        # before it reports its cycle as finished.
         finished = self._cycles.finished_tick
         slots = self._slots
         head = slots.box[0]
-        # A serial whose slot is not filled counts as written: the message was lost, not suppressed.
+        # If the slot of the newest serial is not filled, the writer is not mute: the message was
+        # written and lost.
         spec = self._reader.spec
         due = finished - (finished + spec.lead_ticks - spec.phase) % spec.every
-        # That cycle was not run if the writer was dead, late, or not released by the clock.
+        # The writer may not have run that cycle, because it was dead, late or not released.
         if self._cycles.find_end_ns(due) is None:
             return False
         return slots.copy_slot(head) and slots.serial == head and slots.tick < due

@@ -51,7 +51,7 @@ def open_watched(
 
 
 class MailboxWatcher:
-    """Reader that raises alarms about damaged and forged messages in the task's ring.
+    """Reader of a mailbox that raises alarms if messages are damaged or forged.
 
     It is used for operators' mailboxes, which the clock writes whenever a command is issued. A new
     command need not cancel the effect of an earlier one, so none is skipped: a reading has the
@@ -76,7 +76,7 @@ class MailboxWatcher:
         return self.reader.add_earlier(reading, before)
 
     def is_writer_lost(self, tick: int) -> bool:
-        """Return False. If the clock is lost, no board is released, so no board can notice it."""
+        """Return False: the writer is the clock, without which no board is released to read."""
         return False
 
     @property
@@ -85,7 +85,7 @@ class MailboxWatcher:
         return self.reader.statistics.bad_reads != self._reported.bad_reads
 
     def _report_bad_read(self, tick: int) -> None:
-        """Count a bad read for the task, and raise alarms for a damaged or forged message."""
+        """Add the last read to the task's `troubles`, and raise alarms about a bad message."""
         statistics = self.reader.statistics
         accesses = self.reader.accesses
         self._task.troubles += 1
@@ -149,8 +149,8 @@ class WatchedReader(MailboxWatcher):
 class WatchedQueue(MailboxWatcher):
     """Reader of a queue, which takes as many messages as the level has room for.
 
-    A queue is written on demand, so the silence of its writer is not checked. Only a writer that
-    was found dead or hanging counts as lost.
+    A queue is written on demand, so the silence of its writer is not checked. The writer is lost
+    only if it was found dead or hanging.
     """
 
     reader: QueueReader
@@ -185,7 +185,7 @@ class WatchedQueue(MailboxWatcher):
 
     def is_writer_lost(self, tick: int) -> bool:
         """Check whether the writer has been found lost, without reading the mailbox."""
-        # A loss counts from the tick after it was found. Within that tick, the result would depend
+        # A loss takes effect one tick after it was found. In the same tick, the result would depend
         # on which process is faster.
         return 0 < self._writer[Block.LOST] <= tick
 
@@ -193,7 +193,7 @@ class WatchedQueue(MailboxWatcher):
 class GridReader:
     """Reads a mailbox only at the ticks of a grid, and repeats the last reading in between.
 
-    A read that is due in a skipped cycle is omitted, not made up for in the next cycle. A restarted
+    If the cycle in which a read is due is skipped, the read is omitted, not postponed. A restarted
     task therefore reads at the same ticks as before.
     """
 

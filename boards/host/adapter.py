@@ -23,9 +23,9 @@ class Adapter(Executor):
     """
 
     wired_by: ClassVar[str]
-    """Key of its board's table that lists its ports."""
+    """Key in the table of the adapter's board under which the ports are listed."""
     joins_sides: ClassVar[bool] = False
-    """Whether it connects the real-time side with host boards and reads mailboxes of both."""
+    """Whether the adapter connects tasks with host boards and reads mailboxes of both sides."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -44,8 +44,8 @@ class Adapter(Executor):
             layout: Layout of the rack.
 
         Returns:
-            A dictionary from each such port to whether its messages are sent one by one. Empty if
-            the adapter runs in a replay as in any other run.
+            A dictionary from each such port to True if its messages are sent one by one, otherwise
+            False. Empty if the adapter runs in a replay as in any other run.
         """
         return {}
 

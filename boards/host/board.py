@@ -33,8 +33,8 @@ FAILED_STATUS = 1
 def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output: int) -> int:
     """Run the program of a host board in this process, which becomes the leader of a session.
 
-    Its orphaned descendants become its children. When it ends, they become children of the crate,
-    which kills them.
+    The process becomes the parent of its orphaned descendants. When it ends, the crate becomes
+    their parent and kills them.
 
     Args:
         segment: Segment of the rack.
@@ -49,8 +49,8 @@ def run_host_board(segment: Segment, wiring: HostWiring, attention: int, output:
     adopt_orphans()
     os.dup2(output, 1)
     os.dup2(output, 2)
-    # The crate ignores this signal, and its children inherit that. Raise `SystemExit` instead, so
-    # that the program leaves its `with` and `finally` blocks.
+    # The crate ignores this signal, and its children inherit that. Handle it in this process, so
+    # that the program's `with` and `finally` blocks are executed.
     signal.signal(signal.SIGTERM, _exit_on_signal)
     bus = _open_bus(segment, wiring)
     os.eventfd_write(attention, 1)
@@ -87,7 +87,7 @@ def _open_bus(segment: Segment, wiring: HostWiring) -> HostBus:
 
 
 def _exit_on_signal(number: int, frame: FrameType | None) -> None:
-    """Raise `SystemExit`, as the handler of a signal."""
+    """Handle a signal by raising `SystemExit`."""
     raise SystemExit(f"ended by {signal.Signals(number).name}")
 
 

@@ -19,7 +19,7 @@ from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
 
 WORD = 8
-"""Bytes of a word of the crate's memory."""
+"""Size of a word on the backplane, in bytes."""
 LONGEST_S = 1e9
 """Longest time-out of a paced program in s. Longer time-outs are reduced to it."""
 
@@ -31,7 +31,10 @@ class BusReceiver:
         self._reader = reader
 
     def read(self) -> Reading[AnyMessage]:
-        """Return the newest message and, except in the first read, the unread ones before it."""
+        """Return the newest message, with the unread messages before it in `earlier`.
+
+        In the first read, `earlier` is empty.
+        """
         before = self._reader.serial
         reading = self._reader.peek()
         return self._reader.add_earlier(reading, before) if before else reading
@@ -70,7 +73,7 @@ class BusSender:
 
     @property
     def sent(self) -> int:
-        """Number of messages sent so far."""
+        """Number of messages sent through this port, those of previous processes included."""
         return self._writer.serial
 
 
@@ -116,7 +119,7 @@ class HostBus:
         self.block[Block.STATE] = TaskState.RUNNING
 
     def connect_ports(self, program: HostProgram) -> None:
-        """Set the ports of a program to objects that receive and send messages."""
+        """Set each input of a program to a `BusReceiver`, and each output to a `BusSender`."""
         ports = vars(program)
         for port, mailbox in self._wiring.inputs.items():
             self._segment.message_classes[mailbox] = program.inputs[port].message
@@ -146,7 +149,7 @@ class HostBus:
             timeout_s: Longest time to wait in s. Simulated time for a paced program.
 
         Returns:
-            False after the time-out or at the end of the run.
+            True if a message has arrived. False after the time-out or at the end of the run.
         """
         if self._is_paced:
             ticks = round(min(timeout_s, LONGEST_S) / self._wiring.context.tick_s)
@@ -187,7 +190,7 @@ class HostBus:
 
     @property
     def tasks(self) -> list[str]:
-        """Names of the crate's tasks."""
+        """Names of the rack's tasks."""
         return [task.name for task in self._segment.layout.tasks]
 
     def address(self, name: str) -> int:
@@ -203,14 +206,14 @@ class HostBus:
         return known[name]
 
     def words(self, address: int, count: int = 1) -> list[int]:
-        """Read words of the crate's memory.
+        """Return the values of consecutive words on the backplane.
 
         Args:
             address: Bus address of the first word, a multiple of 8.
             count: Number of words.
 
         Raises:
-            ValueError: The words are not all on the bus.
+            ValueError: The address is not a multiple of 8, or a word is not on the bus.
         """
         size = self._segment.map.size
         last = address + WORD * count

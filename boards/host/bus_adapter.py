@@ -109,7 +109,7 @@ class BusAdapter(Adapter):
 
     @classmethod
     def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return the ports that pass messages of host boards, and the status.
+        """Return the ports that pass messages of host boards, and the status port.
 
         See `Adapter.list_replayed_ports` for the arguments and the result.
         """
@@ -189,8 +189,8 @@ class BusAdapter(Adapter):
         status.error = 0
         status.reason = ""
         if lost:
-            # Report the loss first, because the clock records it at a tick that repeats. In
-            # lockstep the Rack may give a board up at any moment.
+            # Check for a loss first, because it is recorded at the same tick if a lockstep run is
+            # repeated. The tick at which the Rack stops restarting a board may differ.
             status.state = State.HOLDING
             status.reason = f"host board '{lost[0]}' is lost: it is being restarted"
         elif gone:
@@ -201,9 +201,9 @@ class BusAdapter(Adapter):
 
 
 class HostTurn(ReleasedTask):
-    """Gives a host program its turns in lockstep, on behalf of an adapter.
+    """Lets a host program run in turns in lockstep, while its adapter waits.
 
-    `rack.boards.host.bus.HostBus` is their implementation in the program's process.
+    `rack.boards.host.bus.HostBus` is the other side, in the program's process.
     """
 
     def __init__(self, segment: Segment, host: TaskSpec) -> None:
@@ -211,13 +211,13 @@ class HostTurn(ReleasedTask):
         self._segment = segment
 
     def run_turn(self, tick: int) -> None:
-        """If the program is due in the cycle released at `tick`, let it run until it waits.
+        """Let the program run until it waits, if it is due in the cycle released at `tick`.
 
         Raises:
             CannotGoOn: The program has not waited within `LONGEST_S` of real time.
         """
         block = self.block
-        # In a state after RUNNING, the program is finished or was given up.
+        # In a state above RUNNING, the program is finished or will not be restarted.
         if (
             block[Block.STATE] > TaskState.RUNNING
             or block[Block.WAITS_UNTIL] > tick

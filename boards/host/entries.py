@@ -100,7 +100,7 @@ class AdapterParams(Table):
 
     @classmethod
     def read_entries(cls, params: Mapping[str, Any]) -> dict[str, EntryConfig]:
-        """Return the entries in a table of parameters, keyed by port. Empty if it has mistakes."""
+        """Return a parameter table's entries, keyed by port. Empty if the table has mistakes."""
         try:
             return cls.model_validate(params).entries
         except ValidationError:
@@ -136,7 +136,7 @@ class EntryCounters:
         self.written = NEVER if age == NEVER else tick - age
 
     def count_passed(self, tick: int, written: int) -> None:
-        """Count a message, written at tick `written`, that reaches the other side at `tick`."""
+        """Count a message that was written at `written` and reaches the other side at `tick`."""
         self.passed += 1
         self.arrived = tick
         self.written = written
@@ -253,8 +253,8 @@ class OutwardEntry:
         for block, semaphore in self._readers:
             # In lockstep this makes the program due for a turn.
             block[Block.WAITS_UNTIL] = 0
-            # Do not count above 1, or the semaphore of a host board that never waits would
-            # overflow.
+            # Post only if no post is pending, or the semaphore of a host board that never waits
+            # would overflow.
             if not semaphore.value:
                 semaphore.release()
 

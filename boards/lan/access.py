@@ -62,7 +62,7 @@ def build_access_control(rack: str, table: LanTable, is_operator: bool) -> dict[
         by_subject[ANYONE] = [
             *_list_presence_rules(rack),
             *_list_export_rules(exported),
-            # Let others measure this rack's clock: they cannot use messages of unknown age.
+            # Let the others measure this rack's clock. They cannot use messages of unknown age.
             (OUT, SUBSCRIBE, [ping_key("*", rack)]),
             (IN, PUT, [ping_key("*", rack)]),
             (IN, SUBSCRIBE, [pong_key("*", "*")]),
@@ -100,7 +100,7 @@ def _list_exchange_rules(rack: str, peer: str, table: LanTable) -> list[Rule]:
 
 
 def _list_export_rules(keys: Sequence[str]) -> list[Rule]:
-    """Return the rules that let others subscribe to keys under which this rack sends."""
+    """Return the rules that let others subscribe to `keys`, under which this rack sends."""
     return [(IN, SUBSCRIBE, keys), (OUT, PUT, keys)] if keys else []
 
 

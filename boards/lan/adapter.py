@@ -1,4 +1,4 @@
-"""Network adapter: a bus adapter that connects the rack to a network through eclipse-zenoh.
+"""Network adapter, which connects the rack to other racks through eclipse-zenoh.
 
 It is an ordinary board with a rate and a higher priority than its neighbours. In each cycle it
 sends exports, receives imports, updates which racks are present, and sets the emergency stop on
@@ -45,7 +45,7 @@ _LAUNCH_MASK = (1 << 62) - 1
 
 
 class LanAdapter(Adapter):
-    """Exchanges mailboxes with other racks.
+    """Adapter that exchanges mailboxes with other racks over a network.
 
     Besides the imported mailboxes it writes a status, with counters for every export and import,
     and one mailbox with the presence of each other rack.
@@ -109,15 +109,17 @@ class LanAdapter(Adapter):
 
     @classmethod
     def list_replayed_ports(cls, params: Mapping[str, Any], layout: Layout) -> Mapping[str, bool]:
-        """Return a dictionary from each port that a replay writes to whether it is an import.
+        """Return the output ports whose recorded messages a replay writes again.
 
-        Only the messages of imports are sent one by one.
+        Returns:
+            A dictionary from each such port to True for an import, whose messages are sent one by
+            one, or False for the status or a presence.
         """
         imports = read_params(LanTable, params).imports
         return {port: port in imports for port in cls.build_ports(params, {}).outputs}
 
     def attach_segment(self, segment: Segment, entries: RecordedEntries | None) -> None:
-        """Attach to the segment and continue from the state of the mailboxes.
+        """Attach to the segment. After a restart, restore the state from the adapter's mailboxes.
 
         Args:
             segment: Segment of the rack.
@@ -131,8 +133,8 @@ class LanAdapter(Adapter):
         self._rack = segment.rack
         self._launch = launch
         self._grid = OwnGrid(segment, self.context.every)
-        # After a restart, the tokens of running racks reappear at the latest after one lease and
-        # one attempt to connect.
+        # After a restart, the tokens of running racks reappear at the latest after the lease time
+        # plus the time between two attempts to connect.
         confirm_by_tick = words[System.TICK] + self._grid.ticks_in(
             (table.lease_ms + RETRY_MS[1]) * 1e6
         )
@@ -266,7 +268,11 @@ class LanAdapter(Adapter):
         status.state = State.HOLDING if reason else State.EXECUTING
 
     def _find_trouble(self, tick: int) -> str:
-        """Return the reason why the exchange is incomplete, or an empty string."""
+        """Return the reason why messages of another rack are missing or too old.
+
+        Returns:
+            The reason. An empty string if all racks are present and all messages recent enough.
+        """
         for peer in self._peers:
             if not peer.is_present:
                 return f"rack '{peer.rack}' is {'lost' if peer.launches else 'not there yet'}"
@@ -278,7 +284,7 @@ class LanAdapter(Adapter):
         return f"'{self._table.imports[ports[0]].source}' is older than max_age_ms" if ports else ""
 
     def close(self) -> None:
-        """Leave the network. In lockstep, first tell the other racks if the run is over."""
+        """Close the session. In lockstep, first inform the other racks if the run is over."""
         if self._barrier is not None:
             self._barrier.close()
         if self._link is not None:

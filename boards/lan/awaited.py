@@ -15,7 +15,10 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block
 
 GIVE_UP_S = 20.0
-"""Real time in s after which a rack without an adapter counts as lost. A restart takes less."""
+"""Real time in s after which a rack whose adapter has ended is considered lost.
+
+A restart of the adapter takes less.
+"""
 _PLACES = 8
 
 

@@ -262,7 +262,8 @@ def _is_p256(key: object) -> TypeGuard[EllipticCurvePublicKey]:
 def _identify_chain(chain: bytes, authorities: list[Certificate]) -> Identity | None:
     """Return the identity of the first certificate of a DER chain.
 
-    None if the chain is malformed or not signed by an authority, or if the key is not on P-256.
+    The result is None if the chain is malformed or not signed by an authority, or if the key is not
+    on P-256.
     """
     certificates = []
     try:
@@ -275,7 +276,7 @@ def _identify_chain(chain: bytes, authorities: list[Certificate]) -> Identity | 
         name = _read_common_name(certificates[0])
         key = certificates[0].public_key()
     except Exception:
-        # The bytes come from a stranger, and the parser may raise undocumented exceptions.
+        # Anyone may have sent these bytes, and the parser may raise undocumented exceptions.
         return None
     if not trusted or not _is_p256(key):
         return None
@@ -308,7 +309,8 @@ def _find_trust_path(chain: list[Certificate], authorities: list[Certificate]) -
         The certificates of the path. Empty if the chain does not lead to an authority, for example
         if the certificate of one rack has signed the certificate of another.
     """
-    # As in TLS, an authority must be marked as one. Other certificates may have any extensions.
+    # As in TLS, the certificate of an authority must be marked as such. The other certificates may
+    # have any extensions.
     any_kind = ExtensionPolicy.permit_all()
     authority = any_kind.require_present(BasicConstraints, Criticality.AGNOSTIC, None)
     policy = PolicyBuilder().store(Store(authorities))

@@ -61,7 +61,7 @@ class Endpoint(NamedTuple):
 
     @property
     def has_tls(self) -> bool:
-        """Whether both sides must show certificates."""
+        """Whether connections use TLS, so that both sides must show certificates."""
         return self.protocol in TLS
 
     @property

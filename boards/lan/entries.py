@@ -45,28 +45,32 @@ class SequenceTracker:
         self._arrived = 0  # bit n is set if message `number` - n has arrived
 
     def resume_from_counts(self) -> None:
-        """Continue after the newest message in the counters. All earlier ones count as arrived."""
+        """Resume tracking after the newest message recorded in `count`.
+
+        All earlier messages are treated as received.
+        """
         self.launch = self.count.launch
         self._arrived = _WHOLE
 
     def accept_message(self, head: Envelope) -> bool:
-        """Record a message and check whether it should be delivered.
+        """Update the counters for a received message, and check whether to deliver it.
 
         Returns:
-            True if the message is newer than every earlier one. Messages missing before it are
-            counted. Any other message is counted as repeated or disordered.
+            True if the message is newer than all received before. Message numbers that were skipped
+            are counted as missing. False if it is not, and the message is counted as repeated or
+            disordered.
         """
         count = self.count
         if head.launch != self.launch:
-            # A new launch starts a new sequence, and its messages before this one do not count as
-            # missing. Without a launch but with a serial, the counters were resumed in lockstep,
-            # where the status contains no launch: the launch is then still the same.
+            # A new launch starts a new sequence. The messages that it sent before this one are not
+            # counted as missing. If a serial is known but no launch, the counters were resumed from
+            # a status in lockstep, which contains no launch. The launch is then still the same.
             if self.launch != NO_LAUNCH or not count.serial:
                 count.number = head.number
                 count.serial = 0
                 self._arrived = 0
             self.launch = head.launch
-        # A restarted sender may use a number twice, so the serial decides what is newer.
+        # A restarted sender may use a number twice, so the serial decides which message is newer.
         step = head.number - count.number
         if head.serial <= count.serial:
             bit = 1 << min(max(0, -step), WINDOW_MESSAGES)
@@ -117,7 +121,7 @@ class Export:
         self._sealer = sealer
 
     def resend_last(self, tick: int, cycle_ticks: int) -> None:
-        """Repeat the message that the previous adapter sent at `tick`, if it sent one.
+        """Send again the message that the previous adapter sent at `tick`, if it sent one.
 
         Args:
             tick: Release of the last cycle of the previous adapter.
@@ -134,9 +138,9 @@ class Export:
             self.send_newest(tick)
 
     def send_newest(self, tick: int) -> None:
-        """Send the newest message if it was not sent before.
+        """Send the mailbox's newest message if it was not sent before.
 
-        In real time, send it again if a rack has joined since.
+        In real time, a message that was sent before is sent again if `must_resend` is set.
         """
         # Read the mailbox directly, because a port gives neither the serial nor the written tick.
         source = self._source
@@ -232,7 +236,7 @@ class Import:
                 self._set_away(True, tick + self._delay if self._grid.is_lockstep else tick)
 
     def mark_present(self, tick: int) -> None:
-        """Mark the mailbox as present once the message of this cycle becomes visible."""
+        """Mark the mailbox as present from the tick at which this cycle's message is visible."""
         if self._is_away:
             self._set_away(False, tick + self._delay)
 
@@ -242,7 +246,7 @@ class Import:
         self._box[self._word] = encode_switch(tick, is_away)
 
     def deliver_newest(self, out: Sender[AnyMessage], tick: int) -> None:
-        """Process the messages that have arrived. Write the newest valid one unless it is too old.
+        """Check the messages that have arrived, and write the newest valid one if recent enough.
 
         Args:
             out: Output port of the import.
@@ -318,7 +322,7 @@ class Import:
         for _, kept_message in self._early:
             kept_head = self._open_message(kept_message)
             if kept_head is not None and self._is_present_launch(kept_head):
-                # Record its arrival, so that it does not count as missing.
+                # Record its arrival, so that it is not counted as missing.
                 self.count.superseded += self._order.accept_message(kept_head)
             else:
                 self.count.unknown_launch += 1
@@ -330,7 +334,11 @@ class Import:
         return self._peer.is_present and head.launch == self._peer.launch
 
     def _keep_if_newest(self, head: Envelope, payload: bytes) -> bool:
-        """Store a message and return True if it is well formed and newer than all stored before."""
+        """Store a message if its values are permitted and it is newer than all received before.
+
+        Returns:
+            True if it was stored. Otherwise it is counted as refused, repeated or disordered.
+        """
         message = AnyMessage(self._buffer.record.dtype, memoryview(bytearray(payload)))
         if not has_permitted_values(message.record, self._fields):
             self.count.refused += 1

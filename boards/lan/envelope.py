@@ -88,7 +88,7 @@ class Sealer:
     """Seals outgoing messages and checks the seals of received ones.
 
     Attributes:
-        flaws: How often each flaw was found.
+        flaws: Number of messages rejected for each flaw.
 
     Raises:
         CredentialError: The files cannot be used.
@@ -98,7 +98,7 @@ class Sealer:
         self._credentials = credentials
         self._pair = credentials.key_pair if credentials else None
         if credentials and self._pair:
-            # Identify once now: the first identification takes as long as a whole cycle.
+            # Identify a sender once now, because the first identification takes as long as a cycle.
             credentials.identify_sender(self._pair.chain)
         self._most_bytes = most_bytes
         self.flaws = dict.fromkeys(Flaw, 0)
@@ -110,7 +110,7 @@ class Sealer:
         return sealer
 
     def resume_counts(self, flaws: Iterable[int]) -> None:
-        """Continue from the counts of the previous adapter, in the order of `Flaw`."""
+        """Set the counts to those of the previous adapter, given in the order of `Flaw`."""
         self.flaws |= zip(Flaw, flaws, strict=False)
 
     def seal(self, key: str, head: Envelope, payload: bytes | memoryview) -> bytes:
@@ -127,7 +127,7 @@ class Sealer:
         return packed + (self._pair.sign_digest(digest) if self._pair else digest)
 
     def open_message(self, key: str, envelope: bytes | None, payload: bytes) -> Envelope | Flaw:
-        """Check length, format and seal of a received message. If one is wrong, count the flaw.
+        """Check length, format and seal of a received message. Count the first flaw found.
 
         Args:
             key: Key expression under which the message arrived.
@@ -175,7 +175,7 @@ class Sealer:
 def _compute_digest(key: str, packed: bytes, payload: bytes | memoryview) -> bytes:
     """Return the SHA-256 of head, certificates, key expression and payload."""
     digest = sha256(packed)
-    # Include the length of the key, so that no bytes can move between key and payload.
+    # Include the length of the key, so that moving bytes between key and payload changes the hash.
     digest.update(f"{len(key)}:{key}".encode())
     digest.update(payload)
     return digest.digest()

@@ -54,7 +54,7 @@ class OwnGrid:
     def to_local_tick(self, head: Envelope, peer: PeerRack, tick: int) -> int:
         """Convert the time at which another rack wrote a message to a tick of this rack.
 
-        A message never counts as younger than it is: see `to_local_ns`.
+        The result is never later than the true time: see `to_local_ns`.
 
         Args:
             head: Envelope of the message.
@@ -66,7 +66,8 @@ class OwnGrid:
     def to_local_ns(self, head: Envelope, peer: PeerRack, age_ns: int = 0) -> int:
         """Convert the time of a message of another rack to simulated time of this rack in ns.
 
-        The result is early by the uncertainty of the clock comparison.
+        The uncertainty of the clock offset is subtracted, so that the result is never later than
+        the true time.
 
         Args:
             head: Envelope of the message.

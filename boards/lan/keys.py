@@ -81,8 +81,8 @@ def estop_key(sender: str, to: str) -> str:
 
 
 def estop_answer_key(rack: str, to: str) -> str:
-    """Return the key with which a rack seals its answer to an emergency-stop request.
+    """Return the key expression that a rack seals into its answer to an emergency-stop request.
 
-    It differs from the request's key, so that a request cannot be replayed as an answer.
+    It differs from the request's key expression, so that a request cannot be replayed as an answer.
     """
     return f"rack/{rack}/estop-answer/{to}"

@@ -74,7 +74,7 @@ class Question(NamedTuple):
 
 
 class LanLink:
-    """Open session of a rack or an operator.
+    """Open zenoh session of a rack or an operator.
 
     Args:
         rack: Name of the rack or the operator.
@@ -269,10 +269,10 @@ def _build_settings(
         "transport/link/tx/lease": round(table.lease_ms),
         "transport/link/tx/keep_alive": KEEP_ALIVES,
         "transport/link/tx/queue/size/real_time": 16,
-        # An answer inherits the congestion control of its question, which must not make the
+        # An answer inherits the congestion control of its question. Sending it must not make the
         # adapter wait.
         "qos/network": [NO_WAIT],
-        # In lockstep, sending waits for room, but not longer than until the peer counts as lost.
+        # In lockstep, sending waits for room in the queue, but at most for the lease time.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(
             table.lease_ms * 1e3
         ),

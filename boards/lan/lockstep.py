@@ -52,7 +52,7 @@ class StepFlag(IntFlag):
 
 
 class Step(NamedTuple):
-    """One step of a rack.
+    """Message that a rack sends to the others in each cycle in lockstep.
 
     Attributes:
         head: Envelope of the step.
@@ -68,7 +68,7 @@ class Step(NamedTuple):
 
 
 def pack_step(cycle_ns: int, racks: Iterable[str], exports: Sequence[ReceivedMessage]) -> bytes:
-    """Serialise a step.
+    """Serialise the content of a step.
 
     Args:
         cycle_ns: Length of the adapter's cycle in ns of simulated time.
@@ -88,7 +88,7 @@ def unpack_step(head: Envelope, content: bytes) -> Step | None:
     except ZDeserializeError:
         return None
     exports = [ReceivedMessage(*export) for export in export_tuples]
-    # The deserialiser ignores trailing bytes, so compare with what the step packs to.
+    # The deserialiser ignores trailing bytes. To detect them, pack the step again and compare.
     if pack_step(cycle_ns, racks, exports) != content:
         return None
     return Step(head, cycle_ns, racks, exports)
@@ -120,7 +120,7 @@ class Partner:
         self.reset_state()
 
     def reset_state(self) -> None:
-        """Return to the initial state, in which the rack is awaited."""
+        """Reset to the initial state, in which this rack waits for the other one."""
         self.launch = NO_LAUNCH
         self.time_ns = NEVER
         self.steps: deque[Step] = deque()
@@ -176,7 +176,7 @@ class Barrier:
             segment: Segment of the rack.
             board: Board of the adapter.
             racks: Racks with which to run in lockstep.
-            lost: Racks that the previous adapter has already lost. They take no part.
+            lost: Racks that were lost before this adapter was restarted. They do not take part.
         """
         self._segment = segment
         self._block = segment.get_block(board)
@@ -196,7 +196,7 @@ class Barrier:
         self._exports: list[ReceivedMessage] = []
         self._imports: dict[str, deque[ReceivedMessage]] = {}
         self._changes: list[tuple[str, int, bool]] = []
-        # Another rack lacks at most the newest two steps.
+        # Keep two steps: another rack can lack at most the newest two.
         self._steps: deque[tuple[int, bytes]] = deque(maxlen=2)
         self._now_ns = NEVER
         self._sent = 0
@@ -210,7 +210,7 @@ class Barrier:
         self._sealer = link.sealer.with_limit(MAX_STEP_BYTES)
         self._key = step_key(link.rack)
         self._put = link.publish(self._key, reliable=True)
-        # Called in a thread of zenoh, so the handler only wakes the waiting cycle.
+        # The handler is called in a thread of zenoh, so it only queues the sample.
         handler = zenoh.handlers.Callback(self._events.put, indirect=False)
         for partner in self._partners.values():
             self._subscribers.append(
@@ -291,7 +291,7 @@ class Barrier:
         return True
 
     def close(self) -> None:
-        """Tell the other racks to continue without this one if its run has ended.
+        """If the run has ended or lockstep was refused, tell other racks not to wait for this one.
 
         Nothing is sent if only this board ends, because it may be restarted.
         """
@@ -308,18 +308,21 @@ class Barrier:
         self._put(content, self._sealer.seal(self._key, head, content))
 
     def _resend_steps(self, flags: StepFlag) -> None:
-        """Send the newest steps again for a rack that may have missed them. Others ignore them."""
+        """Send the last two steps again for a rack that may have missed them.
+
+        Racks that have received these steps ignore them.
+        """
         for time_ns, content in self._steps:
             self._send_step(time_ns, content, flags)
 
     @property
     def _first_flag(self) -> StepFlag:
-        """`FIRST` until the first exchange is complete, afterwards no flag."""
+        """Flag `FIRST` until the first exchange of steps is complete, afterwards 0."""
         return StepFlag.FIRST if self._is_first else StepFlag(0)
 
     @property
     def _is_over(self) -> bool:
-        """Whether the run is over or was asked to stop."""
+        """Whether the run is over, or its end has been requested."""
         return bool(self._segment.words[System.STOP_REQUEST]) or self._segment.run_is_over
 
     def _process_sample(self, sample: zenoh.Sample) -> None:
@@ -344,7 +347,7 @@ class Barrier:
         """Process a change of another rack's liveliness token.
 
         If the token has appeared, resend this rack's newest steps. If it has expired, start the
-        time-out after which the rack counts as lost.
+        time-out after which the rack is considered lost.
         """
         if is_present and partner.launch in (NO_LAUNCH, launch):
             self._check_cycle(partner, cycle_ns)
@@ -379,7 +382,7 @@ class Barrier:
             )
         partner.add_step(step)
         if partner.is_out and flags & StepFlag.FIRST and not self._has_begun:
-            # Neither run has begun, so the other rack may be started again.
+            # Neither run has begun, so the other rack may be launched again.
             partner.reset_state()
         elif flags & StepFlag.FIRST:
             # The other rack may have started too late to receive the step of this cycle. Repeat it
@@ -387,10 +390,10 @@ class Barrier:
             self._resend_steps(StepFlag(0))
 
     def _is_partner_launch(self, partner: Partner, launch: int) -> bool:
-        """Return True if a launch of another rack may take part. A new one replaces the last one.
+        """Return True if a launch of another rack may take part.
 
-        Once the run has begun, a second launch of a rack cannot join, and the rack no longer takes
-        part.
+        Until the run begins, a new launch replaces the previous one. Later it cannot replace it,
+        and the rack no longer takes part.
         """
         if partner.launch != launch:
             if self._has_begun and partner.launch != NO_LAUNCH:
@@ -401,7 +404,7 @@ class Barrier:
         return True
 
     def _check_cycle(self, partner: Partner, cycle_ns: int) -> None:
-        """Raise `CannotGoOn` if the other rack is in real time or has another cycle length."""
+        """Raise `CannotGoOn` if the other rack runs in real time or with another cycle length."""
         if not cycle_ns:
             self._refuse_lockstep(f"rack '{partner.rack}' runs in real time, this one in lockstep")
         if cycle_ns != self.cycle_ns:
@@ -416,9 +419,9 @@ class Barrier:
         raise CannotGoOn(why)
 
     def _deliver_exports(self, partner: Partner) -> None:
-        """Deliver what a rack exported up to this cycle, and record a change of its presence."""
+        """Deliver a rack's exports up to this cycle, and record a change of its presence."""
         for step in partner.take_steps(self._now_ns):
-            # After a restart of this adapter, steps that it had delivered arrive again. Skip them.
+            # Skip steps that were delivered before this adapter was restarted. They arrive again.
             for export in step.exports if step.head.time_ns > self._passed_ns else ():
                 if export.key.split("/")[1] == partner.rack and export.key in self._imports:
                     self._imports[export.key].append(export)

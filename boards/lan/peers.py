@@ -1,4 +1,4 @@
-"""Presence of the other racks as an adapter sees it: present or lost, and in which launch.
+"""Presence of the other racks: whether each is awaited, present or lost, and in which launch.
 
 Each launch of a rack has a number, which is contained in its liveliness token and in all its
 messages. Tokens may appear and expire in any order. The token of a restarted rack may appear before
@@ -38,11 +38,11 @@ class PeerRack:
     Attributes:
         rack: Name of the rack.
         number: Index of the rack, used in alarms.
-        keeps_messages: Whether levels keep the rack's last messages while it is lost.
+        keeps_messages: Whether levels keep using the rack's last messages while the rack is lost.
         presence: Whether the rack is awaited, present or lost.
         launch: Number of the launch that is present or was last present. 0 if there was none.
         launches: Number of different launches seen.
-        losses: How often the rack was lost.
+        losses: Number of times the rack was lost.
         since: Tick of the last change of presence.
         offset_ns: CLOCK_MONOTONIC of the rack's machine minus that of this machine, in ns. None if
             not yet measured.
@@ -75,17 +75,17 @@ class PeerRack:
         return self.presence is Presence.THERE
 
     def is_superseded(self, launch: int) -> bool:
-        """Return True if `launch` was replaced by another launch and its token has expired."""
+        """Return True if another launch has replaced `launch`, whose token has expired."""
         return launch in self._over
 
     def add_token(self, launch: int, tick: int) -> None:
-        """Process a new token. Its launch becomes the present one unless it is superseded."""
+        """Process a new token. Make `launch` the present launch unless `is_superseded(launch)`."""
         if launch in self._over or (launch not in self.tokens and len(self.tokens) == MAX_LAUNCHES):
             return
         if launch not in self.tokens:
             self.tokens.append(launch)
         if self.is_present and self.launch in (NO_LAUNCH, launch):
-            # The launch is unknown if the state was restored from lockstep, which records none.
+            # The launch is unknown if the state was restored in lockstep, which records none.
             self.launch = launch
             self.confirm_by = -1
         else:
@@ -119,7 +119,7 @@ class PeerRack:
             self.findings.append(Finding(Alarm.PEER_LOST, self.number))
 
     def _mark_present(self, launch: int, tick: int) -> None:
-        """Make a launch the present one. Add a finding if the rack was restarted or is back."""
+        """Mark the rack as present with `launch`. Add a finding if it was restarted or is back."""
         self.mark_lost(tick)
         if launch != self.launch:
             self.offset_ns = None
@@ -140,8 +140,8 @@ class PeerRack:
     def join_lockstep(self, launch: int, tick: int) -> None:
         """Mark the rack as present in lockstep.
 
-        The rack joins at the start of the run, or is still present when this adapter has been
-        restarted.
+        Call this when the rack joins at the start of the run, and when it is still present after
+        this adapter was restarted.
         """
         if self.presence is Presence.AWAITED:
             self.presence = Presence.THERE
@@ -155,7 +155,7 @@ class PeerRack:
 
         Args:
             message: Last `rack.levels.peer.PeerPresence` that the previous adapter wrote.
-            confirm_by: Tick by which a rack that was present must show its token again.
+            confirm_by: Tick by which the token of a rack that was present must reappear.
         """
         self.presence = Presence(message.presence)
         self.launch = message.launch
@@ -182,7 +182,7 @@ class Peers:
     """The racks with which this rack works, indexed by name. Other racks are ignored.
 
     Attributes:
-        arrivals: How often a rack has appeared, including racks that are not peers.
+        arrivals: Number of times any rack has appeared, including racks that are not peers.
     """
 
     def __init__(self, racks: Iterable[str], keep_messages: bool = False) -> None:

@@ -25,7 +25,7 @@ from rack.levels.level import Finding
 
 ESTOP_KIND = xxh3(b"rack estop 1")
 CHECK_FLAG = 1
-"""Flag of a request that is answered like a stop but sets none."""
+"""Flag of a request that only checks the connection. It is answered, but sets no stop."""
 REQUESTS_A_CYCLE = 16
 """Maximum number of requests that are buffered for a cycle and processed in it."""
 
@@ -40,7 +40,7 @@ class EstopResponder:
     def __init__(
         self, segment: Segment, grid: OwnGrid, askers: Mapping[str, int], findings: list[Finding]
     ) -> None:
-        """Create it for the permitted senders.
+        """Create the responder.
 
         Args:
             segment: Segment of the rack.
@@ -64,7 +64,7 @@ class EstopResponder:
             self._requests = link.open_questions(estop_key("*", self._rack), REQUESTS_A_CYCLE)
 
     def answer_requests(self, tick: int) -> None:
-        """Answer the requests of permitted senders. Latch the stop unless they only check."""
+        """Answer each request of a permitted sender, and latch the stop unless it is a check."""
         for request, reply in self._requests():
             head = self._sealer.open_message(*request)
             asker = request.key.split("/")[1]
@@ -90,7 +90,7 @@ class EstopResponder:
     def write_counts(self, record: object) -> None:
         """Write the counters into their group of the adapter's status.
 
-        Nothing is written in lockstep, because the counters do not depend on ticks alone.
+        Nothing is written in lockstep, because the counters would differ from run to run.
         """
         if not self._grid.is_lockstep:
             fill_counts(record, self.count.record.item())

@@ -55,16 +55,17 @@ class ReplayedNetwork:
         self._tick = tick
 
     def take_changes(self) -> Iterator[tuple[str, int, bool]]:
-        """Yield the recorded changes of presence up to this cycle, each of them once.
+        """Yield the recorded changes of presence up to this cycle that were not yielded before.
 
-        As in `Barrier.take_changes`, a change is a tuple (rack, launch, is present).
+        As in `Barrier.take_changes`, a change is a tuple (rack, launch, is present). The launch is
+        not recorded and always `NO_LAUNCH`.
         """
         while self._changes and self._changes[0][0] <= self._tick:
             _, rack, has_appeared = self._changes.pop(0)
             yield rack, NO_LAUNCH, has_appeared
 
     def write_recorded(self, write: Mapping[str, Any], tick: int) -> None:
-        """Write the messages that were recorded in this cycle.
+        """Write the messages that were recorded in this cycle to the adapter's ports.
 
         Args:
             write: Dictionary from names to output ports of the adapter.

@@ -83,7 +83,10 @@ class CommandPath:
 
     @property
     def longest(self) -> int:
-        """Longest response in ticks, if the command just misses a release and all messages wait."""
+        """Longest response in ticks.
+
+        The command just misses a release, and each message waits as long as possible.
+        """
         waits = [
             compute_grid_wait(written, read)
             for written, read in zip(self.releases, self.reads[1:], strict=False)

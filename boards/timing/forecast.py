@@ -26,7 +26,7 @@ class Forecast:
         inboxes: Worst-case cost of interrupts for each inbox, as plain data.
         frames: Distinct frames of each core in a static schedule.
         notes: Limits of the prediction, one sentence each.
-        uncounted: Dictionary from everything that is not included to the reason.
+        uncounted: What the forecast does not include, each with the reason.
     """
 
     rack: RackTiming
@@ -49,7 +49,7 @@ class Forecast:
         Args:
             rack: Data of the rack.
             has_cores: False if this machine lacks cores that the config requests.
-            uncounted: Dictionary from what the timing model cannot include to the reason.
+            uncounted: What the timing model cannot include, each with the reason.
         """
         return cls(
             rack=rack,
@@ -92,9 +92,9 @@ class Forecast:
 
 
 def _list_uncounted(rack: RackTiming) -> dict[str, str]:
-    """Return a dictionary from each task that the forecast does not include to the reason."""
+    """Return the tasks that the forecast does not include, each with the reason."""
     counted = {task.name for task in rack.tasks if task.cost_ns}
-    # A planner whose budget has no planning time is not counted, even if it has an update.
+    # The forecast omits a planner without a planning time, even if its budget has an update time.
     counted -= {f"{b.name}.planner" for b in rack.boards.values() if not b.is_plan_budgeted}
     reasons = {name: NO_BUDGET for name in rack.cores if name not in counted}
     if rack.clock.name in reasons:

@@ -1,4 +1,4 @@
-"""Static cyclic schedules: positions of the boards in the minor frames of a major frame.
+"""Static cyclic schedules: when each board runs in the minor frames of a major frame.
 
 The terms are from T. P. Baker and A. Shaw, *The Cyclic Executive Model and Ada*, Real-Time
 Systems 1 (1989). A board's cycle is a whole number of minor frames and divides the major frame. Its
@@ -24,16 +24,16 @@ Work = dict[tuple[str, int], list[Span]]
 
 @dataclass(frozen=True)
 class FramePlace:
-    """Position of a board in a frame. Times are in ns from the start of the frame.
+    """Interval in which a board runs in a minor frame, in ns from the start of the frame.
 
     Attributes:
         board: The board.
-        offset_ns: Time at which it begins.
-        job_ns: Its budget with two context switches.
-        limit_ns: Time at which it must be done.
-        slack_ns: Time from its end to the limit. If it is not done by the limit, minus the
-            processor time that it still needs.
-        until: Board that begins at the limit. Empty if the frame ends at the limit.
+        offset_ns: Time at which its job begins.
+        job_ns: Budget of the job with two context switches.
+        limit_ns: Time by which the job must end.
+        slack_ns: Time from the end of the job to the limit. If the job has not ended by the limit,
+            minus the processor time that it still needs.
+        until: Board whose job begins at the limit. Empty if the frame ends at the limit.
     """
 
     board: str
@@ -46,12 +46,12 @@ class FramePlace:
 
 @dataclass(frozen=True)
 class CoreFrames:
-    """Frames of one core that are equal: the same boards have the same positions.
+    """Equal minor frames of one core, in which the same boards run at the same times.
 
     Attributes:
         core: The core.
         frames: Numbers of these minor frames within the major frame.
-        places: The positions of the boards.
+        places: Intervals in which the boards run in each of these frames.
     """
 
     core: int
@@ -73,10 +73,10 @@ class CoreFrames:
 
 
 def compute_core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
-    """Return the distinct frames of each core. Empty without a static schedule.
+    """Return the distinct minor frames of each core. Empty without a static schedule.
 
-    The minor frames of the second major frame are used, because they show the effect of boards that
-    are late in the first one.
+    They are taken from the second major frame, which shows the effect of boards that are late in
+    the first one.
     """
     if rack.schedule is None:
         return ()
@@ -101,7 +101,7 @@ def compute_core_frames(rack: RackTiming) -> tuple[CoreFrames, ...]:
 def _list_places(
     tasks: Sequence[TimedTask], work: Work, start: int, minor: int
 ) -> Iterator[FramePlace]:
-    """Yield the positions of one core's tasks in one frame, sorted by time.
+    """Yield when each task of a core runs within one minor frame, sorted by time.
 
     Args:
         tasks: Tasks of the core.
@@ -122,7 +122,8 @@ def _list_places(
         is_last = not later or later[0][0] > release
         spans = work[board, release]
         done = sum(min(s.end_ns, limit) - s.start_ns for s in spans if s.start_ns < limit)
-        # Treat a job that is not done by the limit as ending at the limit.
+        # The limit is the next later release on this core, or the end of the frame. A job that is
+        # not done by then is treated as ending at the limit.
         end = spans[-1].end_ns if done == cost_ns else limit
         begins = max(begins, release)
         yield FramePlace(

@@ -15,8 +15,9 @@ class InboxTiming:
     Attributes:
         task: Task that serves the inbox.
         mailboxes: Mailboxes whose messages interrupt the board.
-        sources: Their periods and service times in ns of simulated time, in the same order. The
-            model assumes that each mailbox is written in every cycle of its writer.
+        sources: Period and service time of each of these mailboxes' messages, in ns of simulated
+            time, in the same order. The model assumes that each mailbox is written in every cycle
+            of its writer.
         depth: Largest number of pending interrupts.
     """
 
@@ -26,7 +27,10 @@ class InboxTiming:
     depth: int
 
     def compute_cost_ns(self, span_ns: int) -> int:
-        """Return the longest processor time in ns of interrupts that arrive within `span_ns`."""
+        """Return the worst-case total processor time, in ns, of interrupts within `span_ns`.
+
+        These are the interrupts that arrive in an interval of this length.
+        """
         return sum(source.service_ns * -(-span_ns // source.every_ns) for source in self.sources)
 
     @property
@@ -35,7 +39,10 @@ class InboxTiming:
         return compute_burst(self.sources)
 
     def to_document(self, cycle_ns: int) -> dict[str, Any]:
-        """Return the worst case as plain data for JSON. `cycle_ns` is the slice of the task."""
+        """Return the worst case as plain data for JSON.
+
+        `cycle_ns` is the task's cycle, or the time slice of its plan, in ns.
+        """
         burst = self.burst
         return {
             "task": self.task,

@@ -41,8 +41,8 @@ class Link:
         readers: Boards of the importing rack that read the messages.
         is_command: Whether the messages are commands, so that `source` is above the readers.
         exported: Times at which the messages are sent.
-        imported: Times at which received messages are taken over.
-        adapter_ns: Time from then until the readers can see them.
+        imported: Times at which the importing adapter takes received messages over.
+        adapter_ns: Time from taking a message over until the readers can see it.
         delay_ns: Longest time on the network. None without a budget.
         max_lost: Number of messages in a row that may be lost.
     """
@@ -61,7 +61,7 @@ class Link:
 
     @property
     def cycle_ns(self) -> int:
-        """Cycle of the link as a level. Without a delay budget, the delay counts as 0."""
+        """Cycle in ns of the link, treated as a level. An unknown delay is taken as 0."""
         return self.exported.every * (1 + self.max_lost) + (self.delay_ns or 0)
 
     def compute_taken_ns(self, written: TickGrid, is_lockstep: bool) -> int:
@@ -92,12 +92,12 @@ class Link:
 
 @dataclass(frozen=True)
 class JoinedPath:
-    """Predicted response along boards of several racks, of which the last rack measures it.
+    """Predicted response along boards of several racks. The last rack can measure it.
 
     Attributes:
         direction: "command", from the highest level down, or "status".
         stations: Boards in the direction of the information, as pairs of rack and board. The first
-            is the earliest whose release the messages carry on to the last.
+            is the farthest board whose release the messages state when they reach the last board.
         port: Import of the last rack through which the information arrives.
         first_cycle_ms: Cycle of the first board.
         exchange_ms: Longest time between two messages of the import: its period, or the cycle of
@@ -154,7 +154,7 @@ class JoinedRacks:
 
     @property
     def unbudgeted_links(self) -> tuple[Link, ...]:
-        """Links on these chains that have no delay budget."""
+        """Links on `chains` that have no delay budget."""
         ways = (way for chain in self.chains for way in (chain, chain[::-1]))
         links = dict.fromkeys(link for way in ways for link in self.list_chain_links(way) or ())
         return tuple(link for link in links if link.delay_ns is None)
@@ -174,9 +174,10 @@ class JoinedRacks:
         return list(dict.fromkeys(paths))
 
     def _build_path(self, direction: Any, chain: tuple[Station, ...]) -> JoinedPath:
-        """Return the predicted response along the part of a chain that messages allow to measure.
+        """Return the predicted response along the part of a chain whose response can be measured.
 
-        Messages that depend on those of a further rack carry the release of its last board.
+        It is measured from a release that the imported messages state. If they depend on messages
+        of a third rack, they state the release of that rack's last board.
         """
         last = chain[-1].rack
         near = _find_beginning(chain)
@@ -218,17 +219,17 @@ class JoinedRacks:
         )
 
     def list_chain_links(self, stations: Sequence[Station]) -> list[Link] | None:
-        """Return the links along boards in the direction of the information.
+        """Return the links that information crosses on its way along `stations`.
 
         Returns:
-            The links, or None if information cannot pass between two of the racks.
+            The links, or None if information cannot pass between two consecutive racks.
         """
         pairs = [(one, other) for one, other in pairwise(stations) if one.rack != other.rack]
         links = [link for pair in pairs if (link := self.find_link(*pair)) is not None]
         return links if len(links) == len(pairs) else None
 
     def compute_response_ns(self, stations: Sequence[Station]) -> int:
-        """Return the longest response along boards, in the direction of the information.
+        """Return the longest response, in ns, along boards in the direction of the information.
 
         As in `RackTiming.compute_response_ticks`, it lasts from the release of the first board to
         the end of the cycle in which the last board acts.
@@ -248,21 +249,21 @@ class JoinedRacks:
         return response_ns
 
     def compute_bound_ns(self, stations: Sequence[Station]) -> int:
-        """Return the bound of eq. 3.2, n R_max, where links count as levels."""
+        """Return the bound of eq. 3.2, n R_max, in ns. Each link is treated as a level."""
         cycles = self._list_cycles_ns(stations)
         return len(cycles) * max(cycles)
 
     def compute_sum_ns(self, stations: Sequence[Station]) -> int:
-        """Return the sum of eq. 3.3, where links count as levels."""
+        """Return the sum of eq. 3.3, in ns. Each link is treated as a level."""
         return sum(self._list_cycles_ns(stations))
 
     def find_cycle_ns(self, station: Station) -> int:
-        """Return the cycle of a board."""
+        """Return the cycle of a board in ns."""
         rack = self.racks[station.rack]
         return rack.boards[station.board].every * rack.clock_ns
 
     def _list_cycles_ns(self, stations: Sequence[Station]) -> list[int]:
-        """Return the cycles of all levels along a chain, links included."""
+        """Return the cycles in ns of all boards and links along a chain."""
         links = self.list_chain_links(stations) or []
         return [*map(self.find_cycle_ns, stations), *(link.cycle_ns for link in links)]
 
@@ -313,7 +314,7 @@ LINK_BOARD = "lan"
 
 
 def _find_beginning(stations: Sequence[Station]) -> int:
-    """Return the index of the first of the stations at the end that are in the last one's rack."""
+    """Return the lowest index from which all stations belong to the rack of the last one."""
     last = stations[-1].rack
     return next(
         at + 1 for at in range(len(stations) - 2, -2, -1) if at < 0 or stations[at].rack != last

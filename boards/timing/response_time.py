@@ -35,7 +35,7 @@ TURN_NS = 4_000_000
 One tick of a 250 Hz kernel. The time slice of Linux is 3 ms.
 """
 MAX_DEADLINES = 10
-"""The search ends after this many deadlines, because it converges slowly near full load."""
+"""Number of deadlines after which the search ends, because it converges slowly near full load."""
 MAX_JOBS = 20_000
 """Largest number of jobs in a schedule that is simulated. Longer schedules use the bound."""
 MAX_STEPS = 10_000
@@ -225,7 +225,7 @@ def merge_parts(task: TimedTask, context_switch_ns: int) -> TimedTask:
 
 
 def compute_blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
-    """Return the longest time in ns for which a task waits for lower priorities on its core.
+    """Return the longest time in ns for which a task waits for tasks of lower priority.
 
     It is the time of one plan update that began before the task's release and whose ceiling is at
     least the task's priority (eq. 3.10).

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from rack.boards.timing.tasks import Part, TimedTask, Unit
 
 Variants = Mapping[str, Sequence[Sequence[Part]]]
-"""Parts of tasks whose cycles differ, keyed by task: sequences that cycles use in rotation."""
+"""For each task whose cycles differ, the sequences of parts that its cycles use in rotation."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Job:
-    """Work of one release. If a late executor skips the release, its job never ends.
+    """Work of one release. If a late executor skips the release, the job never ends.
 
     Attributes:
         task: Name of the task.
@@ -127,7 +127,7 @@ def simulate_schedule(
 
 
 def _simulate_core(runners: list[_TaskSimulation], until_ns: int) -> None:
-    """Simulate the tasks of one core, choosing the task to run at each release or end of a part."""
+    """Simulate the tasks of one core. At each release and end of a part, choose the task to run."""
     now = 0
     while now < until_ns:
         ready = [runner for runner in runners if runner.ready_at <= now]
@@ -144,8 +144,8 @@ class _TaskSimulation:
 
     Attributes:
         task: The task.
-        spans: Its spans so far.
-        ready_at: Time in ns from which its present job, or else its next job, can run.
+        spans: Spans of the task that have been simulated.
+        ready_at: Time in ns from which the task's present job, or else its next job, can run.
     """
 
     def __init__(
@@ -203,7 +203,10 @@ class _TaskSimulation:
         return end
 
     def _begin_job(self, now_ns: int) -> None:
-        """Begin a job for the oldest release that is not too old. Executors skip older releases."""
+        """Begin the job of the oldest release that has not expired.
+
+        Executors skip the releases that have expired.
+        """
         every = self.task.every_ns
         first = self.task.phase_ns
         newest = first + (now_ns - first) // every * every

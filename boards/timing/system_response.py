@@ -12,7 +12,7 @@ from rack.boards.timing.rack import RackTiming
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted response of the hierarchy in simulated time. Without one, it is 0.
+    """Predicted response of the hierarchy in simulated time. 0 if the rack has no hierarchy.
 
     Attributes:
         levels: Boards of each level, as text.
@@ -50,9 +50,9 @@ def predict_response(rack: RackTiming) -> Prediction:
 def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxSpec, ...]:
     """Return the mailboxes that carry information along a sequence of boards.
 
-    Each mailbox is based on the one before it. If no such sequence begins at the first board, the
-    longest one that ends at the last board is returned. It does not contain queues, because their
-    writers determine how long messages wait in them.
+    The messages of each mailbox are computed from those of the mailbox before it. If no such
+    sequence begins at the first board, the longest one that ends at the last board is returned. It
+    does not contain queues, because their writers determine how long messages wait in them.
 
     Args:
         layout: Layout of the rack.
@@ -71,9 +71,10 @@ def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxS
 def find_mailbox_row(
     layout: Layout, boards: Sequence[str], taken: Collection[str]
 ) -> tuple[MailboxSpec, ...]:
-    """Return the longest sequence of mailboxes, each based on the previous, that ends in `taken`.
+    """Return the longest sequence of mailboxes, one of each board, that ends in `taken`.
 
-    It has one mailbox of each board, or fewer if it does not begin at the first board.
+    The messages of each mailbox are computed from those of the mailbox before it. The sequence ends
+    at the last board. It is shorter than `boards` if none begins at the first board.
     """
     if not boards:
         return ()

@@ -9,7 +9,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Budget:
-    """Worst-case processor times of one level in ns. 0 if the level has no such part.
+    """Worst-case processor times of one level in ns. A time is 0 if the level has no such part.
 
     Attributes:
         read_ns: R, reading commands and statuses in one cycle.
@@ -50,7 +50,7 @@ class Unit(StrEnum):
 
 @dataclass(frozen=True)
 class Part:
-    """Uninterrupted part of a job.
+    """Part of a job: one unit function or one context switch.
 
     Attributes:
         unit: Its unit function. None for a context switch.

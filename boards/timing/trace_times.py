@@ -61,7 +61,7 @@ def compute_duration_ns(rows: TraceRows) -> Values:
 
 
 def compute_execution_ns(rows: TraceRows) -> Values:
-    """Return t_exec of eq. 3.5, or the planning time of a planner, in ns with preemption."""
+    """Return t_exec of eq. 3.5, or a planner's planning time, in ns, including preemption."""
     return np.asarray(rows["process_ns"] - rows["read_ns"])
 
 
@@ -79,12 +79,13 @@ def compute_residual_ns(rows: TraceRows, slice_ns: int) -> Values:
 
 
 def compute_gaps_ns(rows: TraceRows, stretches: Values | None = None) -> Values:
-    """Return the time in ns from the start of each cycle to the next start, shape (n - 1,).
+    """Return the times in ns between the starts of consecutive cycles.
 
     Args:
         rows: Trace records.
-        stretches: For each record, the number of the recorded period that contains it, shape (n,).
-            Times from one period to the next are left out. None for a single period.
+        stretches: For each record, the number of the uninterrupted part of the recording that
+            contains it, shape (n,). Times from one part to the next are left out. None if the
+            recording is uninterrupted.
     """
     gaps = np.diff(rows["start_ns"])
     return gaps if stretches is None else gaps[np.diff(stretches) == 0]
@@ -120,7 +121,7 @@ def find_newest_visible(ticks: Values, visible_at: Values) -> Values:
         ticks: The ticks.
         visible_at: Ticks at which messages become visible, in the order in which they were written.
     """
-    # A message that becomes visible late delays the messages after it.
+    # Messages become visible in the order of writing, so a late one delays those after it.
     return np.asarray(np.searchsorted(np.maximum.accumulate(visible_at), ticks, side="right") - 1)
 
 
@@ -240,8 +241,8 @@ def compute_unit_times(rows: TraceRows, above: Occupation) -> Values:
 
     Args:
         rows: Trace records of the task.
-        above: Times in which tasks of higher priority occupied the core. They do not count as
-            times of the parts.
+        above: Times in which tasks of higher priority occupied the core. They are subtracted from
+            the parts that they interrupted.
     """
     stamps = np.stack([rows[name] for name in STAMPS], axis=1)
     starts = stamps[:, :-1]
@@ -256,7 +257,7 @@ def compute_unit_times(rows: TraceRows, above: Occupation) -> Values:
 
 
 def _estimate_undisturbed(parts: Values, processor_ns: Values) -> Values:
-    """Return the undisturbed time in ns of each part, shape (4,).
+    """Estimate the time in ns that each part takes if nothing disturbs it, shape (4,).
 
     Short parts are undisturbed in many cycles. The longest part may be disturbed in all of them, so
     its time is limited to the processor time that the other parts leave.

@@ -134,7 +134,10 @@ def name_response_subject(rack: RackTiming, chains: ParallelChains) -> str:
 def _check_chains(
     rack: RackTiming, chains: ParallelChains, goal_ns: float | None
 ) -> Iterator[EquationVerdict]:
-    """Yield whether the response along a group of chains satisfies eqs 3.2 and 3.3."""
+    """Yield whether the response along a group of chains satisfies eqs 3.2 and 3.3.
+
+    The bound is `goal_ns` or, if it is None, n R_max.
+    """
     subject = name_response_subject(rack, chains)
     bound = goal_ns
     limit = "timing.response_ms"
@@ -168,7 +171,7 @@ def _check_cycle(level: LevelTiming, tick_ns: int) -> Iterator[EquationVerdict]:
 
 
 def _check_planner(level: LevelTiming, switch_ns: int, small: float) -> Iterator[EquationVerdict]:
-    """Yield the verdicts on a level's planner, or none if its planning time is unknown."""
+    """Yield the verdicts on a level's planner. Yields none if its planning time is unknown."""
     if level.planning_ns is None or level.within_cycles is None or level.slice_ns is None:
         return
     board = level.board
