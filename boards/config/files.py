@@ -31,7 +31,7 @@ ANY = "*"
 STATE_TABLES = ("board", ANY, "params", "tables", ANY)
 """Keys under which levels name the files of their state tables. `ANY` stands for any key."""
 EXTENDS = "configs that this file extends, by name or path, in order; its own keys override theirs"
-"""Meaning of the key `extends`, which files have and a loaded config does not."""
+"""Meaning of the key `extends`, which may occur in a file but not in a loaded config."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def append_faults(tables: Tables, name_or_path: str | Path, folder: Path) -> Tab
 
 
 def name_config(path: str) -> str:
-    """Return the name of a bundled config, given its path, or the path of any other."""
+    """Return the name of a bundled config, given its path. Any other path is returned unchanged."""
     stem = Path(path).with_suffix("")
     if not stem.is_relative_to(CONFIGS):
         return path

@@ -44,7 +44,7 @@ About = Literal[
     "nothing",
 ]
 ENGAGED_BY = ("the boards above", DEMANDED, NO_TORQUE, "")
-"""Reasons why brakes engaged that are not errors, by the negated subject of the alarm."""
+"""Reasons why brakes engaged other than errors. Subject -n of an alarm refers to entry n."""
 EMERGENCY_STOP = "emergency stop"
 ANOTHER_RACK = "another rack"
 DEMANDS: Mapping[Demand, str] = {
@@ -352,7 +352,7 @@ class AlarmConverter:
         try:
             key, value = read_setting(command.name)
         except LevelError:
-            # Another program issued the command without checking it, and the level refuses it.
+            # Another program issued the command without checking it. The level refuses it.
             return ""
         param = self._levels[board].live.get(key)
         before = self._live.get((board, key), param and param.launched)

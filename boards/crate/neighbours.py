@@ -87,7 +87,7 @@ def _find_cores_of_processes(rack: str) -> dict[int, Holder]:
 
 
 def _find_cores_of_rack(segment: Segment) -> dict[int, list[str]]:
-    """Return a dictionary from core to the real-time tasks that a running rack has on it."""
+    """Return a dictionary from core to the real-time tasks of a running rack on that core."""
     if segment.words[System.STATE] == Run.STOPPED:
         return {}
     occupied: dict[int, list[str]] = {}

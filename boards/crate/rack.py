@@ -91,7 +91,7 @@ class Rack:
 
     @property
     def events(self) -> list[Event]:
-        """All events so far."""
+        """Events of the run, in the order in which they were recorded."""
         return self._journal.events
 
     @property
@@ -214,9 +214,9 @@ class Rack:
             desk.add_request(request_entry)
 
     def take_over_events(self, events: Iterable[Event]) -> None:
-        """Add events of the continued run, from before the snapshot, to the events of this run.
+        """Add the events of the continued run that precede the snapshot to the events of this run.
 
-        The outcome of this run includes them.
+        The outcome of this run takes them into account.
         """
         self._journal.events.extend(events)
 

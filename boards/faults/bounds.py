@@ -220,7 +220,10 @@ MUTE = Bound(
     format_count(MISSING_WRITES, "write"),
     lambda case: None if case.role == "planner" else MISSING_WRITES * case.write_ticks,
 )
-"""Time after which a mailbox is mute. None for a planner, which does not write periodically."""
+"""Time without messages after which a mailbox is reported as mute.
+
+None for a planner, which does not write periodically.
+"""
 DELAY = Bound("the delay", lambda case: int(case.parameters["by"]) * case.write_ticks)
 SKIP = Bound(
     "the next cycle of the fastest boards",
@@ -228,7 +231,7 @@ SKIP = Bound(
         int(case.parameters["ticks"]), min(task.every for task in case.layout.tasks) - 1
     ),
 )
-"""Skipped releases are noticed in the first tick that is not skipped."""
+"""Time until skipped releases are noticed, in the first tick that is not skipped."""
 DEATH_CYCLES = 4
 DEATH = Bound(
     f"{RACK_NS * 1e-6:g} ms (Rack), {DEATH_CYCLES} cycles + 1 read (reader)",
@@ -238,7 +241,7 @@ DEATH = Bound(
         else DEATH_CYCLES * case.cycle_ticks + case.read_ticks
     ),
 )
-"""A death is noticed by the Rack, or by a reader once the newest message is too old."""
+"""Time until the Rack notices a death, or a reader notices that the newest message is too old."""
 SLICE = Bound("1 time slice", lambda case: case.cycle_ticks)
 RELEASE = Bound("1 cycle", lambda case: case.layout.find_task(case.board).every)
 """Interval between two releases of the task. A planner has several in its time slice."""

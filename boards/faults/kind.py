@@ -85,8 +85,8 @@ class Consequence:
         own: Further alarms about the fault's task, mailboxes or joint.
         arm: Alarms about any joint.
         reactions: Codes of events that must all follow.
-        recovery_s: Simulated time within which every reaction is undone, s, counted from the end of
-            the fault or from its detection.
+        recovery_s: Simulated time, in s, within which every reaction is undone. It is counted from
+            the end of the fault or from its detection.
         ends_process: Whether the task's process ends, so that recovery includes its restart.
         latches: Whether the task may end with an error instead of recovering.
     """

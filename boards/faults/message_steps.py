@@ -231,7 +231,7 @@ class FaultyWriter:
         """Pass the message through all faults and publish the results.
 
         A delayed message becomes visible together with the messages of the cycle that publishes it.
-        What readers see therefore depends on ticks alone, even with faults.
+        Runs with delayed messages therefore repeat exactly in lockstep.
 
         Args:
             tick: Release of the cycle that writes.
@@ -250,7 +250,7 @@ class FaultyWriter:
         return self._written and self._writer.is_in_time(tick, now)
 
     def flush_due(self, tick: int, now: int | None = None) -> None:
-        """Publish the delayed messages that are due at `tick`."""
+        """Publish delayed messages that are due at `tick` or whose fault is over."""
         visible_at = self._writer.compute_visible_tick(tick, now)
         late_messages = self._late
         self._late = []

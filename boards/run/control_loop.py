@@ -92,9 +92,10 @@ class VirtualControlLoop(Task):
         watch.finish_cycle(in_time, deadline, done=tick)
 
     def _handle_delay(self, tick: int) -> None:
-        """Record a pause in reading if releases were skipped, and check whether the clock was late.
+        """Handle the late start of a cycle: check whether the clock was late.
 
-        Called in a cycle that begins late. The first cycle counts as the end of a pause too.
+        If releases were skipped before the cycle, or if it is the first, also record that the
+        mailboxes are read without interruption only since this tick.
         """
         if self.next_cycle.skipped or not self._has_cycled:
             self.inputs.task.since = tick
@@ -125,7 +126,7 @@ class VirtualControlLoop(Task):
         self.faults.burn_time(tick)
 
     def _begins_episode(self, number: int, tick: int) -> bool:
-        """Record a user-defined finding of a level.
+        """Record a user-defined finding, and return whether it begins an episode.
 
         Args:
             number: Number of the kind of finding among those that the level declares.

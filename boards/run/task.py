@@ -157,11 +157,11 @@ class InterruptHandler:
     """Interrupt handler of a board, under protocol interrupt.
 
     It takes processor time for each interrupt, counts interrupts, and reports lost ones. On the
-    original boards the handler ran whenever a message arrived. Here the first task of the board
-    does its work just before it reads, and takes as much processor time as the handler would have
-    used since the last cycle. This adds to the time of reading (t_comm of eq. 3.5), and tasks of
-    lower priority on the same core have to wait. In lockstep, where no task waits for a processor,
-    the handler takes no time.
+    original boards the handler ran whenever a message arrived. In this program, the first task of
+    the board calls the handler before it reads its mailboxes. The handler then uses the processor
+    time for all interrupts since the previous cycle. This adds to the time of reading (t_comm of
+    eq. 3.5), and delays tasks of lower priority on the same core. In lockstep, where no task waits
+    for a processor, the handler takes no time.
     """
 
     def __init__(self, segment: Segment, task: str, inbox: BoardInbox, alarms: AlarmWriter) -> None:
