@@ -482,7 +482,8 @@ class Executor(LevelSection, ABC):
     def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the names to which alarms refer by index, such as control modifications.
 
-        By default, an operator may give the same names. `params` may be invalid.
+        By default there are none. `list_operation_names` returns the same names unless a subclass
+        overrides it. `params` may be invalid.
         """
         return ()
 

@@ -108,7 +108,7 @@ def _connect_ports(
         config: The config of the rack.
         place: Entry of the task in the config.
         kind: Class of the task.
-        types: Message classes of the mailboxes known so far. A port that the config adds has the
+        types: Message classes of the mailboxes that are known. A port that the config adds has the
             type of the mailbox that it reads.
     """
     mistakes: list[Mistake] = []
@@ -225,8 +225,8 @@ class Wiring:
                 for ports in self.ports.values()
                 for port, box in ports.writes.items()
             }
-            # A port that the config adds may pass on another such port, whose type must be known
-            # first: repeat until no mailbox is added.
+            # A port that the config adds may relay the messages of another added port, whose
+            # message type must be known first. Repeat until no mailbox is added.
             if len(written) == len(types):
                 return
             types = written

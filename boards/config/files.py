@@ -258,7 +258,7 @@ def _read_config(
     Args:
         path: The file.
         chain: The files that led to it, each of which extends the next.
-        known: Tables of the files read so far, because several files may extend the same one.
+        known: Tables of the files that have been read, because several may extend the same file.
         mistakes: List to which mistakes are added.
     """
     if path not in known:

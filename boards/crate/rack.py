@@ -238,8 +238,8 @@ class Rack:
         if self._continues is None:
             supervisor.reset_latch()
         else:
-            # The snapshot contains the state of the latch. Discard alarms from before it, which are
-            # events of the continued run.
+            # The snapshot contains the state of the latch. Discard alarms from before the snapshot,
+            # which are events of the continued run.
             supervisor.is_armed = True
             supervisor.alarms.read_alarms()
             tick = self.begins_at

@@ -32,7 +32,10 @@ from rack.levels.robot.wrist import Wrist, find_wrist
 from rack.levels.tables import GripperConfig, Interface, RobotConfig, SceneConfig, SensorConfig
 
 TOUCHING_M = 5e-5
-"""Distance below which geoms at home count as touching, because rounding decides."""
+"""Distance, in m, below which geoms at home are treated as touching.
+
+At smaller distances, rounding would determine whether they touch.
+"""
 SETTLING_S = 1.0
 """Time in which the fingers of a gripper come to rest, in s."""
 

@@ -34,7 +34,7 @@ LIBRARY = str(Path(mujoco.__file__).with_name(f"libmujoco.so.{mujoco.mj_versionS
 
 
 native = partial(c_function, LIBRARY)
-"""A function of MuJoCo that returns nothing, by its name and its number of arguments."""
+"""Declares a C function of MuJoCo that returns nothing: name and number of arguments."""
 mj_step = native("mj_step", 2)
 mj_kinematics = native("mj_kinematics", 2)
 mj_collision = native("mj_collision", 2)

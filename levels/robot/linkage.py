@@ -38,9 +38,9 @@ STEP_TOLERANCE = 1e-10
 SPRING_WEIGHT = 1e-6
 """Weight of the stiffest spring relative to an equality."""
 DAMPING = 1e-9
-"""Weight with which joints stay in place, for joints that nothing else determines."""
+"""Weight of a term that keeps joints in place, for joints that nothing else determines."""
 FREE_RATIO = 0.01
-"""Ratio of `DAMPING` to everything that holds a joint, above which the joint counts as free."""
+"""Ratio of `DAMPING` to all weights that hold a joint, above which the joint is free to move."""
 YIELD_RESIDUAL = 1e-3
 """Residual of an equality, m or rad, above which it yields.
 

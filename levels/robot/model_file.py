@@ -131,7 +131,7 @@ class ModelReader:
         return root
 
     def _read_reference(self, element: ElementTree.Element, path: Path, folder: Path) -> None:
-        """Read the file to which an element refers, and make the element refer to the text read.
+        """Read the file that an element names, and replace its name there by its key in `texts`.
 
         Args:
             element: Includes the file, or declares it as a model to attach.

@@ -51,7 +51,7 @@ class TaskPlanner(Planner):
 
         self._program = self._read_first_program()
         self._id = FIRST_PLAN_ID
-        self._ahead_s = 0.0  # clock to which the actions' `by` refers, minus simulated time
+        self._ahead_s = 0.0  # s: time on the clock of the actions' `by`, minus simulated time
         self._needs = read_params(self.params, context.params)
         cell = build_level_cell(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
