@@ -138,7 +138,10 @@ def add_position_noise(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool
 
 
 def repeat_last_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
-    """Return the fault's first sample, dated one cycle back, as if no new one had arrived."""
+    """Return the sample with which the fault began, as if no new one had arrived since then.
+
+    Its tick is that of one cycle earlier.
+    """
     first = fault.recall_first_sample(sample)
     return first._replace(tick=first.tick - fault.every), True
 

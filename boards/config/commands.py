@@ -77,7 +77,7 @@ def build_request(
 
 
 def build_requests(config: RackConfig, layout: Layout) -> tuple[Request, ...]:
-    """Return the requests for the commands of a checked config."""
+    """Return the operator table's requests for the commands of a checked config."""
     return tuple(_encode_request(command, layout) for command in config.command)
 
 
@@ -140,7 +140,7 @@ def find_command_mistakes(
 def _check_command(
     place: str, command: CommandConfig, config: RackConfig, published: Levels
 ) -> Mistakes:
-    """Yield every mistake in one operator command, whose place is "" if it is live."""
+    """Yield every mistake in one operator command. `place` is "" for a live command."""
     at = partial(format_place, place)
     if command.tick is not None and command.at is not None:
         yield Mistake(at("at"), command.at, "tick is also given; give only one of tick, at")
@@ -224,7 +224,7 @@ def _check_name(place: str, command: CommandConfig, level: PublishedLevel) -> Mi
 
 
 def _check_setting(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
-    """Check that a command sets a live parameter of its level to a valid value."""
+    """Check that a command `set` names a live parameter of its level and a valid value."""
     name = format_place(place, "name")
     try:
         key, value = read_setting(command.name or "")

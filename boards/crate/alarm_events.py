@@ -321,7 +321,7 @@ class AlarmConverter:
         """Return the name of an alarm's subject. Raises `DamageError` if there is no such subject.
 
         Args:
-            about: What kind of subject the alarm has.
+            about: Kind of the subject.
             number: Number of the subject.
             owner: Task that raised the alarm.
         """
@@ -347,7 +347,7 @@ class AlarmConverter:
     def _format_previous_value(self, board: str, command: OperatorCommand) -> str:
         """Return a clause with the value that a parameter had before a command set it.
 
-        The new value is stored, as the previous value for the next command.
+        Also store the new value, which is the previous value for the next command.
         """
         try:
             key, value = read_setting(command.name)

@@ -348,7 +348,7 @@ class Crate:
         return any(host.name == name for host in self._segment.layout.hosts)
 
     def _kill_boards(self, board: str | None = None) -> None:
-        """Kill the named board, or all boards."""
+        """Kill the board of this name, or all boards if it is None."""
         for pidfd, (name, _) in self._boards.items():
             if board in (None, name):
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)

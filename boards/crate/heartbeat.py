@@ -69,13 +69,13 @@ class Heartbeat:
             elif (
                 now - since > self._bounds[name]
                 and name not in self._reported
-                and (name != CLOCK or self._clock_is_stuck())
+                and (name != CLOCK or self._is_clock_stuck())
             ):
                 hanging.append(name)
         self._reported.update(hanging)
         return hanging
 
-    def _clock_is_stuck(self) -> bool:
+    def _is_clock_stuck(self) -> bool:
         """Return True if the clock's process is stopped or dead, or still waits at the same tick.
 
         A process that is runnable only lacks processor time and is not stuck.

@@ -28,7 +28,7 @@ class Holder:
 
     Attributes:
         rack: Name of the rack.
-        process: Its launcher. For another user's rack, one of its boards.
+        process: Text that names its launcher or, for another user's rack, one of its boards.
         tasks: Its tasks on the core.
     """
 

@@ -122,7 +122,7 @@ class OneProcess:
 
     @property
     def serials(self) -> Mapping[str, int]:
-        """Serials of the newest visible messages, keyed by mailbox, without empty mailboxes."""
+        """Serial of each mailbox's newest visible message. Mailboxes without one are left out."""
         newest = {name: post.find_newest(self.tick - 1) for name, post in self._mailboxes.items()}
         return {name: entry[0] for name, entry in newest.items() if entry is not None}
 
@@ -158,7 +158,7 @@ class PrivateMailbox:
             self.stored.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
 
     def find_newest(self, tick: int) -> tuple[int, bytes] | None:
-        """Return the serial and bytes of the newest message visible at `tick`. None if empty."""
+        """Return serial and bytes of the newest message visible at `tick`. None without one."""
         for visible_at, serial, data in reversed(self.stored):
             if visible_at <= tick:
                 return serial, data

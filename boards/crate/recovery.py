@@ -146,7 +146,7 @@ class Recovery:
         text = f"{'host ' * is_host}board '{name}' ended: {describe_end(end.status)}"
         self._journal.add_event("died", name, text, "died", end.seen_ns, end.tick)
         if not self.wirings or (is_over and not is_host):
-            self._record_giving_up(name, text)
+            self._record_final_loss(name, text)
             return
         if end.status == UNRECOVERABLE_STATUS and not is_host:
             record_printed()
@@ -162,14 +162,14 @@ class Recovery:
         else:
             # The clock reacts to this state by braking the arm and ending the run.
             self._segment.get_block(name)[Block.STATE] = TaskState.GIVEN_UP
-        self._record_giving_up(name, text, is_host)
+        self._record_final_loss(name, text, is_host)
 
     def record_crate_loss(self) -> None:
         """Record that the crate, and therefore every board, has ended."""
         self.is_beyond_help = True
         text = "the crate ended, and all boards with it"
         self._journal.add_event("died", "crate", text, "died")
-        self._record_giving_up("crate", text)
+        self._record_final_loss("crate", text)
 
     def report_hanging(self, board: str, why: str = "") -> None:
         """Record an event which states that a board is not responding.
@@ -210,11 +210,11 @@ class Recovery:
                 self._crate.try_request(PowerOff(name))
 
     def _find_printed_reason(self, board: str) -> str:
-        """Return the last line that a board printed about itself. Empty if there is none."""
+        """Return the last line that begins with "board '<board>': ". Empty if there is none."""
         printed = (event.text for event in reversed(self._journal.events))
         return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
 
-    def _record_giving_up(self, board: str, text: str, is_host: bool = False) -> None:
+    def _record_final_loss(self, board: str, text: str, is_host: bool = False) -> None:
         """Record that a board will not be restarted, or that the crate has ended.
 
         Args:

@@ -87,7 +87,7 @@ class Leave:
 
 @dataclass(frozen=True)
 class Left:
-    """Answer to `Leave`: no board is left."""
+    """Answer to `Leave`: all boards of the rack have ended."""
 
 
 @dataclass(frozen=True)

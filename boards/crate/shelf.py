@@ -201,12 +201,12 @@ class SnapshotShelf:
         older = held[: max(2, len(held) // 2)]
         candidates = [old for old in older if old.tick != ticks[0] and old is not held[-1]]
 
-        def gap(snapshot: HeldSnapshot) -> int:
+        def compute_gap(snapshot: HeldSnapshot) -> int:
             """Return the number of ticks between the neighbours of a snapshot."""
             at = ticks.index(snapshot.tick)
             return ticks[min(at + 1, len(ticks) - 1)] - ticks[at - 1]
 
-        return min(candidates, key=gap, default=held[0])
+        return min(candidates, key=compute_gap, default=held[0])
 
     def __len__(self) -> int:
         return len(self._complete_snapshots)

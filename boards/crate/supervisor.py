@@ -145,7 +145,7 @@ class Supervisor:
             )
 
     def _wait_for_messages(self, timeout_s: float) -> None:
-        """Wait up to `timeout_s` for an alarm or a message from the crate. Handle the message."""
+        """Wait up to `timeout_s` for an alarm or a message from the crate, and handle messages."""
         attention = self._crate.attention
         for ready in wait([self._crate.line, attention], timeout_s):
             if ready == attention:

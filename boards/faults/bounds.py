@@ -31,7 +31,7 @@ Up to 0.5 ms per megabyte were seen on a busy machine, and a planner with its li
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
-    """Return the length of a task's cycle in ticks: a planner's time slice, or 1 for the clock."""
+    """Return the cycle of a task in ticks: for a planner its time slice, for the clock 1."""
     if board == CLOCK:
         return 1
     return layout.find_task(board).slice

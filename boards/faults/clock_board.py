@@ -156,7 +156,7 @@ def _find_step(entry: FaultEntry) -> ClockStep:
     return step if isinstance(step, ClockStep) else ELSEWHERE
 
 
-def _next_change(entry: FaultEntry, tick: int) -> int:
+def _find_next_change(entry: FaultEntry, tick: int) -> int:
     """Return the first tick after `tick` at which a fault may begin or end, or `NEVER`."""
     if entry.stage == Stage.WAITING:
         return tick + 1 if entry.when_box >= 0 else max(tick + 1, entry.tick)
@@ -266,7 +266,7 @@ class FaultStage:
                 )
         # While messages flood the rings, do one tick at a time, so that the recorder keeps up.
         must_check = self._awaited or self.driver.is_flooded
-        changes = [tick + 1] if must_check else [_next_change(entry, tick) for entry in faults]
+        changes = [tick + 1] if must_check else [_find_next_change(entry, tick) for entry in faults]
         self.next_tick = min(changes, default=NEVER)
 
     def act_within_tick(self, tick: int) -> None:

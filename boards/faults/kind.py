@@ -116,7 +116,8 @@ class Kind:
         tasks: Roles that can be affected.
         consequence: Effects besides detection.
         lasts: Draws the duration in ticks for a campaign.
-        realtime: Whether the fault is impossible in lockstep, where time waits for every task.
+        realtime: Whether the fault is only possible in real time. In lockstep, time waits for every
+            task.
         once: Whether it acts only once. Other faults last for a time or until the run ends.
         within_tick: Whether it can act within a tick. Other faults begin with a cycle.
         visible_from: Smallest value of the parameter `size` that must be detected.

@@ -92,7 +92,7 @@ class Mute(MessageStep):
 
 
 class Drop(MessageStep):
-    """Loses messages in transit: their serials are used up, but their slots are not filled."""
+    """Loses messages in transit: each uses up a serial, but is not written to its slot."""
 
     def send_message(self, message: Outgoing) -> None:
         """Lose the message with the fault's probability. Otherwise pass it on."""
@@ -185,7 +185,7 @@ class HoldLock(MessageStep):
 
 
 class FaultyWriter:
-    """Replaces the writer of a mailbox that has faults.
+    """Writer of a mailbox that has faults, used in place of the ordinary writer.
 
     Args:
         writer: Writer of the mailbox.

@@ -45,7 +45,7 @@ class ExtraComputing:
     until: LoadStep
 
     def burn_time(self, tick: int) -> None:
-        """Keep the processor busy until the time that the step computes."""
+        """Keep the processor busy until the time that `until` returns, and record that it acted."""
         now_ns = monotonic_ns()
         self.entry.record_action(tick)
         end_ns = self.until(self, tick, now_ns)

@@ -68,7 +68,7 @@ PORT = _build_dtype(
     # Result of the last read, or the signature of an intruder found by the last write.
     "result",
 )
-"""Record of a mailbox to read or to write."""
+"""Record type of a mailbox that compiled code reads or writes."""
 _SIGNATURE = 8 * Slot.EPOCH
 _VISIBLE = 8 * Slot.VISIBLE_AT
 _PORT_SIZE = PORT.itemsize

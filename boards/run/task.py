@@ -212,12 +212,12 @@ def chain_accesses(*accesses: Callable[[int], None] | None) -> Callable[[int], N
     """
     present = [access for access in accesses if access is not None]
 
-    def make_all(tick: int) -> None:
-        """Make all accesses as of `tick`."""
+    def access_all(tick: int) -> None:
+        """Make the accesses in their order, each as of `tick`."""
         for access in present:
             access(tick)
 
-    return make_all if len(present) > 1 else present[0]
+    return access_all if len(present) > 1 else present[0]
 
 
 def slow_access(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:

@@ -66,8 +66,9 @@ class Cell:
     """A compiled cell. Indices refer to the arrays of `model`."""
 
     model: mujoco.MjModel
-    """Has torque motors on all joints of the arm and a force motor on the gripper. For a hand, it
-    has actuators on the tendons instead. Keyframe 0 is the start, with the gripper open."""
+    """Model with torque motors on all joints of the arm and a force motor on the gripper. The model
+    of a hand has actuators on the tendons instead. Keyframe 0 is the start, with the gripper open.
+    """
 
     # The arm, or a hand in its place.
     joints: tuple[str, ...]  # names

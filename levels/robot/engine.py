@@ -1,9 +1,8 @@
 """MuJoCo's functions and memory, for compiled code.
 
-Called from Python, a MuJoCo step costs 2 us more than it takes, and reading its contacts costs half
-a microsecond; both happen in every step. Compiled code calls the C library directly, with the
-addresses of model and data. The same code called as Python reaches the same functions through
-ctypes.
+A call from Python adds 2 us to a MuJoCo step, and half a microsecond to read its contacts; both
+happen in every step. Compiled code calls the C library directly, with the addresses of model and
+data. If the same code is run as Python, it calls the same functions through ctypes.
 
 If MuJoCo reports a fatal error (its memory is exhausted), the Python bindings raise an exception.
 Here the error ends the process, which the exception would have done as well.

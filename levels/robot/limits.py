@@ -53,7 +53,7 @@ One late cycle must not engage the brakes.
 MAX_PATIENCE_S = 0.01
 """Longest default time, in s, for which motors keep their last torque.
 
-However slow or weak the arm is, a longer absence of torques is more than a late cycle or two.
+Even for a slow or weak arm, a longer time without torques means more than one or two late cycles.
 """
 NOISE_SIGMAS = 6.0
 """Standard deviations of noise that a monitor tolerates.
@@ -64,7 +64,7 @@ Less than one sample in a billion exceeds them.
 
 @dataclass(frozen=True)
 class Bounds:
-    """Limits that the arm never exceeds, fault or not, as config and model state them.
+    """Limits from config and model that the arm must never exceed, even during a fault.
 
     Sliding joints have m and N where turning joints have rad and N m.
     """

@@ -5,8 +5,8 @@ every joint stop that is exceeded, as rows of a residual and a Jacobian. Gauss-N
 over them, with springs of joints and tendons as weak rows, find where the linkage settles. Where
 equalities contradict each other or a stop, as soft couplings of tendons do, it settles in between,
 according to their stiffness in the simulation. The linkage is solved once for a number of openings.
-A pose in between is interpolated, which takes some microseconds of a cycle. MuJoCo's own kernels
-add up in a fixed order, so that equal models give equal poses.
+A pose in between is interpolated, which takes some microseconds of a cycle. MuJoCo's own functions
+sum in a fixed order, so that equal models give equal poses.
 
 An equality must not tie a joint of the arm: `check_couplings` refuses that.
 """
@@ -50,11 +50,11 @@ DISABLED_CONSTRAINTS = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
 )
 JACOBIAN_ROUNDING = 1e-9
-"""Threshold for elements of the Jacobian of a tendon."""
+"""Elements of a tendon's Jacobian up to this value are treated as 0."""
 LOOP_EQUALITIES = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 STIFFNESS = 0
 IMPEDANCE = 2
-"""Columns of MuJoCo's `efc_KBIP`."""
+"""Columns `STIFFNESS` and `IMPEDANCE` of MuJoCo's `efc_KBIP`."""
 
 
 @dataclass(frozen=True)
