@@ -160,8 +160,8 @@ class LayoutBuilder:
         """
         delay = reader.slice
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
-        # The writer learns after both delays which messages the reader has taken. During that time
-        # it can send at most `capacity` messages.
+        # The writer learns after the delays of both mailboxes which messages the reader has taken.
+        # During that time it can send at most `capacity` messages.
         most_sent = capacity * (1 + self._retained_ticks // (box.delay + delay))
         # A deep queue retains fewer messages, to limit its memory.
         slots = compute_depth(

@@ -264,7 +264,7 @@ def _format_limits(entry: Schema) -> str:
 
 
 def _format_number(value: float) -> str:
-    """Return a number as text, with at most six significant digits if that is exact."""
+    """Return a number as text, with six significant digits if they represent it exactly."""
     text = f"{value:g}"
     return text if float(text) == value else str(value)
 

@@ -301,7 +301,8 @@ class AlarmConverter:
         )
         tick = found_at = int(row["tick"])
         if alarm == Alarm.BRAKES_CLOSED and since < found_at:
-            # If no board drove the arm when the brakes engaged, the alarm is raised later.
+            # If no board drove the arm when the brakes engaged, the alarm is raised later. The
+            # event gets the tick at which they engaged.
             tick = since
             text += f", known at tick {found_at}"
         return Event(

@@ -81,7 +81,7 @@ LEAVE_S = 0.5
 
 
 class Crate:
-    """Parent process of all boards. It ends when the Rack closes the line or its launcher ends.
+    """Parent process of all boards. It ends when the Rack closes the line or the launcher ends.
 
     Args:
         line: Connection to the Rack.
@@ -112,7 +112,7 @@ class Crate:
         return self._opened
 
     def run(self) -> None:
-        """Serve requests until the Rack closes the line or its launcher ends.
+        """Serve requests until the Rack closes the line or the launcher ends.
 
         Then end all boards and all copies in snapshots.
         """

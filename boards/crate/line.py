@@ -209,7 +209,7 @@ class WarmCrate(CrateLine):
 def build_environment() -> dict[str, str]:
     """Return the environment of the crate.
 
-    It is the environment of this process, changed so that runs repeat exactly.
+    It is the environment of this process, with settings that make runs repeat exactly.
     """
     tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
     return {

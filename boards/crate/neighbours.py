@@ -103,7 +103,7 @@ def _find_cores_of_rack(segment: Segment) -> dict[int, list[str]]:
 
 
 def move_boards(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
-    """Move boards from occupied cores to a free core, unless the config states their core.
+    """Move boards from occupied cores to a free core, unless the config specifies their core.
 
     Args:
         config: The config.

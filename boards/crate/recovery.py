@@ -47,7 +47,7 @@ class RestartPolicy:
             )
 
     def admit_restart(self, task: str, tick: int) -> str:
-        """Decide whether a task that was lost at `tick` may be restarted, and count the restart.
+        """Decide whether a task that was lost at `tick` may be restarted, and if so, count it.
 
         Returns:
             Text such as "restart 1 of at most 3 in 60 s". Empty if no restart is permitted.
@@ -182,7 +182,7 @@ class Recovery:
         self._journal.add_event("detection", "rack", text, "hang", subject=board)
 
     def kill_hanging(self, board: str) -> None:
-        """Kill a hanging board, so that it is lost, unless it is already being restarted."""
+        """Kill a hanging board, which is then handled as lost. Skip one that is being restarted."""
         if board not in (*self._waiting, *self._starting):
             self._crate.try_request(PowerOff(board))
 

@@ -202,7 +202,7 @@ class SnapshotShelf:
         candidates = [old for old in older if old.tick != ticks[0] and old is not held[-1]]
 
         def compute_gap(snapshot: HeldSnapshot) -> int:
-            """Return the number of ticks between the neighbours of a snapshot."""
+            """Return the gap, in ticks, that the removal of a snapshot would leave."""
             at = ticks.index(snapshot.tick)
             return ticks[min(at + 1, len(ticks) - 1)] - ticks[at - 1]
 

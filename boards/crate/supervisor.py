@@ -231,7 +231,7 @@ class Supervisor:
         )
 
     def _is_cycling(self, name: str) -> bool:
-        """Return True if a board is not lost and has yet to finish a cycle."""
+        """Return True if a board has not finished its last released cycle and is not lost."""
         if self.recovery.is_beyond_help or name not in self.segment.map.blocks:
             return False
         block = self.segment.get_block(name)

@@ -40,7 +40,7 @@ def cycle_ticks(layout: Layout, board: str) -> int:
 def compute_last_read_ticks(mailboxes: tuple[str, ...], layout: Layout) -> int:
     """Return the longest time in ticks from a writer's release until all readers have the message.
 
-    It is the maximum over these mailboxes. 0 if nobody reads them.
+    The result is the maximum over the mailboxes, or 0 if no task reads them.
     """
     boxes = [layout.find_mailbox(name) for name in mailboxes]
     return max(
@@ -102,7 +102,7 @@ class BoundCase:
 
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
-        """Affected mailboxes that the reader reads or, without a reader, that any task reads."""
+        """Affected mailboxes that `reader` reads or, if it is None, that any task reads."""
         struck = list_affected_mailboxes(self.layout, self.injection.mailbox, self.board)
         if self.reader:
             return tuple(mailbox for mailbox in struck if self.reader in mailbox.readers)
@@ -127,7 +127,7 @@ class BoundCase:
     def read_ticks(self) -> int:
         """Longest interval in ticks between reads of an affected mailbox.
 
-        Only reads of the reader count or, without a reader, of the fastest reader of each mailbox.
+        The reads are those of `reader` or, if it is None, those of each mailbox's fastest reader.
         """
         read_interval = partial(compute_read_interval, self.layout)
         if self.reader:

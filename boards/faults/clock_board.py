@@ -307,7 +307,7 @@ class FaultStage:
         return reading.has_message and int(getattr(reading.message, field)) == entry.when_value
 
     def _begin_fault(self, entry: FaultEntry, tick: int) -> None:
-        """Activate a fault and carry it out, or schedule it within the tick if it has a phase."""
+        """Activate a fault and carry it out. In real time, schedule it if it has a phase."""
         kind = find_kind(entry)
         entry.tick = tick
         duration_ticks = entry.ticks

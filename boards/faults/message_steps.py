@@ -124,9 +124,9 @@ class Reorder(MessageStep):
     """Swaps messages with their successors."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Send the message ahead of the one held back earlier, if there is one.
+        """If a message is held back, pass on the new message and then the one held back.
 
-        Otherwise hold it back with the fault's probability, or pass it on.
+        Otherwise hold the new message back with the fault's probability, or pass it on.
         """
         if self.held:
             self.onward(message)

@@ -83,7 +83,7 @@ def _omit_missing(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class _AttributeReader:
-    """Reads a tree of objects once. An object referred to several times is shown only once."""
+    """Converts a tree of objects to plain data. Each object is shown only where it occurs first."""
 
     def __init__(self) -> None:
         self._seen: set[int] = set()

@@ -94,8 +94,8 @@ class VirtualControlLoop(Task):
     def _handle_late_start(self, tick: int) -> None:
         """Handle the late start of a cycle: check whether the clock was late.
 
-        If releases were skipped before the cycle, or if it is the first, also record that the
-        mailboxes are read without interruption only since this tick.
+        If releases were skipped before the cycle, or if it is the first, also record this tick as
+        the beginning of regular reads.
         """
         if self.next_cycle.skipped or not self._has_cycled:
             self.inputs.task.since = tick

@@ -147,9 +147,9 @@ class OutputPort:
 
     The basis of a message is the tick of the oldest information on which it depends: the oldest
     basis of the messages of `sources`. A mailbox with a `max_age` is written on demand, only in
-    cycles in which the level has sent a message. Any other mailbox is written in every cycle that
-    is due. If `sends` is true, the level fills a queue by calling `send`. Otherwise the board sends
-    the level's message once per due cycle.
+    cycles in which the level has sent a message. Any other mailbox is written in every cycle in
+    which it is due. If `sends` is true, the level fills a queue by calling `send`. Otherwise the
+    board sends the level's message once in each of these cycles.
     """
 
     def __init__(

@@ -229,7 +229,7 @@ class OperatorCommandIssuer:
             self._leased.append(entry)
 
     def _check_lease(self, entry: RequestEntry, tick: int) -> None:
-        """Release a lease that has ended, and make the level hold if its client is gone.
+        """Release a lease that has ended, and make the level hold if the client is dead or silent.
 
         A lease ends without further effect when a newer command replaces the leased one, or when
         the level refuses it.

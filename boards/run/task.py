@@ -76,7 +76,7 @@ class Task(ABC):
     def wait_until_next_cycle(self) -> int | None:
         """Wait for the next release and return its tick. Returns None if the run is over.
 
-        Faults begin and end here, between cycles.
+        Faults of the task begin and end during this call, between two cycles.
         """
         tick = self.next_cycle.wait()
         if tick is None:

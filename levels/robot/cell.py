@@ -80,7 +80,7 @@ class Cell:
     tool: int  # site
 
     # Limits, sensors and drives of the arm.
-    bounds: Bounds  # never exceeded, fault or not
+    bounds: Bounds  # never exceeded, even during a fault
     limits: Limits  # of planned motion
     encoders: Encoders  # resolution and noise of the joints' sensors
     patience: MotorPatience  # of the motors or valves

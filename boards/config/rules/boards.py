@@ -127,7 +127,7 @@ def check_circles(wiring: Wiring) -> Mistakes:
     except CycleError as error:
         circle = error.args[1][:-1]
         pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
-        # Report a link that only one of its two boards names, if there is one.
+        # Prefer to report a link that only one of its two boards names.
         upper, lower = min(reversed(pairs), key=lambda link: len(_find_declarations(config, *link)))
         board, key, end = _find_declarations(config, upper, lower)[0]
         at = circle.index(lower)
@@ -259,7 +259,7 @@ def check_polling(wiring: Wiring) -> Mistakes:
 
 
 def check_reservations(wiring: Wiring) -> Mistakes:
-    """If the scheduler is earliest deadline first, check that each board can reserve its time."""
+    """With earliest deadline first, check that each board can reserve its processor time."""
     config = wiring.config
     if config.clock.scheduler == "fixed-priority":
         return
