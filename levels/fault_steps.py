@@ -147,7 +147,7 @@ def repeat_last_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool
 
 
 def freeze_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool | None]:
-    """Freeze the affected positions and velocities at their values when the fault began."""
+    """Replace the affected positions and velocities by their values when the fault began."""
     first = fault.recall_first_sample(sample)
     truth = (sample.position, sample.velocity)
     stuck = np.where(fault.joints, (first.position, first.velocity), truth)

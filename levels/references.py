@@ -47,7 +47,7 @@ Configs of users and of recorded runs name the old places.
 
 
 def resolve_moved(reference: str) -> str:
-    """Return a reference "package.module:Name", with the new place of a name that has moved."""
+    """Return a reference "package.module:Name", changed if its module or class has moved."""
     for old, new in MOVED_REFERENCES.items():
         remainder = reference.removeprefix(old)
         if remainder != reference and remainder[:1] in ("", ".", ":"):

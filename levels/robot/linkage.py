@@ -283,7 +283,9 @@ class _Solver:
 
 
 def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask) -> None:
-    """Check that no joint of the gripper has an actuator that nothing commands.
+    """Check that only the gripper's actuator drives joints of the gripper.
+
+    No level would command any other actuator.
 
     Args:
         model: The compiled model.

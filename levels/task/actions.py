@@ -82,7 +82,7 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
 
 @contextmanager
 def _label_refusals(k: int, step: str) -> Iterator[None]:
-    """Add the step, and the number `k` of its action, to a refusal that is raised in the block."""
+    """Prefix a refusal that is raised in the block with `step`, and add the action's number `k`."""
     try:
         yield
     except Refused as refused:

@@ -140,9 +140,9 @@ class TaskPlanner(Planner):
         self.output.count = len(moves)
 
     def _compute_visible_s(self, tick: int) -> float:
-        """Return the time in s at which the level below sees the first moves of a plan.
+        """Return the time, in s, at which the level below sees the first moves of a plan.
 
-        The planner begins the plan at `tick`.
+        `tick` is the tick at which the planner begins the plan.
         """
         # The plan is ready within its cycles, is read and handed down at once, and is visible below
         # a cycle later.
