@@ -40,7 +40,7 @@ class Operation(IntEnum):
     GOTO = 4  # plan and make a motion to a goal, and stay until RESUME
     MODIFY = 5  # switch the control modification `name` on or off
     TABLE = 6  # switch to the state table `name`
-    DO = 7  # execute the level's command `name` instead of the level above's, until RESUME
+    DO = 7  # execute the level's own command `name`, not those from above, until RESUME
     ENABLE = 8  # enable the arm's drives
     DISABLE = 9  # brake the arm, and disable its drives
     RESET = 10  # reset the fault of the arm's drives

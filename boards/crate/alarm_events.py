@@ -193,7 +193,7 @@ class AlarmReader:
                 alarms.append(
                     ReadAlarm(alarm, int(row["subject"]), self._events.build_event(row, owner))
                 )
-        return sorted(alarms, key=lambda rung: (rung.event.tick, rung.event.time_ns))
+        return sorted(alarms, key=lambda alarm: (alarm.event.tick, alarm.event.time_ns))
 
 
 class AlarmConverter:
