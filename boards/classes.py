@@ -1,4 +1,4 @@
-"""Classes of levels by name, such as "package.module:Class", and the folders to search."""
+"""Look-up of level classes by name, as in "package.module:Class", and the folders to search."""
 
 from __future__ import annotations
 

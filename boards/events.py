@@ -33,7 +33,7 @@ OfRun = Literal[
 OfFaults = Literal["fault", "detection", "miss", "reaction", "recovery", "held"]
 EventKind = OfRun | OfFaults
 CONTINUATION_CODE = "continues"
-"""Code of the event with the first tick of a run that continues another one."""
+"""Code of the launch event of a run that continues another one. Its tick is the run's first."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,9 @@ class Event:
 
 DEMANDED = "a stop is demanded"
 NO_TORQUE = "no torque"
-"""Reason for brakes that engaged because no torque was received in time.
+"""`Braking.why` if the brakes engaged because no torque was received in time.
 
-For brakes that engaged because the safety functions required it (`DEMANDED`), other events show the
-cause.
+If the safety functions required the braking, it is `DEMANDED`, and other events show the cause.
 """
 MAX_HOLD_MS = 5e3
 """Longest time, in ms, for which an arm may be braked or a level may hold without interruption.
@@ -84,10 +83,10 @@ MAX_BRAKED_FRACTION = 0.5
 
 @dataclass(frozen=True)
 class Braking:
-    """One engagement of an arm's brakes.
+    """Period for which an arm's brakes were engaged.
 
     Attributes:
-        why: Reason for the engagement.
+        why: Reason why the brakes engaged.
         since: Tick at which the brakes engaged.
         lasted_ms: Time for which they were engaged.
     """
@@ -98,12 +97,12 @@ class Braking:
 
 
 def list_brakings(events: Sequence[Event], end: int, tick_ms: float) -> tuple[Braking, ...]:
-    """List every engagement of the brakes in a run, except at the start.
+    """Return the periods for which brakes were engaged in a run, except the one at the start.
 
     Args:
         events: Events of the run.
-        end: Number of ticks of the run.
-        tick_ms: Length of a tick.
+        end: Number of ticks of the run. Brakes that were not released count as engaged until then.
+        tick_ms: Length of a tick in ms.
     """
     changes = [event for event in events if event.code in ("brakes_closed", "brakes_opened")]
     engagements = [
@@ -124,7 +123,7 @@ def format_brakings(brakings: Sequence[Braking]) -> str:
     """Describe in one line how often, how long and why brakes were engaged.
 
     Args:
-        brakings: Engagements of the brakes, at least one.
+        brakings: Periods for which brakes were engaged, at least one.
     """
     longest = max(brakings, key=lambda braking: braking.lasted_ms)
     total_ms = sum(braking.lasted_ms for braking in brakings)
@@ -156,7 +155,7 @@ SUCCESSES: tuple[Cause, ...] = ("task done", "time over")
 
 @dataclass(frozen=True)
 class Outcome:
-    """End of a run.
+    """Result of a run.
 
     Attributes:
         cause: Reason for the end.
@@ -167,7 +166,7 @@ class Outcome:
         faults: Reasons why the run failed: latched faults, lost boards, objects too far from their
             goals although the task reports that it is done, long holds without a known cause,
             and levels that lost too many cycles.
-        brakings: Engagements of the brakes after the start.
+        brakings: Periods for which brakes were engaged, except the one at the start.
         objects: Final positions of objects with goals.
         excused: A line for each level that lost too many cycles because of injected faults, which
             is not a failure.
@@ -203,18 +202,18 @@ class Outcome:
 def get_event_order(entry: Mapping[str, Any]) -> float:
     """Return the tick of an entry in an event log, as a sort key.
 
-    Logs must be sorted because some events are reported late: a lost board that drives an arm
-    reports only after it has rejoined that the brakes had engaged. Entries without a tick, such as
-    the outcome, come last.
+    Entries without a tick, such as the outcome, get infinity, which sorts them last. Logs must be
+    sorted because some events are reported late. For example, if the board that drives an arm is
+    lost, it reports the engagement of the brakes only after it has rejoined.
     """
     return float(entry.get("tick", math.inf))
 
 
 class Journal:
-    """List of the events of a run, which passes each new event to a function.
+    """Stores the events of a run, and passes each new event to a callback.
 
     Attributes:
-        events: All events so far.
+        events: The recorded events, oldest first.
         segment: Memory of the rack, from which events get their ticks. While it is None, events
             get tick -1.
     """
@@ -234,7 +233,7 @@ class Journal:
         tick: int | None = None,
         subject: str = "",
     ) -> None:
-        """Record an event.
+        """Create an event and record it.
 
         Args:
             kind: Kind of event.
@@ -266,7 +265,7 @@ class Journal:
 
 
 def iterate_statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
-    """Yield the board and the last status of every level whose status has a given field.
+    """Yield (board, last status) for each level whose status has a field named `field`.
 
     Levels that have not written a status are left out.
     """
@@ -278,7 +277,7 @@ def iterate_statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMes
 
 
 def iterate_arm_states(segment: Segment) -> Iterator[tuple[str, AnyMessage]]:
-    """Yield the board and the last state of every arm and every hand."""
+    """Yield (board, last state) for each arm and each hand."""
     for box in segment.layout.mailboxes:
         if box.message == "arm_state":
             yield box.writer, open_observer(segment, box.name).peek().message
@@ -290,7 +289,7 @@ class Ending:
     Args:
         segment: Memory of the rack.
         ends_run: Status mailbox of the level that ends the run, as in `ClockWiring`.
-        silent: Time without a status after which the run ends, as in `ClockWiring`.
+        silent: Number of ticks without a status after which the run ends, as in `ClockWiring`.
     """
 
     def __init__(self, segment: Segment, ends_run: str | None, silent: int) -> None:
@@ -300,10 +299,10 @@ class Ending:
         self._observer = None if ends_run is None else open_observer(segment, ends_run)
 
     def find_final_state(self) -> tuple[str, str]:
-        """Return the last state of the level that ends the run, and the reason for it.
+        """Return the last state of the level that ends the run, and the reason for this state.
 
-        Both are empty if no level ends the run. If the level was silent for too long, the reason
-        says so.
+        Both are empty if no level ends the run. If the level has not written a status for too long,
+        the reason states for how long.
         """
         if self._observer is None:
             return "", ""
@@ -320,8 +319,8 @@ class Ending:
         """Return one line for each level or arm with a latched fault.
 
         A level has a latched fault if its last status reports an error. The level that ends the run
-        is left out. An arm has one if it has exceeded limits or had unintended contacts. It is left
-        out if its level reports an error.
+        is not listed. An arm has a latched fault if it has exceeded limits or had unintended
+        contacts. It is not listed if the level that drives it is.
         """
         reported = {
             board: f"level '{board}': {get_reason(status) or f'error {status.error}'}"
@@ -341,17 +340,18 @@ class Ending:
     ) -> Iterator[str]:
         """Yield a line for each hold that was too long.
 
-        If arms were braked for too long, this is one line about all of them. Otherwise there is one
-        line for each level that held for too long.
+        If arms were braked for longer than `MAX_HOLD_MS` without interruption, or for more than
+        `MAX_BRAKED_FRACTION` of the run in total, yield one line about all of them. Otherwise yield
+        a line for each level that is in a hold of more than `MAX_HOLD_MS` when the run ends.
 
         Nothing is yielded if the cause is known: a fault was injected, an operator has issued a
-        command, or the safety functions require a stop. Levels of a rack on a network are exempt
-        too, because they may wait for other racks.
+        command, or the safety functions require a stop. Levels of a rack on a network are not
+        listed, because they may be waiting for other racks.
 
         Args:
             events: Events of the run.
-            brakings: Engagements of the brakes.
-            ran_ms: Length of the run.
+            brakings: Periods for which brakes were engaged.
+            ran_ms: Length of the run in ms.
         """
         segment = self._segment
         if segment.words[System.DEMAND] or any(
@@ -390,7 +390,7 @@ class Ending:
             yield from held
 
     def find_object_ends(self, goals: Mapping[int, GoalConfig]) -> tuple[ObjectEnd, ...]:
-        """Return the last sensed positions of the objects that have goals.
+        """Compare the last sensed position of each object that has a goal with its goal.
 
         The result is empty if no level senses objects.
 
@@ -410,7 +410,7 @@ class Ending:
         return ()
 
     def find_cause(self) -> Cause:
-        """Return the cause of the end of a run. Call this only if the run was not stopped."""
+        """Return why a run ended. Call this only if the run was not stopped by a request."""
         if self._observer is None or self._ends_run is None:
             return "time over"
         status = self._observer.peek().message
@@ -423,10 +423,10 @@ class Ending:
         return "task refused" if is_refused else "task failed"
 
     def _compute_silent_ticks(self) -> int:
-        """Return the number of ticks since the last status of the level that ends the run.
+        """Return for how many ticks the level that ends the run has written no status.
 
-        The result is 0 if the silence is not longer than permitted, or if the last status has state
-        done or error. Call this only if a level ends the run.
+        The result is 0 if this is not more than permitted, or if the last status has state done or
+        error. Call this only if a level ends the run.
         """
         assert self._observer is not None, "some level ends the run"
         reading = self._observer.peek()

@@ -27,7 +27,7 @@ TAKEN_SUFFIX = "taken"
 """Suffix of the names of fields with arrivals. Fields with ages have `AGE_SUFFIX`."""
 _NEW = Verdict.NEW  # for the hot path
 NEVER = -1
-"""Tick of arrival that stands for no message."""
+"""Arrival tick of an input at which no message has arrived."""
 
 
 def build_exchange_message(reads: Mapping[str, Source]) -> type[Message]:
@@ -53,14 +53,16 @@ def build_exchange_message(reads: Mapping[str, Source]) -> type[Message]:
 
 @dataclass(frozen=True)
 class PortAge:
-    """Age of the message in use and tick of its arrival, both in ticks."""
+    """Age of the message in use at an input, in ticks, and the tick at which it arrived."""
 
     age: int
     taken: int
 
 
 def list_port_ages(exchange: Message) -> dict[str, PortAge]:
-    """Return age and arrival of each input that has received a message.
+    """Return the age and the arrival of the message in use at each input.
+
+    Inputs at which no message has arrived are left out.
 
     Args:
         exchange: Exchange record of a board.
@@ -84,7 +86,7 @@ class InputMailbox(NamedTuple):
     Attributes:
         readings: Table that receives the reading.
         key: Key of the reading in that table.
-        watcher: Reads the mailbox, and checks it.
+        watcher: Reads the mailbox and checks its messages.
     """
 
     readings: dict[str, Reading[AnyMessage]]

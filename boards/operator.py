@@ -45,7 +45,7 @@ def build_hold_command(mailbox: MailboxSpec) -> OperatorCommand:
 
 
 def describe_command(message: OperatorCommand) -> str:
-    """Describe a command in one line: its operation, its goal, and a name if it has one."""
+    """Describe a command in one line: its operation, and its goal or name if it has one."""
     verb = to_enum(Operation, message.what).name.lower()
     goal = message.goal
     if goal == Goal.JOINTS:

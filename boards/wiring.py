@@ -56,7 +56,7 @@ class SnapshotPolicy:
         part: Snapshots are taken as often as possible, but take at most 1 / `part` of the run's
             time. 0 for no such snapshots.
         every: Number of ticks between additional periodic snapshots, 0 for none.
-        at: Tick before which one more snapshot is taken, None for none.
+        at: Tick before which one additional snapshot is taken, None for none.
     """
 
     part: int = 40
@@ -68,8 +68,9 @@ class SnapshotPolicy:
 class Continuation:
     """Point from which a rack in lockstep continues: its crate's last snapshot up to `tick`.
 
-    A task continues in the state of the snapshot, possibly with other settings. If its wiring
-    differs, it is started anew and reads the restored mailboxes.
+    A task continues with its state in the snapshot, even if the settings of its level have changed.
+    If anything else in its wiring has changed, a new process is started, which reads the restored
+    mailboxes.
 
     Attributes:
         tick: Latest permitted tick of the snapshot.

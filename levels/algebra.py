@@ -28,7 +28,7 @@ Ints = NDArray[np.int_]
 Mask = NDArray[np.bool_]
 
 LEAST_PIVOT = 1e-12
-"""Diagonal element of a Cholesky factor below which a matrix counts as singular."""
+"""Diagonal element of a Cholesky factor below which the matrix is treated as singular."""
 
 
 def mat_vec(matrix: Array, vector: Array) -> Array:

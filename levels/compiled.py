@@ -125,7 +125,7 @@ class c_function(compiled[..., Any]):  # noqa: N801  # stands for a function
         self._library = library
 
     def iterate_source(self) -> Iterator[bytes]:
-        """Yield what a caller's machine code depends on: the name and the number of arguments."""
+        """Yield what determines the machine code of a caller: name and number of arguments."""
         yield repr(self._key).encode()
 
     def _build(self) -> Any:

@@ -138,13 +138,16 @@ def add_position_noise(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool
 
 
 def repeat_last_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool]:
-    """Return the fault's first sample, dated one cycle back, as if no new one had arrived."""
+    """Return the sample with which the fault began, as if no new one had arrived since then.
+
+    Its tick is that of one cycle earlier.
+    """
     first = fault.recall_first_sample(sample)
     return first._replace(tick=first.tick - fault.every), True
 
 
 def freeze_sample(sample: Sample, fault: ActiveFault) -> tuple[Sample, bool | None]:
-    """Freeze the affected positions and velocities at their values when the fault began."""
+    """Replace the affected positions and velocities by their values when the fault began."""
     first = fault.recall_first_sample(sample)
     truth = (sample.position, sample.velocity)
     stuck = np.where(fault.joints, (first.position, first.velocity), truth)

@@ -124,7 +124,7 @@ class HostSender(Protocol[M_co]):
 
     @property
     def sent(self) -> int:
-        """Number of messages sent so far, also by earlier processes of this board."""
+        """Number of messages sent by this process and earlier processes of this board."""
 
 
 class ProgramInput(InputPort[M]):

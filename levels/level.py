@@ -56,8 +56,8 @@ accepts none copies `operator` from the command above to its command and status.
 system's response to an operator cannot be measured.
 
 Events: declare what a level can detect, `contact = FindingKind(unit="N m", doc="the arm touches
-something")`, and report it by `self.raise_finding("contact", 3.2, text="left finger")`, in every
-cycle in which it holds if you like. The run records one event for each episode.
+something")`, and report it by `self.raise_finding("contact", 3.2, text="left finger")`. You may do
+so in every cycle in which the level detects it. The run records one event for each episode.
 
 Parameters: declare `params = MyParams`, a `Table`, and read it from `self.settings`. `rack check`
 reports every mistake before the launch. The text below a field states its meaning and unit, and
@@ -482,7 +482,8 @@ class Executor(LevelSection, ABC):
     def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
         """Return the names to which alarms refer by index, such as control modifications.
 
-        By default, an operator may give the same names. `params` may be invalid.
+        By default there are none. `list_operation_names` returns the same names unless a subclass
+        overrides it. `params` may be invalid.
         """
         return ()
 

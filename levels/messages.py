@@ -19,7 +19,7 @@ from rack.levels.operator import AnsweringStatus, RelayedCommand
 WINDOW_MOVES = 8
 """Elemental moves in one task command.
 
-There are enough that the level below never waits for a cycle of the task level.
+With this number, the level below never has to wait for a cycle of the task level.
 """
 SEGMENTS = 2
 """Number of segments in one move command."""
@@ -56,7 +56,7 @@ class Error(IntEnum):
     STALLED = 14  # nothing has moved for the time that the task permits
     MOTORS = 15  # a motor did not produce its torque in any retry
     TABLE = 16  # a state table reached a row with status error
-    GIVEN_UP = 17  # another rack made all racks give up their common program
+    GIVEN_UP = 17  # another rack made all racks abandon their common program
     FORCE = 18  # a contact exceeded the arm's limits of force
     CLIENT = 19  # a server's client is lost or silent
     CONTACT = 20  # a contact was not made, or was lost

@@ -39,8 +39,8 @@ class Operation(IntEnum):
     SETPOINT = 3  # move the joints to positions, and stay until RESUME
     GOTO = 4  # plan and make a motion to a goal, and stay until RESUME
     MODIFY = 5  # switch the control modification `name` on or off
-    TABLE = 6  # use the state table `name` from now on
-    DO = 7  # execute the level's command `name` instead of the level above's, until RESUME
+    TABLE = 6  # switch to the state table `name`
+    DO = 7  # execute the level's own command `name`, not those from above, until RESUME
     ENABLE = 8  # enable the arm's drives
     DISABLE = 9  # brake the arm, and disable its drives
     RESET = 10  # reset the fault of the arm's drives
@@ -330,12 +330,12 @@ class Orders:
     def find_basis(self, above: int) -> int:
         """Return the serial of the newest operator command on which this cycle is based.
 
-        `above` is the same serial for the command from the level above.
+        `above` is the serial in the field `operator` of the command from the level above.
         """
         return max(self.basis, above)
 
     def fill_status(self, status: AnsweringStatus, above: int = 0) -> None:
-        """Write the oldest queued answer to a status, or the last answer again.
+        """Write the oldest queued answer to a status, or repeat the last one if none is queued.
 
         For `above` see `find_basis`.
         """

@@ -16,9 +16,9 @@ from rack.backplane.process import describe_end, die_with_parent, wait_readable
 
 T = TypeVar("T")
 SLOW_S = 2.0
-"""Duration of an import after which the user is told that it continues, in s."""
+"""Duration of an import, in s, after which the user is told that it is still running."""
 MAX_IMPORT_S = 60.0
-"""Duration of an import after which the module is refused, in s."""
+"""Duration of an import, in s, after which the module is refused."""
 IMPORTED_STATUS = 117
 """Exit status of a child that has completed an import. Few modules exit with it themselves."""
 
@@ -47,7 +47,7 @@ Configs of users and of recorded runs name the old places.
 
 
 def resolve_moved(reference: str) -> str:
-    """Return a reference "package.module:Name", with its present name if it has moved."""
+    """Return a reference "package.module:Name", changed if its module or class has moved."""
     for old, new in MOVED_REFERENCES.items():
         remainder = reference.removeprefix(old)
         if remainder != reference and remainder[:1] in ("", ".", ":"):
@@ -109,7 +109,7 @@ def find_class(reference: str, base: type[T], in_child_first: bool = True) -> ty
     return named
 
 
-# A config is checked for many mistakes, and each may need the module.
+# Each of the many checks of a config may need the module.
 @cache
 def _try_import(module: str) -> str:
     """Import a module in a child process, to find out whether this process may import it.

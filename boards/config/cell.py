@@ -31,7 +31,7 @@ def compute_cell_sizes(config: RackConfig) -> dict[str, int]:
 def find_geom_name(config: RackConfig, geom: int) -> str:
     """Return the name of the geom with the given number in the cell of the rack.
 
-    Raises `DamageError` if there is no such geom, because the number comes from shared memory.
+    The number comes from shared memory. Raises `DamageError` if there is no such geom.
     """
     from rack.levels.robot import lookup
 

@@ -77,12 +77,12 @@ def build_request(
 
 
 def build_requests(config: RackConfig, layout: Layout) -> tuple[Request, ...]:
-    """Return the requests for the commands of a checked config."""
+    """Return the operator table's requests for the commands of a checked config."""
     return tuple(_encode_request(command, layout) for command in config.command)
 
 
 def _encode_request(command: CommandConfig, layout: Layout) -> Request:
-    """Convert a checked command to a request, as the operator table stores it."""
+    """Convert a checked command to a request for the operator table."""
     name = f"{command.level}.operator"
     spec = layout.find_mailbox(name)
     message = OperatorCommand(build_message_dtype(spec.fields, spec.size))
@@ -140,7 +140,7 @@ def find_command_mistakes(
 def _check_command(
     place: str, command: CommandConfig, config: RackConfig, published: Levels
 ) -> Mistakes:
-    """Yield every mistake in one operator command, whose place is "" if it is live."""
+    """Yield every mistake in one operator command. `place` is "" for a live command."""
     at = partial(format_place, place)
     if command.tick is not None and command.at is not None:
         yield Mistake(at("at"), command.at, "tick is also given; give only one of tick, at")
@@ -170,7 +170,7 @@ def _check_command(
 
 
 def _check_goal(at: Callable[[str], str], command: CommandConfig, known: Commands) -> Mistakes:
-    """Check that a command has exactly one goal of an accepted form, or none if it takes none.
+    """Check that a command has one goal of an accepted form, or no goal if it does not take any.
 
     Args:
         at: Function that returns the place in the config of a key of the command.
@@ -208,7 +208,7 @@ def _find_goal_key(goal: Goal) -> str:
 
 
 def _check_name(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
-    """Check that a command has a name that its level knows, or none if it takes no name."""
+    """Check that a command has a name that its level knows, or no name if it does not take any."""
     if command.operation not in NAMED_OPERATIONS:
         if command.name is not None:
             yield Mistake(place, command.name, f"{command.what} takes no name; remove it")
@@ -224,7 +224,7 @@ def _check_name(place: str, command: CommandConfig, level: PublishedLevel) -> Mi
 
 
 def _check_setting(place: str, command: CommandConfig, level: PublishedLevel) -> Mistakes:
-    """Check that a command sets a live parameter of its level to a valid value."""
+    """Check that a command `set` names a live parameter of its level and a valid value."""
     name = format_place(place, "name")
     try:
         key, value = read_setting(command.name or "")

@@ -91,7 +91,7 @@ class TaskPorts:
         return {port: f"{self.place.board}.{port}" for port in self.outputs}
 
     def find_origin_mailboxes(self, output: str) -> tuple[str, ...]:
-        """Return the mailboxes whose information an output is based on.
+        """Return the mailboxes on whose messages an output is based.
 
         The result is empty if the output does not declare an input in `rests_on`.
         """
@@ -108,7 +108,7 @@ def _connect_ports(
         config: The config of the rack.
         place: Entry of the task in the config.
         kind: Class of the task.
-        types: Message classes of the mailboxes known so far. A port that the config adds has the
+        types: Message classes of the mailboxes that are known. A port that the config adds has the
             type of the mailbox that it reads.
     """
     mistakes: list[Mistake] = []
@@ -124,7 +124,7 @@ def _connect_ports(
         reads[port] = entry.source
     outputs = {**kind.outputs, **added_ports.outputs}
     if exchange and added_ports.is_complete:
-        # Do not replace an output of this name in the class: `check_exchange` reports it.
+        # Do not replace an output of the class with this name. `check_exchange` reports it.
         outputs.setdefault(EXCHANGE_PORT, Output(build_exchange_message(reads)))
     inputs = {**kind.inputs, **added_ports.inputs}
     return TaskPorts(
@@ -225,8 +225,8 @@ class Wiring:
                 for ports in self.ports.values()
                 for port, box in ports.writes.items()
             }
-            # A port that the config adds may pass on another such port, whose type must be known
-            # first: repeat until no mailbox is added.
+            # A port that the config adds may relay the messages of another added port, whose
+            # message type must be known first. Repeat until no mailbox is added.
             if len(written) == len(types):
                 return
             types = written
@@ -288,7 +288,7 @@ class Wiring:
 
     @cached_property
     def passed_mailboxes(self) -> dict[str, str]:
-        """Dictionary from copies that bus adapters write to the mailboxes that they copy."""
+        """For each mailbox into which a bus adapter copies messages, the mailbox that it copies."""
         return {
             f"{ports.place.board}.{port}": source
             for ports in self.tasks
@@ -321,9 +321,9 @@ class Wiring:
 
     @cached_property
     def unknown_boards(self) -> set[str]:
-        """Boards with mistakes that leave some of their mailboxes unknown.
+        """Boards some of whose mailboxes are unknown because of mistakes.
 
-        A port that reads an unknown mailbox of such a board is not reported as a further mistake.
+        If a port reads an unknown mailbox of such a board, this is not reported as another mistake.
         """
         boards = {place.board for place in self.unusable_classes}
         boards |= {ports.place.board for ports in self.ports.values() if not ports.is_whole}
@@ -366,8 +366,9 @@ class Wiring:
     def find_protocol(self, mailbox: str) -> Protocol:
         """Return the protocol of a mailbox.
 
-        It is the protocol in the config, except for queues, for mailboxes of the host side, and for
-        writers that cannot use it.
+        It is time-slice for mailboxes that host boards read, and queue for queues and for mailboxes
+        that host boards write. For all others it is the protocol in the config, unless the clock or
+        the network adapter writes the mailbox and cannot use this protocol.
         """
         if mailbox in self.mailboxes_to_host:
             # Host boards always read the newest message at once.

@@ -31,7 +31,7 @@ ANY = "*"
 STATE_TABLES = ("board", ANY, "params", "tables", ANY)
 """Keys under which levels name the files of their state tables. `ANY` stands for any key."""
 EXTENDS = "configs that this file extends, by name or path, in order; its own keys override theirs"
-"""Meaning of the key `extends`, which files have and a loaded config does not."""
+"""Meaning of the key `extends`, which may occur in a file but not in a loaded config."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def append_faults(tables: Tables, name_or_path: str | Path, folder: Path) -> Tab
 
 
 def name_config(path: str) -> str:
-    """Return the name of a bundled config, given its path, or the path of any other."""
+    """Return the name of a bundled config, given its path. Any other path is returned unchanged."""
     stem = Path(path).with_suffix("")
     if not stem.is_relative_to(CONFIGS):
         return path
@@ -258,7 +258,7 @@ def _read_config(
     Args:
         path: The file.
         chain: The files that led to it, each of which extends the next.
-        known: Tables of the files read so far, because several files may extend the same one.
+        known: Tables of the files that have been read, because several may extend the same file.
         mistakes: List to which mistakes are added.
     """
     if path not in known:

@@ -1,4 +1,4 @@
-"""Joins the timing of racks that exchange messages, from their configs."""
+"""Joint timing model of racks that exchange messages, built from their configs."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from rack.boards.timing.joined import JoinedRacks, Link, Station
 
 @dataclass(frozen=True)
 class JoinedMember:
-    """One of several racks: its config and its layout."""
+    """Config and layout of one of several racks that exchange messages."""
 
     config: RackConfig
     layout: Layout
 
     def compute_exchange_grid(self, rate_hz: float) -> TickGrid:
-        """Return the times in ns at which the adapter exchanges messages at a rate."""
+        """Return the times, in ns, of exchanges that the adapter makes at `rate_hz`."""
         clock_ns = self.layout.clock_ns
         adapter = self.layout.find_task(LAN).grid
         cycles = round(1e9 / (rate_hz * adapter.every * clock_ns))
@@ -31,7 +31,10 @@ class JoinedMember:
 
 
 def load_partners(config: RackConfig) -> list[RackConfig]:
-    """Load the racks that a config launches or names as partners, with its clock mode and speed.
+    """Load the configs of racks that a config launches or names as partners.
+
+    They get the clock mode and the speed of this config. The result is empty for a rack without a
+    network.
 
     Raises:
         ConfigError: A config has mistakes.
@@ -44,7 +47,7 @@ def load_partners(config: RackConfig) -> list[RackConfig]:
 
 
 def join_racks(configs: Sequence[RackConfig]) -> JoinedRacks:
-    """Join the timing of racks.
+    """Build the joint timing model of several racks.
 
     Args:
         configs: Valid configs of racks with different names.

@@ -27,14 +27,14 @@ from rack.boards.config.schema import RackConfig, TaskEntry
 OPERATOR_DEPTH = 128
 """Slots of an operator's mailbox. Few are needed, because commands are rare."""
 RETAINED_S = 2.0
-"""Simulated time that mailboxes and trace rings retain.
+"""Simulated time, in s, for which mailboxes and trace rings retain their records.
 
 Real-time boards may keep the recorder from running for 1 s, and it must not lose data in that time.
 """
 SUSTAINED = 4
-"""Average number of messages per cycle of a queue's writer with which a recorder can keep up.
+"""Average number of messages per cycle of the writer that a deep queue retains.
 
-It limits the memory of deep queues.
+A recorder can keep up with this rate. The limit saves memory.
 """
 WORD_BYTES = 4
 """Bytes of one word in `[protocol.interrupt]`, the width of the 68020's bus."""
@@ -160,8 +160,8 @@ class LayoutBuilder:
         """
         delay = reader.slice
         read = max((exchange.grid for exchange in box.exchanges), default=reader.grid)
-        # The writer learns after both delays which messages the reader has taken. During that time
-        # it can send at most `capacity` messages.
+        # The writer learns after the delays of both mailboxes which messages the reader has taken.
+        # During that time it can send at most `capacity` messages.
         most_sent = capacity * (1 + self._retained_ticks // (box.delay + delay))
         # A deep queue retains fewer messages, to limit its memory.
         slots = compute_depth(

@@ -142,7 +142,7 @@ def _build_valid_part(tables: Tables, broken: frozenset[str]) -> RackConfig:
 
 
 def _complete_robot(config: RackConfig) -> RackConfig:
-    """Return the config, with the arm's joints, tool and home taken from its model if not given.
+    """Return the config, in which the arm's joints, tool and home come from its model if not given.
 
     Raises:
         ConfigError: The model does not define them.

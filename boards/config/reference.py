@@ -109,7 +109,9 @@ def list_key_tables(config: RackConfig) -> list[KeyTable]:
 
 
 def find_tables(name: str, config: RackConfig) -> list[KeyTable]:
-    """Return the table called `name`, or else those inside it, as "adapter.lan" for "adapter".
+    """Return the table called `name` or, if there is none, the tables inside it.
+
+    For example, the result for "adapter" is the table "adapter.lan".
 
     Raises:
         LookupError: There is no such table. The message lists the top-level tables.
@@ -262,7 +264,7 @@ def _format_limits(entry: Schema) -> str:
 
 
 def _format_number(value: float) -> str:
-    """Return a number as text, with at most six significant digits if that is exact."""
+    """Return a number as text, with six significant digits if they represent it exactly."""
     text = f"{value:g}"
     return text if float(text) == value else str(value)
 

@@ -40,14 +40,14 @@ from rack.levels.level import LevelContext, Pace
 from rack.levels.tables import GoalConfig, RobotConfig
 
 LINGER_S = 0.5
-"""Simulated time that a run continues after the task ends, to let the arm come to rest."""
+"""Simulated time, in s, that a run continues after its task ends, so that the arm comes to rest."""
 SILENT_S = 30.0
-"""Simulated time without a status after which the level that ends the run counts as dead.
+"""Simulated time, in s, for which the level that ends the run may write no status.
 
-The limit is at least 8 cycles of that level.
+After this time, but at least 8 cycles of that level, the run is ended.
 """
 AHEAD_S = RETAINED_S / 2
-"""Simulated time by which lockstep may run ahead of a recorder: half of what the rings retain."""
+"""Simulated time, in s, by which lockstep may be ahead of a recorder: half of what rings retain."""
 LAYOUT_NEEDS = {"clock", "protocol", "robot", "scene", "task"}
 """Tables that a layout depends on. If one has mistakes, no layout is computed."""
 

@@ -38,9 +38,9 @@ CLOCK_SLOT = 1
 """Slot of the system controller, as on VME."""
 LAST_SLOT = 21
 OUTSIDE = 0
-"""Value in place of a slot for host boards, which have none."""
+"""Slot number of host boards, which have no slot."""
 ANY_CORE = -1
-"""Value in place of a core for host boards, which are not pinned."""
+"""Core number of host boards, which are not pinned to a core."""
 
 Coupling = Literal["tight", "loose", "none"]
 Mode = Literal["realtime", "lockstep"]
@@ -554,9 +554,9 @@ class RackConfig(Table):
 
     @property
     def outside_state(self) -> str:
-        """State outside the rack, which snapshots cannot contain, as text. Empty if there is none.
+        """Description of state outside the rack, which snapshots cannot contain. Empty if none.
 
-        A rack with such state repeats a run only if it replays the recorded outside messages.
+        A rack with such state repeats a run only if it replays the messages that came from outside.
         """
         hosts = ", ".join(map(repr, self.host))
         states = [f"{hosts}: a host program's state"] if hosts else []

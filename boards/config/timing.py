@@ -202,9 +202,9 @@ def read_budgets(config: RackConfig) -> dict[str, Budget]:
 
 
 def replace_budgets(config: RackConfig, measured: Mapping[str, Budget]) -> RackConfig:
-    """Return a config with the measured budgets, keyed by board, instead of its own.
+    """Return a copy of a config with its budgets replaced by measured ones, keyed by board.
 
-    Boards without a measured budget have none in the result. `plan_within_ms` is kept.
+    Boards without a measured budget have none in the copy. `plan_within_ms` is kept.
     """
     boards = {}
     for name, board in config.board.items():

@@ -14,7 +14,7 @@ from rack.backplane.bounded_toml import INTEGER_BITS, MAX_DEPTH, TOO_DEEP, TOO_L
 from rack.boards.errors import ConfigError, Mistake, format_value
 
 SETTING = re.compile(r"""((?:"(?:[^"\\\n]|\\.)*"|'[^'\n]*'|[^"'=\n])+)=([^\0]*)""")
-"""Setting "key.sub=value" with a key in TOML, as in `protocol.mailbox."level.plan"=lock`."""
+"""Pattern of a setting "key.sub=value" with a TOML key: `protocol.mailbox."level.plan"=lock`."""
 FREE_FORM = ("params", "task")
 """Tables that levels declare. An empty list in them is a value and must be written."""
 

@@ -44,7 +44,7 @@ About = Literal[
     "nothing",
 ]
 ENGAGED_BY = ("the boards above", DEMANDED, NO_TORQUE, "")
-"""Reasons why brakes engaged that are not errors, by the negated subject of the alarm."""
+"""Reasons why brakes engaged other than errors. Subject -n of an alarm refers to entry n."""
 EMERGENCY_STOP = "emergency stop"
 ANOTHER_RACK = "another rack"
 DEMANDS: Mapping[Demand, str] = {
@@ -193,7 +193,7 @@ class AlarmReader:
                 alarms.append(
                     ReadAlarm(alarm, int(row["subject"]), self._events.build_event(row, owner))
                 )
-        return sorted(alarms, key=lambda rung: (rung.event.tick, rung.event.time_ns))
+        return sorted(alarms, key=lambda alarm: (alarm.event.tick, alarm.event.time_ns))
 
 
 class AlarmConverter:
@@ -301,7 +301,8 @@ class AlarmConverter:
         )
         tick = found_at = int(row["tick"])
         if alarm == Alarm.BRAKES_CLOSED and since < found_at:
-            # If no board drove the arm when the brakes engaged, the alarm is raised later.
+            # If no board drove the arm when the brakes engaged, the alarm is raised later. The
+            # event gets the tick at which they engaged.
             tick = since
             text += f", known at tick {found_at}"
         return Event(
@@ -321,7 +322,7 @@ class AlarmConverter:
         """Return the name of an alarm's subject. Raises `DamageError` if there is no such subject.
 
         Args:
-            about: What kind of subject the alarm has.
+            about: Kind of the subject.
             number: Number of the subject.
             owner: Task that raised the alarm.
         """
@@ -347,12 +348,12 @@ class AlarmConverter:
     def _format_previous_value(self, board: str, command: OperatorCommand) -> str:
         """Return a clause with the value that a parameter had before a command set it.
 
-        The new value is stored, as the previous value for the next command.
+        Also store the new value, which is the previous value for the next command.
         """
         try:
             key, value = read_setting(command.name)
         except LevelError:
-            # Another program issued the command without checking it, and the level refuses it.
+            # Another program issued the command without checking it. The level refuses it.
             return ""
         param = self._levels[board].live.get(key)
         before = self._live.get((board, key), param and param.launched)

@@ -1,4 +1,4 @@
-"""Removal of segments that killed racks have left. A rack in use is never removed."""
+"""Removal of segments that killed racks have left behind. A rack in use is never removed."""
 
 from __future__ import annotations
 

@@ -77,11 +77,11 @@ OUTPUT_PAUSE_S = 0.01
 ORPHANS_S = 1.0
 """Longest wait for the end of processes that a host board has started."""
 LEAVE_S = 0.5
-"""Time that boards have to end by themselves after the launcher has ended."""
+"""Time that boards have to end by themselves when the crate leaves a rack."""
 
 
 class Crate:
-    """Parent process of all boards. It ends when the Rack closes the line or ends.
+    """Parent process of all boards. It ends when the Rack closes the line or the launcher ends.
 
     Args:
         line: Connection to the Rack.
@@ -112,7 +112,10 @@ class Crate:
         return self._opened
 
     def run(self) -> None:
-        """Serve requests until the Rack closes the line or ends, then end all boards and copies."""
+        """Serve requests until the Rack closes the line or the launcher ends.
+
+        Then end all boards and all copies in snapshots.
+        """
         while True:
             printing = [
                 output for output in self._outputs.values() if output not in self._paused_outputs
@@ -177,7 +180,10 @@ class Crate:
                 self._line.send(Shown(-1 if snapshot is None else snapshot.tick, text))
 
     def _open_rack(self, opening: Open) -> None:
-        """Attach to the segment of a rack. If the rack continues a run, restore its snapshot."""
+        """Attach to the segment of a rack, and report this to the Rack.
+
+        If the rack continues a run, the memory of the segment is restored from a snapshot.
+        """
         self._opened = segment = Segment.attach(opening.rack)
         record_used_files()
         set_priority(opening.priority)
@@ -189,7 +195,11 @@ class Crate:
         self._line.send(Opened(-1 if snapshot is None else snapshot.tick))
 
     def _power_on(self, name: str, wiring: TaskWiring | ClockWiring) -> None:
-        """Start a task or the clock: continue its copy in the snapshot, or fork a process."""
+        """Start a task or the clock.
+
+        If the snapshot contains a copy that can continue with this wiring, it continues. Otherwise
+        a new process is forked.
+        """
         self._wirings[name] = wiring
         copy = self._copies_to_continue.pop(name, None)
         if copy is not None and copy.can_continue_as(wiring):
@@ -231,8 +241,8 @@ class Crate:
                 continue
             self._line.send(Preloading(reference))
             with suppress(LookupError):
-                # The launcher tries the import in a child first, which detects a module that ends
-                # its process.
+                # The launcher first tries the import in a child process, to detect a module that
+                # ends the process that imports it.
                 kind = find_class(reference, object, in_child_first=False)
                 try:
                     if issubclass(kind, Executor | Planner):
@@ -287,9 +297,9 @@ class Crate:
             self._line.send(Forked(name, pid))
 
     def _kill_orphans(self) -> None:
-        """Kill the descendants that a host board left behind, in any session.
+        """Kill the remaining descendants of a host board that has ended, in whatever session.
 
-        They became children of the crate when the host board ended.
+        They have become children of the crate.
         """
         deadline = time.monotonic() + ORPHANS_S
         while time.monotonic() < deadline:
@@ -338,7 +348,7 @@ class Crate:
         return any(host.name == name for host in self._segment.layout.hosts)
 
     def _kill_boards(self, board: str | None = None) -> None:
-        """Kill the named board, or all boards."""
+        """Kill the board of this name, or all boards if it is None."""
         for pidfd, (name, _) in self._boards.items():
             if board in (None, name):
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
@@ -370,7 +380,7 @@ class Crate:
             self._opened = None
 
     def _reap_copies(self, are_all: bool = False) -> None:
-        """Reap copies that have ended. If `are_all` is set, wait until all copies have ended."""
+        """Reap copies that have ended. If `are_all` is true, first wait until all have ended."""
         with suppress(ChildProcessError):
             while os.waitpid(-1, 0 if are_all else os.WNOHANG)[0]:
                 continue

@@ -1,7 +1,7 @@
-"""The Rack's check for processes that hang: no progress for much longer than their period.
+"""Detection of hanging processes by the Rack: no progress for much longer than their period.
 
-In real time it checks only the clock, whose own watchdog checks the tasks. In lockstep it checks
-the clock and all tasks.
+In real time only the clock is checked, because the watchdog in the clock's board checks the tasks.
+In lockstep the clock and all tasks are checked.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from rack.backplane.segment import Segment
 from rack.backplane.words import Block, Run, System
 
 HEARTBEATS_MISSED = 4
-"""Ticks without progress after which the clock counts as hanging.
+"""Number of tick periods without progress after which the clock is reported as hanging.
 
 Three ticks gave a false alarm in 24,000 ticks.
 """
@@ -41,7 +41,10 @@ class Heartbeat:
         self._waited_at = -1
 
     def find_hanging(self) -> list[str]:
-        """Return the tasks found to hang since the last call. The clock is called "clock"."""
+        """Return the tasks that hang, with the clock as "clock".
+
+        A task that hangs is returned only once, until it makes progress again.
+        """
         if self._words[System.STATE] != Run.RUNNING:
             return []
         now = time.monotonic()
@@ -66,16 +69,16 @@ class Heartbeat:
             elif (
                 now - since > self._bounds[name]
                 and name not in self._reported
-                and (name != CLOCK or self._clock_is_stuck())
+                and (name != CLOCK or self._is_clock_stuck())
             ):
                 hanging.append(name)
         self._reported.update(hanging)
         return hanging
 
-    def _clock_is_stuck(self) -> bool:
-        """Return True if the clock makes no progress because it is stopped, dead or waiting.
+    def _is_clock_stuck(self) -> bool:
+        """Return True if the clock's process is stopped or dead, or still waits at the same tick.
 
-        If its process is runnable, it only lacks processor time and is not stuck.
+        A process that is runnable only lacks processor time and is not stuck.
         """
         state = read_state(self._words[System.CLOCK_PID])
         tick = self._seen[CLOCK][0]

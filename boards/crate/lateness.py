@@ -20,10 +20,10 @@ from rack.boards.faults.kind import find_kind
 def find_late_tasks(segment: Segment, config: RackConfig, end: int) -> tuple[list[str], list[str]]:
     """Find the tasks that missed or skipped more cycles than the config permits.
 
-    Only totals are known, not which cycles an injected fault cost. Every task may therefore lose
-    as many cycles as were due between the first effect of a fault and the latest end of recovery
-    that the fault's kind permits. Any further lost cycles must not exceed `max_missed_fraction` of
-    the cycles that were due at other times.
+    Tasks only count their lost cycles, and do not record which of them an injected fault caused.
+    Every task may therefore lose as many cycles as were due between the first effect of a fault and
+    the latest end of recovery that the fault's kind permits. Any further lost cycles must not
+    exceed `max_missed_fraction` of the cycles that were due at other times.
 
     Args:
         segment: Segment of the rack. Its boards must have finished their last cycles.

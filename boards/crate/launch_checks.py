@@ -90,7 +90,10 @@ def _find_refusal(plan: Resolved, segment: Segment) -> str:
 
 
 def _list_reservations(plan: Resolved, segment: Segment) -> Iterator[str]:
-    """Yield clauses that name the tasks with reserved processor time and the refused ones."""
+    """Yield a clause for each outcome of reserving processor time, with the tasks that it concerns.
+
+    The reservation was made on the task's core, on any core, or refused.
+    """
     blocks = {
         task.task: segment.get_block(task.task)
         for task in plan.tasks

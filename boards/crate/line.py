@@ -38,7 +38,7 @@ selects at the start of a process, so the setting must be in the environment.
 END_S = 1.0
 """Time that a crate has to end its snapshots and itself before it is killed."""
 LEAVE_S = 10.0
-"""Longest time that a crate takes to leave a rack. It may still be importing."""
+"""Longest wait until a crate has left a rack. The crate may still be importing modules."""
 NO_WINDOWS = {"MUJOCO_GL": "disable"}
 """Setting that stops MuJoCo from starting a process that looks for OpenGL. Boards do not draw."""
 
@@ -155,13 +155,13 @@ class WarmCrate(CrateLine):
 
     @property
     def is_over(self) -> bool:
-        """Whether the crate has ended, by request or because it did not leave a rack in time."""
+        """Whether the crate was ended, on request or because leaving a rack took too long."""
         return self._is_closed
 
     def close(self, timeout_s: float) -> None:
-        """Make the crate end the boards of its rack, and wait until it has done so.
+        """Make the crate end the boards of its rack, and wait until they have ended.
 
-        If `is_last` is set, end the crate itself as well.
+        If `is_last` is set, or if this takes longer than `LEAVE_S`, end the crate itself as well.
 
         Args:
             timeout_s: Time in s after which the crate is killed if it does not end. Used only if
@@ -209,7 +209,7 @@ class WarmCrate(CrateLine):
 def build_environment() -> dict[str, str]:
     """Return the environment of the crate.
 
-    It is the environment of this process, changed so that runs repeat exactly.
+    It is the environment of this process, with settings that make runs repeat exactly.
     """
     tunables = ":".join(filter(None, (os.environ.get(TUNABLES), SAME_LIBM)))
     return {

@@ -28,7 +28,7 @@ class Holder:
 
     Attributes:
         rack: Name of the rack.
-        process: Its launcher. For another user's rack, one of its boards.
+        process: Text that names its launcher or, for another user's rack, one of its boards.
         tasks: Its tasks on the core.
     """
 
@@ -87,7 +87,7 @@ def _find_cores_of_processes(rack: str) -> dict[int, Holder]:
 
 
 def _find_cores_of_rack(segment: Segment) -> dict[int, list[str]]:
-    """Return a dictionary from core to the real-time tasks that a running rack has on it."""
+    """Return a dictionary from core to the real-time tasks of a running rack on that core."""
     if segment.words[System.STATE] == Run.STOPPED:
         return {}
     occupied: dict[int, list[str]] = {}
@@ -103,7 +103,7 @@ def _find_cores_of_rack(segment: Segment) -> dict[int, list[str]]:
 
 
 def move_boards(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackConfig, list[str]]:
-    """Move boards from occupied cores to a free core, unless the config states their core.
+    """Move boards from occupied cores to a free core, unless the config specifies their core.
 
     Args:
         config: The config.

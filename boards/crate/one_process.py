@@ -110,20 +110,20 @@ class OneProcess:
         Raises:
             LookupError: The mailbox does not exist, or no message was visible.
         """
-        post = self._mailboxes.get(mailbox)
-        if post is None:
+        box = self._mailboxes.get(mailbox)
+        if box is None:
             raise LookupError(f"no mailbox '{mailbox}'; mailboxes: {', '.join(self._mailboxes)}")
-        newest = post.find_newest(self.tick - 1)
+        newest = box.find_newest(self.tick - 1)
         if newest is None:
             raise LookupError(f"'{mailbox}' is empty at tick {self.tick - 1}")
-        message = AnyMessage(post.dtype)
+        message = AnyMessage(box.dtype)
         message.raw[:] = newest[1]
         return message
 
     @property
     def serials(self) -> Mapping[str, int]:
-        """Serials of the newest visible messages, keyed by mailbox, without empty mailboxes."""
-        newest = {name: post.find_newest(self.tick - 1) for name, post in self._mailboxes.items()}
+        """Serial of each mailbox's newest visible message. Mailboxes without one are left out."""
+        newest = {name: box.find_newest(self.tick - 1) for name, box in self._mailboxes.items()}
         return {name: entry[0] for name, entry in newest.items() if entry is not None}
 
 
@@ -158,7 +158,7 @@ class PrivateMailbox:
             self.stored.append((tick + self.spec.delay, self.serial, bytes(self.message.raw)))
 
     def find_newest(self, tick: int) -> tuple[int, bytes] | None:
-        """Return the serial and bytes of the newest message visible at `tick`. None if empty."""
+        """Return serial and bytes of the newest message visible at `tick`. None without one."""
         for visible_at, serial, data in reversed(self.stored):
             if visible_at <= tick:
                 return serial, data
@@ -168,15 +168,15 @@ class PrivateMailbox:
 class PrivateReader:
     """Reader of a `PrivateMailbox`, with the same verdicts as the readers of a board."""
 
-    def __init__(self, post: PrivateMailbox, kind: type[Message]) -> None:
-        self._post = post
+    def __init__(self, box: PrivateMailbox, kind: type[Message]) -> None:
+        self._box = box
         self._serial = 0
-        self._message = kind(post.dtype)
+        self._message = kind(box.dtype)
         self._readings = {verdict: Reading(self._message, verdict) for verdict in Verdict}
 
     def read(self, tick: int) -> Reading[Message]:
         """Return the newest message visible at `tick` with its verdict."""
-        newest = self._post.find_newest(tick)
+        newest = self._box.find_newest(tick)
         if newest is None:
             return self._readings[Verdict.NONE]
         serial, data = newest
@@ -193,11 +193,11 @@ class PrivateTask:
     Args:
         layout: Layout of the rack.
         wiring: Wiring of the task.
-        posts: All mailboxes, keyed by name.
+        boxes: All mailboxes, keyed by name.
     """
 
     def __init__(
-        self, layout: Layout, wiring: TaskWiring, posts: Mapping[str, PrivateMailbox]
+        self, layout: Layout, wiring: TaskWiring, boxes: Mapping[str, PrivateMailbox]
     ) -> None:
         self.spec = layout.find_task(wiring.task)
         kind: type[Executor] | type[Planner] = find_class(
@@ -213,15 +213,15 @@ class PrivateTask:
             message = level.inputs[port].message if port in level.inputs else AnyMessage
             table = level.find_input_table(port)
             if isinstance(source, str):
-                self._add_reader(table, port, PrivateReader(posts[source], message))
+                self._add_reader(table, port, PrivateReader(boxes[source], message))
                 continue
             table[port] = {}
             for board, mailbox in source.items():
-                self._add_reader(table[port], board, PrivateReader(posts[mailbox], message))
-        self._posts = [posts[name] for name in wiring.outputs.values()]
+                self._add_reader(table[port], board, PrivateReader(boxes[mailbox], message))
+        self._boxes = [boxes[name] for name in wiring.outputs.values()]
         for port, name in wiring.outputs.items():
             message = level.outputs[port].message if port in level.outputs else AnyMessage
-            level.store_output(port, message(posts[name].dtype, posts[name].message.raw))
+            level.store_output(port, message(boxes[name].dtype, boxes[name].message.raw))
         self._busy_until = 0
         self.cycle = self._run_executor if isinstance(level, Executor) else self._run_planner
 
@@ -256,5 +256,5 @@ class PrivateTask:
 
     def _write_outputs(self, tick: int) -> None:
         """Write all mailboxes that are due at the end of this cycle."""
-        for post in self._posts:
-            post.write(tick, self.spec.every)
+        for box in self._boxes:
+            box.write(tick, self.spec.every)

@@ -42,9 +42,10 @@ class HostOutput:
         os.close(self.writer)
 
     def copy_output(self, is_over: bool = False) -> None:
-        """Copy new output to the crate's own, up to `MOST_LINES` lines in a run.
+        """Copy new output to the crate's standard output, up to `MOST_LINES` lines in a run.
 
-        Each time the number of lines has doubled, report how many were dropped.
+        Further lines are dropped. Their number is reported each time the total number of lines has
+        doubled, and at the end.
 
         Args:
             is_over: Whether the board has ended, so that an incomplete last line is copied too.

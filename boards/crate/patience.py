@@ -13,7 +13,7 @@ from rack.boards.events import Journal
 from rack.boards.lan.awaited import find_waits
 
 COMPILE_S = 300.0
-"""Time limit for compiling one function: thirty times the longest on an idle machine."""
+"""Time limit for compiling one function: thirty times the longest measured on an idle machine."""
 PATIENCE_S = 2.0
 """Time after which a wait is reported. The report is repeated each time the wait has doubled."""
 

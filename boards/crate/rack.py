@@ -91,7 +91,7 @@ class Rack:
 
     @property
     def events(self) -> list[Event]:
-        """All events so far."""
+        """Events of the run, in the order in which they were recorded."""
         return self._journal.events
 
     @property
@@ -215,9 +215,9 @@ class Rack:
             desk.add_request(request_entry)
 
     def take_over_events(self, events: Iterable[Event]) -> None:
-        """Add events of the continued run, from before the snapshot, to the events of this run.
+        """Add the events of the continued run that precede the snapshot to the events of this run.
 
-        The outcome of this run includes them.
+        The outcome of this run takes them into account.
         """
         self._journal.events.extend(events)
 
@@ -239,8 +239,8 @@ class Rack:
         if self._continues is None:
             supervisor.reset_latch()
         else:
-            # The snapshot contains the state of the latch. Discard alarms from before it, which are
-            # events of the continued run.
+            # The snapshot contains the state of the latch. Discard alarms from before the snapshot,
+            # which are events of the continued run.
             supervisor.is_armed = True
             supervisor.alarms.read_alarms()
             tick = self.begins_at

@@ -1,8 +1,8 @@
 """Restarts of lost boards: their limit, their order, and their execution.
 
-The end of each process is recorded, and the board is restarted or given up. Boards rejoin on the
-clock's grid. In real time nothing waits for host boards, and their loss has no effect on the arm.
-The clock admits the return of a host board as it does for other boards.
+The end of each process is recorded, and the board is restarted if the restart policy permits it.
+Boards rejoin on the clock's grid, host boards too. In real time nothing waits for host boards, and
+their loss has no effect on the arm.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ UP_STATES = (TaskState.READY, TaskState.RUNNING)
 class RestartPolicy:
     """Decides whether lost tasks of a rack are restarted, and in which order.
 
-    Times are ticks, so that equal losses in lockstep have equal outcomes.
+    Times are in ticks, so that a repeated lockstep run makes the same decisions.
     """
 
     def __init__(self, config: RackConfig, layout: Layout) -> None:
@@ -47,7 +47,7 @@ class RestartPolicy:
             )
 
     def admit_restart(self, task: str, tick: int) -> str:
-        """Decide whether a task that was lost at `tick` may be restarted. Count the restart if so.
+        """Decide whether a task that was lost at `tick` may be restarted, and if so, count it.
 
         Returns:
             Text such as "restart 1 of at most 3 in 60 s". Empty if no restart is permitted.
@@ -94,8 +94,9 @@ class Recovery:
     Attributes:
         wirings: Wirings of all boards and of the host boards that are not external, keyed by name.
             Empty before the run, when no board is restarted.
-        faults: The reason for each board that was given up.
-        given_up: Whether the crate or a board that is not a host board was given up.
+        faults: For each board that will not be restarted, the reason.
+        given_up: Whether the crate has ended, or a board that is not a host board will not be
+            restarted.
         is_beyond_help: Whether the run cannot continue.
     """
 
@@ -126,7 +127,7 @@ class Recovery:
                 self._crate.try_request(PowerOn(name, wiring))
 
     def record_loss(self, end: Ended, is_over: bool, record_printed: Callable[[], None]) -> None:
-        """Record the end of a board, and schedule a restart or give the board up.
+        """Record the end of a board, and schedule a restart if one is permitted.
 
         Args:
             end: The crate's report on the end.
@@ -145,7 +146,7 @@ class Recovery:
         text = f"{'host ' * is_host}board '{name}' ended: {describe_end(end.status)}"
         self._journal.add_event("died", name, text, "died", end.seen_ns, end.tick)
         if not self.wirings or (is_over and not is_host):
-            self._record_giving_up(name, text)
+            self._record_final_loss(name, text)
             return
         if end.status == UNRECOVERABLE_STATUS and not is_host:
             record_printed()
@@ -161,17 +162,17 @@ class Recovery:
         else:
             # The clock reacts to this state by braking the arm and ending the run.
             self._segment.get_block(name)[Block.STATE] = TaskState.GIVEN_UP
-        self._record_giving_up(name, text, is_host)
+        self._record_final_loss(name, text, is_host)
 
     def record_crate_loss(self) -> None:
         """Record that the crate, and therefore every board, has ended."""
         self.is_beyond_help = True
         text = "the crate ended, and all boards with it"
         self._journal.add_event("died", "crate", text, "died")
-        self._record_giving_up("crate", text)
+        self._record_final_loss("crate", text)
 
     def report_hanging(self, board: str, why: str = "") -> None:
-        """Record as an event that a board hangs.
+        """Record an event which states that a board is not responding.
 
         Args:
             board: Name of the board.
@@ -181,14 +182,14 @@ class Recovery:
         self._journal.add_event("detection", "rack", text, "hang", subject=board)
 
     def kill_hanging(self, board: str) -> None:
-        """Kill a hanging board, so that it is lost, unless it is already being restarted."""
+        """Kill a hanging board, which is then handled as lost. Skip one that is being restarted."""
         if board not in (*self._waiting, *self._starting):
             self._crate.try_request(PowerOff(board))
 
     def restart_due_boards(self) -> None:
-        """Power on lost boards that need not wait for others, and kill stopped host boards.
+        """Power on lost boards that need not wait for others.
 
-        No other check detects that a signal has stopped a host board.
+        Also kill each host board that a signal has stopped, because no other check detects this.
         """
         self._starting = [
             name
@@ -209,12 +210,12 @@ class Recovery:
                 self._crate.try_request(PowerOff(name))
 
     def _find_printed_reason(self, board: str) -> str:
-        """Return the last line that a board printed about itself. Empty if there is none."""
+        """Return the last line that begins with "board '<board>': ". Empty if there is none."""
         printed = (event.text for event in reversed(self._journal.events))
         return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
 
-    def _record_giving_up(self, board: str, text: str, is_host: bool = False) -> None:
-        """Record that a board or the crate was given up.
+    def _record_final_loss(self, board: str, text: str, is_host: bool = False) -> None:
+        """Record that a board will not be restarted, or that the crate has ended.
 
         Args:
             board: Name of the board, or "crate".

@@ -28,7 +28,7 @@ class Preload:
     """Request to import and preload levels, which the boards forked later then share.
 
     Attributes:
-        classes: Classes of levels, as "package.module:Class". Those already loaded cost nothing.
+        classes: Classes of levels, as "package.module:Class". Loaded classes are skipped.
         path: The import path.
         cell: Cell that is compiled as well. None for a rack without an arm.
     """
@@ -87,7 +87,7 @@ class Leave:
 
 @dataclass(frozen=True)
 class Left:
-    """Answer to `Leave`: no board is left."""
+    """Answer to `Leave`: all boards of the rack have ended."""
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class Ended:
 
 @dataclass(frozen=True)
 class ForkFailed:
-    """Report that a board could not be forked, as its end and the reason."""
+    """Report that a board could not be forked: a record of its end, and the reason."""
 
     end: Ended
     why: str

@@ -1,8 +1,9 @@
 """Snapshots that a crate holds: a waiting copy of each process of a rack, and of the segment.
 
-Their number and memory are bounded. When there are too many, the snapshot of the older half is
-dropped whose removal leaves the smallest gap. A snapshot that has lost a copy is dropped as a
-whole. All copies end with the crate, which holds the only other end of each copy's line.
+Their number and memory are limited. When a limit is exceeded, a snapshot of the older half is
+dropped: the one whose removal leaves the smallest gap. A snapshot in which a copy has ended is
+dropped as a whole. All copies end with the crate, because only the crate has the other ends of
+their lines open.
 """
 
 from __future__ import annotations
@@ -106,7 +107,7 @@ class HeldSnapshot:
     is_complete: bool = False
 
     def measure_memory(self) -> None:
-        """Update `private_bytes`."""
+        """Measure the memory that the snapshot does not share, and store it in `private_bytes`."""
         self.private_bytes = os.fstat(self.memory).st_size
         for copy in self.copies.values():
             with suppress(OSError):
@@ -200,12 +201,12 @@ class SnapshotShelf:
         older = held[: max(2, len(held) // 2)]
         candidates = [old for old in older if old.tick != ticks[0] and old is not held[-1]]
 
-        def gap(snapshot: HeldSnapshot) -> int:
-            """Return the ticks from the snapshot before this one to the snapshot after it."""
+        def compute_gap(snapshot: HeldSnapshot) -> int:
+            """Return the gap, in ticks, that the removal of a snapshot would leave."""
             at = ticks.index(snapshot.tick)
             return ticks[min(at + 1, len(ticks) - 1)] - ticks[at - 1]
 
-        return min(candidates, key=gap, default=held[0])
+        return min(candidates, key=compute_gap, default=held[0])
 
     def __len__(self) -> int:
         return len(self._complete_snapshots)

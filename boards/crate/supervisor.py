@@ -97,13 +97,13 @@ class Supervisor:
                 self._stop_by = time.monotonic() + STOP_S
                 self._journal.add_event("stop", "", self._why_stopped)
             self._record_printed()
-            for rung in self.alarms.read_alarms():
+            for raised in self.alarms.read_alarms():
                 # Record each alarm as an event, and kill a process that hangs.
-                self._journal.record_event(rung.event)
-                if rung.alarm == Alarm.HANG:
-                    task = select_item(self.plan.layout.tasks, rung.subject, "task")
+                self._journal.record_event(raised.event)
+                if raised.alarm == Alarm.HANG:
+                    task = select_item(self.plan.layout.tasks, raised.subject, "task")
                     self.recovery.kill_hanging(task.name)
-                elif rung.alarm == Alarm.CLOCK_STOPPED and rung.subject == self.pids.get(CLOCK):
+                elif raised.alarm == Alarm.CLOCK_STOPPED and raised.subject == self.pids.get(CLOCK):
                     # Kill the clock only if it is still the reported process and not its successor.
                     self.recovery.kill_hanging(CLOCK)
             for board in self._heartbeat.find_hanging():
@@ -145,7 +145,7 @@ class Supervisor:
             )
 
     def _wait_for_messages(self, timeout_s: float) -> None:
-        """Wait up to `timeout_s` for an alarm or a message from the crate. Handle the message."""
+        """Wait up to `timeout_s` for an alarm or a message from the crate, and handle messages."""
         attention = self._crate.attention
         for ready in wait([self._crate.line, attention], timeout_s):
             if ready == attention:
@@ -179,8 +179,8 @@ class Supervisor:
 
     def _end_run(self) -> None:
         """Tell the boards that the run is over, and determine and record its outcome."""
-        for rung in self.alarms.read_alarms():
-            self._journal.record_event(rung.event)
+        for raised in self.alarms.read_alarms():
+            self._journal.record_event(raised.event)
         words = self.segment.words
         stop = words[System.TICK] + 1
         if planned := words[System.STOP_TICK]:
@@ -231,7 +231,7 @@ class Supervisor:
         )
 
     def _is_cycling(self, name: str) -> bool:
-        """Return True if a board is still in a cycle that it can finish."""
+        """Return True if a board has not finished its last released cycle and is not lost."""
         if self.recovery.is_beyond_help or name not in self.segment.map.blocks:
             return False
         block = self.segment.get_block(name)

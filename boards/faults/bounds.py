@@ -31,7 +31,7 @@ Up to 0.5 ms per megabyte were seen on a busy machine, and a planner with its li
 
 
 def cycle_ticks(layout: Layout, board: str) -> int:
-    """Return the length of a task's cycle in ticks: a planner's time slice, or 1 for the clock."""
+    """Return the cycle of a task in ticks: for a planner its time slice, for the clock 1."""
     if board == CLOCK:
         return 1
     return layout.find_task(board).slice
@@ -40,7 +40,7 @@ def cycle_ticks(layout: Layout, board: str) -> int:
 def compute_last_read_ticks(mailboxes: tuple[str, ...], layout: Layout) -> int:
     """Return the longest time in ticks from a writer's release until all readers have the message.
 
-    It is the maximum over these mailboxes. 0 if nobody reads them.
+    The result is the maximum over the mailboxes, or 0 if no task reads them.
     """
     boxes = [layout.find_mailbox(name) for name in mailboxes]
     return max(
@@ -102,7 +102,7 @@ class BoundCase:
 
     @cached_property
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
-        """Affected mailboxes that the reader reads or, without a reader, that any task reads."""
+        """Affected mailboxes that `reader` reads or, if it is None, that any task reads."""
         struck = list_affected_mailboxes(self.layout, self.injection.mailbox, self.board)
         if self.reader:
             return tuple(mailbox for mailbox in struck if self.reader in mailbox.readers)
@@ -127,7 +127,7 @@ class BoundCase:
     def read_ticks(self) -> int:
         """Longest interval in ticks between reads of an affected mailbox.
 
-        Only reads of the reader count or, without a reader, of the fastest reader of each mailbox.
+        The reads are those of `reader` or, if it is None, those of each mailbox's fastest reader.
         """
         read_interval = partial(compute_read_interval, self.layout)
         if self.reader:
@@ -220,7 +220,10 @@ MUTE = Bound(
     format_count(MISSING_WRITES, "write"),
     lambda case: None if case.role == "planner" else MISSING_WRITES * case.write_ticks,
 )
-"""Time after which a mailbox is mute. None for a planner, which does not write periodically."""
+"""Time without messages after which a mailbox is reported as mute.
+
+None for a planner, which does not write periodically.
+"""
 DELAY = Bound("the delay", lambda case: int(case.parameters["by"]) * case.write_ticks)
 SKIP = Bound(
     "the next cycle of the fastest boards",
@@ -228,7 +231,7 @@ SKIP = Bound(
         int(case.parameters["ticks"]), min(task.every for task in case.layout.tasks) - 1
     ),
 )
-"""Skipped releases are noticed in the first tick that is not skipped."""
+"""Time until skipped releases are noticed, in the first tick that is not skipped."""
 DEATH_CYCLES = 4
 DEATH = Bound(
     f"{RACK_NS * 1e-6:g} ms (Rack), {DEATH_CYCLES} cycles + 1 read (reader)",
@@ -238,7 +241,7 @@ DEATH = Bound(
         else DEATH_CYCLES * case.cycle_ticks + case.read_ticks
     ),
 )
-"""A death is noticed by the Rack, or by a reader once the newest message is too old."""
+"""Time until the Rack notices a death, or a reader notices that the newest message is too old."""
 SLICE = Bound("1 time slice", lambda case: case.cycle_ticks)
 RELEASE = Bound("1 cycle", lambda case: case.layout.find_task(case.board).every)
 """Interval between two releases of the task. A planner has several in its time slice."""

@@ -126,7 +126,10 @@ def _skip_ticks(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
 
 
 def _delay_tick(stage: FaultStage, entry: FaultEntry, tick: int) -> None:
-    """Delay a tick by a random fraction of its period, at most the fault's parameter."""
+    """Delay a tick by a random part of its period.
+
+    It is between `MIN_LATENESS_TICKS` and the fault's parameter.
+    """
     entry.record_action(tick)
     delay = random.Random(entry.seed + tick).uniform(MIN_LATENESS_TICKS, entry.parameters[0])
     until_ns = stage.clock.compute_time_ns(tick) + int(delay * stage.clock.period_ns)
@@ -141,17 +144,20 @@ CLOCK_STOP = ClockStep(_stop_clock)
 CLOCK_SKIP = ClockStep(_skip_ticks)
 CLOCK_JITTER = ClockStep(during=_delay_tick)
 ELSEWHERE = ClockStep()
-"""Step of a fault that acts in another process: the clock's board has nothing to do."""
+"""Steps of a fault that acts in another process: the clock's board does nothing."""
 
 
 def _find_step(entry: FaultEntry) -> ClockStep:
-    """Return the steps of a fault in the clock's board. `ELSEWHERE` if another process acts."""
+    """Return the steps of a fault that the clock's board carries out.
+
+    `ELSEWHERE` if another process carries out the fault.
+    """
     step = find_kind(entry).step
     return step if isinstance(step, ClockStep) else ELSEWHERE
 
 
-def _next_change(entry: FaultEntry, tick: int) -> int:
-    """Return the first tick after `tick` at which a fault may change. `NEVER` if it is over."""
+def _find_next_change(entry: FaultEntry, tick: int) -> int:
+    """Return the first tick after `tick` at which a fault may begin or end, or `NEVER`."""
     if entry.stage == Stage.WAITING:
         return tick + 1 if entry.when_box >= 0 else max(tick + 1, entry.tick)
     if entry.stage == Stage.ACTIVE:
@@ -169,7 +175,7 @@ class FaultStage:
     real time a fault may have a phase: it then acts at a fraction of its tick, after the releases.
 
     Attributes:
-        injected: Number of faults injected so far.
+        injected: Number of injected faults when the fault table was last read.
         next_tick: Next tick at which a fault may begin, act or end, if no more faults are injected.
     """
 
@@ -187,7 +193,7 @@ class FaultStage:
         self._awaited: dict[int, int] = {}
         """Dictionary from a mailbox's index to the tick from which a new message is awaited."""
         if self._words[System.STATE] == Run.RUNNING:
-            # A restarted clock does not know which messages have been seen before.
+            # A restarted clock does not know which mailboxes had a new message after a fault.
             for entry in self._table.list_entries((Stage.OVER,)):
                 self._await_messages(entry)
         self._phased: list[FaultEntry] = []
@@ -211,7 +217,8 @@ class FaultStage:
             True if the signal was sent, False if the process does not exist.
         """
         pid = task.block[Block.PID]
-        # A host board has no process if its program has finished or was given up, or in a replay.
+        # A host board has no process if its program has finished, if it will not be restarted, or
+        # in a replay.
         # A process may also have ended without the crate having noticed.
         if task.is_lost or task.block[Block.STATE] > TaskState.RUNNING or pid <= 0:
             return False
@@ -259,11 +266,14 @@ class FaultStage:
                 )
         # While messages flood the rings, do one tick at a time, so that the recorder keeps up.
         must_check = self._awaited or self.driver.is_flooded
-        changes = [tick + 1] if must_check else [_next_change(entry, tick) for entry in faults]
+        changes = [tick + 1] if must_check else [_find_next_change(entry, tick) for entry in faults]
         self.next_tick = min(changes, default=NEVER)
 
     def act_within_tick(self, tick: int) -> None:
-        """After the releases of `tick`, carry out its faults with a phase, each at its time."""
+        """Carry out the faults with a phase that begin at `tick`, each at its fraction of the tick.
+
+        Call this after the releases of `tick`.
+        """
         if not self._phased:
             return
         clock = self.clock
@@ -274,7 +284,10 @@ class FaultStage:
         self._phased.clear()
 
     def _is_over(self, entry: FaultEntry, tick: int) -> bool:
-        """Return True if a fault has reached its end, has acted once, or has lost its process."""
+        """Return True if an active fault must end at `tick`.
+
+        Its duration is over, its process is gone, or it acts only once and has done so.
+        """
         kind = find_kind(entry)
         has_acted = kind.once and kind.acts_in_task and entry.count > 0
         return entry.until <= tick or has_acted or _find_step(entry).is_void(self, entry)
@@ -294,7 +307,7 @@ class FaultStage:
         return reading.has_message and int(getattr(reading.message, field)) == entry.when_value
 
     def _begin_fault(self, entry: FaultEntry, tick: int) -> None:
-        """Activate a fault and carry it out, or schedule it within the tick if it has a phase."""
+        """Activate a fault and carry it out. In real time, schedule it if it has a phase."""
         kind = find_kind(entry)
         entry.tick = tick
         duration_ticks = entry.ticks

@@ -109,5 +109,5 @@ def list_sweep_sizes(least: float, visible: float, count: int) -> list[float]:
 
 
 def _round_as_saved(value: float) -> float:
-    """Round a value to 4 significant digits, so that a plan is equal when read back from a file."""
+    """Round a value to 4 significant digits, so that it is equal when read back from a file."""
     return float(f"{value:.4g}")

@@ -85,8 +85,8 @@ class Consequence:
         own: Further alarms about the fault's task, mailboxes or joint.
         arm: Alarms about any joint.
         reactions: Codes of events that must all follow.
-        recovery_s: Simulated time within which every reaction is undone, s, counted from the end of
-            the fault or from its detection.
+        recovery_s: Simulated time, in s, within which every reaction is undone. It is counted from
+            the end of the fault or from its detection.
         ends_process: Whether the task's process ends, so that recovery includes its restart.
         latches: Whether the task may end with an error instead of recovering.
     """
@@ -116,7 +116,8 @@ class Kind:
         tasks: Roles that can be affected.
         consequence: Effects besides detection.
         lasts: Draws the duration in ticks for a campaign.
-        realtime: Whether the fault is impossible in lockstep, where time waits for every task.
+        realtime: Whether the fault is only possible in real time. In lockstep, time waits for every
+            task.
         once: Whether it acts only once. Other faults last for a time or until the run ends.
         within_tick: Whether it can act within a tick. Other faults begin with a cycle.
         visible_from: Smallest value of the parameter `size` that must be detected.

@@ -29,7 +29,7 @@ COMMAND = Consequence(reactions=BRAKED)
 DAMAGE = Consequence(own=(Alarm.GAP, Alarm.HELD_BACK, Alarm.DISORDER, Alarm.MASQUERADE, Alarm.MUTE))
 BIAS_RAD = 0.02
 NOISE_RAD = 0.005
-"""Sensor errors of at least this size must be detected."""
+"""Smallest sensor error, in rad, that must be detected."""
 
 
 # Constructors of kinds that act in the same place and have the same consequences.

@@ -92,7 +92,7 @@ class Mute(MessageStep):
 
 
 class Drop(MessageStep):
-    """Loses messages in transit: their serials are used up, but their slots are not filled."""
+    """Loses messages in transit: each uses up a serial, but is not written to its slot."""
 
     def send_message(self, message: Outgoing) -> None:
         """Lose the message with the fault's probability. Otherwise pass it on."""
@@ -124,9 +124,9 @@ class Reorder(MessageStep):
     """Swaps messages with their successors."""
 
     def send_message(self, message: Outgoing) -> None:
-        """Send the message ahead of the one held back earlier, if there is one.
+        """If a message is held back, pass on the new message and then the one held back.
 
-        Otherwise hold it back with the fault's probability, or pass it on.
+        Otherwise hold the new message back with the fault's probability, or pass it on.
         """
         if self.held:
             self.onward(message)
@@ -185,7 +185,7 @@ class HoldLock(MessageStep):
 
 
 class FaultyWriter:
-    """Replaces the writer of a mailbox that has faults.
+    """Writer of a mailbox that has faults, used in place of the ordinary writer.
 
     Args:
         writer: Writer of the mailbox.
@@ -231,7 +231,7 @@ class FaultyWriter:
         """Pass the message through all faults and publish the results.
 
         A delayed message becomes visible together with the messages of the cycle that publishes it.
-        What readers see therefore depends on ticks alone, even with faults.
+        Runs with delayed messages therefore repeat exactly in lockstep.
 
         Args:
             tick: Release of the cycle that writes.
@@ -250,7 +250,7 @@ class FaultyWriter:
         return self._written and self._writer.is_in_time(tick, now)
 
     def flush_due(self, tick: int, now: int | None = None) -> None:
-        """Publish the delayed messages that are due at `tick`."""
+        """Publish delayed messages that are due at `tick` or whose fault is over."""
         visible_at = self._writer.compute_visible_tick(tick, now)
         late_messages = self._late
         self._late = []

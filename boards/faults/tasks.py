@@ -45,7 +45,7 @@ class ExtraComputing:
     until: LoadStep
 
     def burn_time(self, tick: int) -> None:
-        """Keep the processor busy until the time that the step computes."""
+        """Record that the fault acted, and keep the processor busy until the time from `until`."""
         now_ns = monotonic_ns()
         self.entry.record_action(tick)
         end_ns = self.until(self, tick, now_ns)
@@ -65,7 +65,7 @@ Times are CLOCK_MONOTONIC in ns.
 
 
 def compute_cycle_end(load: ExtraComputing, tick: int, now_ns: int) -> int:
-    """Compute when extra computing of `by` cycles, or a random fraction of that, ends.
+    """Compute when extra computing of `by` cycles, or of a random fraction of this time, ends.
 
     Args:
         load: The extra computing; its fault has the parameters `by` and `random`.
@@ -129,8 +129,8 @@ class TaskFaults:
 
         Returns:
             Generation of the fault table, so that the caller can skip this call while it is
-            unchanged. -1 if a fault will begin at a later tick, because the clock works ahead of
-            the grid; the next cycle must call this again.
+            unchanged. -1 if a fault is marked as active but begins at a later tick, which happens
+            because the clock works ahead of the grid. The next cycle must then call this again.
         """
         generation = self._table.generation
         entries = self._table.list_entries((Stage.ACTIVE,))

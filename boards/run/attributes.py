@@ -1,8 +1,8 @@
 """View of a level's attributes as plain data, to be shown to the user.
 
-The view contains the level's attributes. Of an attribute that is an object, it contains only those
-attributes that have changed since the level was built. Functions, classes, configs and views of
-shared memory are left out.
+The view contains all attributes of the level. If the value of an attribute is an object, it is
+shown by those of its own attributes that have changed since the level was built. Functions,
+classes, configs and views of shared memory are left out.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rack.backplane.segment import Segment
 from rack.boards.run.settings import has_attributes, list_attribute_names
 
 MAX_ITEMS = 24
-"""Maximum number of array elements or items shown. Of larger collections, the size is shown."""
+"""Maximum number of array elements or items shown. Larger collections are shown as their size."""
 MAX_DEPTH = 5
 """Maximum nesting of objects."""
 OMITTED_CLASSES = (ByteLock, Layout, Segment)
@@ -83,7 +83,7 @@ def _omit_missing(items: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 class _AttributeReader:
-    """Reads a tree of objects once. An object referred to several times is shown only once."""
+    """Converts a tree of objects to plain data. Each object is shown only where it occurs first."""
 
     def __init__(self) -> None:
         self._seen: set[int] = set()

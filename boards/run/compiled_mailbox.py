@@ -45,11 +45,11 @@ PORT = _build_dtype(
     "head",
     "slots",
     "record",
-    # Of the slots: distance in bytes, number, and bytes in use.
+    # The slots: distance between two in bytes, number of slots, and bytes used in each.
     "stride",
     "depth",
     "size",
-    # To read: addresses of the reader's state and of the word that marks the writer as lost,
+    # For reading: addresses of the reader's state and of the word that marks the writer as lost,
     # whether visibility depends on ticks, and whether compiled code accepts and checks messages.
     "state",
     "lost",
@@ -57,8 +57,8 @@ PORT = _build_dtype(
     "is_watched",
     "late_from",
     "quiet",  # ticks
-    # To write: address and length of an array with the addresses of the states of the readers on
-    # whose messages the written message depends.
+    # For writing: address and length of an array of addresses. Each is the address of the state of
+    # a reader on whose messages the written message depends.
     "sources",
     "source_count",
     # Period, 0 for a mailbox to read; phase; time until a message is visible. In ticks.
@@ -68,7 +68,7 @@ PORT = _build_dtype(
     # Result of the last read, or the signature of an intruder found by the last write.
     "result",
 )
-"""Record of a mailbox to read or to write."""
+"""Record type of a mailbox that compiled code reads or writes."""
 _SIGNATURE = 8 * Slot.EPOCH
 _VISIBLE = 8 * Slot.VISIBLE_AT
 _PORT_SIZE = PORT.itemsize
@@ -187,7 +187,8 @@ def publish(port: Any, tick: int, stamp: int) -> int:
     record.visible = tick + port.delay
     record.chain = record.check
     record.check = xxh3(port.record + CHECKED_FROM, port.size - CHECKED_FROM, record.chain)
-    # The order of stores is: the previous head, the message, its signature, this head.
+    # Other processes must see the stores in this order: the mailbox's head for the previous
+    # message, this message, its signature, and the mailbox's head for this message.
     fence()
     copy(slot + SIGNED_FROM, port.record + SIGNED_FROM, port.size - SIGNED_FROM)
     fence()

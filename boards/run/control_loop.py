@@ -76,7 +76,7 @@ class VirtualControlLoop(Task):
         deadline = tick + self._due
         watch.start_cycle(tick, self.next_cycle.skipped)
         if watch.is_late:
-            self._handle_delay(tick)
+            self._handle_late_start(tick)
         guard = self._guard
         if guard is not None and self.words[System.CLOCK_SKIPPED] != guard.reported:
             guard.report_skipped(tick)
@@ -91,10 +91,11 @@ class VirtualControlLoop(Task):
         watch.end_ns = monotonic_ns()
         watch.finish_cycle(in_time, deadline, done=tick)
 
-    def _handle_delay(self, tick: int) -> None:
-        """Record a pause in reading if releases were skipped, and check whether the clock was late.
+    def _handle_late_start(self, tick: int) -> None:
+        """Handle the late start of a cycle: check whether the clock was late.
 
-        Called in a cycle that begins late. The first cycle counts as the end of a pause too.
+        If releases were skipped before the cycle, or if it is the first, also record this tick as
+        the beginning of regular reads.
         """
         if self.next_cycle.skipped or not self._has_cycled:
             self.inputs.task.since = tick
@@ -103,7 +104,7 @@ class VirtualControlLoop(Task):
             self._guard.check_release(tick)
 
     def process(self, tick: int) -> None:
-        """Run the level's `process`, then report its findings and the faults that acted in it."""
+        """Run the level's `process`, then handle its findings and the faults that are active."""
         executor = self.executor
         executor.demand = _DEMANDS[self.words[System.DEMAND]]
         executor.process(tick)
@@ -113,19 +114,22 @@ class VirtualControlLoop(Task):
             self._report_findings(tick)
 
     def _report_findings(self, tick: int) -> None:
-        """Raise alarms for the level's findings, and record the faults that acted in the cycle."""
+        """Raise alarms for the level's findings, and record which faults of the arm acted.
+
+        Also burn the processor time of load faults.
+        """
         executor = self.executor
         for finding in executor.findings:
             # A level may raise user-defined findings in every cycle. Raise one alarm per episode.
-            if finding.alarm is not Alarm.OWN or self._begins_episode(finding.subject, tick):
+            if finding.alarm is not Alarm.OWN or self._record_own_finding(finding.subject, tick):
                 self.alarms.raise_alarm(tick, *finding)
         executor.findings.clear()
         self.faults.count_actions(executor.acted, tick)
         executor.acted.clear()
         self.faults.burn_time(tick)
 
-    def _begins_episode(self, number: int, tick: int) -> bool:
-        """Record a user-defined finding of a level.
+    def _record_own_finding(self, number: int, tick: int) -> bool:
+        """Record a user-defined finding, and return whether it begins an episode.
 
         Args:
             number: Number of the kind of finding among those that the level declares.
@@ -198,7 +202,7 @@ class PlannerLoop(Task):
         watch.finish_cycle(in_time, tick + self.slice, done, Flag.PLANNED)
 
     def _pass_release(self, tick: int) -> None:
-        """Finish a cycle in which no plan is wanted.
+        """Finish a cycle in which no plan is wanted, and publish messages that faults have delayed.
 
         The cycle is traced only if it was late or releases were skipped before it.
         """

@@ -167,9 +167,9 @@ class Copier:
         seeds: Any,
         show: Callable[[], Mapping[str, Any]],
     ) -> tuple[ContinueRequest, int]:
-        """In a copy, wait for the request to continue. Requests for attributes are answered.
+        """In a copy, wait for the request to continue. Answer requests for attributes until then.
 
-        The process exits if the crate ends before that.
+        If the crate ends first, the process exits.
 
         Args:
             crate: Pipe to the crate.

@@ -32,7 +32,7 @@ class instruction(compiled[..., Any]):  # noqa: N801  # a decorator
         self._record = record
 
     def iterate_source(self) -> Iterator[bytes]:
-        """Yield what a caller's machine code depends on: this file and the record type."""
+        """Yield what determines the machine code of a caller: this file and the record type."""
         yield Path(__file__).read_bytes()
         yield repr(self._record).encode()
 

@@ -92,7 +92,7 @@ class ReadTable(PortTable):
 def can_read(line: InputMailbox) -> bool:
     """Check whether compiled code can read a mailbox.
 
-    It must be read in every cycle, under a protocol without a lock, queue or interrupts.
+    It can if the mailbox is read in every cycle and its protocol has no lock, queue or interrupts.
     """
     kinds = Reader, DoubleBufferReader
     return isinstance(line.watcher, MailboxWatcher) and type(line.watcher.reader) in kinds

@@ -95,7 +95,7 @@ class InputPorts:
     def read_queue_position(
         self, segment: Segment, queue: QueueWriter, alarms: AlarmWriter
     ) -> None:
-        """Add the position of a queue's reader to the mailboxes that are read in every cycle.
+        """Read, in every cycle, also the mailbox with the position of a queue's reader.
 
         Args:
             segment: Memory of the rack.
@@ -147,9 +147,9 @@ class OutputPort:
 
     The basis of a message is the tick of the oldest information on which it depends: the oldest
     basis of the messages of `sources`. A mailbox with a `max_age` is written on demand, only in
-    cycles in which the level has sent a message. Any other mailbox is written in every cycle that
-    is due. If `sends` is true, the level fills a queue by calling `send`. Otherwise the board sends
-    the level's message once per due cycle.
+    cycles in which the level has sent a message. Any other mailbox is written in every cycle in
+    which it is due. If `sends` is true, the level fills a queue by calling `send`. Otherwise the
+    board sends the level's message once in each of these cycles.
     """
 
     def __init__(
@@ -174,8 +174,8 @@ class OutputPort:
             self.value = Sender(writer.message, self._mark_sent, lambda: 1)
         elif isinstance(writer, QueueWriter) and sends:
             self.value = Sender(writer.message, writer.send, writer.count_free_places)
-        # A cycle is due to write if its message would become visible at a tick of the mailbox's
-        # grid, so if (tick + this number) is a multiple of the mailbox's period.
+        # A cycle is due to write if its message becomes visible at a tick of the mailbox's grid.
+        # This is so if the sum of its tick and this number is a multiple of the mailbox's period.
         self._ahead = spec.lead_ticks - spec.phase
         self._index = segment.layout.find_mailbox_index(spec.name)
         self._episodes = Episodes(segment, spec.name, alarms)
@@ -183,7 +183,7 @@ class OutputPort:
         self._held_up = self._refused = 0
 
     def _mark_sent(self, basis: int | None = None) -> bool:
-        """Request that the message is written in this cycle. Used for mailboxes written on demand.
+        """Request that the message be written in this cycle. Used for mailboxes written on demand.
 
         Args:
             basis: Tick of the oldest information on which the message depends. None to derive it
@@ -356,6 +356,6 @@ class OutputPorts:
 
     @property
     def traffic(self) -> tuple[int, int]:
-        """Number of messages and of bytes written, including earlier processes of the task."""
+        """Numbers of messages and bytes written by this process and earlier ones of the task."""
         writers = self.writers.values()
         return sum(w.serial for w in writers), sum(w.serial * w.spec.size for w in writers)

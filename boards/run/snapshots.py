@@ -51,7 +51,10 @@ class TaskCopies:
         self._view = AttributeView(level)
 
     def __call__(self) -> None:
-        """Fork a copy, and return. In the copy, this returns when a rack continues from it."""
+        """Fork a copy, and report to the clock that it exists or that the task cannot be copied.
+
+        In the copy, this returns when a rack continues from it.
+        """
         block = self._block
         try:
             request = self._copier.fork_copy(block[Block.COPY] - 1, show=self._view.read_attributes)
@@ -115,7 +118,7 @@ class ClockCopies:
         )
 
     def _take_snapshot(self, tick: int) -> bool:
-        """Take a snapshot before `tick`.
+        """Take a snapshot before `tick`. If a task cannot be copied, take no further snapshots.
 
         Returns:
             False in this process. True in a copy of it, once a rack continues from the snapshot.

@@ -37,7 +37,7 @@ from rack.levels.operator import DRIVE_OPERATIONS, SETTINGS, Answer
 START_DELAY_NS = 20_000_000
 """Time from the start of the clock's board to tick 0, so that the start-up delays no tick."""
 OPERATOR_TIMEOUT_NS = 1_000_000_000
-"""Time without a heartbeat after which the client of a lease counts as gone.
+"""Time without a heartbeat after which a lease is released, because its client is assumed dead.
 
 It is converted to ticks. In lockstep, heartbeats are not checked.
 """
@@ -127,8 +127,8 @@ class SystemController:
         """Let a restarted board rejoin, or handle a board that will not be restarted.
 
         In lockstep, a board rejoins a fixed number of ticks after its loss. A board that will not
-        be restarted causes the emergency stop and then the end of the run. If it is a host board,
-        it counts as rejoined instead, and its bus adapter reports the loss.
+        be restarted causes the emergency stop and then the end of the run. A host board that will
+        not be restarted is treated as rejoined, and its bus adapter reports the loss.
         """
         lockstep = self._wiring.lockstep
         if lockstep and tick < task.lost_tick + self._wiring.restart_ticks:
@@ -229,7 +229,7 @@ class OperatorCommandIssuer:
             self._leased.append(entry)
 
     def _check_lease(self, entry: RequestEntry, tick: int) -> None:
-        """Release a lease that has ended, and make the level hold if its client is gone.
+        """Release a lease that has ended, and make the level hold if the client is dead or silent.
 
         A lease ends without further effect when a newer command replaces the leased one, or when
         the level refuses it.
@@ -273,12 +273,12 @@ class OperatorCommandIssuer:
 
 
 class EndOfRun:
-    """Decides at which tick a run ends. The decision depends on ticks alone.
+    """Decides at which tick a run ends, regardless of wall-clock time.
 
-    A run ends at the tick that its config gives or, without one, with its task: a while after the
-    status of the level that ends the run reports done or error, or has been missing for too long.
-    The end of the task is determined even if the config gives a tick, because a run that continues
-    this one may end with the task.
+    A run ends at the tick that its config gives. Without such a tick, it ends a fixed time after
+    its task: after the status of the level that ends the run reports done or error, or has been
+    missing for too long. The end of the task is determined even if the config gives a tick, because
+    a run that continues this one may end with the task.
     """
 
     def __init__(self, segment: Segment, wiring: ClockWiring) -> None:
@@ -288,7 +288,7 @@ class EndOfRun:
         self._reader = open_observer(segment, wiring.ends_run) if wiring.ends_run else None
         self._silent = wiring.silent
         self._heard: int | None = None
-        # If visibility depends on ticks alone, messages become visible only at ticks of the grid.
+        # Under a tick-based protocol, messages become visible only at ticks of the mailbox's grid.
         self._every = 1
         self._phase = 0
         if self._reader is not None:

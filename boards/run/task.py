@@ -76,7 +76,7 @@ class Task(ABC):
     def wait_until_next_cycle(self) -> int | None:
         """Wait for the next release and return its tick. Returns None if the run is over.
 
-        Faults begin and end here, between cycles.
+        Faults of the task begin and end during this call, between two cycles.
         """
         tick = self.next_cycle.wait()
         if tick is None:
@@ -157,11 +157,11 @@ class InterruptHandler:
     """Interrupt handler of a board, under protocol interrupt.
 
     It takes processor time for each interrupt, counts interrupts, and reports lost ones. On the
-    original boards the handler ran whenever a message arrived. Here the first task of the board
-    does its work just before it reads, and takes as much processor time as the handler would have
-    used since the last cycle. This adds to the time of reading (t_comm of eq. 3.5), and tasks of
-    lower priority on the same core have to wait. In lockstep, where no task waits for a processor,
-    the handler takes no time.
+    original boards the handler ran whenever a message arrived. In this program, the first task of
+    the board calls the handler before it reads its mailboxes. The handler then uses the processor
+    time for all interrupts since the previous cycle. This adds to the time of reading (t_comm of
+    eq. 3.5), and delays tasks of lower priority on the same core. In lockstep, where no task waits
+    for a processor, the handler takes no time.
     """
 
     def __init__(self, segment: Segment, task: str, inbox: BoardInbox, alarms: AlarmWriter) -> None:
@@ -212,12 +212,12 @@ def chain_accesses(*accesses: Callable[[int], None] | None) -> Callable[[int], N
     """
     present = [access for access in accesses if access is not None]
 
-    def make_all(tick: int) -> None:
-        """Make all accesses as of `tick`."""
+    def access_all(tick: int) -> None:
+        """Make the accesses in their order, each as of `tick`."""
         for access in present:
             access(tick)
 
-    return make_all if len(present) > 1 else present[0]
+    return access_all if len(present) > 1 else present[0]
 
 
 def slow_access(access: Callable[_P, _R], time_ns: int) -> Callable[_P, _R]:

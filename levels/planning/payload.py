@@ -155,7 +155,7 @@ class Payloads:
         )
 
     def _find_jaws(self) -> list[Jaws]:
-        """Return samples of the jaws from open to closed, up to the last one with a gap."""
+        """Return the jaws at each sampled opening, from open to the last that leaves a gap."""
         cell = self._cell
         gripper = cell.gripper
         if gripper is None:
@@ -175,7 +175,7 @@ class Payloads:
         )
 
     def _sample_jaws(self, fingers: Ints, openings: Array) -> list[Jaws]:
-        """Return the jaws that geoms form at each opening, up to the first without a gap.
+        """Return the jaws that geoms form at each opening, until one leaves no gap between them.
 
         Args:
             fingers: Ids of the geoms that may form the jaws.

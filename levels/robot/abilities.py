@@ -51,7 +51,7 @@ def compute_abilities(cell: Cell) -> Abilities:
 
 
 class Statics:
-    """Reach and loads of an arm at rest, without contacts."""
+    """Computes the reach and the load limits of an arm at rest, ignoring contacts."""
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell

@@ -32,7 +32,10 @@ from rack.levels.robot.wrist import Wrist, find_wrist
 from rack.levels.tables import GripperConfig, Interface, RobotConfig, SceneConfig, SensorConfig
 
 TOUCHING_M = 5e-5
-"""Distance below which geoms at home count as touching, because rounding decides."""
+"""Distance, in m, below which geoms at home are treated as touching.
+
+At smaller distances, rounding would determine whether they touch.
+"""
 SETTLING_S = 1.0
 """Time in which the fingers of a gripper come to rest, in s."""
 
@@ -63,8 +66,9 @@ class Cell:
     """A compiled cell. Indices refer to the arrays of `model`."""
 
     model: mujoco.MjModel
-    """Has torque motors on all joints of the arm and a force motor on the gripper. For a hand, it
-    has actuators on the tendons instead. Keyframe 0 is the start, with the gripper open."""
+    """Model with torque motors on all joints of the arm and a force motor on the gripper. The model
+    of a hand has actuators on the tendons instead. Keyframe 0 is the start, with the gripper open.
+    """
 
     # The arm, or a hand in its place.
     joints: tuple[str, ...]  # names
@@ -76,7 +80,7 @@ class Cell:
     tool: int  # site
 
     # Limits, sensors and drives of the arm.
-    bounds: Bounds  # never exceeded, fault or not
+    bounds: Bounds  # never exceeded, even during a fault
     limits: Limits  # of planned motion
     encoders: Encoders  # resolution and noise of the joints' sensors
     patience: MotorPatience  # of the motors or valves

@@ -62,7 +62,11 @@ class Terms(NamedTuple):
 STATE_ROWS = 2
 BIAS_ROW = 2
 INERTIA_ROW = 3
-"""Rows of an evaluation, (3 + joints, joints): position, velocity, bias, inertia."""
+"""Rows of an evaluation, (3 + joints, joints).
+
+The first two are the state: position and velocity. The third is the bias, and the others are the
+inertia.
+"""
 
 
 class Dynamics:

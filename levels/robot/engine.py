@@ -1,9 +1,8 @@
 """MuJoCo's functions and memory, for compiled code.
 
-Called from Python, a MuJoCo step costs 2 us more than it takes, and reading its contacts costs half
-a microsecond; both happen in every step. Compiled code calls the C library directly, with the
-addresses of model and data. The same code called as Python reaches the same functions through
-ctypes.
+A call from Python adds 2 us to a MuJoCo step, and half a microsecond to read its contacts; both
+happen in every step. Compiled code calls the C library directly, with the addresses of model and
+data. If the same code is run as Python, it calls the same functions through ctypes.
 
 If MuJoCo reports a fatal error (its memory is exhausted), the Python bindings raise an exception.
 Here the error ends the process, which the exception would have done as well.
@@ -34,7 +33,7 @@ LIBRARY = str(Path(mujoco.__file__).with_name(f"libmujoco.so.{mujoco.mj_versionS
 
 
 native = partial(c_function, LIBRARY)
-"""A function of MuJoCo that returns nothing, by its name and its number of arguments."""
+"""Declares a C function of MuJoCo that returns nothing: name and number of arguments."""
 mj_step = native("mj_step", 2)
 mj_kinematics = native("mj_kinematics", 2)
 mj_collision = native("mj_collision", 2)

@@ -121,7 +121,7 @@ def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
 def fit_tendons(
     spec: mujoco.MjSpec, robot: RobotConfig, hand: HandConfig, step_s: float
 ) -> tuple[list[str], Array]:
-    """Prepare a model for a hand: only the tendons continue to drive its joints.
+    """Prepare the model of a hand, so that only the tendons drive its joints.
 
     Each fingertip gets a force sensor. Actuators with a delay get memory for the delayed controls.
 

@@ -34,7 +34,7 @@ MAX_CONTACT_FRACTION = 0.2
 Setting down an object is such a contact. The value is a third more than observed in tasks.
 """
 MAX_RESTING_CONTACT_FRACTION = 0.1
-"""Largest fraction for an arm that holds an object and hardly moves.
+"""Largest such fraction for an arm that holds an object and hardly moves.
 
 Dry friction may then hide the contact force in all joints except one.
 """
@@ -53,7 +53,7 @@ One late cycle must not engage the brakes.
 MAX_PATIENCE_S = 0.01
 """Longest default time, in s, for which motors keep their last torque.
 
-However slow or weak the arm is, a longer absence of torques is more than a late cycle or two.
+Even for a slow or weak arm, a longer time without torques means more than one or two late cycles.
 """
 NOISE_SIGMAS = 6.0
 """Standard deviations of noise that a monitor tolerates.
@@ -64,7 +64,7 @@ Less than one sample in a billion exceeds them.
 
 @dataclass(frozen=True)
 class Bounds:
-    """Limits that the arm never exceeds, fault or not, as config and model state them.
+    """Limits from config and model that the arm must never exceed, even during a fault.
 
     Sliding joints have m and N where turning joints have rad and N m.
     """
@@ -175,14 +175,14 @@ class MotorPatience(NamedTuple):
 
 
 def compute_patience(robot: RobotConfig, bounds: Bounds, energy_j: float) -> MotorPatience:
-    """Return the time for which the motors may keep their last torque.
+    """Return how long the motors may keep applying their last torque when no new one arrives.
 
-    By default, it is the longest time that lengthens a stop from full speed by at most
-    `PATIENCE_FRACTION`, according to two criteria. The first compares the angle through which
-    joints turn at full speed in this time with the angle in which the brakes stop them. The second
-    compares the energy that all motors add at full torque with the kinetic energy that the brakes
-    have to absorb anyway. (The limits do not depend on the patience, because the limit gate checks
-    the torque in every tick.)
+    The result is `robot.patience_ms` if the config gives it. Otherwise it is the longest time that
+    lengthens a stop from full speed by at most `PATIENCE_FRACTION`, according to two criteria. The
+    first compares the angle through which joints turn at full speed in this time with their
+    stopping angle when the brakes engage. The second compares the energy that all motors add at
+    full torque in this time with the kinetic energy that the brakes have to absorb anyway. (The
+    limits do not depend on this time, because the limit gate checks the torque in every tick.)
 
     Args:
         robot: The `[robot]` table.

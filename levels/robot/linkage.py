@@ -5,8 +5,8 @@ every joint stop that is exceeded, as rows of a residual and a Jacobian. Gauss-N
 over them, with springs of joints and tendons as weak rows, find where the linkage settles. Where
 equalities contradict each other or a stop, as soft couplings of tendons do, it settles in between,
 according to their stiffness in the simulation. The linkage is solved once for a number of openings.
-A pose in between is interpolated, which takes some microseconds of a cycle. MuJoCo's own kernels
-add up in a fixed order, so that equal models give equal poses.
+A pose in between is interpolated, which takes some microseconds of a cycle. MuJoCo's own functions
+sum in a fixed order, so that equal models give equal poses.
 
 An equality must not tie a joint of the arm: `check_couplings` refuses that.
 """
@@ -38,9 +38,9 @@ STEP_TOLERANCE = 1e-10
 SPRING_WEIGHT = 1e-6
 """Weight of the stiffest spring relative to an equality."""
 DAMPING = 1e-9
-"""Weight with which joints stay in place, for joints that nothing else determines."""
+"""Weight of a term that keeps joints in place, for joints that nothing else determines."""
 FREE_RATIO = 0.01
-"""Ratio of `DAMPING` to everything that holds a joint, above which the joint counts as free."""
+"""Ratio of `DAMPING` to all weights that hold a joint, above which the joint is free to move."""
 YIELD_RESIDUAL = 1e-3
 """Residual of an equality, m or rad, above which it yields.
 
@@ -50,11 +50,11 @@ DISABLED_CONSTRAINTS = (
     mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
 )
 JACOBIAN_ROUNDING = 1e-9
-"""Threshold for elements of the Jacobian of a tendon."""
+"""Elements of a tendon's Jacobian up to this value are treated as 0."""
 LOOP_EQUALITIES = (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD)
 STIFFNESS = 0
 IMPEDANCE = 2
-"""Columns of MuJoCo's `efc_KBIP`."""
+"""Columns `STIFFNESS` and `IMPEDANCE` of MuJoCo's `efc_KBIP`."""
 
 
 @dataclass(frozen=True)
@@ -283,7 +283,9 @@ class _Solver:
 
 
 def check_commanded(model: mujoco.MjModel, config: GripperConfig, carried: Mask) -> None:
-    """Check that no joint of the gripper has an actuator that nothing commands.
+    """Check that only the gripper's actuator drives joints of the gripper.
+
+    No level would command any other actuator.
 
     Args:
         model: The compiled model.

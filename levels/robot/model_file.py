@@ -131,7 +131,7 @@ class ModelReader:
         return root
 
     def _read_reference(self, element: ElementTree.Element, path: Path, folder: Path) -> None:
-        """Read the file to which an element refers, and make the element refer to the text read.
+        """Read the file that an element names, and set this name to the file's key in `texts`.
 
         Args:
             element: Includes the file, or declares it as a model to attach.
@@ -197,7 +197,7 @@ class ModelReader:
 
 
 def parse_xml(text: bytes) -> ElementTree.Element:
-    """Parse a file, without elements and attributes that have a prefix, declared or not.
+    """Parse a file, and leave out elements and attributes with a prefix, even an undeclared one.
 
     Every start tag stays on its line, because MuJoCo reports the line in its messages.
 

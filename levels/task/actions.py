@@ -29,8 +29,8 @@ MAX_WAYS = 16
 LEANING_RESTARTS = 20
 """Number of random starts of the inverse kinematics for a tool that leans.
 
-Many of its poses are out of reach. Of 7,100 reachable poses in layouts that the PUMA refuses, this
-number missed 80.
+Many of its poses are out of reach. With this number, 80 of 7,100 reachable poses were not found, in
+layouts that the PUMA refuses.
 """
 HALVINGS = 7
 """Number of bisections to find a reachable place on the way to an unreachable one."""
@@ -82,7 +82,7 @@ def rehearse(program: TaskConfig, scene: SceneConfig, start: Rehearsal) -> Rehea
 
 @contextmanager
 def _label_refusals(k: int, step: str) -> Iterator[None]:
-    """Add the step, and the number `k` of its action, to a refusal that is raised in the block."""
+    """Prefix a refusal that is raised in the block with `step`, and add the action's number `k`."""
     try:
         yield
     except Refused as refused:

@@ -47,7 +47,7 @@ class TaskExecutor(Executor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._actions = self._read_first_actions()
-        self._ahead_s = 0.0  # clock to which the actions' `by` refers, minus simulated time
+        self._ahead_s = 0.0  # s: time on the clock of the actions' `by`, minus simulated time
         self._stalled_s = read_params(self.params, context.params).stalled_s
         self._orders = Orders(self.commands)
         self._window = ShownWindow()
@@ -137,7 +137,7 @@ class TaskExecutor(Executor):
         return f"action {action}{why}"
 
     def _interrupt_program(self, plan: TaskPlan, below: MoveStatus) -> int:
-        """Interrupt the program for an operator. Return the number of completed moves."""
+        """Begin, track or end an operator's goto. Return the number of completed moves."""
         return self._detour.step(plan, self._done, below)
 
     def _find_reason_to_wait(self, below: Reading[MoveStatus]) -> str:

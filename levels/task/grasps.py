@@ -26,11 +26,11 @@ from rack.levels.task.program import DOWN, Transfer
 
 UP = np.array([0.0, 0.0, 1.0])
 QUARTER_TURNS = (0, 1, -1, 2)
-"""Quarter turns between object and gripper, in the order of trying."""
+"""Quarter turns between object and gripper, in the order in which they are tried."""
 TILTS_DEG = (*range(10, 91, 10), *range(15, 90, 10))
-"""Angles between the tool and straight down, in the order of trying.
+"""Angles between the tool and straight down, in the order in which they are tried.
 
-They are tried for an object that cannot be taken from straight above.
+They are tried only if an object cannot be taken from straight above.
 """
 FULL_ORIENTATION = 6
 """Number of joints with which the tool reaches a place in every orientation.
@@ -53,7 +53,7 @@ pressed onto its support.
 MIN_LEAN = 0.01
 """1 - cosine of the angle from straight down above which a tool counts as leaning."""
 MAX_DISTANCE_M = 10.0
-"""Distance up to which distances between geoms are measured."""
+"""Range, in m, within which distances between geoms are measured."""
 SKIN_M = 1e-6
 """Distance by which a ray that has hit the arm continues inside the surface."""
 MAX_STANDING_GAP_M = 0.02

@@ -51,7 +51,7 @@ class TaskPlanner(Planner):
 
         self._program = self._read_first_program()
         self._id = FIRST_PLAN_ID
-        self._ahead_s = 0.0  # clock to which the actions' `by` refers, minus simulated time
+        self._ahead_s = 0.0  # s: time on the clock of the actions' `by`, minus simulated time
         self._needs = read_params(self.params, context.params)
         cell = build_level_cell(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
@@ -140,9 +140,9 @@ class TaskPlanner(Planner):
         self.output.count = len(moves)
 
     def _compute_visible_s(self, tick: int) -> float:
-        """Return the time in s at which the level below sees the first moves of a plan.
+        """Return the time, in s, at which the level below sees the first moves of a plan.
 
-        The planner begins the plan at `tick`.
+        `tick` is the tick at which the planner begins the plan.
         """
         # The plan is ready within its cycles, is read and handed down at once, and is visible below
         # a cycle later.

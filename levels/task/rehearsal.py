@@ -1,6 +1,6 @@
 """Rehearsal of a program before anything moves.
 
-Every move is planned as the level below will plan it, and timed.
+Every move is planned as the level below will plan it, and its duration is computed.
 """
 
 from __future__ import annotations

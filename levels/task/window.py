@@ -149,7 +149,7 @@ class Detour:
         return f"diverted by the operator: {goal} {stage}; `resume` continues the program"
 
     def accept_command(self, message: OperatorCommand, is_new: bool) -> None:
-        """Accept a goto, or refuse an invalid one. If it is not new, its move keeps its id."""
+        """Accept a goto, or refuse an invalid one. If `is_new` is False, its move keeps its id."""
         try:
             self._target = self._read_goal(message)
         except ValueError as error:

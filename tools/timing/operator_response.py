@@ -358,7 +358,8 @@ def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
         for c in own
     ]
     end_ms = max(lines[2][0], *values)
-    # Draw a value equal to the longest on the grid to the left of its line, despite rounding.
+    # A value equal to `path.longest` must fall into the bin to the left of its line, even if it is
+    # rounded up.
     width_ms = path.longest * tick_ms / HISTOGRAM_BARS
     edges = np.arange(0.0, end_ms + width_ms, width_ms) * (1.0 + ROUNDING)
     axis.hist(values, bins=edges.tolist(), color=MEASURED, label="measured")

@@ -83,7 +83,7 @@ def _check_name(place: str, name: str) -> Mistakes:
 
 
 def _check_planner(place: str, board: BoardConfig) -> Mistakes:
-    """Check that the planner keys of a board fit its coupling, or are absent without a planner."""
+    """Check that a board's planner keys fit its coupling. Without a planner it must have none."""
     has_planner = board.planner is not None
     is_loose = board.coupling == "loose"
     if has_planner != (board.coupling != "none"):
@@ -127,7 +127,7 @@ def check_circles(wiring: Wiring) -> Mistakes:
     except CycleError as error:
         circle = error.args[1][:-1]
         pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
-        # Report a link that only one of its two boards names, if there is one.
+        # Prefer to report a link that only one of its two boards names.
         upper, lower = min(reversed(pairs), key=lambda link: len(_find_declarations(config, *link)))
         board, key, end = _find_declarations(config, upper, lower)[0]
         at = circle.index(lower)
@@ -141,8 +141,8 @@ def _find_declarations(config: RackConfig, upper: str, lower: str) -> list[tuple
     """Return the keys of the config that put board `upper` above board `lower`.
 
     Returns:
-        For each of them: the board that has it, the key ("above" or "below"), and the level
-        ("highest" or "lowest") that must not have such a key.
+        For each key: the board in whose table it is, its name ("above" or "below"), and which level
+        must not have it ("highest" or "lowest").
     """
     tables = ((upper, "below", "lowest", lower), (lower, "above", "highest", upper))
     return [
@@ -259,7 +259,7 @@ def check_polling(wiring: Wiring) -> Mistakes:
 
 
 def check_reservations(wiring: Wiring) -> Mistakes:
-    """If the scheduler is earliest deadline first, check that each board can reserve its time."""
+    """With earliest deadline first, check that each board can reserve its processor time."""
     config = wiring.config
     if config.clock.scheduler == "fixed-priority":
         return

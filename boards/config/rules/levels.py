@@ -133,7 +133,8 @@ def check_robot(wiring: Wiring) -> Mistakes:
 def check_cell(wiring: Wiring) -> Mistakes:
     """Check that arm and scene match the MuJoCo model.
 
-    If `[robot]` or `[scene]` has other mistakes, check only that the model has their names.
+    If `[robot]` or `[scene]` has other mistakes, check only that the model contains all elements
+    that these tables name.
     """
     robot_table, scene_table = wiring.config.robot, wiring.config.scene
     reasons: list[str] = []
@@ -147,7 +148,7 @@ def check_cell(wiring: Wiring) -> Mistakes:
             reasons = [str(error)]
     from rack.levels.robot.lookup import find_unknown_names
 
-    # If the model can be read and lacks names, report these instead.
+    # If the model can be read and lacks some of the named elements, report these instead.
     with suppress(RobotError):
         reasons = [*find_unknown_names(robot_table, scene_table)] or reasons
     for reason in reasons:

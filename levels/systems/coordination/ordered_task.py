@@ -398,7 +398,11 @@ class OrderedTaskPlanner(TaskPlanner):
         return max(super()._compute_visible_s(tick), self._begin_s + self.context.period_s)
 
     def _check_deadlines(self, moves: Sequence[Rehearsed], visible_s: float) -> None:
-        """Check deadlines, and write the earliest end of the order in the coordinator's time."""
+        """Check that actions with a deadline can be completed in time, as the base class does.
+
+        Also write to `output.earliest` the earliest time at which the order can be completed, on
+        the clock of the coordinator.
+        """
         super()._check_deadlines(moves, visible_s)
         unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
         self.output.earliest = (

@@ -526,9 +526,10 @@ def judge_links(
 
 
 def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
-    """Apply `judge_links` to RCCL, and also check that every joint has a separate processor.
+    """Check that the boards of RCCL exchange as many messages as the rates imply.
 
-    If joints share processors, the claim holds only within bounds.
+    The checks are those of `judge_links`. If joints share processors, the verdict is
+    `Ruling.BOUNDED`.
     """
     joints = [
         task.core for task in resolve_layout(load("rccl")).tasks if task.board.startswith("joint")

@@ -55,7 +55,10 @@ class Chains:
 
 
 def _measure_chains(workshop: Workshop) -> Chains:
-    """Run the pipeline in lockstep, in real time, with locks, and with more boards."""
+    """Measure the pipeline in four runs: one in lockstep and three in real time.
+
+    Of those in real time, one uses locks and one has more boards.
+    """
     return Chains(
         lockstep=_measure_chain("chain-lockstep", workshop, Chain(LEVELS, RATE_HZ, "lockstep")),
         realtime=_measure_chain("chain-realtime", workshop, Chain(LEVELS, RATE_HZ)),

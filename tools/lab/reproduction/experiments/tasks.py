@@ -314,15 +314,16 @@ def _compute_response_ms(general: Recording, servo: Recording) -> float | None:
 
     None if either message is missing.
     """
-    begin_ns = _find_first_ns(general, "modifications.command", "wanted")
-    end_ns = _find_first_ns(servo, "shoulder.status", "reason")
+    begin_ns = _find_modification_ns(general, "modifications.command", "wanted")
+    end_ns = _find_modification_ns(servo, "shoulder.status", "reason")
     return None if begin_ns is None or end_ns is None else 1e-6 * (end_ns - begin_ns)
 
 
-def _find_first_ns(recording: Recording, box: str, field: str) -> int | None:
-    """Return the time, in ns, at which a message that names the modification first became visible.
+def _find_modification_ns(recording: Recording, box: str, field: str) -> int | None:
+    """Return when the first message whose `field` contains `MODIFICATION` became visible, in ns.
 
-    It is CLOCK_MONOTONIC time, or simulated time in lockstep. None if there is no such message.
+    `box` is the mailbox of the messages. The time is on CLOCK_MONOTONIC, or simulated time in
+    lockstep. None if there is no such message.
     """
     is_named = [MODIFICATION in str(text) for text in recording.read_signal(box, field)]
     ticks = recording.read_signal(box, "visible_at")[is_named]
