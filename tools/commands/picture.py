@@ -82,7 +82,7 @@ def _draw_view(run: Path, at_s: float, view: str | None, path: Path) -> list[str
         Failure: The viewer does not run, or has no such view.
     """
     # Import late, because this takes half a second.
-    from rack.tools.viewer.pictures import NoViewerError, draw_picture
+    from rack.tools.viewer.pictures import draw_picture
 
     with INTERRUPT.raise_interrupted(), ExitStack() as stack:
         files = find_viewer_files(run)
@@ -90,12 +90,9 @@ def _draw_view(run: Path, at_s: float, view: str | None, path: Path) -> list[str
             folder = stack.enter_context(TemporaryDirectory(prefix="rack-picture-"))
             files = [Path(folder, FILE)]
             merge_runs([run], files[0])
-        try:
-            drawn = draw_picture(files, at_s, view)
-        except NoViewerError as failure:
-            raise Failure(f"no picture: {failure}; --cell draws the cell without it") from None
+        drawn = draw_picture(files, at_s, view)
     path.write_bytes(drawn.png)
-    return list(drawn.complaints)
+    return drawn.complaints
 
 
 def _draw_cell(recording: Recording, tick: int, path: Path) -> None:

@@ -16,12 +16,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from rack.tools.console.answer import Failure
-from rack.tools.console.interrupt import list_descendants
 
 HOST = "127.0.0.1"
 PANIC_TEXT = "panicked at "
-LISTENING = "0A"
-"""State of a listening socket in /proc/net/tcp."""
 ENDING_S = 1.0
 """Time that a viewer has to end when it is closed. Then it is killed."""
 
@@ -92,23 +89,6 @@ class ViewerWindow:
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(bound_s)
         return not self.is_open
-
-    def is_listening(self, port: int) -> bool:
-        """Return True if the viewer, and not another program, listens on a TCP port."""
-        rows = map(str.split, Path("/proc/net/tcp").read_text().splitlines())
-        sockets = {
-            f"socket:[{row[9]}]"
-            for row in rows
-            if row[1].endswith(f":{port:04X}") and row[3] == LISTENING
-        }
-        processes = (self._process.pid, *list_descendants(self._process.pid))
-        with suppress(OSError):
-            return any(
-                str(file.readlink()) in sockets
-                for pid in processes
-                for file in Path(f"/proc/{pid}/fd").iterdir()
-            )
-        return False
 
     @property
     def is_open(self) -> bool:
