@@ -64,26 +64,27 @@ class Series(NamedTuple):
         for time_s in times_s[~is_equal.all(axis=1)][:1].tolist():
             yield Mark(time_s, "first difference", self.signal.name, time_s)
 
-    def list_curves(self, is_alone: bool) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield label and values of each number. With `is_alone`, labels lack the signal's name."""
-        for index in np.ndindex(self.values.shape[1:]):
-            place = "".join(f"[{number}]" for number in index)
-            name = "" if is_alone and (place or self.run) else self.signal.name
-            yield f"{name}{place} {self.run}".strip(), self.values[(slice(None), *index)]
+
+class Curve(NamedTuple):
+    """One number of a signal over simulated time: its label in a legend, its times and values."""
+
+    label: str
+    time_s: np.ndarray
+    values: np.ndarray
 
 
 class SignalPanel(NamedTuple):
-    """Signals with a common axis of values.
+    """Curves with a common axis of values.
 
     Attributes:
         label: Label of the axis, with the unit.
-        series: The signals.
-        is_alone: True if all of them have the same name.
+        states: Names of the values, with their numbers. Empty for a quantity.
+        runs: Curves of each run.
     """
 
     label: str
-    series: list[Series]
-    is_alone: bool
+    states: tuple[tuple[str, int], ...]
+    runs: list[list[Curve]]
 
 
 class Plot(NamedTuple):
@@ -135,5 +136,14 @@ def build_panels(all_series: list[Series]) -> list[SignalPanel]:
     for group in groups.values():
         signal = group[0].signal
         is_alone = len({series.signal.name for series in group}) == 1
-        panels.append(SignalPanel(signal.heading if is_alone else signal.unit, group, is_alone))
+        runs: defaultdict[str, list[Curve]] = defaultdict(list)
+        for series in group:
+            for index in np.ndindex(series.values.shape[1:]):
+                place = "".join(f"[{number}]" for number in index)
+                name = "" if is_alone and (place or series.run) else series.signal.name
+                label = f"{name}{place} {series.run}".strip()
+                values = series.values[(slice(None), *index)]
+                runs[series.run].append(Curve(label, series.time_s, values))
+        label = signal.heading if is_alone else signal.unit
+        panels.append(SignalPanel(label, signal.spec.values, [*runs.values()]))
     return panels
