@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -127,6 +127,11 @@ def require_number(signal: Signal) -> None:
         raise Failure(f"{signal.name}: is a text; only numbers can be plotted", 2)
 
 
+def format_index(index: Sequence[int]) -> str:
+    """Format an index, as in `[2][0]`."""
+    return "".join(f"[{number}]" for number in index)
+
+
 def build_panels(all_series: list[Series]) -> list[SignalPanel]:
     """Return a panel for each unit and each set of states, in the order of the series."""
     groups: defaultdict[object, list[Series]] = defaultdict(list)
@@ -139,7 +144,7 @@ def build_panels(all_series: list[Series]) -> list[SignalPanel]:
         runs: defaultdict[str, list[Curve]] = defaultdict(list)
         for series in group:
             for index in np.ndindex(series.values.shape[1:]):
-                place = "".join(f"[{number}]" for number in index)
+                place = format_index(index)
                 name = "" if is_alone and (place or series.run) else series.signal.name
                 label = f"{name}{place} {series.run}".strip()
                 values = series.values[(slice(None), *index)]

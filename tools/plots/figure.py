@@ -76,9 +76,7 @@ def save_plot(plot: Plot, path: Path) -> None:
     """Save a plot as PNG or SVG, depending on the suffix of the path."""
     panels = build_panels(plot.series)
     groups = group_marks(plot.marks)
-    with open_figure(
-        [path], 10.0, 2.6 * len(panels) + 0.2 * len(groups) + 0.8, layout="constrained"
-    ) as figure:
+    with open_figure([path], 10.0, 2.6 * len(panels) + 0.2 * len(groups) + 0.8) as figure:
         rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)
         for axes, panel in zip(rows[:, 0], panels, strict=True):
             entries = draw_panel(axes, panel, groups, plot.window_s[1])

@@ -14,7 +14,7 @@ from rack.levels.algebra import Array
 from rack.levels.robot.cell import Cell
 from rack.levels.systems.force.contact import AXIS_NAMES, UNITS
 from rack.tools.viewer.stream import RowBlock, Stream, ViewPart, build_row_sampler
-from rack.tools.viewer.style import COMMANDED, LIMIT, OVERLAID, build_curves, choose_joint_colour
+from rack.tools.viewer.style import COMMANDED, LIMIT, OVERLAID, build_curves, choose_joint_colours
 
 ARROWS = ("cell", "forces")
 FORCES = "forces"
@@ -59,12 +59,12 @@ class ContactPoint(NamedTuple):
         """Name of the coordinate frame at the point, in which the arrow is drawn."""
         return f"contact/{self.name}"
 
-    def compute_pose(self, data: mujoco.MjData) -> tuple[Array, Array]:
+    def compute_pose(self, data: mujoco.MjData) -> Array:
         """Return position in m and quaternion (w first) of the frame for the poses in `data`."""
         quaternion = np.array([1.0, 0.0, 0.0, 0.0])
         if self.orientation_site is not None:
             mujoco.mju_mat2Quat(quaternion, data.site_xmat[self.orientation_site])
-        return data.site_xpos[self.site], quaternion
+        return np.concatenate((data.site_xpos[self.site], quaternion))
 
 
 def list_contacts(cell: Cell) -> list[ContactPoint]:
@@ -118,10 +118,10 @@ def build_task_force_curves(stream: Stream) -> Iterator[ViewPart]:
     For each axis of the task frame there is a curve of the wanted value, and a curve of the value
     that the tool exerts.
     """
-    for index, (axis, unit) in enumerate(AXES.items()):
-        names = [f"{axis} wanted, {unit}", f"{axis} exerted, {unit}"]
+    for index, (axis, colour) in enumerate(zip(AXES, choose_joint_colours(6), strict=True)):
+        names = [f"{axis} {what}, {AXES[axis]}" for what in ("wanted", "exerted")]
         values = partial(_select_wanted_and_exerted, index)
-        shades = [COMMANDED, choose_joint_colour(index)]
+        shades = [COMMANDED, colour]
         yield build_curves(stream, (FORCES, TASK, axis), values, names, shades, OVERLAID)
 
 
@@ -147,7 +147,7 @@ def build_contact_curves(stream: Stream, most: tuple[float, float]) -> Iterator[
         names = [f"limit, {unit}", f"{quantity} of the contact, {unit}"]
         values = partial(_compute_limit_and_magnitude, most[index], 3 * index)
         yield build_curves(
-            stream, (FORCES, CONTACT, quantity), values, names, [LIMIT, choose_joint_colour(0)]
+            stream, (FORCES, CONTACT, quantity), values, names, [LIMIT, *choose_joint_colours(1)]
         )
 
 

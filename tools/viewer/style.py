@@ -79,26 +79,13 @@ PHASES: dict[str, Colour] = {
     "missed": 0xE63232FF,
     "lost": LOST,
 }
-LETTERS = {
-    "wait": " ",
-    "read": "R",
-    "process": "X",
-    "plan": "P",
-    "write": "W",
-    "missed": "!",
-    "lost": "lost",
-}
+LETTERS = {"wait": " ", "read": "R", "process": "X", "plan": "P", "write": "W", "missed": "!"}
 """Labels of phases, as in the paper's figures, because words would not fit into the spans."""
-
-
-def choose_joint_colour(index: int) -> Colour:
-    """Return the colour of the joint with this index. Joints are counted from base to tool."""
-    return _JOINTS[index % len(_JOINTS)]
 
 
 def choose_joint_colours(count: int) -> list[Colour]:
     """Return the colours of `count` joints, from base to tool."""
-    return [choose_joint_colour(index) for index in range(count)]
+    return [_JOINTS[index % len(_JOINTS)] for index in range(count)]
 
 
 def dim_colour(colour: Colour) -> Colour:
@@ -118,7 +105,7 @@ def style_lane(
     stream: Stream,
     entity: Sequence[str],
     colours: Mapping[str, Colour],
-    labels: Mapping[str, str] | None = None,
+    labels: Mapping[str, str] = {},
 ) -> None:
     """Set colours and labels for states of a lane. The viewer chooses the colours of other states.
 
@@ -129,11 +116,9 @@ def style_lane(
         labels: Dictionary from state to label. By default, names of states are the labels.
     """
     shades = pack_colours(colours.values())
-    shown_labels = list(colours)
-    if labels is not None:
-        shown_labels = [labels[name] for name in colours]
+    shown = [labels.get(name, name) for name in colours]
     stream.log_static(
-        entity, rr.StateConfiguration(values=list(colours), labels=shown_labels, colors=shades)
+        entity, rr.StateConfiguration(values=list(colours), labels=shown, colors=shades)
     )
 
 

@@ -22,7 +22,7 @@ from rack.tools.viewer.style import (
     PHASES,
     Colour,
     build_curves,
-    choose_joint_colour,
+    choose_joint_colours,
     dim_colour,
     style_curves,
     style_lane,
@@ -108,7 +108,8 @@ class CycleLane:
 
 def choose_task_colours(layout: Layout, boards: Sequence[str]) -> dict[str, Colour]:
     """Return a dictionary from task to colour. A planner has the dimmed colour of its board."""
-    by_task = {task.name: choose_joint_colour(boards.index(task.board)) for task in layout.tasks}
+    by_board = dict(zip(boards, choose_joint_colours(len(boards)), strict=True))
+    by_task = {task.name: by_board[task.board] for task in layout.tasks}
     return {name: dim_colour(colour) if "." in name else colour for name, colour in by_task.items()}
 
 
