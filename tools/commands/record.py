@@ -108,7 +108,8 @@ def _save_recording(segment: Segment, folder: Path) -> tuple[Document, str]:
             raise Failure(f"--save {name}: nothing is recorded yet")
         merge_runs([folder], folder / FILE)
     tick_s = segment.layout.clock_ns * 1e-9
-    since_s, until_s = (tick * tick_s for tick in find_tick_range(recording))
+    first, end = find_tick_range(recording)
+    since_s, until_s = first * tick_s, (end - 1) * tick_s
     size = measure_size(folder)
     size_note = format_size(size, until_s - since_s)
     summary = f"saved into {folder}: {since_s:.2f} s to {until_s:.2f} s, {size_note}"

@@ -22,20 +22,23 @@ from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES, compute_extent, find_floor_height
 from rack.tools.viewer.curves import (
+    BY_FINGER,
     ERROR,
     GRIP,
     GRIPPER,
+    HAND,
     JOINTS,
     OPENING,
     QUANTITIES,
     SIGNALS,
+    TENSIONS,
+    TIPS,
     find_gripper_units,
     get_plotted_unit,
     has_curves,
 )
 from rack.tools.viewer.events import EVENTS, RACK_LANE, RECORDER
 from rack.tools.viewer.forces import AXES, CONTACT, CONTACT_UNITS, FORCES, TASK
-from rack.tools.viewer.hand import BY_FINGER, HAND, TENSIONS, TIPS
 from rack.tools.viewer.levels import (
     COLUMN,
     HIERARCHY,
@@ -278,6 +281,10 @@ class RackViews:
 
     def _build_scene(self, cell: Cell, name: str) -> rrb.View:
         """Return the 3D view of the cell with the title `name`. Collision shapes are hidden."""
+        # From the eye, arm and objects fill the view.
+        centre, radius = compute_extent(cell)
+        eye = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
+        plane = rr.components.Plane3D((0.0, 0.0, 1.0), find_floor_height(cell) + ABOVE_M)
         return rrb.Spatial3DView(
             origin=self.build_path(CELL),
             contents=[
@@ -286,8 +293,10 @@ class RackViews:
                 self.build_query(FRAMES),
             ],
             name=name,
-            eye_controls=build_eye(cell),
-            line_grid=build_grid(cell),
+            eye_controls=rrb.EyeControls3D(
+                position=eye.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1)
+            ),
+            line_grid=rrb.LineGrid3D(visible=True, plane=plane, spacing=GRID_M, color=GRID),
         )
 
     def _build_arm_plots(self, cell: Cell) -> rrb.Container:
@@ -512,21 +521,6 @@ def _build_plot(
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
         overrides=overrides,
-    )
-
-
-def build_grid(cell: Cell) -> rrb.LineGrid3D:
-    """Return a grid just above the floor of a cell, or above the origin if it has no floor."""
-    plane = rr.components.Plane3D((0.0, 0.0, 1.0), find_floor_height(cell) + ABOVE_M)
-    return rrb.LineGrid3D(visible=True, plane=plane, spacing=GRID_M, color=GRID)
-
-
-def build_eye(cell: Cell) -> rrb.EyeControls3D:
-    """Return an initial eye position from which the arm and the objects fill the view."""
-    centre, radius = compute_extent(cell)
-    position = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
-    return rrb.EyeControls3D(
-        position=position.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1)
     )
 
 

@@ -97,12 +97,7 @@ def find_moving_bodies(model: mujoco.MjModel) -> Ints:
 
     These are bodies with joints or mocap poses, and all bodies attached to them.
     """
-    moves = np.zeros(model.nbody, dtype=bool)
-    # Parents precede their children, so one pass reaches all attached bodies.
-    for body in range(1, model.nbody):
-        has_motion = model.body_jntnum[body] > 0 or model.body_mocapid[body] >= 0
-        moves[body] = has_motion or moves[model.body_parentid[body]]
-    return np.flatnonzero(moves)
+    return np.flatnonzero(model.body_weldid)
 
 
 class ArmShape(NamedTuple):

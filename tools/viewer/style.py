@@ -17,7 +17,7 @@ from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart
 Colour = int
 """A colour, 0xRRGGBBAA."""
 
-_JOINTS: tuple[Colour, ...] = (
+_JOINTS = (
     0x56B4E9FF,
     0xE69F00FF,
     0x00BE8CFF,
@@ -27,14 +27,14 @@ _JOINTS: tuple[Colour, ...] = (
     0x968CFFFF,
 )
 """Colours that are distinguishable with red-green colour blindness (Okabe and Ito)."""
-COMMANDED: Colour = 0x828282A0
-LIMIT: Colour = 0xC83C3C6E
-PLANNED: Colour = 0xFFC828FF
-GOAL: Colour = 0x46D25AFF
-CURRENT: Colour = 0xFF6E28FF
-FORCE: Colour = 0xF03C3CFF
-LOST: Colour = 0xE63232FF
-GRID: Colour = 0xFFFFFF78
+COMMANDED = 0x828282A0
+LIMIT = 0xC83C3C6E
+PLANNED = 0xFFC828FF
+GOAL = 0x46D25AFF
+CURRENT = 0xFF6E28FF
+FORCE = 0xF03C3CFF
+LOST = 0xE63232FF
+GRID = 0xFFFFFF78
 OVERLAID = (2.5, 1.0)
 """Widths of two curves. Where they coincide, the wider one is visible on both sides."""
 LEGEND = "legend"
@@ -42,13 +42,13 @@ LEGEND_ROW = 30.0
 LEGEND_LETTER = 7.0
 """Distance between the entries of a legend, and width of a letter, in the units of a graph."""
 
-_GREY: Colour = 0x6E6E78FF
-_BLUE: Colour = 0x468CE6FF
-_GREEN: Colour = 0x46B45AFF
-_YELLOW: Colour = 0xE6B43CFF
-_ORANGE: Colour = 0xF08C1EFF
-_RED: Colour = 0xDC3232FF
-STATES: dict[str, Colour] = {
+_GREY = 0x6E6E78FF
+_BLUE = 0x468CE6FF
+_GREEN = 0x46B45AFF
+_YELLOW = 0xE6B43CFF
+_ORANGE = 0xF08C1EFF
+_RED = 0xDC3232FF
+STATES = {
     "idle": _GREY,
     "executing": _BLUE,
     "done": _GREEN,
@@ -70,7 +70,7 @@ EVENT_COLOURS: dict[str, Colour] = {
     "recovery": _GREEN,
 }
 """Colour of each kind of event. The viewer chooses the colours of other kinds."""
-PHASES: dict[str, Colour] = {
+PHASES = {
     "wait": 0x3C3E46FF,
     "read": 0x5AAADCFF,
     "process": _GREEN,

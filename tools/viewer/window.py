@@ -95,19 +95,14 @@ class ViewerWindow:
         """True while the viewer process runs."""
         return self._process.poll() is None
 
-    def end(self) -> None:
-        """End the viewer, if it still runs."""
-        self._is_reported = True
+    def close(self) -> None:
+        """End the viewer, if it still runs, and release what it has printed."""
         if self.is_open:
             # The command is a script that starts the viewer. Both are in its process group.
             os.killpg(self._process.pid, signal.SIGTERM)
             if not self.wait_for_end(ENDING_S):
                 os.killpg(self._process.pid, signal.SIGKILL)
                 self._process.wait()
-
-    def close(self) -> None:
-        """End the viewer, and release what it has printed."""
-        self.end()
         self._said.close()
 
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from textwrap import fill
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rack.boards.config import RackConfig
 from rack.tools.console.answer import Document
@@ -44,8 +44,7 @@ COUPLING_MEANINGS = {
 }
 
 
-@dataclass(frozen=True)
-class Region:
+class Region(NamedTuple):
     """A region of the figure: a range of cycle times and its kind of implementation.
 
     Attributes:
