@@ -149,7 +149,7 @@ def write_geometry(stream: Stream, cell: Cell) -> list[ArmShape]:
                 remove_colour(shape)
                 arm.append(ArmShape(entity, shape, read_colour(model, geom)))
             stream.log_static(entity, shape, stream.build_frame(name_frame(model, body)))
-    for body in set(range(1, model.nbody)) - set(find_moving_bodies(model).tolist()):
+    for body in np.flatnonzero(model.body_weldid == 0)[1:].tolist():
         name = name_frame(model, body)
         pose = rr.Transform3D(
             translation=data.xpos[body],
