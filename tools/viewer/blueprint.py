@@ -49,7 +49,7 @@ from rack.tools.viewer.levels import (
     name_lanes,
 )
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, build_path
-from rack.tools.viewer.style import GRID, LEGEND, build_lanes_view, build_legend_view
+from rack.tools.viewer.style import GRID, LEGEND, LEGEND_LETTER, LEGEND_ROW, build_lanes_view
 from rack.tools.viewer.timing import BOARDS, MISSED
 
 CONFIG = "config"
@@ -363,7 +363,11 @@ class RackViews:
 
     def _build_legend(self, what: str, name: str, names: Sequence[str]) -> rrb.View:
         """Return a view, with a title, of the legend `what` that `write_legend` wrote."""
-        return build_legend_view(self.build_path(LEGEND, what), name, names)
+        half = LEGEND_LETTER * max(map(len, names)) / 2 + LEGEND_ROW / 2
+        rows = (-LEGEND_ROW, LEGEND_ROW * len(names))
+        bounds = rrb.VisualBounds2D(x_range=(-half, half), y_range=rows)
+        origin = self.build_path(LEGEND, what)
+        return rrb.GraphView(origin=origin, name=name, visual_bounds=bounds)
 
     def _build_finger_plots(self, hand: Hand) -> rrb.Container:
         """Return the plots of a hand.

@@ -413,7 +413,10 @@ class GoalWriter:
             plan = block.messages[row]
             moves = plan["moves"][: plan["count"]]
             self._goals |= {
-                int(move["id"]): (move["position"].tolist(), self._format_label(move))
+                int(move["id"]): (
+                    move["position"].tolist(),
+                    f"{format_enum(Verb, move['verb'])} {self._find_object_name(move)}".strip(),
+                )
                 for move in moves
             }
             ends = [move for move in moves if move["verb"] == Verb.RELEASE]
@@ -438,10 +441,6 @@ class GoalWriter:
                 labels=[label for _, label in goals],
             )
             self._stream.log_at(block.find_moment(row), CURRENT_GOAL, point)
-
-    def _format_label(self, move: np.void) -> str:
-        """Return the label of a move: its verb, and the name of its object, if any."""
-        return f"{format_enum(Verb, int(move['verb']))} {self._find_object_name(move)}".strip()
 
     def _find_object_name(self, move: np.void) -> str:
         """Return the name of a move's object, or "" if it has none."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import partial
 from math import prod
 
 import mujoco
@@ -77,12 +76,16 @@ def build_joint_curves(
             entity = (JOINTS, name, quantity)
             yield _build_limits(stream, (*entity, "limits"), limits[quantity][index])
             labels = [f"{name} {meaning}, {QUANTITIES[quantity]}" for meaning in fields]
-            values = partial(_select_joint, index, tuple(fields.values()))
-            if len(fields) == 1:
-                yield build_curves(stream, entity, values, labels, [colours[index]])
-            else:
-                shades = [COMMANDED, colours[index]]
-                yield build_curves(stream, entity, values, labels, shades, OVERLAID)
+            shades = [COMMANDED, colours[index]][-len(fields) :]
+
+            def select(
+                block: RowBlock, index: int = index, fields: dict[str, str] = fields
+            ) -> Array:
+                """Return the values of the fields for one joint, shape (rows, fields)."""
+                columns = [block.messages[field][:, index] for field in fields.values()]
+                return np.stack(columns, axis=-1)
+
+            yield build_curves(stream, entity, select, labels, shades, OVERLAID[-len(fields) :])
     labels = [f"{name}, mrad" for name in names]
     yield build_curves(
         stream,
@@ -123,11 +126,6 @@ def _build_limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewP
     )
 
 
-def _select_joint(joint: int, fields: Sequence[str], block: RowBlock) -> Array:
-    """Return the values of these fields for one joint as columns, shape (rows, fields)."""
-    return np.stack([block.messages[field][:, joint] for field in fields], axis=-1)
-
-
 def find_gripper_units(cell: Cell) -> tuple[str, str]:
     """Return the units of opening and force of a cell's gripper. Call this only if it has one."""
     assert cell.gripper is not None, "there is a gripper"
@@ -146,7 +144,12 @@ def build_field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPar
         places = [f"[{position}]" for position in range(prod(field.shape))] if field.shape else [""]
         names = [f"{mailbox.name}.{field.name}{place}{unit}" for place in places]
         entity = (SIGNALS, mailbox.name, field.name)
-        yield build_curves(stream, entity, partial(_flatten_field, field.name), names)
+
+        def flatten(block: RowBlock, name: str = field.name) -> Array:
+            """Return one column for each number, shape (rows, numbers)."""
+            return np.asarray(block.messages[name], float).reshape(len(block.rows), -1)
+
+        yield build_curves(stream, entity, flatten, names)
 
 
 def has_curves(field: FieldSpec) -> bool:
@@ -158,11 +161,6 @@ def has_curves(field: FieldSpec) -> bool:
 def get_plotted_unit(field: FieldSpec) -> str:
     """Return the unit of a field as text, empty for a number without a unit."""
     return "" if field.unit == "1" else field.unit
-
-
-def _flatten_field(field: str, block: RowBlock) -> Array:
-    """Return the values of a field with one column per number, shape (rows, numbers)."""
-    return np.asarray(block.messages[field], float).reshape(len(block.rows), -1)
 
 
 def build_hand_curves(stream: Stream, names: Sequence[str], hand: Hand) -> Iterator[ViewPart]:

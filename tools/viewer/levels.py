@@ -182,7 +182,9 @@ class Hierarchy:
 
     def write(self, task: str, block: RowBlock) -> None:
         """Collect the changes of a task's state from a block of its trace records."""
-        names = _name_states(block.rows)
+        states = np.array([state.name.lower() for state in State] + ["missed"])
+        # A missed cycle counts as a state.
+        names = states[np.where(find_missed_cycles(block.rows), -1, block.rows["state"])]
         before = np.concatenate(([self._states[task]], names[:-1]))
         for row in np.flatnonzero((names != before) | block.resumed):
             self.add_change(block.find_moment(row), task, str(names[row]))
@@ -209,13 +211,6 @@ class Hierarchy:
             labels=[task.partition(".")[2] or task for task in self._tasks],
         )
         self._stream.log_at(when, (HIERARCHY,), nodes)
-
-
-def _name_states(rows: np.ndarray) -> np.ndarray:
-    """Return the state of the level in each trace record, or "missed" for a missed cycle."""
-    names = np.array([state.name.lower() for state in State] + ["missed"])
-    indices = np.where(find_missed_cycles(rows), len(names) - 1, rows["state"])
-    return np.asarray(names[indices])
 
 
 def name_lanes(layout: Layout, rack: RackTiming) -> dict[str, str]:

@@ -174,8 +174,7 @@ class RackWriter:
 
         def mark_lost(noticed: Moment, task: str) -> None:
             """Show a lost task in lanes, in the hierarchy and at the arm, until its next row."""
-            when = cycles[task].find_loss(noticed)
-            cycles[task].mark_lost(when)
+            when = cycles[task].mark_lost(noticed)
             self._hierarchy.add_change(when, task, "lost")
             if task in with_states:
                 write_span(stream, when, (LEVELS, names[task], "state"), "lost")

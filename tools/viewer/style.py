@@ -179,20 +179,6 @@ def write_legend(stream: Stream, what: str, names: Sequence[str], colours: list[
     stream.log_static((LEGEND, what), nodes)
 
 
-def build_legend_view(origin: str, name: str, names: Sequence[str]) -> rrb.View:
-    """Return the view of a legend, large enough for its entries.
-
-    Args:
-        origin: Path of the legend's entity.
-        name: Title of the view.
-        names: Entries of the legend.
-    """
-    half = LEGEND_LETTER * max(map(len, names)) / 2 + LEGEND_ROW / 2
-    rows = (-LEGEND_ROW, LEGEND_ROW * len(names))
-    bounds = rrb.VisualBounds2D(x_range=(-half, half), y_range=rows)
-    return rrb.GraphView(origin=origin, name=name, visual_bounds=bounds)
-
-
 def write_spans(
     stream: Stream, entity: Sequence[str], times: list[rr.TimeColumn], states: Sequence[str]
 ) -> None:
