@@ -65,7 +65,7 @@ class Series(NamedTuple):
             yield Mark(time_s, "first difference", self.signal.name, time_s)
 
 
-class Curve(NamedTuple):
+class PlottedCurve(NamedTuple):
     """One number of a signal over simulated time: its label in a legend, its times and values."""
 
     label: str
@@ -84,7 +84,7 @@ class SignalPanel(NamedTuple):
 
     label: str
     states: tuple[tuple[str, int], ...]
-    runs: list[list[Curve]]
+    runs: list[list[PlottedCurve]]
 
 
 class Plot(NamedTuple):
@@ -141,14 +141,14 @@ def build_panels(all_series: list[Series]) -> list[SignalPanel]:
     for group in groups.values():
         signal = group[0].signal
         is_alone = len({series.signal.name for series in group}) == 1
-        runs: defaultdict[str, list[Curve]] = defaultdict(list)
+        runs: defaultdict[str, list[PlottedCurve]] = defaultdict(list)
         for series in group:
             for index in np.ndindex(series.values.shape[1:]):
                 place = format_index(index)
                 name = "" if is_alone and (place or series.run) else series.signal.name
                 label = f"{name}{place} {series.run}".strip()
                 values = series.values[(slice(None), *index)]
-                runs[series.run].append(Curve(label, series.time_s, values))
+                runs[series.run].append(PlottedCurve(label, series.time_s, values))
         label = signal.heading if is_alone else signal.unit
         panels.append(SignalPanel(label, signal.spec.values, [*runs.values()]))
     return panels

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
+from itertools import product
 from pathlib import Path
 
 import mujoco
@@ -126,7 +127,7 @@ def list_corners(cell: Cell, data: mujoco.MjData, is_drawn: Array) -> Array:
     is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     is_drawn = is_drawn & ~is_large & ~is_plane
     centre, half = np.split(model.geom_aabb[is_drawn], 2, axis=1)
-    signs = np.stack(np.meshgrid(*[(-1, 1)] * 3), axis=-1).reshape(-1, 3)
+    signs = np.array([*product((-1, 1), repeat=3)])
     local = centre[:, None] + half[:, None] * signs
     rotation = data.geom_xmat[is_drawn].reshape(-1, 1, 3, 3)
     corners = data.geom_xpos[is_drawn, None] + (rotation @ local[..., None])[..., 0]

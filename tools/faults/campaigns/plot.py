@@ -22,7 +22,6 @@ ROW_IN = 0.27
 """Height of a row of the upper charts."""
 SIZES_IN = 2.6
 """Height of the lower chart."""
-LABEL_SIZE = 9
 DOT = "#4477aa"
 BOUND = "#cc3311"
 """Colours that are distinguishable with any kind of colour vision (Paul Tol)."""
@@ -45,7 +44,7 @@ def plot_campaign(report: CampaignReport, path: Path) -> None:
         delays, recoveries = upper.subplots(1, 2, sharey=True, width_ratios=(3, 2))
         _draw_delays(delays, report)
         _draw_recoveries(recoveries, report)
-        upper.legend(loc="outside lower center", ncols=4, fontsize=LABEL_SIZE)
+        upper.legend(loc="outside lower center", ncols=4)
         for subfigure in lower:
             _draw_sizes(subfigure.subplots(), report)
 
@@ -69,18 +68,18 @@ def _draw_delays(axes: Axes, report: CampaignReport) -> None:
         figures = report.by_kind[kind]
         numbers = f"{figures.detected} of {figures.injected}"
         frame = ("axes fraction", "data")
-        axes.annotate(numbers, (1.02, row), xycoords=frame, fontsize=LABEL_SIZE, va="center")
-    axes.annotate("detected", (1.02, -1.0), xycoords=frame, fontsize=LABEL_SIZE)
+        axes.annotate(numbers, (1.02, row), xycoords=frame, va="center")
+    axes.annotate("detected", (1.02, -1.0), xycoords=frame)
     axes.scatter([], [], color=DOT, alpha=0.5, label="one fault")
     axes.scatter([], [], label="median of a kind", **MEDIAN)
     axes.scatter([], [], label=f"later than {MAX_FRACTION:g}", **LATE)
     axes.axvline(1.0, color=BOUND, linewidth=1.2, label="longest permitted time")
     axes.set_xlim(-0.03, MAX_FRACTION)
     labels = [f"{kind}: {KINDS[kind].means}" for kind in kinds]
-    axes.set_yticks(range(len(kinds)), labels, fontsize=LABEL_SIZE)
+    axes.set_yticks(range(len(kinds)), labels)
     axes.set_ylim(len(kinds) - 0.4, -0.6)
     axes.grid(axis="y", alpha=0.25)
-    axes.set_title("Time to detection", fontsize=11)
+    axes.set_title("Time to detection")
     axes.set_xlabel("part of the longest permitted time")
 
 
@@ -137,8 +136,8 @@ def _draw_sizes(axes: Axes, report: CampaignReport) -> None:
     axes.set_yscale("symlog", linthresh=report.clock_ms)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_ylim(-0.5 * report.clock_ms, 1.5 * longest)
-    axes.legend(fontsize=LABEL_SIZE, loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    axes.set_title("Time to detection of wrong joint positions", fontsize=11)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    axes.set_title("Time to detection of wrong joint positions")
     axes.set_xlabel("size of the error, rad")
     axes.set_ylabel("time to detection, ms")
 
@@ -150,5 +149,5 @@ def _draw_recoveries(axes: Axes, report: CampaignReport) -> None:
         _draw_row(axes, row, [tick * report.clock_ms * 1e-3 for tick in ticks])
     axes.set_xlim(left=0.0)
     axes.grid(axis="y", alpha=0.25)
-    axes.set_title("Time to recovery", fontsize=11)
+    axes.set_title("Time to recovery")
     axes.set_xlabel("from the fault to the end of its effects, s")
