@@ -59,43 +59,22 @@ def picture(
         if cell:
             _draw_cell(recording, tick, path)
         else:
-            notes = _draw_view(run, at, view, path)
+            # Import late, because this takes half a second.
+            from rack.tools.viewer.pictures import draw_picture
+
+            with INTERRUPT.raise_interrupted(), ExitStack() as stack:
+                files = find_viewer_files(run)
+                if not files:
+                    folder = stack.enter_context(TemporaryDirectory(prefix="rack-picture-"))
+                    files = [Path(folder, FILE)]
+                    merge_runs([run], files[0])
+                drawn = draw_picture(files, at, view)
+            path.write_bytes(drawn.png)
+            notes = drawn.complaints
     document = {"picture": str(path), "at_s": at, "view": view, "notes": notes}
     print_answer(document, "\n".join([f"picture: {path}", *notes]), as_json)
     if notes:
         raise SystemExit(1)
-
-
-def _draw_view(run: Path, at_s: float, view: str | None, path: Path) -> list[str]:
-    """Draw the first view of a run, or one of its views, with the viewer.
-
-    Args:
-        run: Folder of the run.
-        at_s: Simulated time.
-        view: Title of the only view to draw, or a part of it. None for all views.
-        path: File to write.
-
-    Returns:
-        Problems that the viewer reported.
-
-    Raises:
-        Failure: The viewer does not run, or has no such view.
-    """
-    # Import late, because this takes half a second.
-    from rack.tools.viewer.pictures import NoViewerError, draw_picture
-
-    with INTERRUPT.raise_interrupted(), ExitStack() as stack:
-        files = find_viewer_files(run)
-        if not files:
-            folder = stack.enter_context(TemporaryDirectory(prefix="rack-picture-"))
-            files = [Path(folder, FILE)]
-            merge_runs([run], files[0])
-        try:
-            drawn = draw_picture(files, at_s, view)
-        except NoViewerError as failure:
-            raise Failure(f"no picture: {failure}; --cell draws the cell without it") from None
-    path.write_bytes(drawn.png)
-    return list(drawn.complaints)
 
 
 def _draw_cell(recording: Recording, tick: int, path: Path) -> None:

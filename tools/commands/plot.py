@@ -85,7 +85,11 @@ def plot(
         if "/" not in subject and not folder.is_dir():
             segment = stack.enter_context(closing(Segment.attach(subject)))
             if when is not None and from_s is None:
-                from_s = _await_condition(segment, when)
+                trigger = Trigger.parse(when, segment.layout.mailboxes)
+                tick_s = segment.layout.clock_ns * 1e-9
+                after = round(AFTER_S / tick_s)
+                history = SignalHistory(segment, [trigger.signal], after)
+                from_s = await_trigger(segment, history, trigger, after) * tick_s
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="rack-plot-")))
             copy_recording(segment, folder)
         drawn = _build_plot(subject, folder, signals, against, when, (from_s, to_s))
@@ -103,19 +107,6 @@ def plot(
         console = create_console(PLAIN_WIDTH)
         height = console.height - 2 if console.is_terminal else PLAIN_HEIGHT
         console.print(draw_plot(drawn, console, height))
-
-
-def _await_condition(segment: Segment, when: str) -> float:
-    """Wait until a condition holds in a running rack, and until `AFTER_S` after that.
-
-    Returns:
-        The simulated time at which it held.
-    """
-    trigger = Trigger.parse(when, segment.layout.mailboxes)
-    tick_s = segment.layout.clock_ns * 1e-9
-    after = round(AFTER_S / tick_s)
-    history = SignalHistory(segment, [trigger.signal], after)
-    return await_trigger(segment, history, trigger, after) * tick_s
 
 
 def _build_plot(

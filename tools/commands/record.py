@@ -19,6 +19,7 @@ from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, RackName, View, check_local_rack_name, option
 from rack.tools.launch.folder import choose_run_folder
 from rack.tools.recording.checksums import CHECKSUMS
+from rack.tools.recording.divergence import find_tick_range
 from rack.tools.recording.file_names import CODE, CONFIG, ORIGIN, PUBLISHED, SPOOL
 from rack.tools.recording.folder_size import (
     format_recorded_line,
@@ -102,13 +103,13 @@ def _save_recording(segment: Segment, folder: Path) -> tuple[Document, str]:
     name = segment.layout.rack
     with INTERRUPT.raise_interrupted():
         copy_recording(segment, folder, "--save ")
-        traces = [rows["tick"] for rows in Recording(folder).cycles.values()]
-        if not traces:
+        recording = Recording(folder)
+        if not recording.cycles:
             raise Failure(f"--save {name}: nothing is recorded yet")
         merge_runs([folder], folder / FILE)
-    first, last = min(ticks[0] for ticks in traces), max(ticks[-1] for ticks in traces)
     tick_s = segment.layout.clock_ns * 1e-9
-    since_s, until_s = float(first * tick_s), float(last * tick_s)
+    first, end = find_tick_range(recording)
+    since_s, until_s = first * tick_s, (end - 1) * tick_s
     size = measure_size(folder)
     size_note = format_size(size, until_s - since_s)
     summary = f"saved into {folder}: {since_s:.2f} s to {until_s:.2f} s, {size_note}"

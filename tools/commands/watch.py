@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 from rack.backplane.segment import Segment
@@ -18,10 +20,10 @@ from rack.tools.console.tables import create_console
 from rack.tools.monitor.polling import poll_run
 from rack.tools.monitor.signals import (
     SignalHistory,
-    SignalPlot,
     SignalPrinter,
     SignalRows,
     format_value,
+    show_plot,
 )
 from rack.tools.plots.terminal import NO_CURVES
 from rack.tools.recording.signal import Signal, Trigger
@@ -130,20 +132,22 @@ def _show_signals(
     span = round(PLOT_SPAN_S * 1e9 / segment.layout.clock_ns)
     strip = SignalHistory(segment, signals, span)
     first = segment.words[System.TICK]
-    view: SignalPrinter | SignalPlot = SignalPrinter(
-        strip, first, round(every_s / strip.tick_s), as_json
-    )
+    printer = SignalPrinter(strip, first, round(every_s / strip.tick_s), as_json)
+    show_until: Callable[[int], None] = printer.show_until
     terminal = create_console()
     with ExitStack() as stack:
         if terminal.is_terminal and not as_json:
-            try:
-                view = stack.enter_context(SignalPlot(strip, span, terminal))
-            except ImportError:
+            if find_spec("plotext") is None:
                 print(NO_CURVES, file=sys.stderr)
+            else:
+                from rich.live import Live
+
+                live = Live(console=terminal, auto_refresh=False, vertical_overflow="crop")
+                show_until = partial(show_plot, strip, span, stack.enter_context(live))
         for is_over in poll_run(segment, READ_INTERVAL_S):
             strip.read_new()
             settles = 0 if is_over else strip.settling_ticks
-            view.show_until(segment.words[System.TICK] - settles)
+            show_until(segment.words[System.TICK] - settles)
     if strip.lost:
         raise Failure(f"{strip.lost} messages were overwritten before they could be shown")
 
@@ -165,10 +169,10 @@ def await_trigger(segment: Segment, history: SignalHistory, trigger: Trigger, af
     """
     tick = -1
     for _ in poll_run(segment, READ_INTERVAL_S):
-        for written in history.read_new():
-            if tick < 0 and written.mailbox == trigger.signal.mailbox:
-                holding_ticks = written.ticks[trigger.evaluate_messages(written.messages)]
-                tick = int(holding_ticks[0]) if len(holding_ticks) else -1
+        rows = history.read_new()[trigger.signal.mailbox]
+        if tick < 0:
+            holding_ticks = rows["tick"][trigger.evaluate_messages(rows["message"])]
+            tick = next(iter(holding_ticks.tolist()), -1)
         if tick >= 0 and segment.words[System.TICK] > tick + after + history.settling_ticks:
             break
     if tick < 0:

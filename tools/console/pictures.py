@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,22 +26,19 @@ def can_draw() -> bool:
 
 
 @contextmanager
-def open_figure(
-    paths: Sequence[Path], width_in: float, height_in: float, **settings: Any
-) -> Iterator[Figure]:
+def open_figure(paths: Sequence[Path], width_in: float, height_in: float) -> Iterator[Figure]:
     """Provide an empty figure, and save it at the end. Equal figures give identical files.
 
     Args:
         paths: Files to write, with endings in `PICTURE_FORMATS`.
         width_in: Width in inches.
         height_in: Height in inches.
-        settings: Further arguments of `Figure`.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context({"svg.hashsalt": "rack", "font.size": 9}):
-        figure = Figure(figsize=(width_in, height_in), **settings)
+        figure = Figure(figsize=(width_in, height_in), layout="constrained")
         yield figure
         for path in paths:
             metadata = {"Date": None} if path.suffix == ".svg" else None

@@ -5,10 +5,9 @@ No message is missed, and no board is delayed.
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
-from collections.abc import Iterator, Sequence
-from math import nan
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,45 +19,14 @@ from rack.tools.plots.terminal import draw_plot
 from rack.tools.recording.signal import Signal
 
 if TYPE_CHECKING:
-    from rich.console import Console
+    from rich.live import Live
 
-SignalRows = list[tuple[int, list[Any]]]
+SignalRows = list[tuple[int, tuple[Any, ...]]]
 """Rows of a tick and the value of each signal, None before the first message of the signal."""
 
 
-class WrittenMessages(NamedTuple):
-    """Messages of one mailbox, oldest first, with the ticks at which they were released.
-
-    Attributes:
-        lost: Number of earlier messages that were overwritten before they were read.
-    """
-
-    mailbox: str
-    ticks: np.ndarray
-    messages: np.ndarray
-    lost: int
-
-
-class SignalReader:
-    """Reads all new messages in the mailboxes of some signals."""
-
-    def __init__(self, segment: Segment, signals: Sequence[Signal]) -> None:
-        names = dict.fromkeys(signal.mailbox for signal in signals)
-        self._rings = {name: MailboxRing(segment, name) for name in names}
-
-    def read_new(self) -> Iterator[WrittenMessages]:
-        """Yield the messages since the last call.
-
-        The first call yields the messages that are still in the rings, which cover up to 2 s.
-        """
-        for name, ring in self._rings.items():
-            rows, lost = ring.read_new_rows()
-            if len(rows) or lost:
-                yield WrittenMessages(name, rows["tick"], rows["message"], lost)
-
-
 class SignalHistory:
-    """Recent values of signals. A signal keeps its value until its next message.
+    """Recent messages of the mailboxes of signals. A signal keeps its value until its next message.
 
     Attributes:
         settling_ticks: Number of ticks within which all messages released at a tick are written.
@@ -66,9 +34,9 @@ class SignalHistory:
 
     Args:
         segment: The rack.
-        signals: Signals whose values are stored.
-        span: Number of ticks to store. One earlier message of each mailbox is stored as well.
-        followed: Signals whose messages `read_new` returns without storing them.
+        signals: Signals whose values are listed.
+        span: Number of ticks to store. At least one earlier message of each mailbox is stored, too.
+        followed: Further signals, whose messages `read_new` returns as well.
     """
 
     def __init__(
@@ -86,66 +54,54 @@ class SignalHistory:
         self.settling_ticks = max(spec.every + spec.delay for spec in specs)
         # One reading may return all messages of a ring.
         self._span = span + self.settling_ticks + max(spec.every * spec.depth for spec in specs)
-        self._changes: dict[str, deque[tuple[int, dict[str, Any]]]] = defaultdict(deque)
-        """For each mailbox, ticks with the values of its signals, keyed by name."""
-        self._reader = SignalReader(segment, [*signals, *followed])
-        self.lost = 0
-        self.read_new()
-        # Messages overwritten before the start do not count.
+        names = {signal.mailbox for signal in (*signals, *followed)}
+        self._rings = {name: MailboxRing(segment, name) for name in names}
+        # For each mailbox, blocks of rows, which are not empty except for the first one.
+        self._blocks = {
+            name: deque([ring.read_new_rows().rows]) for name, ring in self._rings.items()
+        }
         self.lost = 0
 
-    def read_new(self) -> list[WrittenMessages]:
-        """Read, store and return the messages since the last call."""
-        all_written = [*self._reader.read_new()]
-        for written in all_written:
-            self.lost += written.lost
-            mailbox_signals = [
-                signal for signal in self.signals if signal.mailbox == written.mailbox
-            ]
-            if mailbox_signals:
-                names = [signal.name for signal in mailbox_signals]
-                values = zip(
-                    *(signal.extract_plain(written.messages) for signal in mailbox_signals),
-                    strict=True,
-                )
-                named_rows = (dict(zip(names, row, strict=True)) for row in values)
-                changes = self._changes[written.mailbox]
-                changes.extend(zip(written.ticks.tolist(), named_rows, strict=True))
-                while len(changes) > 1 and changes[1][0] < changes[-1][0] - self._span:
-                    changes.popleft()
-        return all_written
+    def read_new(self) -> dict[str, np.ndarray]:
+        """Store and return the rows since the last call, keyed by mailbox."""
+        new_rows = {}
+        for name, ring in self._rings.items():
+            rows, lost = ring.read_new_rows()
+            self.lost += lost
+            new_rows[name] = rows
+            blocks = self._blocks[name]
+            if len(rows):
+                blocks.append(rows)
+                while len(blocks) > 1 and blocks[1]["tick"][0] < rows["tick"][-1] - self._span:
+                    blocks.popleft()
+        return new_rows
+
+    def _select_rows(self, signal: Signal, first: int, last: int) -> np.ndarray:
+        """Return the stored rows of a signal from the last one before `first` to tick `last`."""
+        rows = np.concatenate(self._blocks[signal.mailbox])
+        begin, end = np.searchsorted(rows["tick"], (first, last + 1)).tolist()
+        return rows[max(begin - 1, 0) : end]
 
     def list_rows(self, first: int, last: int) -> SignalRows:
         """Return a row of values for each tick from `first` to `last` that has a new message."""
-        changes = [
-            change
-            for mailbox_changes in self._changes.values()
-            for change in mailbox_changes
-            if change[0] <= last
-        ]
-        newest: dict[str, Any] = {}
-        table: dict[int, list[Any]] = {}
-        for tick, values in sorted(changes, key=lambda change: change[0]):
-            newest.update(values)
-            if tick >= first:
-                table[tick] = [newest.get(signal.name) for signal in self.signals]
-        return [*table.items()]
+        selected = [self._select_rows(signal, first, last) for signal in self.signals]
+        ticks = np.unique(np.concatenate([rows["tick"] for rows in selected]))
+        ticks = ticks[ticks >= first]
+        columns = []
+        for signal, rows in zip(self.signals, selected, strict=True):
+            values = [None, *signal.extract_plain(rows["message"])]
+            newest = np.searchsorted(rows["tick"], ticks, "right").tolist()
+            columns.append([values[index] for index in newest])
+        return [*zip(ticks.tolist(), zip(*columns, strict=True), strict=True)]
 
-    def build_series(self, last: int) -> list[Series]:
-        """Return the stored values of the signals up to tick `last`. Texts are left out."""
-        all_series = []
-        for signal in self.signals:
-            if signal.is_text:
-                continue
-            rows = [row for row in self._changes[signal.mailbox] if row[0] <= last]
-            numbers: dict[Any, float] = dict(signal.spec.values)
-            numbers[None] = nan
-            values = np.array([values[signal.name] for _, values in rows], object)
-            values = np.array([numbers.get(value, value) for value in values.flat], float)
-            shape = signal.shape[len(signal.index) :]
-            times_s = np.array([tick for tick, _ in rows]) * self.tick_s
-            all_series.append(Series(signal, times_s, values.reshape(len(rows), *shape)))
-        return all_series
+    def build_series(self, first: int, last: int) -> list[Series]:
+        """Return the values of the signals in a range of ticks. Texts are left out."""
+        return [
+            Series(signal, rows["tick"] * self.tick_s, signal.extract_values(rows["message"]))
+            for signal in self.signals
+            if not signal.is_text
+            for rows in [self._select_rows(signal, first, last)]
+        ]
 
     def to_time_s(self, tick: int) -> float:
         """Convert a tick to simulated time in s."""
@@ -184,7 +140,7 @@ class SignalPrinter:
                 self._print_line(tick, values)
                 self._next = tick + self._every
 
-    def _print_line(self, tick: int, values: list[Any]) -> None:
+    def _print_line(self, tick: int, values: Sequence[Any]) -> None:
         """Print the values of all signals at a tick."""
         time_s = self._history.to_time_s(tick)
         if self._as_json:
@@ -195,37 +151,17 @@ class SignalPrinter:
             print(f"{time_s:10.4f}", *map(format_value, values), sep="  ", flush=True)
 
 
-class SignalPlot:
-    """Draws signals as curves on the terminal. Raises `ImportError` without plotext.
+def show_plot(history: SignalHistory, span: int, live: Live, last: int) -> None:
+    """Draw the curves of signals on the terminal.
 
     Args:
         history: History of the signals.
         span: Number of ticks that the plot covers.
-        terminal: Console on which the plot is drawn.
+        live: Display of the terminal.
+        last: Tick at which the plot ends.
     """
-
-    def __init__(self, history: SignalHistory, span: int, terminal: Console) -> None:
-        # Fail before the first plot.
-        import plotext  # noqa: F401
-        from rich.live import Live
-
-        self._history = history
-        self._span_s = history.to_time_s(span)
-        self._live = Live(console=terminal, auto_refresh=False, vertical_overflow="crop")
-
-    def __enter__(self) -> Self:
-        self._live.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._live.stop()
-
-    def show_until(self, last: int) -> None:
-        """Redraw the curves up to tick `last`."""
-        to_s = self._history.to_time_s(last)
-        window_s = max(to_s - self._span_s, 0.0), max(to_s, self._history.tick_s)
-        series = [series.cut(*window_s) for series in self._history.build_series(last)]
-        # Leave one line free, because the terminal would scroll otherwise.
-        console = self._live.console
-        drawn = draw_plot(Plot("", series, [], window_s), console, console.height - 1)
-        self._live.update(drawn, refresh=True)
+    first = max(last - span, 0)
+    window_s = history.to_time_s(first), history.to_time_s(max(last, 1))
+    plot = Plot("", history.build_series(first, last), [], window_s)
+    # Leave one line free, because the terminal would scroll otherwise.
+    live.update(draw_plot(plot, live.console, live.console.height - 1), refresh=True)

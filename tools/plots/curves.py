@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -64,26 +64,27 @@ class Series(NamedTuple):
         for time_s in times_s[~is_equal.all(axis=1)][:1].tolist():
             yield Mark(time_s, "first difference", self.signal.name, time_s)
 
-    def list_curves(self, is_alone: bool) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield label and values of each number. With `is_alone`, labels lack the signal's name."""
-        for index in np.ndindex(self.values.shape[1:]):
-            place = "".join(f"[{number}]" for number in index)
-            name = "" if is_alone and (place or self.run) else self.signal.name
-            yield f"{name}{place} {self.run}".strip(), self.values[(slice(None), *index)]
+
+class PlottedCurve(NamedTuple):
+    """One number of a signal over simulated time: its label in a legend, its times and values."""
+
+    label: str
+    time_s: np.ndarray
+    values: np.ndarray
 
 
 class SignalPanel(NamedTuple):
-    """Signals with a common axis of values.
+    """Curves with a common axis of values.
 
     Attributes:
         label: Label of the axis, with the unit.
-        series: The signals.
-        is_alone: True if all of them have the same name.
+        states: Names of the values, with their numbers. Empty for a quantity.
+        runs: Curves of each run.
     """
 
     label: str
-    series: list[Series]
-    is_alone: bool
+    states: tuple[tuple[str, int], ...]
+    runs: list[list[PlottedCurve]]
 
 
 class Plot(NamedTuple):
@@ -126,6 +127,11 @@ def require_number(signal: Signal) -> None:
         raise Failure(f"{signal.name}: is a text; only numbers can be plotted", 2)
 
 
+def format_index(index: Sequence[int]) -> str:
+    """Format an index, as in `[2][0]`."""
+    return "".join(f"[{number}]" for number in index)
+
+
 def build_panels(all_series: list[Series]) -> list[SignalPanel]:
     """Return a panel for each unit and each set of states, in the order of the series."""
     groups: defaultdict[object, list[Series]] = defaultdict(list)
@@ -135,5 +141,14 @@ def build_panels(all_series: list[Series]) -> list[SignalPanel]:
     for group in groups.values():
         signal = group[0].signal
         is_alone = len({series.signal.name for series in group}) == 1
-        panels.append(SignalPanel(signal.heading if is_alone else signal.unit, group, is_alone))
+        runs: defaultdict[str, list[PlottedCurve]] = defaultdict(list)
+        for series in group:
+            for index in np.ndindex(series.values.shape[1:]):
+                place = format_index(index)
+                name = "" if is_alone and (place or series.run) else series.signal.name
+                label = f"{name}{place} {series.run}".strip()
+                values = series.values[(slice(None), *index)]
+                runs[series.run].append(PlottedCurve(label, series.time_s, values))
+        label = signal.heading if is_alone else signal.unit
+        panels.append(SignalPanel(label, signal.spec.values, [*runs.values()]))
     return panels

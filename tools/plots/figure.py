@@ -42,34 +42,32 @@ def draw_panel(
     Returns:
         Entries of the marks for a legend.
     """
-    run, style = panel.series[0].run, "-"
-    for series in panel.series:
-        if series.run != run:
-            run, style = series.run, "--"
-            # Equal signals of both runs have equal colours.
-            axes.set_prop_cycle(None)
-        times = np.append(series.time_s, end_s)
-        for label, values in series.list_curves(panel.is_alone):
-            axes.step(times, np.append(values, values[-1:]), style, where="post", label=label)
+    for curves, style in zip(panel.runs, ("-", "--"), strict=False):
+        # Equal signals of both runs have equal colours.
+        for number, (label, time_s, values) in enumerate(curves):
+            axes.step(
+                np.append(time_s, end_s),
+                np.append(values, values[-1:]),
+                f"C{number}{style}",
+                where="post",
+                label=label,
+            )
     axes.set_ylabel(panel.label)
-    if states := panel.series[0].signal.spec.values:
-        names, numbers = zip(*states, strict=True)
+    if panel.states:
+        names, numbers = zip(*panel.states, strict=True)
         axes.set_yticks(numbers, names)
     entries: list[Artist] = []
     for entry, marks in groups.items():
-        colour = MARK_COLOURS[marks[0].kind]
-        if marks[0].kind == "hold":
-            spans = [(mark.time_s, mark.until_s - mark.time_s) for mark in marks]
-            artist: Artist = axes.broken_barh(
-                spans, (0, 1), transform=axes.get_xaxis_transform(), color=colour, alpha=0.2
-            )
-        else:
-            times_s = [mark.time_s for mark in marks]
+        kind = marks[0].kind
+        artist = axes.broken_barh(
+            [(mark.time_s, mark.until_s - mark.time_s) for mark in marks],
             # There may be hundreds of missed cycles.
-            top = 0.06 if marks[0].kind == "miss" else 1.0
-            height = axes.get_xaxis_transform()
-            artist = axes.vlines(times_s, 0.0, top, colour, "--", transform=height)
-        artist.set_label(entry)
+            (0, 0.06 if kind == "miss" else 1.0),
+            transform=axes.get_xaxis_transform(),
+            color=MARK_COLOURS[kind],
+            alpha=0.2 if kind == "hold" else 1.0,
+            label=entry,
+        )
         entries.append(artist)
     return entries
 
@@ -78,9 +76,7 @@ def save_plot(plot: Plot, path: Path) -> None:
     """Save a plot as PNG or SVG, depending on the suffix of the path."""
     panels = build_panels(plot.series)
     groups = group_marks(plot.marks)
-    with open_figure(
-        [path], 10.0, 2.6 * len(panels) + 0.2 * len(groups) + 0.8, layout="constrained"
-    ) as figure:
+    with open_figure([path], 10.0, 2.6 * len(panels) + 0.2 * len(groups) + 0.8) as figure:
         rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)
         for axes, panel in zip(rows[:, 0], panels, strict=True):
             entries = draw_panel(axes, panel, groups, plot.window_s[1])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from rack.tools.recording.divergence import find_tick_range
@@ -35,15 +35,18 @@ class Mark(NamedTuple):
 def list_marks(recording: Recording) -> list[Mark]:
     """Return the marks of a recorded run, earliest first."""
     tick_s = recording.layout.clock_ns * 1e-9
-    marks = []
+    instants = [
+        (miss["tick"], "miss", f"{miss['task']} {miss['what']}") for miss in list_misses(recording)
+    ]
     for event in recording.events:
         is_detection = event["kind"] == "detection"
         if kind := "detection" if is_detection else MARKED_CODES.get(event.get("code", "")):
-            time_s = round(event["tick"] * tick_s, 9)
-            marks.append(Mark(time_s, kind, f"{event['board']}: {event['text']}", time_s))
-    for miss in list_misses(recording):
-        time_s = round(miss["tick"] * tick_s, 9)
-        marks.append(Mark(time_s, "miss", f"{miss['task']} {miss['what']}", time_s))
+            instants.append((event["tick"], kind, f"{event['board']}: {event['text']}"))
+    marks = [
+        Mark(time_s, kind, text, time_s)
+        for tick, kind, text in instants
+        for time_s in [round(tick * tick_s, 9)]
+    ]
     end_s = find_tick_range(recording)[1] * tick_s
     for hold in list_holds(recording):
         until_s = end_s if hold["until_s"] is None else hold["until_s"]
@@ -51,18 +54,15 @@ def list_marks(recording: Recording) -> list[Mark]:
     return sorted(marks)
 
 
-def group_marks(marks: Iterable[Mark]) -> dict[str, list[Mark]]:
+def group_marks(marks: Sequence[Mark]) -> dict[str, list[Mark]]:
     """Group equal marks, and return them by their entry in a legend.
 
     If there are too many entries, marks are grouped by kind.
     """
-    groups: defaultdict[tuple[str, ...], list[Mark]] = defaultdict(list)
+    groups: defaultdict[tuple[object, ...], list[Mark]] = defaultdict(list)
+    is_by_text = len({mark[1:3] for mark in marks}) <= MAX_LEGEND_ENTRIES
     for mark in marks:
-        groups[mark[1:3]].append(mark)
-    if len(groups) > MAX_LEGEND_ENTRIES:
-        groups.clear()
-        for mark in marks:
-            groups[mark[1:2]].append(mark)
+        groups[mark[1 : 2 + is_by_text]].append(mark)
     return {_format_entry(*group): group for group in groups.values()}
 
 

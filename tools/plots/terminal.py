@@ -51,21 +51,17 @@ def draw_plot(plot: Plot, console: Console, height: int) -> Text:
         plotext.plotsize(console.width, max(rows // len(panels) - 2, MIN_HEIGHT))
         legend = Text()
         lows = []
-        curves = [
-            (series, label, values)
-            for series in panel.series
-            for label, values in series.list_curves(panel.is_alone)
-        ]
-        for number, (series, label, values) in enumerate(curves):
+        curves = [curve for curves in panel.runs for curve in curves]
+        for number, (label, time_s, values) in enumerate(curves):
             marker = "braille" if has_colours or len(curves) == 1 else MARKERS[number % 36]
             colour = COLOURS[number % len(COLOURS)]
-            points = _list_points(series.time_s, values, plot.window_s, console.width)
+            points = _list_points(time_s, values, plot.window_s, console.width)
             lows += points[1]
             plotext.plot(*points, marker=marker, color=colour if has_colours else None)
             sign = "⠤⠤" if marker == "braille" else marker
             legend.append(f"{sign} {label}  ", f"color({colour})")
-        if states := panel.series[0].signal.spec.values:
-            names, numbers = zip(*states, strict=True)
+        if panel.states:
+            names, numbers = zip(*panel.states, strict=True)
             plotext.yticks(numbers, names)
         # The letter of the earlier mark covers the others.
         for letter, (_, marks) in reversed(groups):

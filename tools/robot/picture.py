@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
+from itertools import product
 from pathlib import Path
 
 import mujoco
@@ -27,7 +28,7 @@ MARGIN = 1.1
 FLOOR_BELOW_M = 0.005
 """Distance from the lowest point to an added floor, so that a fixed box can be a floor, too."""
 FLOOR_COLOUR = (0.6, 0.62, 0.65, 1.0)
-SKY_COLOUR = (0.5, 0.56, 0.62, 1.0)
+SKY_COLOUR = (128, 143, 158)
 NO_PICTURE = "no picture: it needs OpenGL (EGL); on Debian: libegl1 libgl1-mesa-dri"
 
 
@@ -75,21 +76,35 @@ def draw_arm(cell: Cell, path: Path, data: mujoco.MjData | None = None) -> str:
     categories = mujoco.mjtCatBit.mjCAT_ALL
     mujoco.mjv_updateScene(model, data, option, None, camera, categories, scene)
     if not (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).any():
+        floor = scene.geoms[scene.ngeom]
+        size = 2.5 * camera.distance
         place = np.array([*camera.lookat[:2], points[:, 2].min() - FLOOR_BELOW_M])
-        _add_plane(scene, 2.5 * camera.distance, place, np.eye(3), FLOOR_COLOUR)
-    # A background behind everything, because labels are unreadable on black.
-    right, up, forward = compute_axes()
-    place = camera.lookat + 4 * camera.distance * forward
-    facing = np.column_stack((right, up, -forward))
-    _add_plane(scene, 9 * camera.distance, place, facing, SKY_COLOUR).emission = 1.0
+        mujoco.mjv_initGeom(
+            floor,
+            mujoco.mjtGeom.mjGEOM_PLANE,
+            np.array([size, size, 0.1]),
+            place,
+            np.eye(3).ravel(),
+            np.array(FLOOR_COLOUR, np.float32),
+        )
+        scene.ngeom += 1
     if not model.nlight:
-        _add_light(scene, camera)
+        light = scene.lights[0]
+        light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+        light.pos = camera.lookat + np.array([0.0, 0.0, camera.distance])
+        light.dir = (-0.3, 0.25, -0.92)
+        light.diffuse = (0.5, 0.5, 0.5)
+        light.castshadow = True
+        scene.nlight = 1
     pixels = np.zeros((HEIGHT, WIDTH, 3), dtype=np.uint8)
+    depth = np.zeros((HEIGHT, WIDTH), dtype=np.float32)
     window = mujoco.MjrRect(0, 0, WIDTH, HEIGHT)
     mujoco.mjr_render(window, scene, renderer)
-    mujoco.mjr_readPixels(pixels, None, window, renderer)
+    mujoco.mjr_readPixels(pixels, depth, window, renderer)
     renderer.free()
     context.free()
+    # Nothing is drawn there, except labels. They are unreadable on black.
+    pixels[(depth == depth.max()) & (pixels == 0).all(axis=2)] = SKY_COLOUR
     Image.fromarray(pixels[::-1]).save(path, "png")
     return str(path)
 
@@ -112,7 +127,7 @@ def list_corners(cell: Cell, data: mujoco.MjData, is_drawn: Array) -> Array:
     is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
     is_drawn = is_drawn & ~is_large & ~is_plane
     centre, half = np.split(model.geom_aabb[is_drawn], 2, axis=1)
-    signs = np.stack(np.meshgrid(*[(-1, 1)] * 3), axis=-1).reshape(-1, 3)
+    signs = np.array([*product((-1, 1), repeat=3)])
     local = centre[:, None] + half[:, None] * signs
     rotation = data.geom_xmat[is_drawn].reshape(-1, 1, 3, 3)
     corners = data.geom_xpos[is_drawn, None] + (rotation @ local[..., None])[..., 0]
@@ -146,37 +161,3 @@ def compute_axes() -> Array:
     forward = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
     return np.array([right, np.cross(right, forward), forward])
-
-
-def _add_plane(
-    scene: mujoco.MjvScene, size: float, place: Array, axes: Array, colour: tuple[float, ...]
-) -> mujoco.MjvGeom:
-    """Add a square to a scene, and return it.
-
-    Args:
-        scene: The scene.
-        size: Half of its width in m.
-        place: Its centre in m, shape (3,).
-        axes: Its axes as columns, shape (3, 3). The last one is its normal.
-        colour: Its colour.
-    """
-    plane = scene.geoms[scene.ngeom]
-    sizes = np.array([size, size, 0.1])
-    rgba = np.array(colour, np.float32)
-    kind = mujoco.mjtGeom.mjGEOM_PLANE
-    mujoco.mjv_initGeom(plane, kind, sizes, place, axes.ravel(), rgba)
-    plane.castshadow = False
-    scene.ngeom += 1
-    return plane
-
-
-def _add_light(scene: mujoco.MjvScene, camera: mujoco.MjvCamera) -> None:
-    """Add a light from above that casts shadows."""
-    light = scene.lights[scene.nlight]
-    light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    light.pos = camera.lookat + np.array([0.0, 0.0, camera.distance])
-    light.dir = (-0.3, 0.25, -0.92)
-    light.diffuse = (0.5, 0.5, 0.5)
-    light.ambient = light.specular = (0.0, 0.0, 0.0)
-    light.castshadow = True
-    scene.nlight += 1

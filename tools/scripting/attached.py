@@ -14,6 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from rack.backplane.lines import UtilityLines
+from rack.backplane.mailbox.history import MailboxRing
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import AnyMessage
@@ -26,7 +27,6 @@ from rack.tools.launch.folder import choose_run_folder
 from rack.tools.monitor import pausing
 from rack.tools.monitor.desk import LevelCommander
 from rack.tools.monitor.replies import Reply
-from rack.tools.monitor.signals import SignalReader
 from rack.tools.monitor.snapshot import RackMonitor, Snapshot
 from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.recorder.process import RecorderProcess
@@ -169,15 +169,13 @@ class AttachedRack:
             newest message.
         """
         trigger = Trigger.parse(condition, self._boxes)
-        tap = SignalReader(self._segment, [trigger.signal])
+        ring = MailboxRing(self._segment, trigger.signal.mailbox)
         newest = slice(-1, None)
         for _ in self._poll_rack(timeout_s):
-            for written in tap.read_new():
-                holding_ticks = written.ticks[newest][
-                    trigger.evaluate_messages(written.messages[newest])
-                ]
-                if len(holding_ticks):
-                    return int(holding_ticks[0])
+            rows = ring.read_new_rows().rows[newest]
+            holding_ticks = rows["tick"][trigger.evaluate_messages(rows["message"])]
+            if len(holding_ticks):
+                return int(holding_ticks[0])
             newest = slice(None)
         raise self._build_timeout(condition, timeout_s)
 

@@ -13,7 +13,7 @@ from rack.boards.events import Event
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.launch.continued import parse_tick
-from rack.tools.plots.curves import Series, build_panels, require_number
+from rack.tools.plots.curves import Series, build_panels, format_index, require_number
 from rack.tools.plots.marks import MAX_LEGEND_ENTRIES, group_marks, list_marks
 from rack.tools.recording.in_force import VisibleMessages
 from rack.tools.recording.recording import Recording
@@ -59,7 +59,8 @@ class RecordedRun:
     @cached_property
     def events(self) -> list[Event]:
         """Events of the run, oldest first. Empty in a recording by `rack record`."""
-        return _list_events(self._recording)
+        recorded = self._recording.events
+        return [Event(**event) for event in recorded if event["kind"] != "outcome"]
 
     @cached_property
     def report(self) -> Document:
@@ -164,16 +165,6 @@ class RecordedSignal:
         return axes
 
 
-def _list_events(recording: Recording) -> list[Event]:
-    """Return the events of a run, without its outcome."""
-    return [Event(**event) for event in recording.events if event["kind"] != "outcome"]
-
-
-def _format_index(index: Sequence[int]) -> str:
-    """Format an index, as in `[2][0]`."""
-    return "".join(f"[{number}]" for number in index)
-
-
 def _build_table(signals: Sequence[RecordedSignal]) -> DataFrame:
     """Return the signals of one mailbox as a table. Raises `Failure` without pandas."""
     try:
@@ -184,5 +175,5 @@ def _build_table(signals: Sequence[RecordedSignal]) -> DataFrame:
     for signal in signals:
         values = signal.signal.replace_numbers(signal.values)
         for index in np.ndindex(values.shape[1:]):
-            columns[f"{signal.name}{_format_index(index)}"] = values[(slice(None), *index)]
+            columns[f"{signal.name}{format_index(index)}"] = values[(slice(None), *index)]
     return DataFrame(columns, index=Index(signals[0].time_s, name="time_s"))

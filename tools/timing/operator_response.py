@@ -320,7 +320,7 @@ def plot_response(response: OperatorResponse, folder: Path) -> list[Path]:
         if any(c.level == level for c in response.measured_commands)
     ]
     paths = list_picture_paths(folder / "response")
-    with open_figure(paths, 8.0, 0.8 + 1.7 * len(levels), layout="constrained") as figure:
+    with open_figure(paths, 8.0, 0.8 + 1.7 * len(levels)) as figure:
         axes = figure.subplots(len(levels), 1, squeeze=False)
         for axis, level in zip(axes[:, 0], levels, strict=True):
             _plot_level(axis, response, level)

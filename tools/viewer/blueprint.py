@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
@@ -22,20 +22,23 @@ from rack.levels.systems.trajectory.messages import MotionStatus
 from rack.tools.viewer import timing
 from rack.tools.viewer.cell import CELL, COLLISION, FRAMES, compute_extent, find_floor_height
 from rack.tools.viewer.curves import (
+    BY_FINGER,
     ERROR,
     GRIP,
     GRIPPER,
+    HAND,
     JOINTS,
     OPENING,
     QUANTITIES,
     SIGNALS,
+    TENSIONS,
+    TIPS,
     find_gripper_units,
     get_plotted_unit,
     has_curves,
 )
 from rack.tools.viewer.events import EVENTS, RACK_LANE, RECORDER
 from rack.tools.viewer.forces import AXES, CONTACT, CONTACT_UNITS, FORCES, TASK
-from rack.tools.viewer.hand import BY_FINGER, HAND, TENSIONS, TIPS
 from rack.tools.viewer.levels import (
     COLUMN,
     HIERARCHY,
@@ -46,7 +49,7 @@ from rack.tools.viewer.levels import (
     name_lanes,
 )
 from rack.tools.viewer.stream import LOG, SIM_TIME, Stream, build_path
-from rack.tools.viewer.style import GRID, LEGEND, build_lanes_view, build_legend_view
+from rack.tools.viewer.style import GRID, LEGEND, LEGEND_LETTER, LEGEND_ROW, build_lanes_view
 from rack.tools.viewer.timing import BOARDS, MISSED
 
 CONFIG = "config"
@@ -59,6 +62,7 @@ MAX_GRID = 4
 """Largest number of plots of signals that are shown side by side. More are shown as tabs."""
 STATUS_FIELDS = [field.name for field in Status.message_type.fields]
 """Fields of every status, which are shown as lanes and log lines."""
+ERROR_TITLE = "tracking error, mrad"
 CYCLES = "boards, cycle by cycle: R read, X process, P plan, W write"
 CYCLES_S = 0.022
 """Time shown before and after the cursor in the lanes of cycles: several cycles of most boards."""
@@ -115,12 +119,11 @@ def build_comparison_view(runs: Mapping[str, RackViews]) -> rrb.Container:
     Args:
         runs: Dictionary from the name of each run to its views.
     """
-    first, other = runs.values()
+    first, other = (views.list_main_curves() for views in runs.values())
     names = "{} in grey, {} in colour".format(*runs)
-    both = zip(first.list_main_curves().items(), other.list_main_curves().values(), strict=True)
     plots = [
-        _build_plot(f"{title}: {names}", [*grey, *coloured], overrides=dict.fromkeys(grey, DIMMED))
-        for (title, grey), coloured in both
+        _build_plot(f"{title}: {names}", grey + other[title], False, dict.fromkeys(grey, DIMMED))
+        for title, grey in first.items()
     ]
     below = rrb.Horizontal(
         _build_common_log(runs, "runs"), rrb.Tabs(*plots, active_tab=0), column_shares=[2, 5]
@@ -204,8 +207,8 @@ class RackViews:
         curves: rrb.Container | rrb.View
         if self._hand is not None:
             curves = self._build_finger_plots(self._hand)
-        elif self._joints:
-            curves = self._build_arm_plots()
+        elif self._cell is not None and self._joints:
+            curves = self._build_arm_plots(self._cell)
         else:
             curves = self._build_unit_plots("signals", self._layout.mailboxes)
         right = rrb.Vertical(
@@ -238,7 +241,7 @@ class RackViews:
             ]
             for quantity, unit in QUANTITIES.items()
         }
-        return {"tracking error, mrad": [self.build_path(ERROR)], **by_quantity}
+        return {ERROR_TITLE: [self.build_path(ERROR)], **by_quantity}
 
     def build_column(self, name: str) -> rrb.Container | rrb.View:
         """Return a column for a view of several racks: the cell, if any, above the level lanes."""
@@ -278,6 +281,10 @@ class RackViews:
 
     def _build_scene(self, cell: Cell, name: str) -> rrb.View:
         """Return the 3D view of the cell with the title `name`. Collision shapes are hidden."""
+        # From the eye, arm and objects fill the view.
+        centre, radius = compute_extent(cell)
+        eye = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
+        plane = rr.components.Plane3D((0.0, 0.0, 1.0), find_floor_height(cell) + ABOVE_M)
         return rrb.Spatial3DView(
             origin=self.build_path(CELL),
             contents=[
@@ -286,34 +293,40 @@ class RackViews:
                 self.build_query(FRAMES),
             ],
             name=name,
-            eye_controls=build_eye(cell),
-            line_grid=build_grid(cell),
+            eye_controls=rrb.EyeControls3D(
+                position=eye.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1)
+            ),
+            line_grid=rrb.LineGrid3D(visible=True, plane=plane, spacing=GRID_M, color=GRID),
         )
 
-    def _build_arm_plots(self) -> rrb.Container:
+    def _build_arm_plots(self, cell: Cell) -> rrb.Container:
         """Return the plots of the arm.
 
         Each quantity has one plot with all joints and, in a second tab, one plot per joint with
-        limits. Requests, forces, tracking error and gripper follow in further tabs.
+        limits. Own signals, requests, forces, tracking error and gripper follow in further tabs.
         """
-        error, *plots = (_build_plot(*curves) for curves in self.list_main_curves().items())
+        curves = self.list_main_curves()
         views = [
             rrb.Tabs(
-                plot,
+                _build_plot(f"{quantity}, {unit}", curves[f"{quantity}, {unit}"]),
                 rrb.Grid(
-                    *(self._build_joint_plot(name, quantity) for name in self._joints),
+                    *(
+                        self._plot(
+                            f"{name}, {unit}",
+                            (JOINTS, name, quantity),
+                            (JOINTS, name, quantity, "limits"),
+                        )
+                        for name in self._joints
+                    ),
                     name="by joint, with limits",
                 ),
             )
-            for plot, quantity in zip(plots, QUANTITIES, strict=True)
+            for quantity, unit in QUANTITIES.items()
         ]
         own = self._list_own_mailboxes()
         other_plots = rrb.Tabs(
             *([self._build_unit_plots("own signals", own)] if own else []),
-            *self._build_request_plots(),
-            *self._build_force_plots(),
-            error,
-            *self._build_gripper_plots(),
+            *self._list_other_plots(cell),
             active_tab=0,
         )
         legend = self._build_legend(JOINTS, "joints", self._joints)
@@ -321,69 +334,40 @@ class RackViews:
             rrb.Grid(*views, other_plots, grid_columns=2), legend, column_shares=[9, 1]
         )
 
-    def _build_request_plots(self) -> list[rrb.Container]:
-        """Return plots for levels that execute motion requests.
+    def _list_other_plots(self, cell: Cell) -> Iterator[rrb.Container | rrb.View]:
+        """Yield the plots of requests, forces, tracking error and gripper that the rack has."""
+        for box in self._layout.mailboxes:
+            if box.message == MotionStatus.message_type.name:
+                signals = (SIGNALS, box.name)
+                yield rrb.Horizontal(
+                    self._plot("taken and done", (*signals, "taken"), (*signals, "done")),
+                    self._plot("from moving goal, m", (*signals, "astray")),
+                    name="queue and moving goal",
+                )
+        if cell.wrist is not None:
+            yield self._plot("force along z, wanted and exerted, N", (FORCES, TASK, "z"))
+            for what, unit in CONTACT_UNITS.items():
+                axes = [(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit]
+                yield self._plot(f"{what} wanted and exerted, {unit}", *axes)
+            for what, unit in CONTACT_UNITS.items():
+                title = f"contact: {what}, with its limit, {unit}"
+                yield self._plot(title, (FORCES, CONTACT, what))
+        yield self._plot(ERROR_TITLE, (ERROR,))
+        if cell.gripper is not None:
+            for name, unit in zip((OPENING, GRIP), find_gripper_units(cell), strict=True):
+                yield self._plot(f"gripper's {name}, {unit}", (GRIPPER, name))
 
-        They show the requests taken and done, and the distance from a moving goal.
-        """
-        return [
-            rrb.Horizontal(
-                _build_plot("taken and done", self._list_field_paths(box, "taken", "done")),
-                _build_plot("from moving goal, m", self._list_field_paths(box, "astray")),
-                name="queue and moving goal",
-            )
-            for box in self._layout.mailboxes
-            if box.message == MotionStatus.message_type.name
-        ]
-
-    def _build_gripper_plots(self) -> list[rrb.View]:
-        """Return plots of the gripper's opening and force. Empty without a gripper."""
-        if self._cell is None or self._cell.gripper is None:
-            return []
-        units = zip((OPENING, GRIP), find_gripper_units(self._cell), strict=True)
-        return [
-            _build_plot(f"gripper's {name}, {unit}", [self.build_path(GRIPPER, name)])
-            for name, unit in units
-        ]
-
-    def _list_field_paths(self, mailbox: MailboxSpec, *names: str) -> list[str]:
-        """Return the entity paths at which the given fields of a mailbox are plotted."""
-        return [self.build_path(SIGNALS, mailbox.name, name) for name in names]
+    def _plot(self, title: str, *entities: tuple[str, ...]) -> rrb.View:
+        """Return a plot of the curves of some entities of this rack."""
+        return _build_plot(title, [self.build_path(*entity) for entity in entities])
 
     def _build_legend(self, what: str, name: str, names: Sequence[str]) -> rrb.View:
-        """Return a view of the legend that `write_legend` wrote.
-
-        Args:
-            what: Name of the legend.
-            name: Title of the view.
-            names: Entries of the legend.
-        """
-        return build_legend_view(self.build_path(LEGEND, what), name, names)
-
-    def _build_force_plots(self) -> list[rrb.View]:
-        """Return plots of wanted and exerted forces, and of contact forces with limits.
-
-        Empty without a wrist sensor.
-        """
-        if self._cell is None or self._cell.wrist is None:
-            return []
-        views = [
-            _build_plot(
-                f"{what} wanted and exerted, {unit}",
-                [self.build_path(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit],
-            )
-            for what, unit in CONTACT_UNITS.items()
-        ]
-        along = _build_plot(
-            "force along z, wanted and exerted, N", [self.build_path(FORCES, TASK, "z")]
-        )
-        contact = [
-            _build_plot(
-                f"contact: {what}, with its limit, {unit}", [self.build_path(FORCES, CONTACT, what)]
-            )
-            for what, unit in CONTACT_UNITS.items()
-        ]
-        return [along, *views, *contact]
+        """Return a view, with a title, of the legend `what` that `write_legend` wrote."""
+        half = LEGEND_LETTER * max(map(len, names)) / 2 + LEGEND_ROW / 2
+        rows = (-LEGEND_ROW, LEGEND_ROW * len(names))
+        bounds = rrb.VisualBounds2D(x_range=(-half, half), y_range=rows)
+        origin = self.build_path(LEGEND, what)
+        return rrb.GraphView(origin=origin, name=name, visual_bounds=bounds)
 
     def _build_finger_plots(self, hand: Hand) -> rrb.Container:
         """Return the plots of a hand.
@@ -393,18 +377,15 @@ class RackViews:
         """
         tabs = [
             rrb.Grid(
-                *(
-                    _build_plot(f"{finger}, {unit}", [self.build_path(HAND, finger, kind)])
-                    for finger in hand.names
-                ),
+                *(self._plot(f"{finger}, {unit}", (HAND, finger, kind)) for finger in hand.names),
                 grid_columns=2,
                 name=TITLES.get(kind, kind),
             )
             for kind, unit in BY_FINGER.items()
         ]
-        tips = _build_plot("force on the tips, N", [self.build_path(*TIPS)])
+        tips = self._plot("force on the tips, N", TIPS)
         pulls = [
-            _build_plot("weight and pull, N", self._list_field_paths(box, "load"))
+            self._plot("weight and pull, N", (SIGNALS, box.name, "load"))
             for box in self._layout.mailboxes
             if box.message == GraspStatus.message_type.name
         ]
@@ -414,14 +395,6 @@ class RackViews:
             self._build_legend(HAND, "fingers", hand.names),
             column_shares=[5, 4, 1],
         )
-
-    def _build_joint_plot(self, name: str, quantity: str) -> rrb.View:
-        """Return a plot of one quantity of a joint, with its limits."""
-        entities = [
-            self.build_path(JOINTS, name, quantity),
-            self.build_path(JOINTS, name, quantity, "limits"),
-        ]
-        return _build_plot(f"{name}, {QUANTITIES[quantity]}", entities)
 
     def _list_own_mailboxes(self) -> list[MailboxSpec]:
         """Return the mailboxes of the user's levels whose messages this package does not know."""
@@ -469,8 +442,8 @@ class RackViews:
         titles = ("execution, % of cycle", "execution, ms")
         if not is_lockstep:
             titles = ("slice used, %", "late and execution, ms")
-        queries = (self.build_query(timing.LOAD), self.build_query(timing.TIMES))
-        plots = [_build_plot(*plot) for plot in zip(titles, ([q] for q in queries), strict=True)]
+        groups = zip(titles, (timing.LOAD, timing.TIMES), strict=True)
+        plots = [_build_plot(title, [self.build_query(group)]) for title, group in groups]
         return rrb.Tabs(*plots, active_tab=0)
 
     def _build_age_plots(self) -> rrb.Container:
@@ -491,8 +464,8 @@ class RackViews:
         """Return tabs with the log, the config, and the recorder's load and losses."""
         log = rrb.TextLogView(origin=self.build_path(LOG), name="log", columns=LOG_COLUMNS)
         config = rrb.TextDocumentView(origin=self.build_path(CONFIG), name="config")
-        load = _build_plot("recorder, % of a core", [self.build_path(RECORDER, "load")])
-        lost = _build_plot("rows lost", [self.build_path(RECORDER, "rows_lost")])
+        load = self._plot("recorder, % of a core", (RECORDER, "load"))
+        lost = self._plot("rows lost", (RECORDER, "rows_lost"))
         return rrb.Tabs(log, config, load, lost)
 
     def _build_graph(self) -> rrb.View:
@@ -546,30 +519,12 @@ def _build_plot(
         legend: Whether to show a legend.
         overrides: Dictionary from entity to the style that replaces the recorded one.
     """
-    axis = rrb.TimeAxis(link="LinkToGlobal")
-    legend_style = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend)
     return rrb.TimeSeriesView(
-        origin="/",
         contents=contents,
         name=name,
-        axis_x=axis,
-        plot_legend=legend_style,
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
         overrides=overrides,
-    )
-
-
-def build_grid(cell: Cell) -> rrb.LineGrid3D:
-    """Return a grid just above the floor of a cell, or above the origin if it has no floor."""
-    plane = rr.components.Plane3D((0.0, 0.0, 1.0), find_floor_height(cell) + ABOVE_M)
-    return rrb.LineGrid3D(visible=True, plane=plane, spacing=GRID_M, color=GRID)
-
-
-def build_eye(cell: Cell) -> rrb.EyeControls3D:
-    """Return an initial eye position from which the arm and the objects fill the view."""
-    centre, radius = compute_extent(cell)
-    position = centre + DISTANCE * radius * DIRECTION / np.linalg.norm(DIRECTION)
-    return rrb.EyeControls3D(
-        position=position.tolist(), look_target=centre.tolist(), eye_up=(0, 0, 1)
     )
 
 

@@ -64,6 +64,8 @@ POINT_M = 0.008
 LABEL = 0xFFFFFFFF
 LINE_M = 0.003
 BRAKES = (CELL, "brakes")
+BRAKE_LABELS = {"brakes_closed": "brakes engaged", "brakes_opened": ""}
+"""Label of the arm by code of an event."""
 FAULTS = (CELL, "faults")
 MARK_PART = 0.09
 """Radius of a mark, relative to the radius of arm and objects.
@@ -95,12 +97,7 @@ def find_moving_bodies(model: mujoco.MjModel) -> Ints:
 
     These are bodies with joints or mocap poses, and all bodies attached to them.
     """
-    moves = np.zeros(model.nbody, dtype=bool)
-    # Parents precede their children, so one pass reaches all attached bodies.
-    for body in range(1, model.nbody):
-        has_motion = model.body_jntnum[body] > 0 or model.body_mocapid[body] >= 0
-        moves[body] = has_motion or moves[model.body_parentid[body]]
-    return np.flatnonzero(moves)
+    return np.flatnonzero(model.body_weldid)
 
 
 class ArmShape(NamedTuple):
@@ -152,7 +149,7 @@ def write_geometry(stream: Stream, cell: Cell) -> list[ArmShape]:
                 remove_colour(shape)
                 arm.append(ArmShape(entity, shape, read_colour(model, geom)))
             stream.log_static(entity, shape, stream.build_frame(name_frame(model, body)))
-    for body in set(range(1, model.nbody)) - set(find_moving_bodies(model).tolist()):
+    for body in np.flatnonzero(model.body_weldid == 0)[1:].tolist():
         name = name_frame(model, body)
         pose = rr.Transform3D(
             translation=data.xpos[body],
@@ -201,30 +198,29 @@ class PoseWriter:
         if not len(bodies) or not len(chosen):
             return
         count = len(self._frames)
-        positions = np.empty((len(chosen), count, 3))
-        quaternions = np.empty((len(chosen), count, 4))
+        poses = np.empty((len(chosen), count, 7))
         tool = np.empty((len(chosen), 3))
         for row, state in enumerate(block.messages["state"][chosen]):
             view_state(self._cell.model, data, state)
             mujoco.mj_kinematics(self._cell.model, data)
-            positions[row, : len(bodies)] = data.xpos[bodies]
-            quaternions[row, : len(bodies)] = data.xquat[bodies]
+            poses[row, : len(bodies)] = np.hstack((data.xpos[bodies], data.xquat[bodies]))
             for index, contact in enumerate(self._contacts, len(bodies)):
-                positions[row, index], quaternions[row, index] = contact.compute_pose(data)
+                poses[row, index] = contact.compute_pose(data)
             tool[row] = data.site_xpos[self._cell.tool]
             if self._has_pushes:
                 self._write_pushes(block.find_moment(chosen[row]))
         self._stream.send_columns(
             TOOL, block.build_time_columns(chosen), rr.Points3D.columns(positions=tool)
         )
-        poses = rr.Transform3D.columns(
-            translation=positions.reshape(-1, 3),
-            quaternion=convert_to_xyzw(quaternions).reshape(-1, 4),
-            parent_frame=[self._world] * (len(chosen) * count),
+        translations, quaternions = np.split(poses.reshape(-1, 7), [3], axis=1)
+        columns = rr.Transform3D.columns(
+            translation=translations,
+            quaternion=convert_to_xyzw(quaternions),
+            parent_frame=[self._world] * len(translations),
             child_frame=self._frames * len(chosen),
         )
         self._stream.send_columns(
-            (FRAMES,), block.build_time_columns(np.repeat(chosen, count)), poses
+            (FRAMES,), block.build_time_columns(np.repeat(chosen, count)), columns
         )
 
     def _write_pushes(self, when: Moment) -> None:
@@ -273,36 +269,49 @@ class MarkWriter:
         for entity, name in ((BRAKES, joints[-1]), *(((*FAULTS, name), name) for name in joints)):
             body = int(cell.model.joint(name).bodyid[0])
             stream.log_static(entity, stream.build_frame(name_frame(cell.model, body)))
-        self.mark_brakes(stream.times.estimate_moment(0), "")
+        self._mark_brakes(stream.times.estimate_moment(0), "")
 
     def write(self, block: RowBlock) -> None:
         """Colour the arm red when the brakes engage, and as before when they are released."""
         braked = block.messages["braked"]
         for row in np.union1d(self._braking_rows(braked), np.flatnonzero(block.resumed)):
-            self.mark_brakes(block.find_moment(row), "brakes engaged" if braked[row] else "")
+            self._mark_brakes(block.find_moment(row), "brakes engaged" if braked[row] else "")
 
     def mark_lost(self, when: Moment, task: str) -> None:
         """Colour the arm red if the lost task drives it: without torque, the brakes engage."""
         if task in self._drivers:
-            self.mark_brakes(when, f"brakes engaged: {task} is lost")
+            self._mark_brakes(when, f"brakes engaged: {task} is lost")
 
-    def mark_brakes(self, when: Moment, text: str) -> None:
+    def _mark_brakes(self, when: Moment, text: str) -> None:
         """Colour the arm red and label its last joint, or undo both if the text is empty."""
         for entity, shape, colour in self._arm:
             self._stream.log_at(when, entity, colour_shape(shape, LOST if text else colour))
-        place = [list(self._joints.values())[-1]] if text else []
-        labels = [text] if text else None
-        label = rr.Points3D(place, radii=POINT_M, colors=[LABEL], labels=labels)
-        self._stream.log_at(when, BRAKES, label)
+        *_, place = self._joints.values()
+        self._log_point(when, BRAKES, place, text, POINT_M, LABEL)
 
-    def mark_fault(self, when: Moment, event: Event) -> None:
-        """Mark a joint when a fault begins, and clear the mark when it ends.
+    def _log_point(
+        self,
+        when: Moment,
+        entity: tuple[str, ...],
+        place: Array,
+        text: str,
+        radius: float,
+        colour: int,
+    ) -> None:
+        """Write a labelled point, or clear it if the text is empty."""
+        points, labels = ([place], [text]) if text else ([], None)
+        point = rr.Points3D(points, radii=radius, colors=[colour], labels=labels)
+        self._stream.log_at(when, entity, point)
 
-        Args:
-            when: Time of the event.
-            event: Beginning or end of a fault. If the fault concerns no joint, the first joint is
-                marked.
+    def mark_event(self, when: Moment, event: Event) -> None:
+        """Mark a joint from the beginning to the end of a fault, and the arm while it is braked.
+
+        If a fault concerns no joint, the first joint is marked.
         """
+        if event.code in BRAKE_LABELS:
+            self._mark_brakes(when, BRAKE_LABELS[event.code])
+        if event.kind != "fault":
+            return
         joint = event.subject if event.subject in self._joints else next(iter(self._joints))
         if event.code == "begins":
             text = event.text.partition(" begins")[0]
@@ -311,10 +320,8 @@ class MarkWriter:
             self._faults.pop(event.fault, None)
         texts = dict(self._faults.values())
         for name, place in self._joints.items():
-            labels = [texts[name]] if name in texts else None
-            places = [place] if labels else []
-            balls = rr.Points3D(places, radii=self._radius, colors=[LOST], labels=labels)
-            self._stream.log_at(when, (*FAULTS, name), balls)
+            entity = (*FAULTS, name)
+            self._log_point(when, entity, place, texts.get(name, ""), self._radius, LOST)
 
 
 def compute_extent(cell: Cell) -> tuple[Array, float]:
@@ -406,7 +413,10 @@ class GoalWriter:
             plan = block.messages[row]
             moves = plan["moves"][: plan["count"]]
             self._goals |= {
-                int(move["id"]): (move["position"].tolist(), self._format_label(move))
+                int(move["id"]): (
+                    move["position"].tolist(),
+                    f"{format_enum(Verb, move['verb'])} {self._find_object_name(move)}".strip(),
+                )
                 for move in moves
             }
             ends = [move for move in moves if move["verb"] == Verb.RELEASE]
@@ -431,10 +441,6 @@ class GoalWriter:
                 labels=[label for _, label in goals],
             )
             self._stream.log_at(block.find_moment(row), CURRENT_GOAL, point)
-
-    def _format_label(self, move: np.void) -> str:
-        """Return the label of a move: its verb, and the name of its object, if any."""
-        return f"{format_enum(Verb, int(move['verb']))} {self._find_object_name(move)}".strip()
 
     def _find_object_name(self, move: np.void) -> str:
         """Return the name of a move's object, or "" if it has none."""

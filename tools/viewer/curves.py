@@ -1,17 +1,18 @@
-"""Curves of the arm's joints with set points and limits, and of the numbers of any message."""
+"""Curves of an arm with set points and limits, of a hand, and of the numbers of any message."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import partial
 from math import prod
 
 import mujoco
 import numpy as np
 
 from rack.backplane.layout import FieldSpec, MailboxSpec
-from rack.levels.algebra import Array
+from rack.levels.algebra import Array, Ints
 from rack.levels.robot.cell import Cell
+from rack.levels.robot.hand import Hand
+from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
 from rack.tools.viewer.stream import RowBlock, Stream, ViewPart
 from rack.tools.viewer.style import (
     COMMANDED,
@@ -19,6 +20,7 @@ from rack.tools.viewer.style import (
     OVERLAID,
     build_curves,
     choose_joint_colours,
+    dim_colour,
     style_curves,
     write_legend,
 )
@@ -39,6 +41,12 @@ FIELDS = {
     "torque": {"applied": "torque"},
 }
 """For each quantity of a joint, a dictionary from curve to field of the status."""
+HAND = "hand"
+TENSIONS = "tensions"
+FINGER_FORCES = "forces"
+BY_FINGER = {TENSIONS: "N", JOINTS: "rad", FINGER_FORCES: "N"}
+"""Curves of a finger, and their units."""
+TIPS = (HAND, "tip_forces")
 
 
 def build_joint_curves(
@@ -68,12 +76,16 @@ def build_joint_curves(
             entity = (JOINTS, name, quantity)
             yield _build_limits(stream, (*entity, "limits"), limits[quantity][index])
             labels = [f"{name} {meaning}, {QUANTITIES[quantity]}" for meaning in fields]
-            values = partial(_select_joint, index, tuple(fields.values()))
-            if len(fields) == 1:
-                yield build_curves(stream, entity, values, labels, [colours[index]])
-            else:
-                shades = [COMMANDED, colours[index]]
-                yield build_curves(stream, entity, values, labels, shades, OVERLAID)
+            shades = [COMMANDED, colours[index]][-len(fields) :]
+
+            def select(
+                block: RowBlock, index: int = index, fields: dict[str, str] = fields
+            ) -> Array:
+                """Return the values of the fields for one joint, shape (rows, fields)."""
+                columns = [block.messages[field][:, index] for field in fields.values()]
+                return np.stack(columns, axis=-1)
+
+            yield build_curves(stream, entity, select, labels, shades, OVERLAID[-len(fields) :])
     labels = [f"{name}, mrad" for name in names]
     yield build_curves(
         stream,
@@ -114,11 +126,6 @@ def _build_limits(stream: Stream, entity: Sequence[str], limits: Array) -> ViewP
     )
 
 
-def _select_joint(joint: int, fields: Sequence[str], block: RowBlock) -> Array:
-    """Return the values of these fields for one joint as columns, shape (rows, fields)."""
-    return np.stack([block.messages[field][:, joint] for field in fields], axis=-1)
-
-
 def find_gripper_units(cell: Cell) -> tuple[str, str]:
     """Return the units of opening and force of a cell's gripper. Call this only if it has one."""
     assert cell.gripper is not None, "there is a gripper"
@@ -137,7 +144,12 @@ def build_field_curves(stream: Stream, mailbox: MailboxSpec) -> Iterator[ViewPar
         places = [f"[{position}]" for position in range(prod(field.shape))] if field.shape else [""]
         names = [f"{mailbox.name}.{field.name}{place}{unit}" for place in places]
         entity = (SIGNALS, mailbox.name, field.name)
-        yield build_curves(stream, entity, partial(_flatten_field, field.name), names)
+
+        def flatten(block: RowBlock, name: str = field.name) -> Array:
+            """Return one column for each number, shape (rows, numbers)."""
+            return np.asarray(block.messages[name], float).reshape(len(block.rows), -1)
+
+        yield build_curves(stream, entity, flatten, names)
 
 
 def has_curves(field: FieldSpec) -> bool:
@@ -151,6 +163,73 @@ def get_plotted_unit(field: FieldSpec) -> str:
     return "" if field.unit == "1" else field.unit
 
 
-def _flatten_field(field: str, block: RowBlock) -> Array:
-    """Return the values of a field with one column per number, shape (rows, numbers)."""
-    return np.asarray(block.messages[field], float).reshape(len(block.rows), -1)
+def build_hand_curves(stream: Stream, names: Sequence[str], hand: Hand) -> Iterator[ViewPart]:
+    """Yield the view parts that show a `HandStatus`.
+
+    Args:
+        stream: Stream to write to.
+        names: Names of all joints of the hand.
+        hand: The hand.
+    """
+    colours = choose_joint_colours(len(hand.names))
+    write_legend(stream, HAND, hand.names, colours)
+    for index, finger in enumerate(hand.names):
+        yield from _build_finger_curves(
+            stream, names, finger, index, np.flatnonzero(hand.fingers[index])
+        )
+    labels = [f"{finger}, N" for finger in hand.names]
+    yield build_curves(
+        stream, TIPS, lambda block: np.linalg.norm(block.messages["force"], axis=2), labels, colours
+    )
+
+
+def _build_finger_curves(
+    stream: Stream, names: Sequence[str], finger: str, finger_index: int, joints: Ints
+) -> Iterator[ViewPart]:
+    """Yield the view parts that show joints, tensions and tip force of one finger.
+
+    Args:
+        stream: Stream to write to.
+        names: Names of all joints of the hand.
+        finger: Name of the finger.
+        finger_index: Index of the finger.
+        joints: Indices of the finger's joints.
+    """
+    joint_names = [names[joint] for joint in joints]
+    colours = choose_joint_colours(len(joint_names))
+    yield build_curves(
+        stream,
+        (HAND, finger, JOINTS),
+        lambda block: block.messages["position"][:, joints],
+        [f"{name}, rad" for name in joint_names],
+        colours,
+    )
+
+    def stack_tensions(block: RowBlock) -> np.ndarray:
+        """Return the finger's tensions in N, shape (rows, tensions).
+
+        Commanded tensions precede sensed ones. In each group flexors precede extensors.
+        """
+        columns = [
+            block.messages[field][:, row][:, joints]
+            for field in ("wanted", "tension")
+            for row in (FLEXOR, EXTENSOR)
+        ]
+        return np.hstack(columns)
+
+    tendons = [f"{name} {row}" for row in ("flexor", "extensor") for name in joint_names]
+    yield build_curves(
+        stream,
+        (HAND, finger, TENSIONS),
+        stack_tensions,
+        [f"{tendon}{suffix}, N" for suffix in (" commanded", "") for tendon in tendons],
+        [COMMANDED] * len(tendons) + colours + [dim_colour(colour) for colour in colours],
+        np.repeat(OVERLAID, len(tendons)).tolist(),
+    )
+    yield build_curves(
+        stream,
+        (HAND, finger, FINGER_FORCES),
+        lambda block: block.messages["force"][:, finger_index],
+        [f"{axis}, N" for axis in "xyz"],
+        choose_joint_colours(3),
+    )

@@ -25,8 +25,6 @@ KINDS_WITHOUT_LANE = ("printed", "miss")
 """Kinds of events without a lane. Misses have a separate lane next to their board's level."""
 CAUSE_ORDER = ("command", "fault", "died", "miss", "detection", "reaction", "recovery")
 """Kinds of events of the same tick, in the order of cause and effect. Other kinds follow."""
-BRAKES = {"brakes_closed": "brakes engaged", "brakes_opened": ""}
-"""Label of the arm by code of an event."""
 RACK_LANE = "rack"
 """Lane of events that belong to no board."""
 LOG_LEVELS = {
@@ -86,12 +84,12 @@ class EventWriter:
 
     def _read_new_events(self) -> Iterator[Event]:
         """Yield the events that were added to the file since the last call."""
-        if not self._path.is_file() or self._path.stat().st_size == self._read:
+        if not self._path.is_file():
             return
         with self._path.open("rb") as file:
             file.seek(self._read)
             # A line that is still incomplete is read in the next call.
-            lines = [line for line in file.read().splitlines(keepends=True) if line.endswith(b"\n")]
+            lines = [line for line in file if line.endswith(b"\n")]
         self._read += sum(map(len, lines))
         for line in lines:
             event = parse_checked_line(line.decode())
@@ -108,10 +106,8 @@ class EventWriter:
         self._stream.log_line(when, "events", text, LOG_LEVELS.get(event.kind, "INFO"))
         if event.kind not in KINDS_WITHOUT_LANE:
             self._write_lane(when, board, event)
-        if event.kind == "fault" and self._marks is not None:
-            self._marks.mark_fault(when, event)
-        if event.code in BRAKES and self._marks is not None:
-            self._marks.mark_brakes(when, BRAKES[event.code])
+        if self._marks is not None:
+            self._marks.mark_event(when, event)
         lost = board if event.kind == "died" else event.subject if event.code == "hang" else ""
         # A task that hangs is killed later, but is lost only once.
         if lost in self._names.keys() - self._lost:
@@ -125,14 +121,10 @@ class EventWriter:
         lane = (EVENTS, self._names.get(board, board))
         if board not in self._lanes:
             style_lane(self._stream, lane, EVENT_COLOURS)
-        state: str = event.kind
-        if event.code == "ends":
-            # The end of a fault ends the span of that fault, but not the span of a later event.
-            if self._lanes.get(board) != state:
-                return
-            state = ""
-        self._lanes[board] = state
-        write_span(self._stream, when, lane, state)
+        # The end of a fault ends the span of that fault, but not the span of a later event.
+        if event.code != "ends" or self._lanes.get(board) == event.kind:
+            self._lanes[board] = "" if event.code == "ends" else event.kind
+            write_span(self._stream, when, lane, self._lanes[board])
 
 
 def get_cause_order(event: Event) -> tuple[int, int]:

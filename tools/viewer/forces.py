@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from typing import NamedTuple
 
 import mujoco
@@ -14,7 +13,7 @@ from rack.levels.algebra import Array
 from rack.levels.robot.cell import Cell
 from rack.levels.systems.force.contact import AXIS_NAMES, UNITS
 from rack.tools.viewer.stream import RowBlock, Stream, ViewPart, build_row_sampler
-from rack.tools.viewer.style import COMMANDED, LIMIT, OVERLAID, build_curves, choose_joint_colour
+from rack.tools.viewer.style import COMMANDED, LIMIT, OVERLAID, build_curves, choose_joint_colours
 
 ARROWS = ("cell", "forces")
 FORCES = "forces"
@@ -59,12 +58,12 @@ class ContactPoint(NamedTuple):
         """Name of the coordinate frame at the point, in which the arrow is drawn."""
         return f"contact/{self.name}"
 
-    def compute_pose(self, data: mujoco.MjData) -> tuple[Array, Array]:
+    def compute_pose(self, data: mujoco.MjData) -> Array:
         """Return position in m and quaternion (w first) of the frame for the poses in `data`."""
         quaternion = np.array([1.0, 0.0, 0.0, 0.0])
         if self.orientation_site is not None:
             mujoco.mju_mat2Quat(quaternion, data.site_xmat[self.orientation_site])
-        return data.site_xpos[self.site], quaternion
+        return np.concatenate((data.site_xpos[self.site], quaternion))
 
 
 def list_contacts(cell: Cell) -> list[ContactPoint]:
@@ -118,22 +117,18 @@ def build_task_force_curves(stream: Stream) -> Iterator[ViewPart]:
     For each axis of the task frame there is a curve of the wanted value, and a curve of the value
     that the tool exerts.
     """
-    for index, (axis, unit) in enumerate(AXES.items()):
-        names = [f"{axis} wanted, {unit}", f"{axis} exerted, {unit}"]
-        values = partial(_select_wanted_and_exerted, index)
-        shades = [COMMANDED, choose_joint_colour(index)]
+    for index, (axis, colour) in enumerate(zip(AXES, choose_joint_colours(6), strict=True)):
+        names = [f"{axis} {what}, {AXES[axis]}" for what in ("wanted", "exerted")]
+        shades = [COMMANDED, colour]
+
+        def values(block: RowBlock, index: int = index) -> Array:
+            """Return both values. Nothing is wanted while position is controlled, not force."""
+            selected, wanted, wrench = (
+                block.messages[field][:, index] for field in ("selected", "wanted", "wrench")
+            )
+            return np.column_stack((np.where(selected == 1, wanted, np.nan), -wrench))
+
         yield build_curves(stream, (FORCES, TASK, axis), values, names, shades, OVERLAID)
-
-
-def _select_wanted_and_exerted(axis: int, block: RowBlock) -> Array:
-    """Return the wanted and the exerted value along an axis, shape (rows, 2).
-
-    The wanted value is NaN while the axis is controlled by position instead of force.
-    """
-    selected, wanted, wrench = (
-        block.messages[field][:, axis] for field in ("selected", "wanted", "wrench")
-    )
-    return np.column_stack((np.where(selected == 1, wanted, np.nan), -wrench))
 
 
 def build_contact_curves(stream: Stream, most: tuple[float, float]) -> Iterator[ViewPart]:
@@ -145,19 +140,14 @@ def build_contact_curves(stream: Stream, most: tuple[float, float]) -> Iterator[
     """
     for index, (quantity, unit) in enumerate(CONTACT_UNITS.items()):
         names = [f"limit, {unit}", f"{quantity} of the contact, {unit}"]
-        values = partial(_compute_limit_and_magnitude, most[index], 3 * index)
+
+        def values(block: RowBlock, index: int = index) -> Array:
+            """Return the limit, and the magnitude of the force or torque."""
+            wrench = block.messages["wrench"][:, 3 * index : 3 * index + 3]
+            return np.column_stack(
+                (np.full(len(wrench), most[index]), np.linalg.norm(wrench, axis=1))
+            )
+
         yield build_curves(
-            stream, (FORCES, CONTACT, quantity), values, names, [LIMIT, choose_joint_colour(0)]
+            stream, (FORCES, CONTACT, quantity), values, names, [LIMIT, *choose_joint_colours(1)]
         )
-
-
-def _compute_limit_and_magnitude(limit: float, first: int, block: RowBlock) -> Array:
-    """Return a limit, and the magnitude of the force or torque in each row, shape (rows, 2).
-
-    Args:
-        limit: The limit, which is equal in all rows.
-        first: Index of the first of three numbers in the wrench: 0 for force, 3 for torque.
-        block: Messages with wrenches.
-    """
-    size = np.linalg.norm(block.messages["wrench"][:, first : first + 3], axis=1)
-    return np.column_stack((np.full(len(size), limit), size))

@@ -77,19 +77,9 @@ def format_serial(serial: int) -> str:
     return str(serial) if serial else ""
 
 
-def format_step(step: tuple[int, int]) -> str:
-    """Format a step of a grasp, given as number of earlier steps and kind of step."""
-    return f"{step[0] + 1} {format_enum(GraspKind, step[1])}"
-
-
 def format_move(move: tuple[int, int]) -> str:
     """Format a move, given as serial and verb. Returns "" for serial 0, which means no move."""
     return format_enum(Verb, move[1]) if move[0] else ""
-
-
-def format_row(row: tuple[int, bytes]) -> str:
-    """Format a row of a state table, given as its number and its name."""
-    return f"{row[0]} {decode_text(row[1])}"
 
 
 def format_enum(kind: type[IntEnum], number: int) -> str:
@@ -101,7 +91,14 @@ VALUE_LANES: tuple[tuple[type[Message], ValueLane], ...] = (
     (MoveStatus, ValueLane("move", ["current", "verb"], format_move)),
     (MotionStatus, ValueLane("request", "current", format_serial)),
     (ServerStatus, ValueLane("request", "current", format_serial)),
-    (GraspStatus, ValueLane("step", ["step", "kind"], format_step)),
+    (
+        GraspStatus,
+        ValueLane(
+            "step",
+            ["step", "kind"],
+            lambda step: f"{step[0] + 1} {format_enum(GraspKind, step[1])}",
+        ),
+    ),
     (ServerStatus, ValueLane("mode", "mode", partial(format_enum, Mode))),
 )
 """Lanes for messages of certain classes."""
@@ -119,7 +116,7 @@ def list_value_lanes(mailbox: MailboxSpec) -> Iterator[ValueLane]:
     elif port == "command" and "id" in names and kind not in (*STREAMED, *STREAMED_DOWN):
         yield ValueLane(port, "id", format_serial)
     if names.issuperset(FIRED):
-        yield ValueLane("row", FIRED[1:3], format_row)
+        yield ValueLane("row", FIRED[1:3], lambda row: f"{row[0]} {decode_text(row[1])}")
     yield from (lane for message, lane in VALUE_LANES if kind == message.message_type.name)
 
 
@@ -185,7 +182,9 @@ class Hierarchy:
 
     def write(self, task: str, block: RowBlock) -> None:
         """Collect the changes of a task's state from a block of its trace records."""
-        names = _name_states(block.rows)
+        states = np.array([state.name.lower() for state in State] + ["missed"])
+        # A missed cycle counts as a state.
+        names = states[np.where(find_missed_cycles(block.rows), -1, block.rows["state"])]
         before = np.concatenate(([self._states[task]], names[:-1]))
         for row in np.flatnonzero((names != before) | block.resumed):
             self.add_change(block.find_moment(row), task, str(names[row]))
@@ -212,13 +211,6 @@ class Hierarchy:
             labels=[task.partition(".")[2] or task for task in self._tasks],
         )
         self._stream.log_at(when, (HIERARCHY,), nodes)
-
-
-def _name_states(rows: np.ndarray) -> np.ndarray:
-    """Return the state of the level in each trace record, or "missed" for a missed cycle."""
-    names = np.array([state.name.lower() for state in State] + ["missed"])
-    indices = np.where(find_missed_cycles(rows), len(names) - 1, rows["state"])
-    return np.asarray(names[indices])
 
 
 def name_lanes(layout: Layout, rack: RackTiming) -> dict[str, str]:

@@ -43,10 +43,8 @@ def build_shape(model: mujoco.MjModel, geom: int) -> Shape | None:
     match Geom(int(model.geom_type[geom])):
         case Geom.mjGEOM_BOX:
             return rr.Boxes3D(half_sizes=[size], **centred)
-        case Geom.mjGEOM_SPHERE:
-            return rr.Ellipsoids3D(half_sizes=[[radius] * 3], **centred)
-        case Geom.mjGEOM_ELLIPSOID:
-            return rr.Ellipsoids3D(half_sizes=[size], **centred)
+        case Geom.mjGEOM_SPHERE | Geom.mjGEOM_ELLIPSOID:
+            return rr.Ellipsoids3D(half_sizes=[model.geom_aabb[geom, 3:]], **centred)
         case Geom.mjGEOM_CYLINDER:
             return rr.Cylinders3D(lengths=[2 * half], radii=[radius], **centred)
         case Geom.mjGEOM_CAPSULE:

@@ -33,14 +33,13 @@ from rack.tools.viewer.cell import (
     build_path_part,
     write_geometry,
 )
-from rack.tools.viewer.curves import build_field_curves, build_joint_curves
+from rack.tools.viewer.curves import build_field_curves, build_hand_curves, build_joint_curves
 from rack.tools.viewer.events import EventWriter, build_load_writer, build_loss_writer
 from rack.tools.viewer.forces import (
     build_contact_arrows,
     build_contact_curves,
     build_task_force_curves,
 )
-from rack.tools.viewer.hand import build_hand_curves
 from rack.tools.viewer.levels import (
     FIRED,
     LEVELS,
@@ -175,8 +174,7 @@ class RackWriter:
 
         def mark_lost(noticed: Moment, task: str) -> None:
             """Show a lost task in lanes, in the hierarchy and at the arm, until its next row."""
-            when = cycles[task].find_loss(noticed)
-            cycles[task].mark_lost(when)
+            when = cycles[task].mark_lost(noticed)
             self._hierarchy.add_change(when, task, "lost")
             if task in with_states:
                 write_span(stream, when, (LEVELS, names[task], "state"), "lost")

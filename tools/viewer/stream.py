@@ -47,14 +47,6 @@ class Moment(NamedTuple):
     stamp_ns: int
 
 
-class RowTimes(NamedTuple):
-    """Times of rows on the three timelines of the recording, each of shape (rows,)."""
-
-    simulated_ns: Ints
-    ticks: Ints
-    wall_ns: Ints
-
-
 class Timelines:
     """Converts ticks and CLOCK_MONOTONIC stamps to times on the timelines of the recording.
 
@@ -69,8 +61,10 @@ class Timelines:
         self._ticks: Ints = np.zeros(1, dtype=np.int64)
         self._stamps: Ints = np.array([launch.monotonic_ns])
 
-    def compute_times(self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0) -> RowTimes:
-        """Return the times of rows on the timelines.
+    def compute_times(
+        self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0
+    ) -> tuple[Ints, Ints, Ints]:
+        """Return the times of rows on the three timelines: simulated time, tick and wall clock.
 
         Args:
             ticks: Release ticks, shape (rows,).
@@ -78,29 +72,22 @@ class Timelines:
             within_ns: Simulated time to add to each release.
         """
         if (placed := self._placed) is None:
-            return RowTimes(ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns)
-        released = placed.convert_ticks(ticks, 0) // placed.reference_grid.clock_ns
-        return RowTimes(
+            return ticks * self.clock_ns + within_ns, ticks, stamps_ns + self._offset_ns
+        return (
             placed.convert_ticks(ticks, within_ns),
-            released,
+            placed.convert_ticks(ticks, 0) // placed.reference_grid.clock_ns,
             placed.convert_to_wall_clock(stamps_ns),
         )
 
     def build_columns(
         self, ticks: Ints, stamps_ns: Ints, within_ns: Ints | int = 0
     ) -> list[rr.TimeColumn]:
-        """Return the times of rows as one time column for each timeline.
-
-        Args:
-            ticks: Release ticks, shape (rows,).
-            stamps_ns: Time stamps of CLOCK_MONOTONIC, shape (rows,).
-            within_ns: Simulated time to add to each release.
-        """
-        times = self.compute_times(ticks, stamps_ns, within_ns)
+        """Return the times of rows as one time column for each timeline; see `compute_times`."""
+        simulated_ns, ticks, wall_ns = self.compute_times(ticks, stamps_ns, within_ns)
         return [
-            rr.TimeColumn(SIM_TIME, duration=times.simulated_ns.astype("timedelta64[ns]")),
-            rr.TimeColumn(TICK, sequence=times.ticks),
-            rr.TimeColumn(WALL, timestamp=times.wall_ns.astype("datetime64[ns]")),
+            rr.TimeColumn(SIM_TIME, duration=simulated_ns.astype("timedelta64[ns]")),
+            rr.TimeColumn(TICK, sequence=ticks),
+            rr.TimeColumn(WALL, timestamp=wall_ns.astype("datetime64[ns]")),
         ]
 
     def add_stamps(self, ticks: Ints, stamps_ns: Ints) -> None:
@@ -320,12 +307,11 @@ class Stream:
             entity: The entity.
             archetype: The data.
         """
-        times = self.times.compute_times(np.array([when.tick]), np.array([when.stamp_ns]))
-        self._recording.set_time(
-            SIM_TIME, duration=np.timedelta64(int(times.simulated_ns[0]), "ns")
-        )
-        self._recording.set_time(TICK, sequence=int(times.ticks[0]))
-        self._recording.set_time(WALL, timestamp=np.datetime64(int(times.wall_ns[0]), "ns"))
+        moment = np.array([when.tick]), np.array([when.stamp_ns])
+        simulated_ns, tick, wall_ns = (int(times[0]) for times in self.times.compute_times(*moment))
+        self._recording.set_time(SIM_TIME, duration=np.timedelta64(simulated_ns, "ns"))
+        self._recording.set_time(TICK, sequence=tick)
+        self._recording.set_time(WALL, timestamp=np.datetime64(wall_ns, "ns"))
         self._recording.log(self._build_path(entity), archetype)
 
     def log_line(self, when: Moment, source: str, text: str, level: str) -> None:

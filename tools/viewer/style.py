@@ -17,7 +17,7 @@ from rack.tools.viewer.stream import Moment, RowBlock, Stream, ViewPart
 Colour = int
 """A colour, 0xRRGGBBAA."""
 
-_JOINTS: tuple[Colour, ...] = (
+_JOINTS = (
     0x56B4E9FF,
     0xE69F00FF,
     0x00BE8CFF,
@@ -27,14 +27,14 @@ _JOINTS: tuple[Colour, ...] = (
     0x968CFFFF,
 )
 """Colours that are distinguishable with red-green colour blindness (Okabe and Ito)."""
-COMMANDED: Colour = 0x828282A0
-LIMIT: Colour = 0xC83C3C6E
-PLANNED: Colour = 0xFFC828FF
-GOAL: Colour = 0x46D25AFF
-CURRENT: Colour = 0xFF6E28FF
-FORCE: Colour = 0xF03C3CFF
-LOST: Colour = 0xE63232FF
-GRID: Colour = 0xFFFFFF78
+COMMANDED = 0x828282A0
+LIMIT = 0xC83C3C6E
+PLANNED = 0xFFC828FF
+GOAL = 0x46D25AFF
+CURRENT = 0xFF6E28FF
+FORCE = 0xF03C3CFF
+LOST = 0xE63232FF
+GRID = 0xFFFFFF78
 OVERLAID = (2.5, 1.0)
 """Widths of two curves. Where they coincide, the wider one is visible on both sides."""
 LEGEND = "legend"
@@ -42,13 +42,13 @@ LEGEND_ROW = 30.0
 LEGEND_LETTER = 7.0
 """Distance between the entries of a legend, and width of a letter, in the units of a graph."""
 
-_GREY: Colour = 0x6E6E78FF
-_BLUE: Colour = 0x468CE6FF
-_GREEN: Colour = 0x46B45AFF
-_YELLOW: Colour = 0xE6B43CFF
-_ORANGE: Colour = 0xF08C1EFF
-_RED: Colour = 0xDC3232FF
-STATES: dict[str, Colour] = {
+_GREY = 0x6E6E78FF
+_BLUE = 0x468CE6FF
+_GREEN = 0x46B45AFF
+_YELLOW = 0xE6B43CFF
+_ORANGE = 0xF08C1EFF
+_RED = 0xDC3232FF
+STATES = {
     "idle": _GREY,
     "executing": _BLUE,
     "done": _GREEN,
@@ -70,7 +70,7 @@ EVENT_COLOURS: dict[str, Colour] = {
     "recovery": _GREEN,
 }
 """Colour of each kind of event. The viewer chooses the colours of other kinds."""
-PHASES: dict[str, Colour] = {
+PHASES = {
     "wait": 0x3C3E46FF,
     "read": 0x5AAADCFF,
     "process": _GREEN,
@@ -79,26 +79,13 @@ PHASES: dict[str, Colour] = {
     "missed": 0xE63232FF,
     "lost": LOST,
 }
-LETTERS = {
-    "wait": " ",
-    "read": "R",
-    "process": "X",
-    "plan": "P",
-    "write": "W",
-    "missed": "!",
-    "lost": "lost",
-}
+LETTERS = {"wait": " ", "read": "R", "process": "X", "plan": "P", "write": "W", "missed": "!"}
 """Labels of phases, as in the paper's figures, because words would not fit into the spans."""
-
-
-def choose_joint_colour(index: int) -> Colour:
-    """Return the colour of the joint with this index. Joints are counted from base to tool."""
-    return _JOINTS[index % len(_JOINTS)]
 
 
 def choose_joint_colours(count: int) -> list[Colour]:
     """Return the colours of `count` joints, from base to tool."""
-    return [choose_joint_colour(index) for index in range(count)]
+    return [_JOINTS[index % len(_JOINTS)] for index in range(count)]
 
 
 def dim_colour(colour: Colour) -> Colour:
@@ -118,7 +105,7 @@ def style_lane(
     stream: Stream,
     entity: Sequence[str],
     colours: Mapping[str, Colour],
-    labels: Mapping[str, str] | None = None,
+    labels: Mapping[str, str] = {},
 ) -> None:
     """Set colours and labels for states of a lane. The viewer chooses the colours of other states.
 
@@ -129,11 +116,9 @@ def style_lane(
         labels: Dictionary from state to label. By default, names of states are the labels.
     """
     shades = pack_colours(colours.values())
-    shown_labels = list(colours)
-    if labels is not None:
-        shown_labels = [labels[name] for name in colours]
+    shown = [labels.get(name, name) for name in colours]
     stream.log_static(
-        entity, rr.StateConfiguration(values=list(colours), labels=shown_labels, colors=shades)
+        entity, rr.StateConfiguration(values=list(colours), labels=shown, colors=shades)
     )
 
 
@@ -192,20 +177,6 @@ def write_legend(stream: Stream, what: str, names: Sequence[str], colours: list[
     places = [(0.0, LEGEND_ROW * row) for row in range(len(names))]
     nodes = rr.GraphNodes(names, labels=names, positions=places, colors=pack_colours(colours))
     stream.log_static((LEGEND, what), nodes)
-
-
-def build_legend_view(origin: str, name: str, names: Sequence[str]) -> rrb.View:
-    """Return the view of a legend, large enough for its entries.
-
-    Args:
-        origin: Path of the legend's entity.
-        name: Title of the view.
-        names: Entries of the legend.
-    """
-    half = LEGEND_LETTER * max(map(len, names)) / 2 + LEGEND_ROW / 2
-    rows = (-LEGEND_ROW, LEGEND_ROW * len(names))
-    bounds = rrb.VisualBounds2D(x_range=(-half, half), y_range=rows)
-    return rrb.GraphView(origin=origin, name=name, visual_bounds=bounds)
 
 
 def write_spans(

@@ -22,7 +22,7 @@ from rack.tools.viewer.style import (
     PHASES,
     Colour,
     build_curves,
-    choose_joint_colour,
+    choose_joint_colours,
     dim_colour,
     style_curves,
     style_lane,
@@ -87,28 +87,31 @@ class CycleLane:
         self._ticks = np.concatenate((self._ticks[-1:], block.ticks))
         self._ends = np.concatenate((self._ends[-1:], ends))
 
-    def find_loss(self, when: Moment) -> Moment:
-        """Return when a task was lost, given when this was noticed.
+    def mark_lost(self, when: Moment) -> Moment:
+        """Write the state "lost", which the next cycle ends, but only after the previous cycle.
 
-        If it was noticed late, the task was already lost at the release after its last cycle.
+        Args:
+            when: Time at which the loss was noticed.
+
+        Returns:
+            Time of the loss. If it was noticed late, the task was already lost at the release after
+            its last cycle.
         """
-        cycles = self._ticks[self._ticks <= when.tick]
-        if not len(cycles) or (missed := int(cycles[-1]) + self._every) >= when.tick:
-            return when
-        return self._stream.times.estimate_moment(missed)
-
-    def mark_lost(self, when: Moment) -> None:
-        """Write the state "lost", which the next cycle ends, but only after the previous cycle."""
         times = self._stream.times
-        ended = self._ends[self._ticks <= when.tick]
-        within = max(0, int(ended[-1]) + 1 - when.tick * times.clock_ns) if len(ended) else 0
+        within = 0
+        if count := int(np.searchsorted(self._ticks, when.tick, "right")):
+            if (missed := int(self._ticks[count - 1]) + self._every) < when.tick:
+                when = times.estimate_moment(missed)
+            within = max(0, int(self._ends[count - 1]) + 1 - when.tick * times.clock_ns)
         columns = times.build_columns(np.array([when.tick]), np.array([when.stamp_ns]), within)
         write_spans(self._stream, self._lane, columns, ["lost"])
+        return when
 
 
 def choose_task_colours(layout: Layout, boards: Sequence[str]) -> dict[str, Colour]:
     """Return a dictionary from task to colour. A planner has the dimmed colour of its board."""
-    by_task = {task.name: choose_joint_colour(boards.index(task.board)) for task in layout.tasks}
+    by_board = dict(zip(boards, choose_joint_colours(len(boards)), strict=True))
+    by_task = {task.name: by_board[task.board] for task in layout.tasks}
     return {name: dim_colour(colour) if "." in name else colour for name, colour in by_task.items()}
 
 

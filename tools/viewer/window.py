@@ -16,12 +16,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from rack.tools.console.answer import Failure
-from rack.tools.console.interrupt import list_descendants
 
 HOST = "127.0.0.1"
 PANIC_TEXT = "panicked at "
-LISTENING = "0A"
-"""State of a listening socket in /proc/net/tcp."""
 ENDING_S = 1.0
 """Time that a viewer has to end when it is closed. Then it is killed."""
 
@@ -93,41 +90,19 @@ class ViewerWindow:
             self._process.wait(bound_s)
         return not self.is_open
 
-    def is_listening(self, port: int) -> bool:
-        """Return True if the viewer, and not another program, listens on a TCP port."""
-        rows = map(str.split, Path("/proc/net/tcp").read_text().splitlines())
-        sockets = {
-            f"socket:[{row[9]}]"
-            for row in rows
-            if row[1].endswith(f":{port:04X}") and row[3] == LISTENING
-        }
-        processes = (self._process.pid, *list_descendants(self._process.pid))
-        with suppress(OSError):
-            return any(
-                str(file.readlink()) in sockets
-                for pid in processes
-                for file in Path(f"/proc/{pid}/fd").iterdir()
-            )
-        return False
-
     @property
     def is_open(self) -> bool:
         """True while the viewer process runs."""
         return self._process.poll() is None
 
-    def end(self) -> None:
-        """End the viewer, if it still runs."""
-        self._is_reported = True
+    def close(self) -> None:
+        """End the viewer, if it still runs, and release what it has printed."""
         if self.is_open:
             # The command is a script that starts the viewer. Both are in its process group.
             os.killpg(self._process.pid, signal.SIGTERM)
             if not self.wait_for_end(ENDING_S):
                 os.killpg(self._process.pid, signal.SIGKILL)
                 self._process.wait()
-
-    def close(self) -> None:
-        """End the viewer, and release what it has printed."""
-        self.end()
         self._said.close()
 
 

@@ -36,6 +36,9 @@ def test_the_first_view_and_one_of_its_views_are_drawn(run: Path, tmp_path: Path
     with Image.open(run / "picture-6s.png") as whole, Image.open(path) as part:
         assert part.width < whole.width
         assert len(part.convert("RGB").getcolors(1 << 24) or ()) > 10
+    # This view is in a tab behind another one.
+    shown = rack("picture", run, "--at", 6, "--view", "plan age", "--out", path)
+    assert (shown.returncode, shown.stderr.splitlines()[1:]) == (0, [])
 
 
 @pytest.mark.slow

@@ -8,12 +8,14 @@ import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rack.boards.config import load
 from rack.boards.events import Event
 from rack.tools.recording.checksums import format_checked_line
+from tests.processes import wait_until
 from tests.shared_runs import slow_run, small_run
 from tests.tools.command_line import rack
 from tests.tools.held_racks import held_rack
@@ -174,8 +176,16 @@ def test_without_a_package_the_line_that_installs_it_is_printed(
 def test_of_a_running_rack_the_recording_so_far_is_plotted(tmp_path: Path, rack_name: str) -> None:
     with held_rack(tmp_path, rack_name, "--out", tmp_path / "run"):
         assert rack("step", rack_name, "--ticks", "200").returncode == 0
-        shown = rack("plot", rack_name, "counter.status.row", "--json")
-    found = json.loads(shown.stdout)
+        found: dict[str, Any] = {}
+        # The recorder writes a little later than the rack.
+        wait_until(
+            lambda: (
+                found.update(
+                    json.loads(rack("plot", rack_name, "counter.status.row", "--json").stdout)
+                )
+                or "curves" in found
+            )
+        )
     assert found["curves"][0]["time_s"][:3] == pytest.approx([0.0, 0.01, 0.02])
     assert found["title"] == rack_name
 

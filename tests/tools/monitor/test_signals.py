@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from rack.tools.monitor.signals import SignalHistory, SignalReader
+from rack.tools.monitor.signals import SignalHistory
 from rack.tools.recording.signal import Signal
 from tests.backplane.bus import NAME
 from tests.link import Link, links
@@ -29,19 +29,18 @@ def signals(link: Link) -> list[Signal]:
 def test_every_message_is_read_once_and_overwritten_ones_are_counted(
     link: Link, signals: list[Signal]
 ) -> None:
-    tap = SignalReader(link.segment, signals)
-    taken = []
+    history = SignalHistory(link.segment, signals, span=20)
+    taken: list[tuple[int, int]] = []
     for first in range(0, 60, 20):
         link.run(first, first + 20)
-        for written in tap.read_new():
-            assert (written.mailbox, written.lost) == (NAME, 0)
-            taken += zip(written.ticks.tolist(), written.messages["id"].tolist(), strict=True)
+        rows = history.read_new()[NAME]
+        taken += zip(rows["tick"].tolist(), rows["message"]["id"].tolist(), strict=True)
     assert taken == [(tick, tick) for tick in range(0, 60, 2)]
-    assert [*tap.read_new()] == []
+    assert (len(history.read_new()[NAME]), history.lost) == (0, 0)
     link.run(60, 460)
-    (written,) = tap.read_new()
-    assert written.lost + len(written.ticks) == 200
-    assert written.lost > 0
+    rows = history.read_new()[NAME]
+    assert history.lost + len(rows) == 200
+    assert history.lost > 0
 
 
 def test_a_strip_has_a_row_for_each_tick_and_keeps_its_span(
@@ -50,14 +49,16 @@ def test_a_strip_has_a_row_for_each_tick_and_keeps_its_span(
     strip = SignalHistory(link.segment, signals, span=20)
     link.run(0, 40)
     strip.read_new()
-    assert strip.list_rows(10, 15) == [(10, [10, 10]), (12, [12, 12]), (14, [14, 14])]
+    assert strip.list_rows(10, 15) == [(10, (10, 10)), (12, (12, 12)), (14, (14, 14))]
     for first in range(40, 400, 40):
         link.run(first, first + 40)
         strip.read_new()
     kept = strip.list_rows(0, 400)
-    assert kept[-1] == (398, [398, 398])
-    # The span, and as much as one look may bring: the ring, and what is being written.
-    assert kept[0][0] == 398 - 20 - 2 * 64 - 4 - 2
+    assert kept[-1] == (398, (398, 398))
+    # The span, and as much as one reading may bring: the ring, and what is being written. The
+    # oldest block of 40 ticks may reach further back.
+    first = 398 - 20 - 2 * 64 - 4
+    assert first - 40 <= kept[0][0] < first
 
 
 def test_a_signal_keeps_its_value_between_messages(link: Link, signals: list[Signal]) -> None:
@@ -65,5 +66,5 @@ def test_a_signal_keeps_its_value_between_messages(link: Link, signals: list[Sig
     assert strip.list_rows(0, 10) == []
     link.run(0, 8)
     strip.read_new()
-    assert strip.list_rows(5, 6) == [(6, [6, 6])]
+    assert strip.list_rows(5, 6) == [(6, (6, 6))]
     assert strip.to_time_s(6) == 0.015

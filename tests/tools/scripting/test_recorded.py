@@ -123,8 +123,8 @@ def test_a_plot_has_units_names_and_marks(small: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(count.get_ydata(), [*values, values[-1]])
     assert axes.get_xlabel() == "simulated time, s"
     assert axes.get_ylabel() == "lower.status.count"
-    marks = {mark.get_label(): mark.get_segments() for mark in axes.collections}  # type: ignore[attr-defined]
-    assert [(label, lines[0][0][0]) for label, lines in marks.items()] == [
+    marks = {mark.get_label(): mark.get_paths() for mark in axes.collections}
+    assert [(label, paths[0].vertices[0][0]) for label, paths in marks.items()] == [
         ("fault, 1 s: lower: wave begins", 1.0),
         ("fault, 2 s: lower: kill begins", 2.0),
         ("lost, 2 s: lower: board 'lower' ended", 2.0),

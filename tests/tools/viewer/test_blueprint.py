@@ -148,7 +148,7 @@ def test_brakes_and_faults_are_red_at_their_joints_while_they_last(tmp_path: Pat
     for tick, code in ((2, "begins"), (7, "ends")):
         text = f"sensor-nan (j3) {code}, and more"
         event = Event(0, tick, "fault", "servo", text, code, fault=0, subject="j3")
-        marks.mark_fault(Moment(tick, 0), event)
+        marks.mark_event(Moment(tick, 0), event)
     stream.close()
     assert len(arm) > len(config.robot.joints)
     for part in arm:

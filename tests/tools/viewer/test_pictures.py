@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 from pathlib import Path
 
 import pytest
 
-from rack.tools.viewer.pictures import NoViewerError, _connect_client
+from rack.tools.viewer.pictures import _connect_client
 from rack.tools.viewer.window import ViewerWindow, find_free_port
 
 LOOPBACK, LISTENS = "0100007F", "0A"
@@ -30,21 +29,11 @@ def test_the_viewer_listens_to_this_machine_alone() -> None:
             for place, _, state in sockets
             if place.endswith(f":{port:04X}") and state == LISTENS
         ]
-    except NoViewerError as error:
+    except ConnectionError as error:
         pytest.skip(str(error))
     finally:
         window.close()
     assert found == [f"{LOOPBACK}:{port:04X}"]
-
-
-def test_a_port_of_another_program_is_not_the_viewers() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        port = other.getsockname()[1]
-        window = ViewerWindow(headless=True, port=port)
-        try:
-            assert not window.is_listening(port)
-        finally:
-            window.close()
 
 
 @pytest.mark.slow
@@ -55,7 +44,7 @@ def test_a_viewer_that_is_killed_while_it_draws_is_reported() -> None:
         _connect_client(window, port)
         os.killpg(window._process.pid, signal.SIGKILL)
         assert window.wait_until_closed() == "the viewer was ended by SIGKILL"
-    except NoViewerError as error:
+    except ConnectionError as error:
         pytest.skip(str(error))
     finally:
         window.close()

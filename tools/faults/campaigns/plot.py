@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from statistics import median
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.ticker import NullFormatter
 
@@ -22,11 +22,12 @@ ROW_IN = 0.27
 """Height of a row of the upper charts."""
 SIZES_IN = 2.6
 """Height of the lower chart."""
-LABEL_SIZE = 9
 DOT = "#4477aa"
-MIDDLE = "#222222"
 BOUND = "#cc3311"
 """Colours that are distinguishable with any kind of colour vision (Paul Tol)."""
+MEDIAN: dict[str, Any] = {"marker": "|", "s": 180, "color": "#222222"}
+LATE: dict[str, Any] = {"marker": ">", "s": 40, "color": BOUND}
+"""Markers of the median and of late detections."""
 MAX_FRACTION = 1.5
 """Fraction of a bound up to which delays are drawn. Longer ones are arrows at the edge."""
 
@@ -35,7 +36,7 @@ def plot_campaign(report: CampaignReport, path: Path) -> None:
     """Draw the charts of a campaign into one image: delays, recovery times, effects of size."""
     rows_in = ROW_IN * (len(report.by_kind) + 1)
     heights = (rows_in + 1.7, SIZES_IN) if report.curves else (rows_in + 1.7,)
-    with open_figure([path], WIDTH_IN, sum(heights), layout="constrained") as figure:
+    with open_figure([path], WIDTH_IN, sum(heights)) as figure:
         upper, *lower = figure.subfigures(len(heights), height_ratios=heights, squeeze=False)[:, 0]
         upper.suptitle(
             f"Faults injected into the rack {report.order.name}: {report.trials_text}", fontsize=13
@@ -43,7 +44,7 @@ def plot_campaign(report: CampaignReport, path: Path) -> None:
         delays, recoveries = upper.subplots(1, 2, sharey=True, width_ratios=(3, 2))
         _draw_delays(delays, report)
         _draw_recoveries(recoveries, report)
-        upper.legend(loc="outside lower center", ncols=4, fontsize=LABEL_SIZE)
+        upper.legend(loc="outside lower center", ncols=4)
         for subfigure in lower:
             _draw_sizes(subfigure.subplots(), report)
 
@@ -60,33 +61,25 @@ def _draw_delays(axes: Axes, report: CampaignReport) -> None:
             fraction for fraction in map(_compute_fraction, detected) if fraction is not None
         ]
         _draw_row(axes, row, [fraction for fraction in fractions if fraction <= MAX_FRACTION])
-        late_count = sum(fraction > MAX_FRACTION for fraction in fractions)
-        axes.scatter(
-            [MAX_FRACTION] * late_count,
-            [row] * late_count,
-            marker=">",
-            s=40,
-            color=BOUND,
-            clip_on=False,
-        )
+        if max(fractions, default=0.0) > MAX_FRACTION:
+            axes.scatter(MAX_FRACTION, row, clip_on=False, **LATE)
         if fractions:
-            middle = min(MAX_FRACTION, median(fractions))
-            axes.scatter([middle], [row], marker="|", s=180, color=MIDDLE)
+            axes.scatter(min(MAX_FRACTION, median(fractions)), row, **MEDIAN)
         figures = report.by_kind[kind]
         numbers = f"{figures.detected} of {figures.injected}"
         frame = ("axes fraction", "data")
-        axes.annotate(numbers, (1.02, row), xycoords=frame, fontsize=LABEL_SIZE, va="center")
-    axes.annotate("detected", (1.02, -1.0), xycoords=frame, fontsize=LABEL_SIZE)
+        axes.annotate(numbers, (1.02, row), xycoords=frame, va="center")
+    axes.annotate("detected", (1.02, -1.0), xycoords=frame)
     axes.scatter([], [], color=DOT, alpha=0.5, label="one fault")
-    axes.scatter([], [], marker="|", s=180, color=MIDDLE, label="median of a kind")
-    axes.scatter([], [], marker=">", s=40, color=BOUND, label=f"later than {MAX_FRACTION:g}")
+    axes.scatter([], [], label="median of a kind", **MEDIAN)
+    axes.scatter([], [], label=f"later than {MAX_FRACTION:g}", **LATE)
     axes.axvline(1.0, color=BOUND, linewidth=1.2, label="longest permitted time")
     axes.set_xlim(-0.03, MAX_FRACTION)
     labels = [f"{kind}: {KINDS[kind].means}" for kind in kinds]
-    axes.set_yticks(range(len(kinds)), labels, fontsize=LABEL_SIZE)
+    axes.set_yticks(range(len(kinds)), labels)
     axes.set_ylim(len(kinds) - 0.4, -0.6)
     axes.grid(axis="y", alpha=0.25)
-    axes.set_title("Time to detection", fontsize=11)
+    axes.set_title("Time to detection")
     axes.set_xlabel("part of the longest permitted time")
 
 
@@ -143,8 +136,8 @@ def _draw_sizes(axes: Axes, report: CampaignReport) -> None:
     axes.set_yscale("symlog", linthresh=report.clock_ms)
     axes.yaxis.set_major_formatter("{x:g}")
     axes.set_ylim(-0.5 * report.clock_ms, 1.5 * longest)
-    axes.legend(fontsize=LABEL_SIZE, loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    axes.set_title("Time to detection of wrong joint positions", fontsize=11)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    axes.set_title("Time to detection of wrong joint positions")
     axes.set_xlabel("size of the error, rad")
     axes.set_ylabel("time to detection, ms")
 
@@ -156,5 +149,5 @@ def _draw_recoveries(axes: Axes, report: CampaignReport) -> None:
         _draw_row(axes, row, [tick * report.clock_ms * 1e-3 for tick in ticks])
     axes.set_xlim(left=0.0)
     axes.grid(axis="y", alpha=0.25)
-    axes.set_title("Time to recovery", fontsize=11)
+    axes.set_title("Time to recovery")
     axes.set_xlabel("from the fault to the end of its effects, s")

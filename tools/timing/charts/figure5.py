@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from textwrap import fill
+from typing import TYPE_CHECKING, NamedTuple
 
 from rack.boards.config import RackConfig
 from rack.tools.console.answer import Document
@@ -42,8 +44,7 @@ COUPLING_MEANINGS = {
 }
 
 
-@dataclass(frozen=True)
-class Region:
+class Region(NamedTuple):
     """A region of the figure: a range of cycle times and its kind of implementation.
 
     Attributes:
@@ -160,7 +161,7 @@ def save_picture(config: RackConfig, stem: Path) -> list[Path]:
     """Draw the figure with the levels of a rack into `stem`.png and .svg. Returns their paths."""
     levels = merge_levels(place_levels(config))
     paths = list_picture_paths(stem)
-    with open_figure(paths, 9.0, 1.7 + 0.36 * len(levels), layout="constrained") as figure:
+    with open_figure(paths, 9.0, 1.7 + 0.36 * len(levels)) as figure:
         axes = figure.subplots()
         _draw_regions(axes)
         _draw_levels(axes, levels)
@@ -174,13 +175,10 @@ def save_picture(config: RackConfig, stem: Path) -> list[Path]:
 
 def _draw_regions(axes: Axes) -> None:
     """Draw the regions and the axis of cycle times."""
-    starts = [SHORTEST_S, *(region.to_s for region in REGIONS[:-1])]
-    ends = [*(region.to_s for region in REGIONS[:-1]), LONGEST_S]
-    for region, start, end, colour in zip(REGIONS, starts, ends, REGION_COLOURS, strict=True):
+    borders = pairwise([SHORTEST_S, *(region.to_s for region in REGIONS[:-1]), LONGEST_S])
+    for region, (start, end), colour in zip(REGIONS, borders, REGION_COLOURS, strict=True):
         axes.axvspan(start, end, color=colour, linewidth=0)
-        words = (
-            region.words.replace(" or ", "\nor ").replace(", ", ",\n").replace(" multi", "\nmulti")
-        )
+        words = fill(region.words, 18)
         axes.text((start * end) ** 0.5, -1.2, words, ha="center", va="center", fontsize=8)
     axes.set_xscale("log")
     axes.set_xlim(SHORTEST_S, LONGEST_S)
@@ -192,24 +190,22 @@ def _draw_regions(axes: Axes) -> None:
 
 def _draw_levels(axes: Axes, levels: Sequence[PlacedLevel]) -> None:
     """Draw a marker and a label for each level, and the entries of the legend."""
+    meanings = dict(COUPLING_MEANINGS)
     for row, level in enumerate(levels):
         marker, face = MARKERS[level.coupling]
-        (point,) = axes.plot(
-            [level.cycle_s], [row], marker, markersize=8, markeredgewidth=1.4, clip_on=False
-        )
-        point.set(markerfacecolor=face, markeredgecolor=EDGE_COLOUR)
-        label = f"{level.level}, {format_duration(level.cycle_s)}"
-        axes.annotate(label, (level.cycle_s, row), (9, 0), textcoords="offset points", va="center")
-    for coupling in dict.fromkeys(level.coupling for level in levels):
-        marker, face = MARKERS[coupling]
         axes.plot(
-            [],
-            [],
+            [level.cycle_s],
+            [row],
             marker,
+            markersize=8,
+            markeredgewidth=1.4,
+            clip_on=False,
             markerfacecolor=face,
             markeredgecolor=EDGE_COLOUR,
-            label=COUPLING_MEANINGS[coupling],
+            label=meanings.pop(level.coupling, None),
         )
+        label = f"{level.level}, {format_duration(level.cycle_s)}"
+        axes.annotate(label, (level.cycle_s, row), (9, 0), textcoords="offset points", va="center")
 
 
 def _format_remark(region: Region, coupling: str) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, load, read_budgets, resolve_layout
@@ -22,8 +22,7 @@ NO_BUDGET = (
 )
 
 
-@dataclass(frozen=True)
-class Subject:
+class Subject(NamedTuple):
     """The config or the run that a chart shows.
 
     Attributes:
@@ -63,8 +62,7 @@ def find_subject(text: str, settings: Sequence[str], out: Path | None) -> Subjec
     return Subject(config, resolve_layout(config), None, out or RUNS / f"{config.name}-gantt")
 
 
-@dataclass(frozen=True)
-class Gantt:
+class Gantt(NamedTuple):
     """Panels of one window of time, with notes. The measurement precedes the schedule."""
 
     rack: str

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import count, groupby
 
-from rack.boards.timing.schedule import Chart, Job
+from rack.boards.timing.schedule import Chart
 from rack.tools.console.tables import format_ms
 from rack.tools.timing.charts.panel import Panel
 from rack.tools.timing.charts.patterns import IDLE, Lane
@@ -143,26 +143,19 @@ def choose_frame_labels(
 def choose_label_times(panel: Panel, column_ns: int) -> range:
     """Return the times, in ns, at which the axis is labelled, far enough apart for the labels."""
     chart = panel.chart
+    longest_ns = (chart.end_ns - chart.start_ns) // 2
+    cycles = sorted(lane.cycle_ns for lane in panel.lanes)
     columns = 0
     widest = LABEL_COLUMNS
     while widest > columns:
         columns = widest
-        step = choose_label_interval(panel, columns * column_ns)
+        least_ns = columns * column_ns
+        # Prefer a cycle of a lane to a round number.
+        step = next((cycle for cycle in cycles if least_ns <= cycle <= longest_ns), 0)
+        step = step or choose_column_ns(least_ns * MAX_COLUMNS, None)
         times = range(-(-chart.start_ns // step) * step, chart.end_ns + 1, step)
         widest = max((len(format_ms(time)) + 2 for time in times), default=0)
     return times
-
-
-def choose_label_interval(panel: Panel, narrowest_ns: int) -> int:
-    """Return the time between two labels of the axis, in ns.
-
-    It is the shortest cycle of a lane from `narrowest_ns` to half of the window or, if there is no
-    such cycle, a round number of at least `narrowest_ns`.
-    """
-    longest_ns = (panel.chart.end_ns - panel.chart.start_ns) // 2
-    cycles = sorted(lane.cycle_ns for lane in panel.lanes)
-    step = next((cycle for cycle in cycles if narrowest_ns <= cycle <= longest_ns), None)
-    return step or choose_column_ns(narrowest_ns * MAX_COLUMNS, None)
 
 
 def _format_patterns(panel: Panel) -> Iterator[str]:
@@ -214,15 +207,10 @@ def _format_late_jobs(panel: Panel) -> Iterator[str]:
             skipped = f", {count.skipped} of them skipped" if count.skipped else ""
             late = [job for job in panel.list_late_jobs(lane) if job.task == task]
             yield f"late: {task}: {count.late} of {count.jobs} {kind}{skipped}"
-            yield from (f"  {_describe_late_job(job)}" for job in late[:MAX_LISTED])
-
-
-def _describe_late_job(job: Job) -> str:
-    """Describe the release, deadline and end of a late job."""
-    due = f"released at {format_ms(job.release_ns)} ms, due at {format_ms(job.deadline_ns)} ms"
-    if job.end_ns is None:
-        return f"{due}: not done by then"
-    return (
-        f"{due}: done at {format_ms(job.end_ns)} ms, "
-        f"{format_ms(job.end_ns - job.deadline_ns)} ms late"
-    )
+            for job in late[:MAX_LISTED]:
+                release, due = format_ms(job.release_ns), format_ms(job.deadline_ns)
+                done = "not done by then"
+                if job.end_ns is not None:
+                    late_ms = format_ms(job.end_ns - job.deadline_ns)
+                    done = f"done at {format_ms(job.end_ns)} ms, {late_ms} ms late"
+                yield f"  released at {release} ms, due at {due} ms: {done}"

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -167,8 +168,7 @@ class TracedRun:
         return records
 
 
-@dataclass(frozen=True)
-class _TaskTrace:
+class _TaskTrace(NamedTuple):
     """Trace of one task, with the length of a tick on the wall clock in ns."""
 
     task: TimedTask

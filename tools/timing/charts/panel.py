@@ -107,32 +107,9 @@ class Panel:
             "from_ms": self.chart.start_ns / NS_PER_MS,
             "to_ms": self.chart.end_ns / NS_PER_MS,
             "frame_ms": self.frame_ns / NS_PER_MS or None,
-            "lanes": [
-                {
-                    "core": lane.core,
-                    "board": lane.board,
-                    "tasks": list(lane.tasks),
-                    **_convert_to_ms(lane, "cycle", "slice"),
-                }
-                for lane in self.lanes
-            ],
-            "spans": [
-                {
-                    "task": span.task,
-                    "core": span.core,
-                    "unit": span.unit.value,
-                    **_convert_to_ms(span, "start", "end", "release"),
-                }
-                for span in self.chart.spans
-            ],
-            "jobs": [
-                {
-                    "task": job.task,
-                    **_convert_to_ms(job, "release", "deadline", "end"),
-                    "late": job in late,
-                }
-                for job in self.chart.jobs
-            ],
+            "lanes": [{"tasks": list(lane.tasks), **_convert_to_ms(lane)} for lane in self.lanes],
+            "spans": [_convert_to_ms(span) for span in self.chart.spans],
+            "jobs": [{**_convert_to_ms(job), "late": job in late} for job in self.chart.jobs],
             "patterns": {
                 lane: {kind: dict(counts.most_common()) for kind, counts in found._asdict().items()}
                 for lane, found in self.patterns.items()
@@ -141,12 +118,13 @@ class Panel:
         }
 
 
-def _convert_to_ms(entry: Span | Job | Lane, *names: str) -> dict[str, float | None]:
-    """Return the named times of an entry in ms. Each key is the name with the suffix "_ms"."""
-    times = {name: getattr(entry, f"{name}_ns") for name in names}
+def _convert_to_ms(entry: Span | Job | Lane) -> Document:
+    """Return the fields of an entry. Times are in ms, and their keys end in "_ms"."""
     return {
-        f"{name}_ms": None if time_ns is None else time_ns / NS_PER_MS
-        for name, time_ns in times.items()
+        name.replace("_ns", "_ms"): value / NS_PER_MS
+        if name[-3:] == "_ns" and value is not None
+        else value
+        for name, value in vars(entry).items()
     }
 
 

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-    from rack.boards.timing.schedule import Chart, Job
     from rack.tools.timing.charts.patterns import Lane
 
 UNIT_COLOURS = {
@@ -78,18 +77,16 @@ def save_picture(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
     lanes = [len(panel.lanes) for panel in panels]
     height = LANE_IN * sum(lanes) + 0.45 * len(panels) + 1.2
     paths = list_picture_paths(stem)
-    with open_figure(paths, WIDTH_IN, height, layout="constrained") as figure:
+    with open_figure(paths, WIDTH_IN, height) as figure:
         rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False, height_ratios=lanes)
         for axes, panel in zip(rows[:, 0], panels, strict=True):
             draw_panel(axes, panel)
         rows[-1, 0].set_xlabel("time, ms")
-        used = [
-            unit
-            for unit in Unit
-            if any(span.unit is unit for panel in panels for span in panel.chart.spans)
-        ]
+        used = {span.unit for panel in panels for span in panel.chart.spans}
         handles: list[Artist] = [
-            Patch(facecolor=UNIT_COLOURS[unit], label=UNIT_NAMES[unit]) for unit in used
+            Patch(facecolor=UNIT_COLOURS[unit], label=UNIT_NAMES[unit])
+            for unit in Unit
+            if unit in used
         ]
         handles.append(Patch(facecolor="none", label=f"{IDLE}  idle core"))
         if any(panel.list_late_jobs(lane) for panel in panels for lane in panel.lanes):
@@ -155,16 +152,12 @@ def _draw_lane(axes: Axes, panel: Panel, lane: Lane, row: int) -> None:
         axes.vlines(
             list(starts), low - 0.1, low + BAR_HEIGHT + 0.1, colors=GRID_COLOUR, linewidth=0.9
         )
+    height = low + BAR_HEIGHT + 0.06
+    # Mark each missed deadline, and the time from the deadline to the end of the job.
     for job in panel.list_late_jobs(lane):
-        _mark_late(axes, chart, job, low + BAR_HEIGHT + 0.06)
-
-
-def _mark_late(axes: Axes, chart: Chart, job: Job, height: float) -> None:
-    """Mark a missed deadline, and the time from the deadline to the end of the job."""
-    start_ns = max(job.deadline_ns, chart.start_ns)
-    if start_ns == job.deadline_ns:
-        axes.plot([start_ns], [height], marker="v", markersize=6, color=LATE_COLOUR, clip_on=False)
-    if job.end_ns is not None:
-        axes.hlines(
-            height, start_ns, min(job.end_ns, chart.end_ns), colors=LATE_COLOUR, linewidth=1.6
-        )
+        start_ns = max(job.deadline_ns, chart.start_ns)
+        if start_ns == job.deadline_ns:
+            axes.plot(start_ns, height, "v", markersize=6, color=LATE_COLOUR, clip_on=False)
+        if job.end_ns is not None:
+            end_ns = min(job.end_ns, chart.end_ns)
+            axes.hlines(height, start_ns, end_ns, colors=LATE_COLOUR, linewidth=1.6)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import lcm
-from typing import TypeVar
+from typing import Any
 
 from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, build_rack_timing
 from rack.boards.timing.frames import compute_core_frames
-from rack.boards.timing.schedule import Chart, Job, Span, simulate_schedule
+from rack.boards.timing.schedule import simulate_schedule
 from rack.boards.timing.tasks import Part, Unit
 from rack.tools.console.answer import Failure
 from rack.tools.timing.charts.panel import JobCount, Panel
@@ -22,9 +22,6 @@ MAX_DEFAULT_FRAMES = 24
 """Maximum number of minor frames of a static schedule in a default chart."""
 MAX_SIMULATED_CYCLES = 1_000_000
 """Maximum number of simulated cycles of all tasks, which take about a minute."""
-
-
-E = TypeVar("E", Chart, Span, Job)
 
 
 class Schedule:
@@ -102,12 +99,15 @@ class Schedule:
                 2,
             )
         chart = simulate_schedule(self.tasks, until_ns, self.switch_ns, self._variants)
+        shown = chart.cut_window(start_ns - skipped_ns, end_ns - skipped_ns)
         lanes = build_lanes(self.tasks)
         detail = PatternDetail(gap_ns=2 * self.switch_ns)
         return Panel(
             kind="schedule",
-            chart=_shift_chart(
-                chart.cut_window(start_ns - skipped_ns, end_ns - skipped_ns), skipped_ns
+            chart=replace(
+                _shift_times(shown, skipped_ns),
+                spans=tuple(_shift_times(span, skipped_ns) for span in shown.spans),
+                jobs=tuple(_shift_times(job, skipped_ns) for job in shown.jobs),
             ),
             lanes=lanes,
             patterns={
@@ -134,15 +134,8 @@ class Schedule:
         return [(*parts[:index], Part(Unit.PROCESS, time), *parts[index:]) for time in times_ns]
 
 
-def _shift_chart(chart: Chart, by_ns: int) -> Chart:
-    """Return a chart with all times increased by `by_ns`."""
-
-    def shift(entry: E) -> E:
-        """Return a chart, span or job with all its times increased by `by_ns`."""
-        times = {name: time for name, time in vars(entry).items() if name.endswith("_ns")}
-        shifted = {name: time + by_ns for name, time in times.items() if time is not None}
-        return replace(entry, **shifted)
-
-    return replace(
-        shift(chart), spans=tuple(map(shift, chart.spans)), jobs=tuple(map(shift, chart.jobs))
-    )
+def _shift_times(entry: Any, by_ns: int) -> Any:
+    """Return a chart, span or job with all its own times increased by `by_ns`."""
+    times = {name: time for name, time in vars(entry).items() if name.endswith("_ns")}
+    shifted = {name: time + by_ns for name, time in times.items() if time is not None}
+    return replace(entry, **shifted)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from rack.boards.timing.tasks import TimedTask
 from rack.tools.console.answer import Failure
@@ -18,8 +18,7 @@ MAX_CYCLES = 2000
 """Maximum number of a level's cycles in any chart."""
 
 
-@dataclass(frozen=True)
-class WindowOptions:
+class WindowOptions(NamedTuple):
     """Window that the user asked for, in ns. None for a limit that is not given."""
 
     from_ns: int | None = None
