@@ -53,7 +53,7 @@ def test_the_site_has_every_page_and_the_code_that_pages_link_to(site: Path) -> 
 
 
 def test_the_api_reference_is_made_from_docstrings(site: Path) -> None:
-    launched = (site / "tools" / "scripting" / "API.html").read_text()
+    launched = (site / "tools" / "PYTHON.html").read_text()
     assert "A rack launched by a program." in launched
     assert 'id="rack.tools.scripting.attached.AttachedRack.wait_until"' in launched
     levels = (site / "levels" / "API.html").read_text()
