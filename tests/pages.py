@@ -36,8 +36,7 @@ REFERENCES = [
         page
         for layer in LAYERS[1:]
         for page in sorted(layer.parent.glob("*.md"))
-        if page != layer
-        and str(page.relative_to(ROOT)) not in (*GUIDES, *WITHOUT_COMMANDS)
+        if page != layer and str(page.relative_to(ROOT)) not in (*GUIDES, *WITHOUT_COMMANDS)
     ),
 ]
 PAGES = [*REFERENCES, *(ROOT / name for name in (*GUIDES, *WITHOUT_COMMANDS[1:]))]

@@ -52,6 +52,12 @@ def test_the_site_has_every_page_and_the_code_that_pages_link_to(site: Path) -> 
     )
 
 
+def test_the_navigation_names_each_page_once(site: Path) -> None:
+    links = re.findall(r'<a href="([^"#]+)" class="md-nav__link', (site / "index.html").read_text())
+    assert len(links) > 50
+    assert not {link for link in links if links.count(link) > 1}
+
+
 def test_the_api_reference_is_made_from_docstrings(site: Path) -> None:
     launched = (site / "tools" / "PYTHON.html").read_text()
     assert "A rack launched by a program." in launched
