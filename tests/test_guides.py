@@ -32,6 +32,9 @@ BOUND_S = 100
 LAUNCH_S = 60
 NAMES = "nasrem|hardware"
 """Racks that pages launch under a name that another test may use at the same time."""
+ENDLESS = " --set board.task.ends_run=false --seconds 300"
+"""For a run in another terminal: on a busy machine the page's commands may take longer than its
+task."""
 SHORT = " --seconds 2 --no-record"
 """For a run whose length and recording no later command of the page needs."""
 
@@ -140,7 +143,7 @@ def test_guide_can_be_followed_to_its_end(name: str, shell: PageShell) -> None:
         if mark.startswith("file "):
             (shell.folder / mark.removeprefix("file ")).write_text(code)
         elif mark == "background":
-            shell.start(with_own_name(code.strip(), shell.own))
+            shell.start(with_own_name(code.strip(), shell.own) + ENDLESS)
         elif language == "python":
             named = code.replace(
                 'Rack("nasrem"', f'Rack("nasrem", settings={{"name": "{shell.own}"}}'
