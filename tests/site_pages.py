@@ -1,7 +1,8 @@
 """Hook of mkdocs for `make docs`: pages stay beside the code, and links to code lead to pages.
 
 A linked source file becomes a page that shows it, and a linked folder without a README a page that
-lists its files. In `nav` a glob stands for all pages that no other entry names.
+lists its files. In `nav` a glob stands for all pages that no other entry names and no earlier glob
+has.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ def _named_pages(nav: Any) -> Iterator[str]:
 
 
 def _expand(nav: Any, uris: list[str], named: set[str]) -> Any:
-    """Return a navigation with the pages of each glob in its place."""
+    """Return a navigation with the pages of each glob in its place, and add them to `named`."""
     if isinstance(nav, dict):
         return {title: _expand(entry, uris, named) for title, entry in nav.items()}
     if isinstance(nav, str):
@@ -126,7 +127,9 @@ def _expand(nav: Any, uris: list[str], named: set[str]) -> Any:
     expanded = []
     for entry in nav:
         if isinstance(entry, str) and "*" in entry:
-            expanded += [uri for uri in uris if fnmatch(uri, entry) and uri not in named]
+            found = [uri for uri in uris if fnmatch(uri, entry) and uri not in named]
+            named.update(found)
+            expanded += found
         else:
             expanded.append(_expand(entry, uris, named))
     return expanded

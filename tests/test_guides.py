@@ -1,5 +1,5 @@
-"""Tutorial, how-to pages and troubleshooting: their commands run in order, as the pages have them,
-and print the lines that the pages show."""
+"""Guides, such as the tutorial, can be followed: their commands run from the first to the last, as
+the pages have them, and print the lines that the pages show. Reference pages: test_pages.py."""
 
 from __future__ import annotations
 
@@ -14,29 +14,13 @@ from textwrap import dedent
 
 import pytest
 
+from tests.pages import GUIDES, ROOT
 from tests.processes import wait_until
-from tests.test_course import EXERCISES, is_shown
-from tests.test_examples import FOLDERS
-from tests.test_readme import PAGES as LAYERS
+from tests.test_course import is_shown
 from tests.tools.command_line import rack
 
-pytestmark = pytest.mark.thorough
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 
-ROOT = Path(__file__).resolve().parent.parent
-PAGES = (
-    "tools/TROUBLESHOOTING.md",
-    "boards/lan/TWO-MACHINES.md",
-    "configs/ANNOTATED.md",
-    "configs/TUTORIAL.md",
-    "levels/arm/HARDWARE.md",
-    "tools/faults/INJECT.md",
-    "tools/recording/EXPORT.md",
-    "tools/recording/REWIND.md",
-    "tools/recording/SIGNALS.md",
-    "tools/scripting/API.md",
-)
-ELSEWHERE = {"CONTRIBUTING.md": "the commands of make"}
-"""Pages with commands that no test runs, and the reason."""
 BLOCK = re.compile(
     r"(?:^ *<!-- test: (?P<mark>[\w .-]+) -->\n)?"
     r"^(?P<indent> *)```(?P<language>sh|python|toml)\n(?P<code>.*?)^ *```\n"
@@ -48,7 +32,11 @@ BOUND_S = 100
 LAUNCH_S = 60
 NAMES = "nasrem|hardware"
 """Racks that pages launch under a name that another test may use at the same time."""
-MOST_COLUMNS, MOST_PARAGRAPH_LINES, MOST_LINES = 100, 6, 430
+ENDLESS = " --set board.task.ends_run=false --seconds 300"
+"""For a run in another terminal: on a busy machine the page's commands may take longer than its
+task."""
+SHORT = " --seconds 2 --no-record"
+"""For a run whose length and recording no later command of the page needs."""
 
 
 def commands(code: str) -> Iterator[str]:
@@ -65,7 +53,7 @@ def commands(code: str) -> Iterator[str]:
 
 
 def with_own_name(command: str, own: str) -> str:
-    """Return a command for a rack of its own name, on a machine that may be too busy."""
+    """Return a command for a rack of its own name, on a machine that may be too busy, and short."""
     command, hash_sign, remark = command.partition("  #")
     command = re.sub(
         rf"\brack (status|stop|inject|watch|mailbox|command) ({NAMES})\b",
@@ -74,8 +62,10 @@ def with_own_name(command: str, own: str) -> str:
     )
     if command.startswith("rack stop"):
         command += " --wait 60"
-    if re.match(r"rack run (?!brown)", command):
+    if command.startswith("rack run"):
         command += f" --set name={own} --set supervision.max_missed_fraction=1 --share"
+        is_short = re.search(" --(seconds|out|no-record)", command)
+        command += "" if is_short else SHORT
     return command + hash_sign + remark
 
 
@@ -142,10 +132,9 @@ def shell(tmp_path: Path) -> Iterator[PageShell]:
     made.close()
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("name", PAGES)
-def test_page_runs_as_it_stands_there(name: str, shell: PageShell) -> None:
+@pytest.mark.parametrize("name", GUIDES)
+def test_guide_can_be_followed_to_its_end(name: str, shell: PageShell) -> None:
     blocks = list(BLOCK.finditer((ROOT / name).read_text()))
     assert blocks
     for block in blocks:
@@ -154,7 +143,7 @@ def test_page_runs_as_it_stands_there(name: str, shell: PageShell) -> None:
         if mark.startswith("file "):
             (shell.folder / mark.removeprefix("file ")).write_text(code)
         elif mark == "background":
-            shell.start(with_own_name(code.strip(), shell.own))
+            shell.start(with_own_name(code.strip(), shell.own) + ENDLESS)
         elif language == "python":
             named = code.replace(
                 'Rack("nasrem"', f'Rack("nasrem", settings={{"name": "{shell.own}"}}'
@@ -173,45 +162,3 @@ def test_page_runs_as_it_stands_there(name: str, shell: PageShell) -> None:
         missing = [line for line in shown if not is_shown(line, printed)]
         assert not missing, f"{missing} after {code}: {printed[-5000:]}"
     shell.end()
-
-
-def test_every_page_with_commands_has_a_test() -> None:
-    covered = {
-        *PAGES,
-        *ELSEWHERE,
-        *(str(page.relative_to(ROOT)) for page in LAYERS),
-        *(f"configs/course/{name}/README.md" for name in EXERCISES),
-        "configs/course/answers.md",
-        *(f"configs/examples/{name}/README.md" for name in FOLDERS),
-    }
-    listed = subprocess.run(
-        ["git", "ls-files", "*.md"], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.split()
-    assert listed
-    assert not [
-        name
-        for name in listed
-        if name not in covered and re.search(r"^ *```sh$", (ROOT / name).read_text(), re.MULTILINE)
-    ]
-
-
-@pytest.mark.parametrize("name", [*PAGES, "tools/COMPARISON.md", "README.md", "levels/API.md"])
-def test_page_can_be_read_in_an_editor_and_to_its_end(name: str) -> None:
-    text = (ROOT / name).read_text()
-    assert len(text.splitlines()) <= MOST_LINES
-    # Tables, pictures, links, commands and their output are as wide as they are.
-    prose = re.sub(r"^ *```.*?^ *```$", "", text, flags=re.DOTALL | re.MULTILINE)
-    paragraphs = [part.splitlines() for part in re.split(r"\n\s*\n|\n(?=- |\d\. )", prose)]
-    wide = [
-        line
-        for part in paragraphs
-        for line in part
-        if len(line) > MOST_COLUMNS and not re.match(r"\||!?\[[^]]*\]\(\S+\)$", line)
-    ]
-    assert not wide
-    long = [
-        part
-        for part in paragraphs
-        if len(part) > MOST_PARAGRAPH_LINES and not part[0].startswith(("|", ":::"))
-    ]
-    assert not long

@@ -1,5 +1,8 @@
-"""The pages of the layers are short enough to be read, and their commands run: here those that need
-a recorded run or a running rack, in test_readme.py all others."""
+"""The commands and programs of the README and of the reference pages work, each alone.
+
+A command that needs a recorded run gets a run of this file, one that needs a running rack gets a
+rack in lockstep, and a command of several pages runs once. Guides: test_guides.py.
+"""
 
 from __future__ import annotations
 
@@ -20,26 +23,15 @@ import pytest
 
 from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import System
+from tests.pages import BLOCK, README, REFERENCES, ROOT, SHELL
 from tests.processes import RACK, wait_until
-from tests.test_readme import BLOCK, CODE, ELSEWHERE, PAGES, SHELL
-from tests.tools.command_line import BOUND_S, ROOT, rack
+from tests.tools.command_line import BOUND_S, rack
 
-pytestmark = pytest.mark.thorough
-
-MOST_WORDS, MOST_FIGURES = 900, 15
-MOST_WORDS_OF_DETAILS = 1500
-LAYERS = [page for page in PAGES[1:] if page.name in ("README.md", "ARCHITECTURE.md")]
-UNITS = (
-    r"(?:%|[mun]?s|min|h|minutes?|hours?|seconds?|[kMG]?Hz|[mck]?m|kg|J|N|W|m?rad(?:/s)?"
-    r"|degrees|[kMG]?B|kB/s)"
-)
-NUMBER = r"\d[\d,]*(?:\.\d+)?"
-FIGURE = re.compile(rf"{NUMBER}(?:(?: to |, | and |-){NUMBER})* ?{UNITS}(?![\w/])")
-"""A figure is a number with a unit of measurement, measured or quoted, in prose or in a table.
-Numbers in code, of equations and of sections are none, nor are counts of things."""
+pytestmark = [pytest.mark.slow, pytest.mark.thorough]
 
 OWN_NAME = f"pages-{os.getpid()}"
-MODEL = ROOT / "configs" / "examples" / "own-arm" / "desk-arm.xml"
+OWN = ("--set", f"name={OWN_NAME}", "--set", "supervision.max_missed_fraction=1", "--share")
+"""A rack of the same name may be at work on this machine, which may be too busy to be in time."""
 COMMANDED = f"""
 format = 2
 name = "{OWN_NAME}"
@@ -61,6 +53,7 @@ RECORDED = re.compile(r"\b(RUN2?|OTHER)\b|runs/<(run|other|branch)>")
 NAMES = {
     "RUN@12.5": "whole@6 --seconds 6.2 --no-record --share",
     "--out RUN": f"--out new --seconds 1 --set name={OWN_NAME} --share",
+    "--at 11": "--at 3",
     "runs/<run>": "whole",
     "runs/<other>": "branch",
     "runs/<branch>": "branch",
@@ -86,10 +79,10 @@ REPLACED = {
 OTHER_TESTS = {
     "rack run nasrem --view": "tools/commands/test_record.py",
     "rack record nasrem --view": "tools/commands/test_record.py",
-    "rack run nasrem --faults kill-each-board": "golden.py",
     "rack run rccl --faults kill-each-board": "golden.py",
     "rack run nist-state-table --lockstep --step": "tools/test_state_table_run.py",
     "rack run brown --lockstep": "test_brown_network.py",
+    "rack run brown --lockstep --seconds 2": "test_brown_network.py",
     "rack run cell/puma --share": "test_cell_page.py",
     "rack run cell/k1607 --share": "test_cell_page.py",
     "rack run cell --share": "test_cell_page.py",
@@ -103,30 +96,26 @@ OTHER_TESTS = {
     "rack bench cycle": "tools/lab/benches/test_cycle.py",
     "rack bench lockstep": "tools/lab/benches/test_lockstep.py",
     "rack bench launch": "tools/lab/benches/test_launch.py",
+    "rack robot new <arm.urdf> --name arm": "tools/robot/test_new.py",
+    "rack run arm --lockstep": "test_guides.py",
+    "rack run metered.toml --lockstep --seconds 8": "test_examples.py",
 }
-"""Commands that take minutes, a network or a screen, each with the test that runs it."""
+"""Commands that take minutes, a network or a screen, or are those of a guide or an example, each
+with the test that runs it."""
 
 
-def lines_of(page: Path) -> list[str]:
-    """Return the commands of a page that test_readme.py does not run, without their remarks."""
+def lines_of(page: Path) -> dict[str, int]:
+    """Return the commands of a page without their remarks, with the exit status that these have."""
     blocks = SHELL.findall(page.read_text())
-    lines = [line.partition("#")[0].strip() for block in blocks for line in block.splitlines()]
-    return [line for line in lines if line.startswith("rack ") and ELSEWHERE.search(line)]
+    parts = [line.partition("#") for block in blocks for line in block.splitlines()]
+    return {
+        line.strip(): int("exit status 1" in remark)
+        for line, _, remark in parts
+        if line.startswith("rack ")
+    }
 
 
-@pytest.mark.parametrize("page", LAYERS, ids=lambda page: f"{page.parent.name}/{page.name}")
-def test_the_page_of_a_layer_can_be_read_to_its_end(page: Path) -> None:
-    text = page.read_text()
-    figures = FIGURE.findall(CODE.sub("", text))
-    counted = [number for figure in figures for number in re.findall(NUMBER, figure)]
-    assert len(text.split()) <= MOST_WORDS
-    assert len(counted) <= MOST_FIGURES, figures
-
-
-def test_every_other_page_has_one_subject_but_the_list_of_measured_figures() -> None:
-    words = {page.name: len(page.read_text().split()) for page in PAGES}
-    long = {name for name, count in words.items() if count > MOST_WORDS_OF_DETAILS}
-    assert long <= {"MEASURED.md"}
+LINES = {line: status for page in REFERENCES for line, status in lines_of(page).items()}
 
 
 def kind_of(line: str) -> str:
@@ -135,28 +124,61 @@ def kind_of(line: str) -> str:
         return "other"
     if RUNNING.match(line):
         return "running"
-    return "recorded" if RECORDED.search(line) else "new"
+    return "recorded" if RECORDED.search(line) else "alone"
 
 
 def of_kind(kind: str) -> list[str]:
     """Return the commands of all pages that one test runs, each once."""
-    lines = dict.fromkeys(line for page in PAGES for line in lines_of(page))
-    return [line for line in lines if kind_of(line) == kind]
+    return [line for line in LINES if kind_of(line) == kind]
 
 
-def parsed(line: str) -> subprocess.CompletedProcess[str]:
-    """Let `rack` read the words and options of a command without running it."""
-    return rack(*shlex.split(line)[1:], "--help")
+def list_running() -> dict[Path, list[str]]:
+    """Return the commands on a running rack by page, each for the first page that has it."""
+    seen: set[str] = set()
+    by_page = {}
+    for page in REFERENCES:
+        lines = [line for line in lines_of(page) if kind_of(line) == "running"]
+        if new := [line for line in lines if line not in seen]:
+            by_page[page] = sorted(new, key=lambda line: line.startswith("rack stop"))
+            seen.update(new)
+    return by_page
 
 
-@pytest.mark.slow
+RUNNING_LINES = list_running()
+
+
+def words_of(line: str) -> list[str]:
+    """Return the words of a command for a test; of an option that is given twice the last one
+    counts."""
+    words = shlex.split(line)[1:]
+    if words == ["bench", "mailbox"]:
+        return [*words, "--rounds", "20"]
+    if words[0] != "run":
+        return words
+    # What the racks do is asserted by test_golden.py.
+    return [*words, *OWN, "--no-record", "--seconds", "2" if "--lockstep" in words else "1"]
+
+
+@pytest.mark.usefixtures("without_templates")
+@pytest.mark.parametrize("line", of_kind("alone"))
+def test_a_command_works(line: str, tmp_path: Path) -> None:
+    for page in REFERENCES:
+        for name, block in BLOCK.findall(page.read_text()):
+            if name in line:
+                (tmp_path / name).write_text(block)
+    done = rack(*words_of(line), folder=tmp_path)
+    assert done.returncode == LINES[line], done.stderr
+    assert done.stdout
+
+
 @pytest.mark.parametrize("line", OTHER_TESTS)
 def test_a_command_of_a_test_elsewhere_is_on_a_page_and_understood(line: str) -> None:
     assert line in of_kind("other")
     program = (ROOT / "tests" / OTHER_TESTS[line]).read_text()
     assert re.search(rf"\b{line.split()[1]}\b|\b{line.split()[2]}\b", program)
-    assert parsed(line).returncode == 0
-    assert parsed(f"{line} --no-such-option").returncode == 2
+    words = shlex.split(line)[1:]
+    assert rack(*words, "--help").returncode == 0
+    assert rack(*words, "--no-such-option", "--help").returncode == 2
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +204,6 @@ def on_own_runs(line: str) -> list[str]:
     return [*words, "--out", "shown.rrd"] if words[0] == "replay" else words
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("line", of_kind("recorded"))
 def test_a_command_on_a_recorded_run_works(
     line: str, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -231,18 +252,11 @@ def start_watching(words: list[str], folder: Path) -> subprocess.Popen[str]:
     return process
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "page",
-    [page for page in PAGES if any(kind_of(line) == "running" for line in lines_of(page))],
-    ids=lambda page: str(page.relative_to(ROOT)),
-)
+@pytest.mark.parametrize("page", RUNNING_LINES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_commands_on_a_running_rack_work_in_their_order(page: Path, tmp_path: Path) -> None:
-    lines = [line for line in lines_of(page) if kind_of(line) == "running"]
-    lines.sort(key=lambda line: line.startswith("rack stop"))
     watching = []
     with running_rack(tmp_path):
-        for line in lines:
+        for line in RUNNING_LINES[page]:
             for shown, own in REPLACED.items():
                 line = line.replace(shown, own)
             words = shlex.split(line)[1:]
@@ -260,73 +274,74 @@ def test_the_commands_on_a_running_rack_work_in_their_order(page: Path, tmp_path
         assert process.returncode == 0
 
 
-@pytest.mark.slow
-def test_an_arm_is_made_of_a_model_and_moves(tmp_path: Path) -> None:
-    lines = [line for line in of_kind("new") if re.search(r"robot new|run arm", line)]
-    assert [line.split()[1] for line in lines] == ["robot", "run"]
-    for line in lines:
-        words = line.replace("<arm.urdf>", str(MODEL)).split()[1:]
-        short = ["--seconds", "1", "--no-record", "--share"] if words[0] == "run" else []
-        done = rack(*words, *short, folder=tmp_path)
-        assert done.returncode == 0, done.stderr
+@pytest.mark.parametrize("kind", ["alone", "other", "recorded", "running"])
+def test_the_pages_have_commands_of_every_kind(kind: str) -> None:
+    assert of_kind(kind)
 
 
-@pytest.mark.slow
-def test_a_config_of_a_page_runs_beside_its_class(tmp_path: Path) -> None:
-    blocks = {name: block for page in PAGES for name, block in BLOCK.findall(page.read_text())}
-    configs = [name for name in blocks if name.endswith(".toml")]
-    lines = [line for line in of_kind("new") if ".toml" in line]
-    assert sorted(configs) == sorted(line.split()[2] for line in lines)
-    for name, block in blocks.items():
-        (tmp_path / name).write_text(block)
-    for line in lines:
-        own = ("--set", f"name={OWN_NAME}", "--share", "--no-record")
-        done = rack(*line.split()[1:], *own, "--seconds", "2", folder=tmp_path)
-        assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.slow
-def test_certificates_are_made_as_the_page_says(tmp_path: Path) -> None:
-    (line,) = [line for line in of_kind("new") if line.startswith("rack lan")]
-    done = rack(*line.split()[1:], folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert {"cell", "cell-puma", "operator"} <= {path.stem for path in tmp_path.rglob("*")}
-
-
-def test_every_command_of_the_pages_has_a_test() -> None:
-    known = re.compile(r"rack (robot new|run arm|lan|run \S+\.toml)")
-    assert not [line for line in of_kind("new") if not known.match(line)]
-    assert all(of_kind(kind) for kind in ("recorded", "running", "new", "other"))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "printed"),
-    [
-        ("message", "12.5 (6,)\n"),
-        ("signal", "time over\n(400, 6) rad\n"),
-        ("moment", "(6,)\n[0.     0.0025 0.005 ]\n"),
-    ],
-)
-def test_a_program_of_a_page_prints_what_it_says(name: str, printed: str, tmp_path: Path) -> None:
-    (block,) = {
-        block for page in PAGES for shown, block in BLOCK.findall(page.read_text()) if shown == name
-    }
-    # A rack of the same name may be at work on this machine.
-    own = block.replace("lockstep=True", f'lockstep=True, settings={{"name": "{OWN_NAME}"}}')
-    (tmp_path / "program.py").write_text(own)
+def run_program(program: str, folder: Path) -> str:
+    """Run a program of a page under a rack's name of its own; return what it printed."""
+    own = program.replace('["clock', f'["name={OWN_NAME}", "clock')
+    own = own.replace(
+        "lockstep=True, out", f'lockstep=True, settings={{"name": "{OWN_NAME}"}}, out'
+    )
+    own = own.replace('{"seed"', f'{{"name": "{OWN_NAME}", "seed"')
+    own = own.replace('attach("nasrem")', f'attach("{OWN_NAME}")')
+    (folder / "program.py").write_text(own)
     done = subprocess.run(
         [sys.executable, "program.py"],
-        cwd=tmp_path,
+        cwd=folder,
         capture_output=True,
         text=True,
         timeout=BOUND_S,
         check=False,
     )
-    assert (done.returncode, done.stdout) == (0, printed), done.stderr
+    assert done.returncode == 0, done.stderr
+    return done.stdout
 
 
-@pytest.mark.slow
+def find_program(start: str) -> str:
+    """Return the program of the pages that starts with a pattern."""
+    text = "\n".join(page.read_text() for page in REFERENCES)
+    (found,) = re.findall(rf"```python\n({start}.*?)```", text, re.DOTALL)
+    return str(found)
+
+
+@pytest.mark.parametrize(
+    ("name", "printed"), [("message", "12.5 (6,)\n"), ("signal", "time over\n(400, 6) rad\n")]
+)
+def test_a_program_of_a_page_prints_what_it_says(name: str, printed: str, tmp_path: Path) -> None:
+    (block,) = {
+        block
+        for page in REFERENCES
+        for shown, block in BLOCK.findall(page.read_text())
+        if shown == name
+    }
+    assert run_program(block, tmp_path) == printed
+
+
+def test_the_program_that_launches_boards_works(tmp_path: Path) -> None:
+    program = find_program(r"from rack\.boards").replace("seconds=10", "seconds=1")
+    assert run_program(program, tmp_path).startswith("time over 400 ")
+
+
+def test_the_program_of_the_readme_plots_a_killed_board(tmp_path: Path) -> None:
+    (program,) = re.findall(r"```python\n(import rack\n.*?)```", README.read_text(), re.DOTALL)
+    assert len(program.splitlines()) <= 15
+    printed = run_program(program, tmp_path).splitlines()
+    assert len(printed) == 2
+    assert printed[0].startswith("'primitive' rejoined after ")
+    assert printed[1] == "time over"
+    assert (tmp_path / "velocity.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_run_reads_back_as_the_page_has_it(runs: Path, tmp_path: Path) -> None:
+    shutil.copytree(runs / "whole", tmp_path / "run")
+    program = find_program("from pathlib").replace("runs/nasrem-20250101-120000", "run")
+    program += "\nprint(ticks.shape, measured.shape, error.values.shape[1], len(lateness) > 0)"
+    assert run_program(program, tmp_path) == "(2800,) (2800, 6) 6 True\n"
+
+
 def test_the_prompt_of_rewind_answers_as_its_page_shows(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -345,11 +360,8 @@ def test_the_prompt_of_rewind_answers_as_its_page_shows(
     assert (tmp_path / "slower" / "report.json").is_file()
 
 
-def test_every_measured_figure_has_a_date_a_commit_and_a_command() -> None:
-    text = (ROOT / "tools" / "MEASURED.md").read_text()
-    rows = re.findall(r"^\| (?!bench \||figure \||-)(.+) \|$", text, re.MULTILINE)
-    cells = [re.split(r"\s*\|\s*", row) for row in rows if not row.startswith("---")]
-    assert cells
-    assert not [row for row in cells if len(row) not in (4, 6) or not row[0] or not row[1]]
-    assert not [row for row in cells if not re.fullmatch(r"\d{4}-\d\d-\d\d", row[-2])]
-    assert not [row for row in cells if not re.fullmatch(r"[0-9a-f]{8}", row[-1])]
+def test_certificates_are_made_as_the_page_says(tmp_path: Path) -> None:
+    (line,) = [line for line in LINES if line.startswith("rack lan")]
+    done = rack(*words_of(line), folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert {"cell", "cell-puma", "operator"} <= {path.stem for path in tmp_path.rglob("*")}

@@ -54,6 +54,14 @@ def test_a_figure_is_printed_as_in_the_paper_and_drawn(
 
 
 @pytest.mark.slow
+def test_the_rows_of_a_large_rack_are_not_wrapped_in_a_pipe(tmp_path: Path) -> None:
+    shown = rack("gantt", "nasrem", "--out", tmp_path).stdout.splitlines()
+    lanes = [line for line in shown if line.startswith("core ")]
+    assert len(lanes) == 6
+    assert all(re.fullmatch(r"core \d  \w+ +[A-Z.-]{40,76}", line) for line in lanes)
+
+
+@pytest.mark.slow
 def test_times_that_change_from_cycle_to_cycle_give_the_papers_figure_2_to_the_ms(
     tmp_path: Path,
 ) -> None:

@@ -16,7 +16,7 @@ from rack.tools.timing.charts.patterns import IDLE, Lane
 
 OTHER_BOARD = "."
 """Sign of a column in which another board has the core."""
-MAX_COLUMNS = 100
+MAX_COLUMNS = 76
 """Maximum number of columns of a chart."""
 MIN_CYCLE_COLUMNS = 4
 """Minimum number of columns of a cycle for its start to be marked."""
