@@ -53,6 +53,7 @@ class RunReport:
     restarts: Any = None
     tasks: Any = None
     system_response: Any = None
+    data_ages: Any = None
     entries: Any = None
     network: Any = None
     task: Any = None
