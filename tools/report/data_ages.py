@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from rack.boards.exchange import AGE_SUFFIX, EXCHANGE_PORT, TAKEN_SUFFIX
+from rack.boards.exchange import AGE_SUFFIX, EXCHANGE_PORT
 from rack.boards.timing.trace_times import compute_distribution
 from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
@@ -22,18 +20,17 @@ def summarize_data_ages(recording: Recording) -> list[Document]:
         if port != EXCHANGE_PORT:
             continue
         ticks = recording.read_signal(box.name, "tick")
-        for field in box.fields[::2]:
-            label = field.name.removesuffix(f"_{AGE_SUFFIX}")
-            taken = recording.read_signal(box.name, f"{label}_{TAKEN_SUFFIX}")
-            ages = recording.read_signal(box.name, field.name)[taken == ticks]
-            if len(ages):
-                ages_ms = ages * (recording.layout.clock_ns * 1e-6)
+        # Ages and arrivals alternate.
+        for age, taken in zip(box.fields[::2], box.fields[1::2], strict=True):
+            is_new = recording.read_signal(box.name, taken.name) == ticks
+            ages = recording.read_signal(box.name, age.name)[is_new] * recording.layout.clock_ns
+            if ages_ms := compute_distribution(ages * 1e-6):
                 inputs.append(
                     {
-                        "entry": f"{board}.{label}",
+                        "entry": f"{board}.{age.name.removesuffix(f'_{AGE_SUFFIX}')}",
                         "taken": len(ages),
-                        "jitter": round(float(np.ptp(ages_ms)), 6),
-                        "age_ms": compute_distribution(ages_ms),
+                        "jitter": ages_ms["max"] - ages_ms["min"],
+                        "age_ms": ages_ms,
                     }
                 )
     return inputs

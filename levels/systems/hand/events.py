@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 from numpy import ndarray
-from pydantic import Field
 
 from rack.backplane.message import Command, State, Status, field, integer_field
 from rack.levels.algebra import norm
@@ -20,11 +19,12 @@ from rack.levels.robot.cell import build_level_cell
 from rack.levels.systems.hand.kinematics import FingerKinematics
 from rack.levels.systems.hand.loop_boards import FingertipLoop
 from rack.levels.systems.hand.messages import HandStatus
-from rack.levels.tables import Positive, Table
 
 TOUCH_N = 0.3
 LEAVE_N = 0.1
 """Forces on a tip above which it touches something, and below which it has left it."""
+PAD_M = 0.009
+"""Distance between the site of a tip and its surface."""
 
 
 class TipEvent(Command, version=1):
@@ -89,23 +89,12 @@ class EventfulFingertipLoop(FingertipLoop):
                     self._sent += 1
 
 
-class EventParams(Table):
-    """`[board.<name>.params]` of an event server."""
-
-    pad: Positive = 0.009
-    """distance between the site of a tip and its surface [m]"""
-    per_cycle: int = Field(1, ge=1, le=16)
-    """most events that are served in a cycle"""
-
-
 class EventServer(Executor):
     """Serves the events of a hand, and computes the points at which tips touch something."""
 
     events = Input(TipEvent, "fingertip.events")
     before = Input(EventStatus, "own.status")
     status = Output(EventStatus)
-    params = EventParams
-    settings: EventParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -115,20 +104,20 @@ class EventServer(Executor):
         self._has_started = False
 
     def max_messages(self, port: str) -> int:
-        """Return how many events to take in a cycle. The others wait for later frames."""
-        return self.settings.per_cycle if self._has_started else 0
+        """Take one event in a cycle. The others wait for later frames."""
+        return int(self._has_started)
 
     def process(self, tick: int) -> None:
-        """Serve the events that were taken in this cycle."""
+        """Serve the event that was taken in this cycle, if any."""
         status = self.status
         if not self._has_started:
             self._has_started = True
             if self.before.has_message:
                 status.copy_from(self.before.message)
-        events = (*self.events.earlier, self.events.message) if self.events.is_new else ()
-        for event in events:
-            self._serve(event, tick)
-        status.state = State.EXECUTING if events else State.IDLE
+        status.state = State.IDLE
+        if self.events.is_new:
+            status.state = State.EXECUTING
+            self._serve(self.events.message, tick)
 
     def _serve(self, event: TipEvent, tick: int) -> None:
         """Store an event in the status, with the point of contact if the tip touches something."""
@@ -142,5 +131,5 @@ class EventServer(Executor):
         if event.touches:
             self._kinematics.set_position(event.position)
             # The surface pushes the tip away, so it is on the side from which the force comes.
-            depth = self.settings.pad / norm(event.force)
+            depth = PAD_M / norm(event.force)
             status.contact[finger] = self._kinematics.find_tip(finger) - depth * event.force
