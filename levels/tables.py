@@ -321,10 +321,13 @@ class HandConfig(Table):
     least: Positive
     """tension below which a tendon is slack [N]"""
     rest: Positive
-    """mean tension of a pair at rest [N]; it does not stiffen joints with linear tendons"""
+    """mean tension of a pair at rest [N]; it stiffens the joints if `stiffening` is above 0"""
     closed: NotNegative = 0.0
-    """stiffness of a tendon whose valve is closed, due to the enclosed air [N/m]; with 0 it keeps
-    its tension"""
+    """stiffness of a slack tendon whose valve is closed, due to the enclosed air [N/m]; with 0 it
+    keeps its tension"""
+    stiffening: NotNegative = 0.0
+    """fraction by which each newton of tension raises that stiffness [1/N]; above 0, the tendon is
+    a spring while its valve is open, too, against its tension loop"""
 
 
 class ToolConfig(Table):

@@ -45,7 +45,8 @@ class Hand:
     least: float  # N: tension below which a tendon is slack
     rest: float  # N: mean tension of a pair at rest
     most: Array  # (joints,), N: largest tension of either tendon
-    closed: float  # N/m: stiffness of a tendon whose valve is closed
+    closed: float  # N/m: stiffness of a slack tendon whose valve is closed
+    stiffening: float  # 1/N: fraction by which tension raises that stiffness
 
     @property
     def torque(self) -> Array:
@@ -224,6 +225,7 @@ def find_hand(model: mujoco.MjModel, robot: RobotConfig, hand: HandConfig) -> Ha
         rest=hand.rest,
         most=np.array(most[0]),
         closed=hand.closed,
+        stiffening=hand.stiffening,
     )
 
 

@@ -39,6 +39,7 @@ from rack.tools.recording.origin import Origin
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.stalls import analyze_stalls
 from rack.tools.report import arm_outcome
+from rack.tools.report.data_ages import summarize_data_ages
 from rack.tools.report.miss_causes import add_causes
 from rack.tools.report.report_markdown import format_markdown
 from rack.tools.report.run_report import RunReport
@@ -121,6 +122,7 @@ def build_report(recording: Recording) -> Document:
         **report_faults(recording.events, layout),
         tasks={task.name: _build_task_entry(recording, config, task) for task in layout.tasks},
         system_response=response,
+        data_ages=summarize_data_ages(recording),
         entries=_summarize_entries(recording),
         network=summarize_network(recording),
         task=arm_outcome.summarize_task(recording),

@@ -88,6 +88,9 @@ def format_report(document: Document) -> Blocks:
         yield from ("", "## System response, ms of simulated time")
         for chain in (response, *response["others"]):
             yield from _format_response(chain)
+    if report.data_ages:
+        yield from ("", "## Data ages of the boards' inputs, ms of simulated time", "")
+        yield _build_traffic_table(report.data_ages, ("taken",))
     if report.entries:
         yield from ("", "## Bus adapters, ages in ms of simulated time", "")
         yield _build_traffic_table(report.entries, ("superseded", "waiting", "source"))

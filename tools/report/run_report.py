@@ -57,6 +57,7 @@ class RunReport:
     restarts: Any = None
     tasks: Any = None
     system_response: Any = None
+    data_ages: Any = None
     entries: Any = None
     network: Any = None
     task: Any = None

@@ -1,5 +1,6 @@
 """A hand with tendon-driven fingers: its plant, and its loops from tendon tension to grasp."""
 
+from rack.levels.systems.hand.events import EventfulFingertipLoop, EventServer
 from rack.levels.systems.hand.executor import HandExecutor
 from rack.levels.systems.hand.grasp import GraspExecutor
 from rack.levels.systems.hand.loop_boards import (
@@ -10,6 +11,8 @@ from rack.levels.systems.hand.loop_boards import (
 )
 
 __all__ = [
+    "EventServer",
+    "EventfulFingertipLoop",
     "FingerExecutor",
     "FingertipLoop",
     "GraspExecutor",

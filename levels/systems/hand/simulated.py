@@ -38,10 +38,14 @@ class SimulatedHand(Simulation):
     """A hand driven by tendons.
 
     It has no brakes: without commands its valves close and keep the grip. The air in a closed valve
-    acts as a spring. The tension of its tendon rises by `Hand.closed` for each metre by which the
-    joint pulls the tendon. Moving fingers therefore come to rest, and the grip is kept by the
-    tension at which the valves closed. Initially the valves are closed, with tensions that carry
-    the weight of the open hand.
+    acts as a spring: the joint changes the tension of a tendon by pulling it. Its stiffness is
+    `Hand.closed` (1 + `Hand.stiffening` tension). Moving fingers therefore come to rest, and the
+    grip is kept by the tension at which the valves closed. Initially the valves are closed, with
+    tensions that carry the weight of the open hand.
+
+    If tendons stiffen, they are also springs while the valves are open. The tension loop of a valve
+    then returns to the commanded tension with its lag, so that a pair resists quick motion, the
+    more the higher its mean tension.
     """
 
     def __init__(
@@ -138,19 +142,25 @@ class SimulatedHand(Simulation):
             self._data.time = self._now_s
 
     def _simulate_tick(self) -> None:
-        """Simulate one tick. While the valves are closed, the tensions follow the joints.
+        """Simulate one tick. While the tendons are springs, the tensions follow the joints.
 
         The stored controls may be negative, which MuJoCo clamps to 0. A slack tendon therefore
         becomes tight at the same joint position at which it became slack.
         """
-        if not self.braked:
+        stiffening = self.hand.stiffening
+        if not (self.braked or stiffening):
             super()._simulate_tick()
             return
         position = self._state[0]
         before = position.copy()
         super()._simulate_tick()
+        is_lagging = self._acts is not None and not self.braked
+        tension = self._data.act[self._acts] if is_lagging else self._data.ctrl[self.hand.actuators]
         drawn = self._spring * (position - before)
-        self._data.ctrl[self.hand.actuators] += drawn
+        # Exponential in the length, to second order, so that it returns to the same tension.
+        drawn *= (1.0 + stiffening * tension) / (1.0 - 0.5 * stiffening * drawn)
+        if self.braked:
+            self._data.ctrl[self.hand.actuators] += drawn
         if self._acts is not None:
             self._data.act[self._acts] = np.maximum(self._data.act[self._acts] + drawn, 0.0)
 

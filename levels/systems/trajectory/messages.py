@@ -32,10 +32,13 @@ class MotionKind(IntEnum):
     # End the request under way and drop all queued before this one. The arm ramps to rest.
     CANCEL = 4
     GRIP = 5  # move the gripper to `opening` with at most `force`, the arm at rest
-    # The last two are for a server of force and motion only, see
+    # The next two are for a server of force and motion only, see
     # `rack.levels.systems.force.messages`.
     COMPLY = 6
     GUARD = 7
+    MEET = (
+        8  # wait for another arm, and start with it: see `rack.levels.systems.trajectory.meeting`
+    )
 
 
 class RequestEnd(IntEnum):

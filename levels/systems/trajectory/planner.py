@@ -138,6 +138,13 @@ class GripStep(Table):
     """time for the motion [s]; 0 for the level's default"""
 
 
+class MeetStep(Table):
+    """Wait at the previous goal for another arm, and begin the next step together with it."""
+
+    do: Literal["meet"] = "meet"
+    """the kind of step"""
+
+
 class CancelStep(Table):
     """Cancel all requests under way or queued. The arm ramps to rest."""
 
@@ -147,7 +154,7 @@ class CancelStep(Table):
     """time since the previous step began [s]"""
 
 
-Step = MoveStep | LineStep | HomeStep | StayStep | GripStep | CancelStep
+Step = MoveStep | LineStep | HomeStep | StayStep | GripStep | MeetStep | CancelStep
 
 
 class MotionProgram(Program):
@@ -342,6 +349,8 @@ class RequestPlanner(Planner):
             request.segment = step.seconds
             request.opening = step.opening
             request.force = default if step.force is None else step.force
+        elif isinstance(step, MeetStep):
+            request.kind = MotionKind.MEET
         else:
             request.kind = MotionKind.CANCEL
 
