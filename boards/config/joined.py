@@ -12,7 +12,7 @@ from rack.boards.config.resolved import resolve_layout
 from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.config.timing import NS_PER_MS, build_rack_timing
 from rack.boards.errors import ConfigError, Mistake
-from rack.boards.timing.joined import JoinedRacks, Link, Station
+from rack.boards.timing.joined import JoinedRacks, RackLink, Station
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def join_racks(configs: Sequence[RackConfig]) -> JoinedRacks:
     return JoinedRacks(timings, layouts, tuple(_list_links(members)))
 
 
-def _list_links(members: Mapping[str, JoinedMember]) -> Iterator[Link]:
+def _list_links(members: Mapping[str, JoinedMember]) -> Iterator[RackLink]:
     """Yield a link for each mailbox that one of the racks imports from another."""
     for name, member in members.items():
         table = member.config.adapter.lan
@@ -77,7 +77,7 @@ def _list_links(members: Mapping[str, JoinedMember]) -> Iterator[Link]:
                 why = f"rack '{entry.rack}' does not export this mailbox; its exports: {listed}"
                 raise ConfigError([Mistake(place, entry.source, why)])
             clock_ns = member.layout.clock_ns
-            yield Link(
+            yield RackLink(
                 source=Station(entry.rack, source.layout.find_mailbox(entry.mailbox).writer),
                 mailbox=entry.mailbox,
                 rack=name,

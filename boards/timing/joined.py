@@ -30,7 +30,7 @@ class Station(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Link:
+class RackLink:
     """Path of the messages of one mailbox from a rack to the boards of another that read them.
 
     Attributes:
@@ -139,7 +139,7 @@ class JoinedRacks:
 
     racks: Mapping[str, RackTiming]
     layouts: Mapping[str, Layout]
-    links: tuple[Link, ...]
+    links: tuple[RackLink, ...]
 
     @cached_property
     def chains(self) -> tuple[tuple[Station, ...], ...]:
@@ -153,7 +153,7 @@ class JoinedRacks:
         return tuple(chain for chain in chains if len({station.rack for station in chain}) > 1)
 
     @property
-    def unbudgeted_links(self) -> tuple[Link, ...]:
+    def unbudgeted_links(self) -> tuple[RackLink, ...]:
         """Links on these chains that have no delay budget."""
         ways = (way for chain in self.chains for way in (chain, chain[::-1]))
         links = dict.fromkeys(link for way in ways for link in self.list_chain_links(way) or ())
@@ -204,7 +204,7 @@ class JoinedRacks:
         )
         return JoinedPath(direction, stations, link.port, *(ns * 1e-6 for ns in times_ns))
 
-    def find_link(self, source: Station, reader: Station) -> Link | None:
+    def find_link(self, source: Station, reader: Station) -> RackLink | None:
         """Return the link that carries messages from one board to another, or None."""
         return next(
             (
@@ -217,7 +217,7 @@ class JoinedRacks:
             None,
         )
 
-    def list_chain_links(self, stations: Sequence[Station]) -> list[Link] | None:
+    def list_chain_links(self, stations: Sequence[Station]) -> list[RackLink] | None:
         """Return the links along boards in the direction of the information.
 
         Returns:

@@ -30,15 +30,6 @@ def create_console(pipe_width: int = PIPE_WIDTH) -> Console:
     return stdout_console if stdout_console.is_terminal else Console(width=pipe_width)
 
 
-def terminal_width() -> int | None:
-    """Return the width of the terminal on stdout, in characters.
-
-    None if stdout is not a terminal.
-    """
-    stdout_console = Console()
-    return stdout_console.width if stdout_console.is_terminal else None
-
-
 def format_table(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
@@ -217,9 +208,9 @@ def format_decimal(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def format_figure(distribution: Mapping[str, Any] | None, key: str) -> str:
+def format_figure(distribution: Mapping[str, Any] | None, key: str, digits: int = 3) -> str:
     """Format one value of a distribution, or return "-" if the distribution is None."""
-    return "-" if distribution is None else format_decimal(distribution[key])
+    return "-" if distribution is None else format_decimal(distribution[key], digits)
 
 
 def format_ms(time_ns: float | None) -> str:

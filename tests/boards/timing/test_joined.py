@@ -11,7 +11,7 @@ from rack.backplane.layout import TickGrid
 from rack.boards.config import CONFIGS, RackConfig, load
 from rack.boards.config.joined import join_racks, load_partners
 from rack.boards.errors import ConfigError
-from rack.boards.timing.joined import JoinedPath, JoinedRacks, Link, Station
+from rack.boards.timing.joined import JoinedPath, JoinedRacks, RackLink, Station
 from rack.tools.console.answer import Failure
 from rack.tools.timing.joined_check import format_joined_verdicts, judge_joined_racks
 
@@ -51,7 +51,7 @@ def test_a_link_takes_its_waits_its_delay_and_its_losses(
     written: TickGrid, read: TickGrid, is_lockstep: bool, max_lost: int, expected_ms: int
 ) -> None:
     grid = TickGrid(20 * MS)
-    link = Link(
+    link = RackLink(
         Station("upper", "a"),
         "a.command",
         "lower",

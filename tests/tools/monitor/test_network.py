@@ -53,7 +53,7 @@ def segment(rack_name: str) -> Iterator[Segment]:
     config = load_text(TEXT.replace('name = "one"', f'name = "{rack_name}"'))
     made = Segment.create(resolve_layout(config), config.to_toml_text())
     status, peer = open_writer(made, "lan.status"), open_writer(made, "lan.peer_other_one")
-    status.message.import_other[...] = (*COUNTS.values(), 99, 40, 80, 16, 0.04)
+    status.message.import_other[...] = (*COUNTS.values(), 99, 40, 80, 16, 0.04, 0.5)
     status.message.export_pulse[...] = (12, 24)
     status.write(8)
     found = peer.message
