@@ -186,21 +186,21 @@ def render_text(blocks: Iterable[str | TextTable], width: int | None = None) -> 
             yield block
 
 
-def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
-    """Print text and tables on a terminal. Tables fit its width, and titles are bold."""
+def print_blocks(blocks: Iterable[str | TextTable], terminal: Console | None = None) -> None:
+    """Print text and tables, fitted to the terminal or to `PIPE_WIDTH`. Titles have no "#".
+
+    Args:
+        blocks: Text and tables.
+        terminal: Terminal or pipe. None for stdout.
+    """
+    terminal = terminal or create_console()
     for line in render_text(blocks, terminal.width):
-        is_title = line.startswith("#")
-        text = line.lstrip("# ") if is_title else line
-        terminal.print(text, style="bold" if is_title else "", highlight=False, markup=False)
-
-
-def print_blocks(blocks: Iterable[str | TextTable]) -> None:
-    """Print text and tables on stdout, fitted to the terminal or to `PIPE_WIDTH`."""
-    terminal = create_console()
-    if terminal.is_terminal:
-        show_blocks(blocks, terminal)
-    else:
-        print_text(render_text(blocks, terminal.width))
+        text = line.lstrip("# ") if line.startswith("#") else line
+        if terminal.is_terminal:
+            style = "bold" if line.startswith("#") else ""
+            terminal.print(text, style=style, highlight=False, markup=False)
+        else:
+            print_text([text], terminal.file)
 
 
 def format_decimal(value: float | None, digits: int = 3) -> str:

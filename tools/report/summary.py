@@ -88,6 +88,7 @@ def _format_rows(rows: Iterable[Row], width: int, max_lines: int) -> list[str]:
             width,
             initial_indent=f"{label:{len(INDENT)}}",
             subsequent_indent=INDENT,
+            break_long_words=False,
             break_on_hyphens=False,
             max_lines=MAX_ROW_LINES * ceil(WIDTH / width),
             placeholder=" ... see --full",

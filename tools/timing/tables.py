@@ -20,6 +20,18 @@ from rack.tools.console.tables import Blocks, Cell, TextTable, format_ms
 TABULATED = {*BEYOND} - {PLAN_WITHIN}
 """Criteria that have separate tables."""
 RESULTS = {True: "ok", False: "FAILS"}
+LEVEL_COLUMNS = {
+    "R_i": "cycle_ns",
+    "t_exec": "execution_ns",
+    "t_comm": "communication_ns",
+    "R": "read_ns",
+    "W": "write_ns",
+    "C": "exchange_ns",
+    "t_residual": "residual_ns",
+    "t_plan": "planning_ns",
+    "P": "plan_ns",
+}
+"""Times of a level in a table, and their names."""
 Row = dict[str, Cell]
 
 
@@ -50,17 +62,10 @@ def format_forecast(forecast: Forecast) -> Blocks:
     if rack.responses:
         yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
         yield _build_response_table(rack.responses)
-        yield ""
-        loads = (
-            f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}"
-            for core, load in rack.loads.items()
-        )
-        yield f"load: {', '.join(loads)}"
     if forecast.inboxes:
         yield from ("", "interrupts, served by the first task of the board, ms:", "")
         yield _build_inbox_table(forecast.inboxes)
     yield from _format_schedule(forecast)
-    yield from forecast.notes
 
 
 def _format_schedule(forecast: Forecast) -> Blocks:
@@ -119,15 +124,7 @@ def build_level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> 
         {
             "level": level.board,
             about: word,
-            "R_i": format_ms(level.cycle_ns),
-            "t_exec": format_ms(level.execution_ns),
-            "t_comm": format_ms(level.communication_ns),
-            "R": format_ms(level.read_ns),
-            "W": format_ms(level.write_ns),
-            "C": format_ms(level.exchange_ns),
-            "t_residual": format_ms(level.residual_ns),
-            "t_plan": format_ms(level.planning_ns),
-            "P": format_ms(level.plan_ns),
+            **{head: format_ms(getattr(level, name)) for head, name in LEVEL_COLUMNS.items()},
             "U": format_ms(None if level.plan_ns is None else level.update_ns),
             "d": level.within_cycles,
             "d R_i": format_ms(level.slice_ns),

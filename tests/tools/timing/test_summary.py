@@ -12,7 +12,6 @@ import pytest
 
 from rack.backplane.mailbox.inbox import InterruptSource
 from rack.boards.config import load
-from rack.boards.timing.forecast import Forecast
 from rack.boards.timing.interrupts import InboxTiming
 from rack.boards.timing.verdicts import INBOX, evaluate_rack
 from rack.tools.timing.judged_config import JudgedConfig
@@ -54,7 +53,7 @@ def test_a_rack_that_does_not_fit_shows_failures_and_helpful_changes(small: Path
     assert any(line.endswith("% too much") for line in found)
     failing = [line for line in found if "FAILS" in line]
     assert [line.split()[0] for line in failing] == ["3.8", "response", "load"]
-    assert "      board 'lower': within_cycles 4 -> 7 (a plan every 17.5 ms)" in found
+    assert "      board 'lower': within_cycles 4 -> 7, a plan every 17.5 ms" in found
     assert found[-1] == MORE
 
 
