@@ -32,6 +32,7 @@ from rack.tools.recording.history import (
     list_holds,
     list_misses,
     summarize_frequency,
+    summarize_gaps,
     summarize_steal,
 )
 from rack.tools.recording.origin import Origin
@@ -125,10 +126,7 @@ def build_report(recording: Recording) -> Document:
         queues=summarize_queues(recording),
         interrupts=summarize_interrupts(recording),
         recording=ended.get("recording", "without the end of the run"),
-        rows_lost={name: count for name, count in recording.lost_rows.items() if count},
-        gaps=[gap._asdict() for gap in recording.find_gaps()],
-        untraced=recording.count_traced_cycles(),
-        kept=recording.kept_text or None,
+        **summarize_gaps(recording),
     ).to_document()
 
 

@@ -11,6 +11,7 @@ from rack.boards.timing.verdicts import EquationVerdict, evaluate_rack
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks
 from rack.tools.recording.cycles import START_UP_S, Cycles, list_restarts
+from rack.tools.recording.history import summarize_gaps
 from rack.tools.report.analysis import MOST_CYCLES_PERCENTILE, Analysis, EquationPair
 from rack.tools.report.task_times import MS_PER_NS, build_times_table, compute_task_times
 from rack.tools.timing.summary import find_tightest, format_margin
@@ -37,10 +38,7 @@ def build_document(analysis: Analysis) -> Document:
         "context_switch_ms": config.timing.context_switch_ms,
         "percentile": analysis.percentile,
         "start_up_s": START_UP_S,
-        "rows_lost": {name: count for name, count in recording.lost_rows.items() if count},
-        "gaps": [gap._asdict() for gap in recording.find_gaps()],
-        "untraced": recording.count_traced_cycles(),
-        "kept": recording.kept_text or None,
+        **summarize_gaps(recording),
         "holds": analysis.is_fulfilled,
         "levels": {
             name: _build_sides(
