@@ -1,4 +1,4 @@
-"""What happened in a run, as rows of clauses, which the summary and report.md show."""
+"""Facts about a run as rows of clauses, for the summary and for report.md."""
 
 from __future__ import annotations
 
