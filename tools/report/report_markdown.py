@@ -42,8 +42,8 @@ def format_report(document: Document) -> Blocks:
     yield (
         f"{report.simulated_s:.2f} s simulated in {report.wall_s:.2f} s, {report.mode}, "
         f"{report.missed} missed, {report.skipped} skipped cycles."
-        f"{f' Digest `{report.digest}`.' if report.digest else ''}"
     )
+    yield f"Digest `{report.digest or 'unknown'}`."
     for label, clauses in (*list_reasons(report), *list_facts(report)):
         # The headline names the failures.
         if label != "because" and (text := "; ".join(filter(None, clauses))):
