@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import fill
-from typing import Any, NoReturn, TextIO
+from typing import IO, Any, NoReturn
 
 from rack.backplane.json_text import encode_json
 from rack.boards.errors import Failure as Failure
@@ -67,7 +67,7 @@ def print_answer(document: Any, text: str | Iterable[str], as_json: bool) -> Non
         print_text(text.split("\n") if isinstance(text, str) else text)
 
 
-def print_text(lines: Iterable[str], stream: TextIO | None = None) -> None:
+def print_text(lines: Iterable[str], stream: IO[str] | None = None) -> None:
     """Print lines of text. A pipe gets no wide lines, and wrapped commands remain executable.
 
     Args:

@@ -30,15 +30,6 @@ def create_console(pipe_width: int = PIPE_WIDTH) -> Console:
     return stdout_console if stdout_console.is_terminal else Console(width=pipe_width)
 
 
-def terminal_width() -> int | None:
-    """Return the width of the terminal on stdout, in characters.
-
-    None if stdout is not a terminal.
-    """
-    stdout_console = Console()
-    return stdout_console.width if stdout_console.is_terminal else None
-
-
 def format_table(
     head: Sequence[str],
     rows: Sequence[Sequence[str]],
@@ -195,21 +186,21 @@ def render_text(blocks: Iterable[str | TextTable], width: int | None = None) -> 
             yield block
 
 
-def show_blocks(blocks: Iterable[str | TextTable], terminal: Console) -> None:
-    """Print text and tables on a terminal. Tables fit its width, and titles are bold."""
+def print_blocks(blocks: Iterable[str | TextTable], terminal: Console | None = None) -> None:
+    """Print text and tables, fitted to the terminal or to `PIPE_WIDTH`. Titles have no "#".
+
+    Args:
+        blocks: Text and tables.
+        terminal: Terminal or pipe. None for stdout.
+    """
+    terminal = terminal or create_console()
     for line in render_text(blocks, terminal.width):
-        is_title = line.startswith("#")
-        text = line.lstrip("# ") if is_title else line
-        terminal.print(text, style="bold" if is_title else "", highlight=False, markup=False)
-
-
-def print_blocks(blocks: Iterable[str | TextTable]) -> None:
-    """Print text and tables on stdout, fitted to the terminal or to `PIPE_WIDTH`."""
-    terminal = create_console()
-    if terminal.is_terminal:
-        show_blocks(blocks, terminal)
-    else:
-        print_text(render_text(blocks, terminal.width))
+        text = line.lstrip("# ") if line.startswith("#") else line
+        if terminal.is_terminal:
+            style = "bold" if line.startswith("#") else ""
+            terminal.print(text, style=style, highlight=False, markup=False)
+        else:
+            print_text([text], terminal.file)
 
 
 def format_decimal(value: float | None, digits: int = 3) -> str:
@@ -217,9 +208,9 @@ def format_decimal(value: float | None, digits: int = 3) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def format_figure(distribution: Mapping[str, Any] | None, key: str) -> str:
+def format_figure(distribution: Mapping[str, Any] | None, key: str, digits: int = 3) -> str:
     """Format one value of a distribution, or return "-" if the distribution is None."""
-    return "-" if distribution is None else format_decimal(distribution[key])
+    return "-" if distribution is None else format_decimal(distribution[key], digits)
 
 
 def format_ms(time_ns: float | None) -> str:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, TextIO
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -28,17 +29,11 @@ if TYPE_CHECKING:
 
 SCHEDULING = {DEADLINE: "deadline", 0: "other"}
 
-COLUMNS: dict[str, Callable[[TaskRow], str]] = {
-    "slot": lambda row: str(row.slot),
-    "task": lambda row: row.task,
-    "core": lambda row: str(row.core),
+COLUMNS: dict[str, Callable[[TaskRow], Any]] = {
+    **{name: attrgetter(name) for name in ("slot", "task", "core")},
     "sched": lambda row: SCHEDULING.get(row.priority, f"FIFO {row.priority}"),
     "Hz": lambda row: f"{row.rate_hz:g}",
-    "tick": lambda row: str(row.tick),
-    "cycles": lambda row: str(row.cycles),
-    "missed": lambda row: str(row.missed),
-    "skipped": lambda row: str(row.skipped),
-    "restarts": lambda row: str(row.restarts),
+    **{name: attrgetter(name) for name in ("tick", "cycles", "missed", "skipped", "restarts")},
     "exec ms": lambda row: format_decimal(row.exec_ms, 2),
     "late ms": lambda row: format_decimal(row.lateness_ms, 2),
     "state": lambda row: row.state + " (operator)" * (row.mode == "operator"),
@@ -188,7 +183,9 @@ class RackView:
         width = options.max_width
         yield _format_head(snapshot)
         names = [row.task for row in snapshot.tasks]
-        columns = {name: [*map(cell, snapshot.tasks)] for name, cell in COLUMNS.items()}
+        columns = {
+            name: [str(cell(row)) for row in snapshot.tasks] for name, cell in COLUMNS.items()
+        }
         if self.lateness:
             columns["lateness"] = [self.lateness[name] for name in names]
         reasons = dict(zip(names, _list_reasons(snapshot), strict=True))

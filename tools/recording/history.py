@@ -88,6 +88,16 @@ def count_misses(entries: Sequence[Document]) -> tuple[int, int]:
     return late, left_out
 
 
+def summarize_gaps(recording: Recording) -> Document:
+    """Return what a recording lacks: lost rows, gaps, untraced cycles, and ranges not kept."""
+    return {
+        "rows_lost": {name: count for name, count in recording.lost_rows.items() if count},
+        "gaps": [gap._asdict() for gap in recording.find_gaps()],
+        "untraced": recording.count_traced_cycles(),
+        "kept": recording.kept_text or None,
+    }
+
+
 def summarize_steal(recording: Recording) -> Document:
     """Return the time that the hypervisor stole from each core.
 

@@ -1,8 +1,8 @@
-"""Outcome of the task, its objects, and the arm or hand, as data and as text of a report."""
+"""Outcome of the task, its objects, and the arm or hand, as data."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
@@ -12,7 +12,6 @@ from rack.boards.config import RackConfig
 from rack.levels.messages import ArmState, Scene, TaskStatus
 from rack.tools.console.answer import Document
 from rack.tools.recording.recording import Recording
-from rack.tools.report.run_report import RunReport
 
 DRIVING = ("servo_status", "arm_status")
 HAND_STATUS = "hand_status"
@@ -36,16 +35,6 @@ MIN_FALL_M = 0.005
 
 Tasks release objects up to 2 mm above the support, and opening pads can drag an object along.
 """
-
-
-COUNT_TEXTS = {
-    "touches": "{} unintended contacts",
-    "violations": "limits exceeded in {} substeps",
-    "pushed": "pushed beyond them in {}",
-    "clipped_cycles": "commands refused or cut in {} cycles",
-}
-Row = tuple[str, Sequence[str]]
-"""A label, and clauses about its subject."""
 Signals = Callable[[str], np.ndarray]
 """Function from the name of a field to its values in all messages of a mailbox."""
 
@@ -208,44 +197,3 @@ def find_signals(recording: Recording, *messages: str) -> Signals | None:
     """
     name = next((m.name for m in recording.layout.mailboxes if m.message in messages), None)
     return partial(recording.read_signal, name) if name in recording.mailboxes else None
-
-
-def list_outcome_rows(report: RunReport) -> list[Row]:
-    """Return clauses about the task, and about the arm or hand."""
-    rows: list[Row] = []
-    if (task := report.task) is not None:
-        moves = f"{task['moves_done']} of {task['moves']} moves"
-        done = f"{task['state']}, {task['action']} of {task['actions']} actions, {moves}"
-        rows.append(("task", [done, *filter(None, [task["reason"]])]))
-    if ends := sorted(report.objects, key=lambda end: end["tolerance_mm"] - end["off_mm"]):
-        worst = f"worst {ends[0]['object']} {ends[0]['off_mm']:.1f} mm"
-        at_goal = sum(end["off_mm"] <= end["tolerance_mm"] for end in ends)
-        clauses = [f"{at_goal} of {len(ends)} at goal, {worst} ({ends[0]['tolerance_mm']:g} mm)"]
-        rows.append(("objects", clauses))
-    if (motion := report.motion) is not None:
-        tracking = []
-        if (rms := motion["tracking_rms_mrad"]) is not None:
-            tracking = [f"tracking {rms:.2g} mrad RMS, {motion['tracking_peak_mrad']:.2g} peak"]
-        rows.append(("motion", [*tracking, *_list_counts(motion)]))
-    if (hand := report.hand) is not None:
-        forces = ", ".join(f"{finger} {n:.2f}" for finger, n in hand["largest_force_n"].items())
-        clauses = [
-            f"tension error {hand['tension_rms_n']:.2f} N RMS, {hand['tension_peak_n']:.2f} peak",
-            f"tensions {hand['least_tension_n']:.2f} to {hand['largest_tension_n']:.2f} N",
-            *_list_counts(hand),
-            f"valves closed in {hand['closed_cycles']} cycles",
-            f"largest forces on the tips {forces} N",
-        ]
-        rows.append(("hand", clauses))
-    if (force := report.force) is not None:
-        rms_n = force["force_rms_n"]
-        largest = f"at most {force['largest_force_n']:.1f} N, {force['largest_torque_nm']:.2f} N m"
-        clauses = [largest, f"above the limits in {force['exceeded_cycles']} cycles"]
-        rows.append(("contact", clauses + ([] if rms_n is None else [f"error {rms_n:.2f} N RMS"])))
-    return rows
-
-
-def _list_counts(report: Document) -> list[str]:
-    """Return clauses about the counts of an arm or hand that are not zero."""
-    clauses = [text.format(report[key]) for key, text in COUNT_TEXTS.items() if report[key]]
-    return clauses or ["no contact, no limit reached"]

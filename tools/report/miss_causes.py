@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from pydantic import TypeAdapter
 
-from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import TaskSpec
 from rack.boards.timing.trace_times import (
     Occupation,
@@ -46,11 +45,14 @@ def add_causes(
     if recording.rack_config.clock.mode == "realtime":
         for task in layout.tasks:
             causes |= _find_delays(recording, task, absent)
+    strikes = TypeAdapter(tuple[Strike, ...]).validate_python(
+        recording.end_counts.get("faults", ())
+    )
     explained = []
     for miss in misses:
         task = layout.find_task(miss["task"])
         why, ns = causes.get((task.name, miss["tick"]), (NOT_RECORDED, 0))
-        if fault := next(_list_faults(recording, task, miss), ""):
+        if fault := next(_list_faults(recording, task, miss, strikes), ""):
             why, ns = fault, 0
         # The kernel counts steal in steps that are longer than most delays.
         ms = ns / 1e6 if ns and why != HYPERVISOR else None
@@ -78,28 +80,32 @@ def _find_delays(recording: Recording, task: TaskSpec, absent: Mapping[int, Occu
         OWN_EXECUTION: np.where(own_ns > task.slice * grid_ns, own_ns, 0),
     }
     causes: Causes = {}
-    for at in np.flatnonzero(missed | (skipped > 0)).tolist():
-        cause = next(((why, int(ns[at])) for why, ns in found.items() if ns[at] > 0), None)
-        tick = int(rows["tick"][at])
-        if cause:
-            causes[task.name, tick] = cause
-            causes[task.name, tick - int(skipped[at]) * task.every] = cause
+    for why, ns in found.items():
+        for at in np.flatnonzero((missed | (skipped > 0)) & (ns > 0)):
+            for tick in (rows["tick"][at], rows["tick"][at] - skipped[at] * task.every):
+                causes.setdefault((task.name, int(tick)), (why, int(ns[at])))
     return causes
 
 
-def _list_faults(recording: Recording, task: TaskSpec, miss: Document) -> Iterator[str]:
-    """Yield the faults and the losses of a board that took cycles from a task."""
+def _list_faults(
+    recording: Recording, task: TaskSpec, miss: Document, strikes: Sequence[Strike]
+) -> Iterator[str]:
+    """Yield the faults and the losses of a board that took cycles from a task.
+
+    Args:
+        recording: The run.
+        task: The task.
+        miss: The lost cycles.
+        strikes: All faults.
+    """
     since, until = miss["tick"] - task.every, miss["tick"] + miss["count"] * task.every
-    core, _ = recording.find_core_and_priority(task)
-    on_core = {
-        other.name
-        for other in recording.layout.tasks
-        if recording.find_core_and_priority(other)[0] == core
-    }
-    strikes = recording.end_counts.get("faults", ())
-    for strike in TypeAdapter(tuple[Strike, ...]).validate_python(strikes):
+    tasks = recording.layout.tasks
+    cores = {other.name: recording.find_core_and_priority(other)[0] for other in tasks}
+    for strike in strikes:
         is_active = 0 <= strike.first_tick <= until and not 0 <= strike.ends < since
-        if is_active and takes_cycles(strike) and strike.board in {CLOCK, *on_core}:
+        # The clock, which is no task, delays the tasks on all cores.
+        is_near = cores.get(strike.board) in (None, cores[task.name])
+        if is_active and is_near and takes_cycles(strike):
             yield f"fault '{strike.kind}' of {strike.board}"
     for event in recording.events:
         is_near = event.get("code") in LOSS_CODES and since <= event["tick"] <= until

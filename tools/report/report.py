@@ -28,11 +28,11 @@ from rack.tools.monitor.queues import summarize_queues
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.folder_size import measure_sizes
 from rack.tools.recording.history import (
-    count_misses,
     list_fired_rows,
     list_holds,
     list_misses,
     summarize_frequency,
+    summarize_gaps,
     summarize_steal,
 )
 from rack.tools.recording.origin import Origin
@@ -103,13 +103,9 @@ def build_report(recording: Recording) -> Document:
     last_tick = max((int(rows["tick"][-1]) for rows in recording.cycles.values()), default=-1)
     stalls, absent = analyze_stalls(recording)
     response = measure_system_response(recording)
-    report = _build_head(config, ended, last_tick + 1, response)
-    if not ended:
-        # Without the counts at the end of the run, count the misses in the trace.
-        missed, skipped = count_misses(missed_cycles)
-        report = replace(report, missed=missed, skipped=skipped)
+    tasks = {task.name: _build_task_entry(recording, config, task) for task in layout.tasks}
     return replace(
-        report,
+        _build_head(config, ended, tasks, last_tick + 1, response),
         folder=str(recording.folder),
         continues=None if origin is None else origin.to_document(layout.clock_ns),
         misses=add_causes(recording, missed_cycles, absent),
@@ -120,7 +116,6 @@ def build_report(recording: Recording) -> Document:
         holds=list_holds(recording),
         state_tables=list_fired_rows(recording),
         **report_faults(recording.events, layout),
-        tasks={task.name: _build_task_entry(recording, config, task) for task in layout.tasks},
         system_response=response,
         data_ages=summarize_data_ages(recording),
         entries=_summarize_entries(recording),
@@ -133,10 +128,7 @@ def build_report(recording: Recording) -> Document:
         queues=summarize_queues(recording),
         interrupts=summarize_interrupts(recording),
         recording=ended.get("recording", "without the end of the run"),
-        rows_lost={name: count for name, count in recording.lost_rows.items() if count},
-        gaps=[gap._asdict() for gap in recording.find_gaps()],
-        untraced=recording.count_traced_cycles(),
-        kept=recording.kept_text or None,
+        **summarize_gaps(recording),
     ).to_document()
 
 
@@ -150,31 +142,32 @@ def build_unrecorded_report(config: RackConfig, ended: Mapping[str, Any]) -> Doc
         ended: Counts at the end of the run.
     """
     layout = resolve_layout(config)
-    head = _build_head(config, ended, 0, None)
-    return replace(
-        head,
-        unjudged=[*head.unjudged, UNRECORDED],
-        tasks={
-            task.name: {**_describe_task(task, layout), **ended["tasks"][task.name]}
-            for task in layout.tasks
-        },
-        recording=ended["recording"],
-    ).to_document()
+    tasks = {
+        task.name: {**_describe_task(task, layout), **ended["tasks"][task.name]}
+        for task in layout.tasks
+    }
+    head = _build_head(config, ended, tasks, 0, None)
+    unjudged = [*head.unjudged, UNRECORDED]
+    return replace(head, unjudged=unjudged, recording=ended["recording"]).to_document()
 
 
 def _build_head(
-    config: RackConfig, ended: Mapping[str, Any], ticks: int, response: Document | None
+    config: RackConfig,
+    ended: Mapping[str, Any],
+    tasks: Mapping[str, Document],
+    ticks: int,
+    response: Document | None,
 ) -> RunReport:
     """Return the part of a report that needs no recording.
 
     Args:
         config: Config of the run.
         ended: Counts at the end of the run. Empty if the end was not recorded.
+        tasks: Entries of the tasks.
         ticks: Length of the run in ticks, which is used if the end was not recorded.
         response: Measured response of the system, or None.
     """
     outcome = ended.get("outcome", {})
-    counters = ended.get("tasks", {}).values()
     return RunReport(
         rack=config.name,
         mode=config.clock.mode,
@@ -188,8 +181,9 @@ def _build_head(
         wall_s=round(ended.get("wall_s", 0.0), 6),
         clock_skipped=ended.get("clock_skipped", 0),
         others=list(ended.get("others", ())),
-        missed=sum(task["missed"] for task in counters),
-        skipped=sum(task["skipped"] for task in counters),
+        tasks=tasks,
+        missed=sum(task["missed"] for task in tasks.values()),
+        skipped=sum(task["skipped"] for task in tasks.values()),
     )
 
 

@@ -14,8 +14,6 @@ from rack.tools.console.answer import Document, Failure, print_json
 from rack.tools.recording.checksums import Checksums, read_file
 from rack.tools.recording.file_names import SPOOL
 
-FULL_WIDTH = 100
-"""Width of the whole report if stdout is not a terminal."""
 REPORT_FILES = ("report.json", "report.md")
 RECORDED_FILES = ("config.toml", "cycles.parquet", "signals", "events.jsonl")
 PROGRAM_FOLDER = Path(__file__).resolve().parents[2]
@@ -66,8 +64,6 @@ def load_report(folder: Path) -> Document:
 def print_report(data: Document, as_json: bool, is_full: bool = False) -> None:
     """Print a report as JSON, as a summary or as the whole text.
 
-    The width of a terminal, or `FULL_WIDTH`, limits the columns of tables.
-
     Args:
         data: The report as data.
         as_json: Whether to print `data` as one JSON document.
@@ -80,14 +76,11 @@ def print_report(data: Document, as_json: bool, is_full: bool = False) -> None:
         # Printing stored lines needs no import of slow libraries.
         print(*data["summary"], sep="\n")
         return
-    from rack.tools.console.tables import create_console, show_blocks
-
-    console = create_console(FULL_WIDTH)
-    if is_full:
-        from rack.tools.report.report_markdown import format_for_terminal
-
-        show_blocks(format_for_terminal(data), console)
-        return
+    from rack.tools.console.tables import create_console, print_blocks
+    from rack.tools.report.report_markdown import format_report
     from rack.tools.report.summary import show_summary
 
-    show_summary(data, console)
+    if is_full:
+        print_blocks(format_report(data))
+    else:
+        show_summary(data, create_console())

@@ -11,6 +11,7 @@ from rack.boards.timing.verdicts import EquationVerdict, evaluate_rack
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks
 from rack.tools.recording.cycles import START_UP_S, Cycles, list_restarts
+from rack.tools.recording.history import summarize_gaps
 from rack.tools.report.analysis import MOST_CYCLES_PERCENTILE, Analysis, EquationPair
 from rack.tools.report.task_times import MS_PER_NS, build_times_table, compute_task_times
 from rack.tools.timing.summary import find_tightest, format_margin
@@ -37,10 +38,7 @@ def build_document(analysis: Analysis) -> Document:
         "context_switch_ms": config.timing.context_switch_ms,
         "percentile": analysis.percentile,
         "start_up_s": START_UP_S,
-        "rows_lost": {name: count for name, count in recording.lost_rows.items() if count},
-        "gaps": [gap._asdict() for gap in recording.find_gaps()],
-        "untraced": recording.count_traced_cycles(),
-        "kept": recording.kept_text or None,
+        **summarize_gaps(recording),
         "holds": analysis.is_fulfilled,
         "levels": {
             name: _build_sides(
@@ -164,7 +162,13 @@ def _format_summary(analysis: Analysis) -> Iterator[str]:
     count = f"{len(verdicts)} equations"
     result = f"{len(failed)} of {count} failed" if failed else f"all {count} held"
     name = analysis.recording.rack_config.name
-    yield f"{name}: {result}; {_describe_end(analysis)}"
+    ended = analysis.recording.end_counts
+    cause = ended.get("outcome", {}).get("cause", "no end recorded")
+    missed, skipped = (
+        sum(count[kind] for count in ended.get("tasks", {}).values())
+        for kind in ("missed", "skipped")
+    )
+    yield f"{name}: {result}; {cause}, {missed} cycles missed, {skipped} skipped"
     yield from (f"  {format_margin(verdict)}" for verdict in failed[:MAX_SHOWN_FAILURES])
     if failed and analysis.percentile > MOST_CYCLES_PERCENTILE:
         mostly = [pair for pair in analysis.typical_pairs if pair.is_failed]
@@ -214,18 +218,6 @@ def _list_unjudged(analysis: Analysis) -> Iterator[str]:
         yield kept
 
 
-def _describe_end(analysis: Analysis) -> str:
-    """Return a clause that says how the run ended and how many cycles it missed."""
-    ended = analysis.recording.end_counts
-    cause = ended.get("outcome", {}).get("cause", "no end recorded")
-    counts = ended.get("tasks", {}).values()
-    missed = sum(count["missed"] for count in counts)
-    skipped = sum(count["skipped"] for count in counts)
-    if not missed + skipped:
-        return f"{cause}, no cycle missed or skipped"
-    return f"{cause}, {missed} cycles missed, {skipped} skipped"
-
-
 def _choose_advice(analysis: Analysis, has_failed: bool) -> str:
     """Return a line that says what to do about failed equations, or about a failed run."""
     folder = analysis.recording.folder
@@ -248,10 +240,5 @@ def _choose_advice(analysis: Analysis, has_failed: bool) -> str:
 
 
 def _join_equations(pairs: list[EquationPair]) -> str:
-    """Return equations grouped by subject, as in "servo 3.1, 3.6; core 1 load"."""
-    subjects = dict.fromkeys(pair.subject for pair in pairs)
-    named = {
-        name: ", ".join(pair.equation for pair in pairs if pair.subject == name)
-        for name in subjects
-    }
-    return "; ".join(f"{name} {equations}" for name, equations in named.items())
+    """Return equations with their subjects, as in "servo 3.1, servo 3.6, core 1 load"."""
+    return ", ".join(f"{pair.subject} {pair.equation}" for pair in pairs)

@@ -28,7 +28,6 @@ from rack.tools.recording.in_force import VisibleMessages
 from rack.tools.recording.recording import Recording
 from rack.tools.recording.signal import MAX_SUGGESTIONS, Signal, Trigger
 from rack.tools.report.report import write_report
-from rack.tools.report.report_markdown import format_summary
 from rack.tools.scripting.moment import RecordedMoment
 
 
@@ -224,7 +223,7 @@ class RewoundRun:
             "outcome": asdict(result.outcome),
             "first_difference": None if difference is None else asdict(difference),
         }
-        return RewindAnswer(document, [*format_summary(report), where, f"recorded into {folder}"])
+        return RewindAnswer(document, [*report["summary"], where, f"recorded into {folder}"])
 
 
 def _flatten_attributes(

@@ -16,17 +16,6 @@ LOSS_CODES = ("died", "hang")
 """Event codes of a lost board."""
 
 
-NOT_MEASURED: Document = {
-    "levels": [],
-    "measured_ms": None,
-    "bound_ms": None,
-    "holds": None,
-    "beyond": [],
-    "unseen": 0,
-}
-"""Response in a direction that is not measured along these boards."""
-
-
 class Origins(NamedTuple):
     """When the information in the messages of a chain arrived at the first board of another rack.
 
@@ -152,13 +141,13 @@ def _list_delays(
 
 
 def build_direction(
-    levels: Sequence[str], bound_ms: float, measurements: Sequence[ChainResponses]
+    levels: Sequence[str], bound_ms: float | None, measurements: Sequence[ChainResponses]
 ) -> Document:
     """Return the responses along parallel chains in one direction as plain data.
 
     Args:
         levels: Levels of the chains, in the direction of the information.
-        bound_ms: Bound of the response.
+        bound_ms: Bound of the response. None without measurements.
         measurements: Responses along each chain.
     """
     responses_ms = np.concatenate([np.zeros(0), *(one.ms for one in measurements)])
@@ -171,3 +160,7 @@ def build_direction(
         "beyond": beyond,
         "unseen": sum(one.unseen for one in measurements),
     }
+
+
+NOT_MEASURED = build_direction((), None, ())
+"""Response in a direction that is not measured along these boards."""

@@ -7,6 +7,7 @@ states how an arm behaves without new torques.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
@@ -17,7 +18,7 @@ from rack.boards.timing.chains import format_names
 from rack.levels.level import Executor
 from rack.levels.tables import read_params
 from rack.tools.console.answer import Document
-from rack.tools.console.tables import Blocks, TextTable
+from rack.tools.console.tables import Blocks, Cell, TextTable
 
 PATIENCE_LINE = (
     "patience: '{board}' keeps its last torque for {ms:g} ms ({cycles} cycles; at most"
@@ -153,8 +154,15 @@ def _describe_network(config: RackConfig) -> Document | None:
     entries: list[Document] = []
     for direction, ports in (("out", table.exports), ("in", table.imports)):
         for port, entry in ports.items():
-            columns = {"entry": f"{LAN}.{port}", "way": direction, "mailbox": entry.source}
-            entries.append(columns | entry.model_dump(include={"rate_hz", "max_age_ms"}))
+            entries.append(
+                {
+                    "entry": f"{LAN}.{port}",
+                    "way": direction,
+                    "mailbox": entry.source,
+                    "rate_hz": entry.rate_hz,
+                    "max_age_ms": getattr(entry, "max_age_ms", None),
+                }
+            )
     keys = ("listen", "connect", "lease_ms", "on_peer_loss")
     return {**{key: getattr(table, key) for key in keys}, "peers": table.racks, "entries": entries}
 
@@ -165,52 +173,27 @@ def format_inventory(data: Document) -> Blocks:
     crate = f"{boards} board{'s' * (boards > 1)} and the clock"
     yield f"rack {data['rack']}: {crate}, {data['clock_ms']:g} ms, {data['mode']}"
     yield from data["notes"]
-    has_phases = any(task["phase_ticks"] for task in data["tasks"])
-    rows = [
-        {
-            "slot": task["slot"],
-            "task": task["task"],
-            "core": task["core"],
-            "FIFO": task["priority"] or None,
-            "rate, Hz": task["rate_hz"],
-            "ticks": task["every_ticks"],
-            **({"phase": task["phase_ticks"]} if has_phases else {}),
-            "slice, ms": task["slice_ms"],
-            "trace at": _format_address(task["trace_address"]),
-        }
-        for task in data["tasks"]
-    ]
     clock = {
-        **dict.fromkeys(rows[0], ""),
+        **dict.fromkeys(data["tasks"][0], ""),
         "slot": CLOCK_SLOT,
         "task": "clock",
         "core": data["clock_core"],
-        "FIFO": data["clock_priority"] or None,
+        "priority": data["clock_priority"],
     }
     yield ""
-    yield TextTable([clock, *rows], ("trace at", "slice, ms"))
-    yield from _format_hosts(data["hosts"])
-    yield from _format_network(data["network"])
+    yield _build_table([clock, *data["tasks"]], ("phase ticks", "trace address", "slice ms"))
+    if data["hosts"]:
+        yield ""
+        yield _build_table(data["hosts"], ("external", "program"))
+    if (network := data["network"]) is not None:
+        peers = ", ".join(network["peers"]) or "no rack in particular"
+        ends = [f"{key} {', '.join(network[key])}" for key in ("listen", "connect") if network[key]]
+        rule = f"lost after {network['lease_ms']:g} ms: {network['on_peer_loss']}"
+        yield ""
+        yield f"network: {'; '.join([*ends, f'works with {peers}', rule])}"
+        yield _build_table(network["entries"])
     yield ""
-    mailboxes = [
-        {
-            "bus address": _format_address(mailbox["address"]),
-            "mailbox": mailbox["mailbox"],
-            "message": mailbox["message"],
-            "bytes": mailbox["size"],
-            "slots": mailbox["depth"],
-            # Show a queue with its depth, as in `[protocol.depth]`.
-            "protocol": f"{mailbox['protocol']} of {mailbox['capacity']}"
-            if mailbox["capacity"]
-            else mailbox["protocol"],
-            "delay, ms": mailbox["delay_ms"],
-            "written by > read by": (
-                f"{mailbox['writer']} > {format_names(mailbox['readers']) or '(nobody)'}"
-            ),
-        }
-        for mailbox in data["mailboxes"]
-    ]
-    yield TextTable(mailboxes, ("slots", "bytes", "message", "protocol"))
+    yield _build_table(data["mailboxes"], ("depth", "size", "message", "capacity", "protocol"))
     yield ""
     windows = ", ".join(
         f"{board} {_format_address(address)}" for board, address in data["windows"].items()
@@ -218,41 +201,24 @@ def format_inventory(data: Document) -> Blocks:
     yield f"segment: {data['segment_bytes']} bytes; board windows: {windows}"
 
 
-def _format_hosts(hosts: Sequence[Document]) -> Blocks:
-    """Yield a table of the host boards, which have no rate and are not in the timing model."""
-    if hosts:
-        rows = [
-            {
-                "host side": host["board"],
-                "program": "rack prompt" if host["external"] else host["program"],
-                "writes": ", ".join(host["writes"]),
-                "reads": ", ".join(host["reads"]),
-            }
-            for host in hosts
-        ]
-        yield ""
-        yield TextTable(rows, ("program",))
+def _build_table(records: Sequence[Document], dropped: Sequence[str] = ()) -> TextTable:
+    """Return a table of records of an inventory.
+
+    Args:
+        records: The records, with the same keys, which become the columns.
+        dropped: Columns that a narrow terminal leaves out, in that order.
+    """
+    return TextTable(
+        [{key.replace("_", " "): _format_cell(key, each[key]) for key in each} for each in records],
+        dropped,
+    )
 
 
-def _format_network(network: Document | None) -> Blocks:
-    """Yield the peers and exchanges of a rack, and its reaction to a lost peer."""
-    if network is None:
-        return
-    peers = ", ".join(network["peers"]) or "no rack in particular"
-    ends = [f"{key} {', '.join(network[key])}" for key in ("listen", "connect") if network[key]]
-    rule = f"lost after {network['lease_ms']:g} ms: {network['on_peer_loss']}"
-    yield from ("", f"network: {'; '.join([*ends, f'works with {peers}', rule])}")
-    rows = [
-        {
-            "exchange": entry["entry"],
-            "way": entry["way"],
-            "mailbox": entry["mailbox"],
-            "rate, Hz": entry["rate_hz"],
-            "max age, ms": entry.get("max_age_ms", ""),
-        }
-        for entry in network["entries"]
-    ]
-    yield TextTable(rows)
+def _format_cell(key: str, value: Any) -> Cell:
+    """Return a value of a record as a cell."""
+    if key.endswith("address") and value:
+        return _format_address(value)
+    return format_names(value) if isinstance(value, list | tuple) else value
 
 
 def format_arm_lines(data: Document) -> Iterator[str]:

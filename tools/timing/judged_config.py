@@ -172,52 +172,31 @@ class Change:
         }
 
     def _list_parts(self) -> Iterator[str]:
-        """Yield a text for each part of the change."""
-        old, new = (rack.config.board[self.board] for rack in (self.before, self.after))
-        changed = self.settings
-        for key in ("priority", "planner_priority"):
-            if key in changed:
-                yield f"{key} {getattr(old, key)} -> {changed[key]}"
-        if "coupling" in changed:
-            yield f"coupling {new.coupling}, planner_slot {new.planner_slot}"
-        for key in ("planner_core", "core"):
-            if (core := changed.get(key)) is not None:
-                before = "" if getattr(old, key) is None else f"{getattr(old, key)} -> "
-                yield f"{key} {before}{core} ({self._describe_sharing(core)})"
+        """Yield a text for each changed setting, and for each effect on the rack."""
+        table = self.before.config.board[self.board]
+        for key, value in self.settings.items():
+            before = getattr(table, key)
+            if value is not None:
+                yield f"{key} {value}" if before is None else f"{key} {before} -> {value}"
         yield from (f"{mailbox} by {protocol}" for mailbox, protocol in self.protocols.items())
-        yield from self._describe_cycles()
-        if changed.get("coupling") == "loose" and not self._level_timings[1].exchange_ns:
-            yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
-
-    def _describe_cycles(self) -> Iterator[str]:
-        """Yield the changes of the cycle, of the system's response, and of the age of plans."""
         old, new = self._level_timings
         if new.cycle_ns != old.cycle_ns:
-            ticks = [rack.timing.boards[self.board].every for rack in (self.before, self.after)]
-            cycles = f"cycle {old.cycle_ns * 1e-6:g} -> {new.cycle_ns * 1e-6:g} ms"
-            responses = [
-                predict_response(rack.timing).command_ms for rack in (self.before, self.after)
+            yield f"cycle {old.cycle_ns * 1e-6:g} -> {new.cycle_ns * 1e-6:g} ms"
+        responses = [predict_response(rack.timing).command_ms for rack in (self.before, self.after)]
+        if responses[0] != responses[1]:
+            yield f"R_s {responses[0]:g} -> {responses[1]:g} ms"
+        if new.slice_ns is not None and new.slice_ns != old.slice_ns:
+            yield f"a plan every {new.slice_ns * 1e-6:g} ms"
+        if self.settings.get("coupling") == "loose" and not new.exchange_ns:
+            yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
+        for core in {
+            self.settings[key] for key in ("planner_core", "core") if key in self.settings
+        }:
+            others = [
+                task
+                for task, task_core in self.after.timing.cores.items()
+                if task_core == core and task.partition(".")[0] != self.board
             ]
-            if responses[0] != responses[1]:
-                cycles += f"; R_s {responses[0]:g} -> {responses[1]:g} ms"
-            yield f"every {ticks[0]} -> {ticks[1]} ({cycles})"
-        if new.slice_ns is None or not {"every", "within_cycles"} & {*self.settings}:
-            return
-        age = f"a plan every {new.slice_ns * 1e-6:g} ms"
-        if new.within_cycles != old.within_cycles:
-            age = f"within_cycles {old.within_cycles} -> {new.within_cycles} ({age})"
-        yield age
-
-    def _describe_sharing(self, core: int) -> str:
-        """Describe which other tasks are on a core, and whether this machine has the core."""
-        own_tasks = (self.board, f"{self.board}.planner")
-        others = [
-            name
-            for name, task_core in self.after.timing.cores.items()
-            if task_core == core and name not in own_tasks
-        ]
-        sharing = f"shared with {', '.join(others)}" if others else "not shared"
-        obtained = find_core(core)
-        if obtained == core:
-            return sharing
-        return f"{sharing}; this machine has no core {core}, uses core {obtained}"
+            yield f"core {core} shared with {', '.join(others) or 'no other'}"
+            if (obtained := find_core(core)) != core:
+                yield f"this machine has no core {core}, uses core {obtained}"

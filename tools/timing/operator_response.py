@@ -63,6 +63,7 @@ class AnsweredCommand:
         fate: Outcome of the command.
         wall_ms: Response by the wall clock, from giving the command to writing the status of that
             cycle, ms. None in lockstep.
+        ticks: Measured response. None without `acts`.
     """
 
     serial: int
@@ -74,6 +75,7 @@ class AnsweredCommand:
     acts: int | None
     fate: Fate
     wall_ms: float | None = None
+    ticks: int | None = None
 
 
 @dataclass(frozen=True)
@@ -95,12 +97,7 @@ class OperatorResponse:
     @property
     def measured_commands(self) -> list[AnsweredCommand]:
         """Commands on which a torque depends."""
-        return [command for command in self.commands if command.acts is not None]
-
-    def compute_response_ticks(self, command: AnsweredCommand) -> int:
-        """Return the response, in ticks, to one of the measured commands."""
-        assert command.acts is not None, "it was acted on"
-        return self.paths[command.level].compute_response(command.given, command.acts)
+        return [command for command in self.commands if command.ticks is not None]
 
     @property
     def commands_beyond_bound(self) -> list[AnsweredCommand]:
@@ -109,14 +106,15 @@ class OperatorResponse:
         The bounds are the longest response on the grid, and the bound of equation 3.2, which counts
         from the release that reads the command.
         """
-        return [command for command in self.measured_commands if self._is_beyond_bound(command)]
-
-    def _is_beyond_bound(self, command: AnsweredCommand) -> bool:
-        """Return True if the response to a measured command exceeded a bound."""
-        path = self.paths[command.level]
-        ticks = self.compute_response_ticks(command)
-        # R_s of eq. 3.2 begins with the release that reads the command.
-        return ticks > path.longest or ticks - (command.sampled - command.given) > path.bound_eq_3_2
+        return [
+            c
+            for c in self.commands
+            if c.ticks is not None
+            and (
+                c.ticks > self.paths[c.level].longest
+                or c.ticks - (c.sampled - c.given) > self.paths[c.level].bound_eq_3_2
+            )
+        ]
 
     @property
     def mispredicted_commands(self) -> list[AnsweredCommand]:
@@ -139,16 +137,17 @@ class OperatorResponse:
     def _build_row(self, level: str, path: CommandPath) -> Document:
         """Return the figures of one level, in ms of simulated time."""
         commands = [c for c in self.measured_commands if c.level == level]
-        ms = np.array([self.compute_response_ticks(c) for c in commands]) * self.tick_ms
+        ms = np.array([c.ticks for c in commands]) * self.tick_ms
         waits_ms = np.array([c.sampled - c.given for c in commands]) * self.tick_ms
-        stats = compute_distribution(ms) or {}
+        none = dict.fromkeys(("min", "p50", "max"))
+        stats = compute_distribution(ms) or none
         return {
             "level": level,
             "commands": len(commands),
-            "min_ms": stats.get("min"),
-            "median_ms": stats.get("p50"),
-            "max_ms": stats.get("max"),
-            "max_from_reading_ms": (compute_distribution(ms - waits_ms) or {}).get("max"),
+            "min_ms": stats["min"],
+            "median_ms": stats["p50"],
+            "max_ms": stats["max"],
+            "max_from_reading_ms": (compute_distribution(ms - waits_ms) or none)["max"],
             "longest_ms": path.longest * self.tick_ms,
             "sum_eq_3_3_ms": path.sum_eq_3_3 * self.tick_ms,
             "bound_eq_3_2_ms": path.bound_eq_3_2 * self.tick_ms,
@@ -166,11 +165,7 @@ class OperatorResponse:
             "beyond": len(self.commands_beyond_bound),
             "off_prediction": len(self.mispredicted_commands),
             "levels": self.build_rows(),
-            "each": [
-                asdict(c)
-                | {"ticks": self.compute_response_ticks(c) if c.acts is not None else None}
-                for c in self.commands
-            ],
+            "each": [*map(asdict, self.commands)],
         }
 
     def format_blocks(self) -> Blocks:
@@ -269,6 +264,7 @@ def _find_answers(
             acts=acts,
             fate=fate,
             wall_ms=None if lockstep else wall_ms,
+            ticks=None if acts is None else path.compute_response(int(tick), acts),
         )
 
 
@@ -314,11 +310,8 @@ def plot_response(response: OperatorResponse, folder: Path) -> list[Path]:
     Returns:
         Paths of the pictures.
     """
-    levels = [
-        level
-        for level in response.paths
-        if any(c.level == level for c in response.measured_commands)
-    ]
+    measured = {command.level for command in response.measured_commands}
+    levels = [level for level in response.paths if level in measured]
     paths = list_picture_paths(folder / "response")
     with open_figure(paths, 8.0, 0.8 + 1.7 * len(levels)) as figure:
         axes = figure.subplots(len(levels), 1, squeeze=False)
@@ -344,27 +337,19 @@ def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
     own = [command for command in response.measured_commands if command.level == level]
     wait = path.delay + path.reads[0].every - 1
     lines = (
-        ((wait + path.sum_eq_3_3) * tick_ms, SUM, "-.", "longest wait to be read + sum, eq. 3.3"),
-        (path.longest * tick_ms, GRID, "--", "longest on the grid"),
-        (
-            (wait + path.bound_eq_3_2) * tick_ms,
-            BOUND,
-            "-",
-            "longest wait to be read + bound, eq. 3.2",
-        ),
+        (wait + path.sum_eq_3_3, SUM, "-.", "longest wait to be read + sum, eq. 3.3"),
+        (path.longest, GRID, "--", "longest on the grid"),
+        (wait + path.bound_eq_3_2, BOUND, "-", "longest wait to be read + bound, eq. 3.2"),
     )
-    values = [
-        response.compute_response_ticks(c) * tick_ms if c.wall_ms is None else c.wall_ms
-        for c in own
-    ]
-    end_ms = max(lines[2][0], *values)
+    values = [(c.ticks or 0) * tick_ms if c.wall_ms is None else c.wall_ms for c in own]
+    end_ms = max(lines[2][0] * tick_ms, *values)
     # A value equal to `path.longest` must fall into the bin to the left of its line, even if it is
     # rounded up.
     width_ms = path.longest * tick_ms / HISTOGRAM_BARS
     edges = np.arange(0.0, end_ms + width_ms, width_ms) * (1.0 + ROUNDING)
     axis.hist(values, bins=edges.tolist(), color=MEASURED, label="measured")
-    for at_ms, colour, style, label in lines:
-        axis.axvline(at_ms, color=colour, linestyle=style, label=label)
+    for at, colour, style, label in lines:
+        axis.axvline(at * tick_ms, color=colour, linestyle=style, label=label)
     axis.set_xlim(0.0, 1.04 * end_ms)
     axis.set_ylabel("commands")
     axis.yaxis.set_major_locator(MaxNLocator(integer=True))

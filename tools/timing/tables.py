@@ -5,7 +5,8 @@ It shows the response of the system, and tables of levels, verdicts and response
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
 from itertools import pairwise
 from math import isinf
 from typing import Any
@@ -15,12 +16,24 @@ from rack.boards.timing.forecast import Forecast
 from rack.boards.timing.level import LevelTiming
 from rack.boards.timing.response_time import TaskResponse
 from rack.boards.timing.verdicts import BEYOND, PLAN_WITHIN, EquationVerdict
-from rack.tools.console.tables import Blocks, Cell, TextTable, format_ms
+from rack.tools.console.tables import Blocks, TextTable, format_ms
 
 TABULATED = {*BEYOND} - {PLAN_WITHIN}
 """Criteria that have separate tables."""
 RESULTS = {True: "ok", False: "FAILS"}
-Row = dict[str, Cell]
+LEVEL_COLUMNS = {
+    "R_i": "cycle_ns",
+    "t_exec": "execution_ns",
+    "t_comm": "communication_ns",
+    "R": "read_ns",
+    "W": "write_ns",
+    "C": "exchange_ns",
+    "t_residual": "residual_ns",
+    "t_plan": "planning_ns",
+    "P": "plan_ns",
+}
+"""Times of a level in a table, and their names."""
+Row = dict[str, Any]
 
 
 def format_forecast(forecast: Forecast) -> Blocks:
@@ -49,18 +62,19 @@ def format_forecast(forecast: Forecast) -> Blocks:
         yield build_verdict_table(("", verdict) for verdict in paper)
     if rack.responses:
         yield from ("", "response times of the tasks that share a core, by priority, ms:", "")
-        yield _build_response_table(rack.responses)
-        yield ""
-        loads = (
-            f"core {core} {load:.3f}{' FAILS' if load > 1 else ''}"
-            for core, load in rack.loads.items()
-        )
-        yield f"load: {', '.join(loads)}"
+        yield _build_table(_list_responses(rack.responses), ("priority", "margin"))
     if forecast.inboxes:
         yield from ("", "interrupts, served by the first task of the board, ms:", "")
-        yield _build_inbox_table(forecast.inboxes)
+        inboxes = (
+            inbox
+            | {
+                "mailboxes": format_names([box.partition(".")[0] for box in inbox["mailboxes"]]),
+                "fits": RESULTS[inbox["fits"]],
+            }
+            for inbox in forecast.inboxes
+        )
+        yield _build_table(inboxes, ("mailboxes",))
     yield from _format_schedule(forecast)
-    yield from forecast.notes
 
 
 def _format_schedule(forecast: Forecast) -> Blocks:
@@ -119,15 +133,7 @@ def build_level_table(levels: Iterable[tuple[str, LevelTiming]], about: str) -> 
         {
             "level": level.board,
             about: word,
-            "R_i": format_ms(level.cycle_ns),
-            "t_exec": format_ms(level.execution_ns),
-            "t_comm": format_ms(level.communication_ns),
-            "R": format_ms(level.read_ns),
-            "W": format_ms(level.write_ns),
-            "C": format_ms(level.exchange_ns),
-            "t_residual": format_ms(level.residual_ns),
-            "t_plan": format_ms(level.planning_ns),
-            "P": format_ms(level.plan_ns),
+            **{head: format_ms(getattr(level, name)) for head, name in LEVEL_COLUMNS.items()},
             "U": format_ms(None if level.plan_ns is None else level.update_ns),
             "d": level.within_cycles,
             "d R_i": format_ms(level.slice_ns),
@@ -170,48 +176,31 @@ def format_side(value: float, unit: str) -> str:
     return format_ms(value) if unit == "ns" else f"{value:.3g}"
 
 
-def _build_response_table(responses: Iterable[TaskResponse]) -> TextTable:
-    """Build a table with the worst-case response of each task that shares a core.
+def _list_responses(responses: Iterable[TaskResponse]) -> Iterator[Row]:
+    """Yield the worst-case responses of tasks, by core, then by descending priority."""
+    for response in sorted(responses, key=lambda task: (task.core, -task.priority)):
+        worst_ns, deadline_ns = response.response_ns, response.deadline_ns
+        margin_ns = None if worst_ns is None else deadline_ns - worst_ns
+        yield asdict(response) | {"margin_ns": margin_ns, "": RESULTS[response.holds]}
 
-    Its rows are sorted by core, then by descending priority.
+
+def _build_table(records: Iterable[Row], dropped: Sequence[str]) -> TextTable:
+    """Build a table of tasks. The keys of the records become its columns, and ns become ms.
+
+    Args:
+        records: A record for each row, with the task under the key "task".
+        dropped: Columns that a narrow terminal leaves out, in that order.
     """
-    rows: Iterable[Row] = (
+    rows = (
         {
-            "core": response.core,
-            "task": response.task,
-            "FIFO": response.priority or None,
-            "computes": format_ms(response.job_ns),
-            "blocked": format_ms(response.blocking_ns),
-            "response": format_ms(response.response_ns),
-            "deadline": format_ms(response.deadline_ns),
-            "margin": format_ms(
-                None
-                if response.response_ns is None
-                else response.deadline_ns - response.response_ns
-            ),
-            "": RESULTS[response.holds],
+            key.removesuffix("_ns").replace("_", " "): (
+                format_ms(value) if key.endswith("_ns") else value
+            )
+            for key, value in record.items()
         }
-        for response in sorted(responses, key=lambda task: (task.core, -task.priority))
+        for record in records
     )
-    return TextTable(merge_rows(rows, "task"), ("FIFO", "margin"))
-
-
-def _build_inbox_table(inboxes: Iterable[Mapping[str, Any]]) -> TextTable:
-    """Build a table of the boards that receive interrupts, with the costs and the worst bursts."""
-    rows: Iterable[Row] = (
-        {
-            "board": inbox["task"],
-            "interrupted by": format_names([name.partition(".")[0] for name in inbox["mailboxes"]]),
-            "in a cycle": format_ms(inbox["cycle_cost_ns"]),
-            "load": f"{inbox['load']:.3f}",
-            "longest": format_ms(inbox["longest_ns"]),
-            "wait": inbox["waiting"],
-            "of": inbox["depth"],
-            "": RESULTS[inbox["fits"]],
-        }
-        for inbox in inboxes
-    )
-    return TextTable(merge_rows(rows, "board"), ("interrupted by",))
+    return TextTable(merge_rows(rows, "task"), dropped)
 
 
 def merge_rows(rows: Iterable[Mapping[str, Any]], name: str) -> list[dict[str, Any]]:

@@ -15,7 +15,6 @@ from rack.tools.console.tables import (
     print_blocks,
     render_markdown,
     render_text,
-    show_blocks,
 )
 
 HEAD = ("task", "count", "what it says of itself")
@@ -87,8 +86,8 @@ def test_markdown_and_pipe_output_have_the_same_content() -> None:
 
 
 def test_titles_on_a_terminal_have_no_hash_sign() -> None:
-    terminal = Console(width=40, record=True, file=io.StringIO())
-    show_blocks(BLOCKS, terminal)
+    terminal = Console(width=40, record=True, file=io.StringIO(), force_terminal=True)
+    print_blocks(BLOCKS, terminal)
     lines = [line.rstrip() for line in terminal.export_text().splitlines()]
     assert lines == ["Levels", *list(render_text(BLOCKS))[1:]]
 

@@ -71,7 +71,7 @@ def test_a_continued_run_is_recorded_with_its_origin(run: Path, tmp_path: Path) 
         "time_s": 1.2,
         "launched_ns": one.launch.created_ns,
     }
-    assert f"\n- continues {run} from 1.2 s\n" in rack("report", two).stdout
+    assert f"continues {run} from 1.2 s" in " ".join(rack("report", two).stdout.split())
     assert content(run) == before
     assert json.loads(rack("report", run, "--json").stdout)["continues"] is None
 

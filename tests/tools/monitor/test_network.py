@@ -53,7 +53,7 @@ def segment(rack_name: str) -> Iterator[Segment]:
     config = load_text(TEXT.replace('name = "one"', f'name = "{rack_name}"'))
     made = Segment.create(resolve_layout(config), config.to_toml_text())
     status, peer = open_writer(made, "lan.status"), open_writer(made, "lan.peer_other_one")
-    status.message.import_other[...] = (*COUNTS.values(), 99, 40, 80, 16, 0.04)
+    status.message.import_other[...] = (*COUNTS.values(), 99, 40, 80, 16, 0.04, 0.5)
     status.message.export_pulse[...] = (12, 24)
     status.write(8)
     found = peer.message
@@ -117,5 +117,4 @@ def test_a_report_has_counts_ages_and_losses(segment: Segment) -> None:
     ]
     lines = list(_format_network(found))
     assert "- rack other-one: lost; lost 1 times, 0.04 s; restarted 1 times" in lines
-    assert list(_format_network(None)) == []
     assert summarize_network(SimpleNamespace(config='name = "alone"', mailboxes=())) is None  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ def test_status_check_and_report_show_fill_and_refusals_of_a_queue(
         )
         if "upper.requests " in line
     )
-    assert "queue of 7" in line
+    assert " queue 7 upper lower " in " ".join(line.split())
     with Rack(config) as rack:
         (empty,) = list_queue_fills(NewestMessages(rack.segment))
         assert empty.line == "queue upper.requests: 0 of 7 unread"

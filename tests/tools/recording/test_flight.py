@@ -114,7 +114,7 @@ def test_removed_stretches_count_neither_as_lost_nor_as_gaps(
     assert recording.kept_text.startswith("kept ")
     assert recording.kept_text.endswith("; the rest was not kept, as [record] keep says")
     assert report["kept"] == recording.kept_text
-    assert f"- {recording.kept_text}\n" in text
+    assert f"- recording: {recording.kept_text}\n" in text
     assert (report["rows_lost"], report["gaps"], report["untraced"]) == ({}, [], {})
     # Ages must not span the removed stretch.
     assert report["tasks"]["lower"]["plan_age_ms"]["max"] < 100

@@ -17,14 +17,14 @@ from rack.boards.config import load
 from rack.levels.systems.force.messages import ForceStatus, Wrench
 from rack.levels.systems.hand.messages import HandStatus
 from rack.levels.systems.joint_boards.messages import DRIVING
-from rack.tools.console.tables import show_blocks
+from rack.tools.console.tables import print_blocks
 from rack.tools.launch.launch import run_rack
 from rack.tools.launch.verdict import ACROSS_RACKS, build_verdict
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
 from rack.tools.report import arm_outcome
 from rack.tools.report.report import build_report, write_report
-from rack.tools.report.report_markdown import format_for_terminal, format_markdown
+from rack.tools.report.report_markdown import format_markdown, format_report
 from rack.tools.report.task_times import compute_task_times
 from rack.tools.timing.measured_response import measure_system_response
 from tests.boards.commanded_racks import COMMANDED, commands
@@ -191,10 +191,10 @@ def test_the_section_of_misses_explains_why_it_lists_fewer_than_the_headline(fol
     assert whys == ["own execution, 2.9 ms", "not recorded"]
     assert "The tasks counted" not in format_markdown(report)
     fewer = format_markdown({**report, "missed": 2, "skipped": 7})
-    assert "The tasks counted 2 and 7; the recording does not contain all of them." in fewer
-    lossy = format_markdown({**report, "missed": 2, "skipped": 7, "rows_lost": {"lower": 4}})
-    assert "The tasks counted 2 and 7; the recorder lost rows." in lossy
-    assert "- the recorder lost rows: lower 4" in lossy.splitlines()
+    explanation = "2 and 7 lost cycles; the recording does not contain all of them."
+    assert f"The tasks counted {explanation}" in fewer
+    lossy = format_markdown({**report, "rows_lost": {"lower": 4}})
+    assert "- recording: 4 rows of lower lost" in lossy.splitlines()
 
 
 @pytest.mark.slow
@@ -206,8 +206,8 @@ def test_a_report_fits_the_width_of_the_terminal(folder: Path, width: int) -> No
         **dict.fromkeys(("lateness_ms", "residual_ms"), dict.fromkeys(PARTS, 1234.567)),
     }
     report["tasks"] = dict.fromkeys(("elemental_move.planner", "lower"), task)
-    terminal = Console(width=width, record=True, file=io.StringIO())
-    show_blocks(format_for_terminal(report), terminal)
+    terminal = Console(width=width, record=True, file=io.StringIO(), force_terminal=True)
+    print_blocks(format_report(report), terminal)
     lines = terminal.export_text().splitlines()
     assert max(map(len, lines)) <= width
     rows = [line.split() for line in lines if line.startswith("elemental_move.planner")]

@@ -91,5 +91,7 @@ def test_a_response_at_another_tick_or_beyond_a_bound_is_detected(
     assert not replace(response, commands=(late,)).is_within_bounds
     assert replace(response, commands=(late,)).mispredicted_commands == [late]
     assert replace(response, commands=(late,)).commands_beyond_bound == []
-    lost = replace(response.commands[0], acts=101 + 40)
+    ticks = response.commands[0].ticks
+    assert ticks is not None
+    lost = replace(response.commands[0], acts=101 + 40, ticks=ticks + 40)
     assert replace(response, commands=(lost,), lockstep=False).commands_beyond_bound == [lost]
