@@ -6,17 +6,21 @@ the ruling, and the reason for the ruling if the claim holds.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from types import MappingProxyType
+from typing import Any
 
 from rack.tools.lab.reproduction import predictions, rules
 from rack.tools.lab.reproduction.experiments import (
     partition,
     response,
     sharing,
+    speedup,
     switch,
     tasks,
 )
+from rack.tools.lab.reproduction.experiments.experiment import Experiment
 from rack.tools.lab.reproduction.experiments.figures import (
     BUFFERED,
     FIG2,
@@ -40,7 +44,7 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
     NasremRun,
 )
 from rack.tools.lab.reproduction.page import PaperClaim, Section
-from rack.tools.lab.reproduction.verdict import ClaimVerdict
+from rack.tools.lab.reproduction.verdict import MAX_STRAY_SHARE, ClaimVerdict
 
 
 def _build_equation_claim(
@@ -76,19 +80,26 @@ def _build_system_claim(
     name: str,
     title: str,
     quote: str,
+    why: str,
     rates_hz: dict[str, int],
-    judge: Callable[..., ClaimVerdict] = rules.judge_links,
+    at_least: Mapping[str, float] = MappingProxyType({}),
+    at_most: Mapping[str, float] = MappingProxyType({}),
+    judge: Callable[..., ClaimVerdict] = rules.judge_system,
     rack: str = "",
 ) -> PaperClaim:
     """Build a claim about one of the paper's systems.
 
-    The default rule counts the messages between the parts of the system.
+    The default rule counts the messages between the parts of the system, and compares the
+    measurements of the mechanism that the sentence names.
 
     Args:
         name: Anchor of the claim.
         title: Heading.
         quote: Sentence of the paper.
+        why: Reason for the ruling.
         rates_hz: Rate of each mailbox between the parts, Hz.
+        at_least: Smallest permitted values of these measurements.
+        at_most: Largest permitted values.
         judge: Rule of the claim.
         rack: Rack that models the system. Empty if it has the name of the claim.
     """
@@ -96,14 +107,16 @@ def _build_system_claim(
         name,
         title,
         quote,
-        "Both sides worked together until the task was done.",
+        why,
         (tasks.TASKS[rack or name],),
-        partial(judge, rates_hz),
+        partial(judge, rates_hz, at_least, at_most),
     )
 
 
 SYSTEMS = (NAME, tasks.STATE_TABLES, *tasks.TASKS)
 """Racks that model the paper's systems."""
+TASKS_OF_SYSTEMS: tuple[Experiment[Any], ...] = (NASREM, tasks.TABLES, *tasks.TASKS.values())
+"""Experiments with their whole tasks."""
 SHORT_RESPONSE = ("timing.response_ms=1000",)
 """Setting that demands a response within 1 s, too short for NASREM's four levels."""
 SECTIONS = (
@@ -130,8 +143,8 @@ SECTIONS = (
                 "Speedup by processors",
                 "A robot controller will be characterized as a speedup-oriented multiprocessing"
                 " application.",
-                "A level makes more plans on two processors than on one.",
-                (FIG3.experiment, FIG4.experiment),
+                "Levels make more plans with each processor, and more than a sequential program.",
+                (speedup.SPEEDUP,),
                 rules.judge_speedup,
             ),
             PaperClaim(
@@ -139,9 +152,18 @@ SECTIONS = (
                 "Modular growth",
                 "Multiprocessor systems are beneficial for many reasons, including ... modular"
                 " growth.",
-                "After five boards were added to five, all cycles were in time.",
-                (sharing.CHAINS,),
+                "With a level more, all levels closed their loops and kept their cycles.",
+                (tasks.SMALL_TABLES, tasks.TABLES),
                 rules.judge_growth,
+            ),
+            PaperClaim(
+                "flexibility",
+                "Flexibility by partitioning",
+                "... and flexibility for testing alternative control strategies via different"
+                " partitioning.",
+                "The same task was done along the same path in every partition.",
+                (partition.TASKS,),
+                rules.judge_flexibility,
             ),
             PaperClaim(
                 "replication",
@@ -464,6 +486,7 @@ SECTIONS = (
                 "host-services",
                 "Services of hosts, over the adapter",
                 "The hosts provide non-real-time services.",
+                "Both sides worked together until the task was done.",
                 {"workstation.plan": 1, "adapter.hand": 50, "adapter.world": 50},
                 rack="condor",
             ),
@@ -489,60 +512,103 @@ SECTIONS = (
                 "These architectures share common characteristics with the concurrent,"
                 " hierarchical control model.",
                 "All systems do their tasks on one set of mechanisms, within their bounds.",
-                (NASREM, tasks.TABLES, *tasks.TASKS.values()),
+                TASKS_OF_SYSTEMS,
                 partial(rules.judge_systems, SYSTEMS),
             ),
             PaperClaim(
                 "two-levels",
                 "At least two levels",
                 "Most systems have at least a two-level hierarchy.",
-                "From the configs alone: no level is faster than one below it.",
-                (),
-                partial(rules.judge_layers, [name for name in SYSTEMS if name != tasks.BROWN]),
+                "Each system ran closed loops of two levels or more, none faster than one below"
+                " it.",
+                TASKS_OF_SYSTEMS,
+                partial(rules.judge_layers, SYSTEMS),
             ),
             _build_system_claim(
                 "rccl",
-                "RCCL: a processor a joint",
-                "The joint control level operates at 1 kHz and assigns 1 processor per joint.",
+                "RCCL: a queue of requests, and a processor a joint",
+                "The joint control level operates at 1 kHz and assigns 1 processor per joint. ..."
+                " a rough motion planner asynchronously produces a queue of motion requests.",
+                "Requests waited in the queue, motions were blended, and a live goal was followed.",
                 {
                     "planning.plan": 1,
                     "trajectory.command": 50,
                     **{f"joint{number}.command": 1000 for number in range(1, 7)},
                 },
-                rules.judge_rccl,
+                {
+                    "requests_queued": 2,
+                    "blends": 1,
+                    "slowest_in_blend_share": 0.02,
+                    "live_goal_followed_m": 0.05,
+                },
+                {"live_goal_astray_m": 0.005},
+                judge=rules.judge_rccl,
             ),
             _build_system_claim(
                 "hic",
                 "HIC: layers of servo loops",
-                "This model emphasis layers of servo loops with deterministic scheduling.",
+                "This model emphasis layers of servo loops with deterministic scheduling ... and"
+                " uses periodic data buffers for communication.",
+                "Every loop kept its frame and locked nothing; each got data of one age.",
                 {"tendon.command": 500, "joint.command": 500, "fingertip.command": 125},
+                {"frames": 1, "messages_taken_over": 1},
+                {
+                    "locked_mailboxes": 0,
+                    "cycles_outside_frame_share": MAX_STRAY_SHARE,
+                    "ages_off_share": MAX_STRAY_SHARE,
+                },
             ),
             _build_system_claim(
                 "condor",
                 "CONDOR: boards, an adapter and a workstation",
                 "... Motorola 68020 based boards connected by VME bus to VME bus adapter to a"
                 " SUN-3 workstation controlling the Utah/MIT hand.",
+                "The fingers of several boards gripped as the workstation had planned.",
                 {"workstation.plan": 1, "adapter.plan": 1},
+                {
+                    "entries_in": 1,
+                    "entries_out": 1,
+                    "boards_driving_hand": 2,
+                    "fingers_on_planned_grasp": 2,
+                },
             ),
             _build_system_claim(
                 "ibm",
                 "IBM: a real-time bridge",
-                "IBM extends the exchange of commands and status to include varying frequencies.",
-                {"bridge.requests": 1, "bridge.sensors": 50, "bridge.motion": 200},
+                "IBM extends the exchange of commands and status to include varying frequencies;"
+                " such as every cycle, every nth invocation or asynchronously.",
+                "The bridge passed messages in each of the three ways, and all requests ended.",
+                {"bridge.requests": 1},
+                {
+                    "entries_every_cycle": 1,
+                    "entries_every_nth_cycle": 1,
+                    "entries_asynchronous": 1,
+                },
+                {"requests_not_ended": 0},
             ),
             _build_system_claim(
                 "chimera",
                 "CHIMERA: motion control and commands",
                 "... low-level real-time motion control connected to a non-real-time AML/X"
                 " command environment.",
-                {"command.requests": 1, "bridge.requests": 1},
+                "Commands came at any time and were carried out; set points came in every cycle.",
+                {"command.requests": 1},
+                {"requests": 2, "entries_out_periodic": 1},
+                {
+                    "entries_in_periodic": 0,
+                    "requests_not_ended": 0,
+                    "cycles_without_set_point_share": MAX_STRAY_SHARE,
+                },
             ),
             _build_system_claim(
                 "penn",
                 "Pennsylvania: a server of forces and motions",
                 "... a robot coordinator issue force and motion commands to a real-time robot"
                 " force and motion server.",
-                {"coordinator.requests": 1, "bridge.requests": 1},
+                "The tool slid along a surface with the commanded force.",
+                {"coordinator.requests": 1},
+                {"motion_requests": 1, "force_requests": 1, "slid_under_force_s": 1.0},
+                {"force_error_share": 0.1},
             ),
             # The servo rack starts later. It and the network pass on four of five messages.
             _build_system_claim(
@@ -550,6 +616,7 @@ SECTIONS = (
                 "Brown: servo systems on a network",
                 "... high-speed networks connecting a real-time servo systems and general"
                 " computing resources.",
+                "The servo rack followed the references and modifications of the other machine.",
                 {
                     "planning.plan": 1,
                     "trajectory.command": 50,
@@ -557,6 +624,7 @@ SECTIONS = (
                     "lan.joints": 40,
                     "supervisor.command": 400,
                 },
+                at_most={"modifications_unanswered": 0, "references_lacking_share": 0.2},
             ),
         ),
     ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from math import ceil, inf
 
 from rack.boards.config import build_rack_timing, load, resolve_layout
@@ -27,6 +28,7 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
 from rack.tools.lab.reproduction.experiments.partition import Partition, PartitionFigures
 from rack.tools.lab.reproduction.experiments.response import ResponseRun
 from rack.tools.lab.reproduction.experiments.sharing import LEVELS, Chains, Waits
+from rack.tools.lab.reproduction.experiments.speedup import SpeedupRun
 from rack.tools.lab.reproduction.experiments.switch import PAPER_US, SwitchRun
 from rack.tools.lab.reproduction.experiments.tasks import (
     EXTRA_DELAY_MS,
@@ -69,6 +71,8 @@ MAX_RATE_ERROR = 0.01
 MAX_FEW_SHARE = 0.01
 """Largest share of missed cycles or plans that counts as stray."""
 ROUNDING_MS = 1e-6
+MAX_OFF_PATH_RAD = 0.01
+"""Largest distance of paths that count as the same, rad. A missed cycle shifts a path a little."""
 
 
 def check_done(*runs: TaskRun) -> list[Check]:
@@ -100,20 +104,53 @@ def judge_determinism(runs: Sequence[ComparedRun]) -> ClaimVerdict:
     )
 
 
-def judge_speedup(on_one: FigureRun, on_two: FigureRun) -> ClaimVerdict:
-    """Check that a level makes more plans on two processors than on one."""
-    plans_on_one, plans_on_two = (run.tasks[PLANNER].jobs for run in (on_one, on_two))
-    needs = [compare_value("plans_on_one_processor", plans_on_one, ">=", 1)]
+def judge_speedup(run: SpeedupRun) -> ClaimVerdict:
+    """Check that concurrent levels make more plans than a sequential program, on each processor.
+
+    One processor may make fewer, because it also switches between the levels.
+    """
+    plans = list(run.by_cores.values())
+    steps = (
+        compare_value(f"plans_per_s_on_{number}_processors", now, ">", before)
+        for number, (before, now) in enumerate(pairwise(plans), 2)
+    )
     return rule_on(
-        compare_value("plans_on_two_processors", plans_on_two, ">", plans_on_one), needs=needs
+        *steps,
+        compare_value("plans_per_s", max(plans), ">", run.sequential),
+        needs=[
+            compare_value("sequential_plans_per_s", run.sequential, ">", 0),
+            compare_value("processors", len(plans), ">=", 2),
+        ],
     )
 
 
-def judge_growth(chains: Chains) -> ClaimVerdict:
-    """Check that a chain of boards misses no cycles after more boards were added."""
-    grown = chains.grown
-    on_time = compare_value("messages_on_time", grown.took.get(grown.boards, 0), ">=", 1)
-    return rule_on_rare_event("cycles_missed", grown.missed, grown.due, on_time)
+def judge_growth(small: TaskRun, grown: TableRuns) -> ClaimVerdict:
+    """Check that a rack with an additional level runs more closed loops and misses few cycles.
+
+    A level without work commands nothing, so it closes no loop.
+    """
+    run = grown.disturbed
+    return rule_on(
+        *check_done(run),
+        compare_value("levels", len(run.levels), ">", len(small.levels)),
+        ideal=check_none(missed_share=run.missed),
+        here=[compare_value("missed_share", run.missed, "<=", MAX_STRAY_SHARE)],
+        needs=[compare_value("levels_before", len(small.levels), ">=", 1)],
+    )
+
+
+def judge_flexibility(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
+    """Check that a task is done along the same path in every partition."""
+    return rule_on(
+        *check_none(tasks_not_done=sum(run.ended != TASK_DONE for run in partitions)),
+        compare_value(
+            "off_path_rad", max(run.off_path_rad for run in partitions), "<=", MAX_OFF_PATH_RAD
+        ),
+        needs=[
+            compare_value("partitions", len({run.partition for run in partitions}), ">=", 2),
+            compare_value("moved_rad", min(run.moved_rad for run in partitions), ">", 1.0),
+        ],
+    )
 
 
 def judge_locks(chains: Chains) -> ClaimVerdict:
@@ -487,26 +524,41 @@ def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimV
     )
 
 
-def judge_layers(names: Iterable[str]) -> ClaimVerdict:
-    """Check that each system has at least two levels, none of them faster than a level below it."""
-    configs = {name: load(name) for name in names}
-    paths = {
-        name: build_rack_timing(one, resolve_layout(one)).hierarchy for name, one in configs.items()
+def judge_layers(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimVerdict:
+    """Check that each system ran at least two levels, none of them faster than a level below it.
+
+    Args:
+        names: Names of the systems.
+        records: Record of each system's whole task.
+    """
+    levels = {
+        name: (run.disturbed if isinstance(run, TableRuns) else run).levels
+        for name, run in zip(names, records, strict=True)
     }
-    faster = sum(sorted(path.cycles, reverse=True) != [*path.cycles] for path in paths.values())
-    levels = (
-        compare_value(f"{name}_levels", len(path.levels), ">=", 2) for name, path in paths.items()
+    faster = sum(
+        upper > (1.0 + MAX_STRAY_SHARE) * lower
+        for cycles in levels.values()
+        for upper, lower in pairwise(cycles)
     )
-    return rule_on(*levels, *check_none(systems_with_a_faster_level_above=faster))
+    counts = (
+        compare_value(f"{name}_levels", len(cycles), ">=", 2) for name, cycles in levels.items()
+    )
+    return rule_on(*counts, *check_none(levels_faster_than_one_below=faster))
 
 
-def judge_links(
-    rates_hz: Mapping[str, int], run: TaskRun, ideal: Sequence[Check] = ()
+def judge_system(
+    rates_hz: Mapping[str, int],
+    at_least: Mapping[str, float],
+    at_most: Mapping[str, float],
+    run: TaskRun,
+    ideal: Sequence[Check] = (),
 ) -> ClaimVerdict:
-    """Check that the parts of a system exchange as many messages as the rates imply.
+    """Check the mechanism of a system, and that its parts exchange as many messages as they should.
 
     Args:
         rates_hz: Rate of each mailbox, Hz. 1 requires at least one message.
+        at_least: Smallest permitted values of measurements of the mechanism.
+        at_most: Largest permitted values.
         run: Whole task of the system.
         ideal: Further comparisons. If one fails, the claim holds only within bounds.
     """
@@ -521,12 +573,22 @@ def judge_links(
             compare_value(f"{box}_messages", run.messages.get(box, 0), ">=", count)
             for box, count in min_counts.items()
         ),
+        *(
+            compare_value(name, run.mechanism[name], sign, demanded)
+            for sign, values in ((">=", at_least), ("<=", at_most))
+            for name, demanded in values.items()
+        ),
         ideal=ideal,
     )
 
 
-def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
-    """Apply `judge_links` to RCCL, and also check that every joint has a separate processor.
+def judge_rccl(
+    rates_hz: Mapping[str, int],
+    at_least: Mapping[str, float],
+    at_most: Mapping[str, float],
+    run: TaskRun,
+) -> ClaimVerdict:
+    """Apply `judge_system` to RCCL, and also check that every joint has a separate processor.
 
     If joints share processors, the claim holds only within bounds.
     """
@@ -534,7 +596,7 @@ def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
         task.core for task in resolve_layout(load("rccl")).tasks if task.board.startswith("joint")
     ]
     cores = compare_value("processors_of_joints", len(set(joints)), ">=", len(joints))
-    return judge_links(rates_hz, run, [cores])
+    return judge_system(rates_hz, at_least, at_most, run, [cores])
 
 
 def judge_predictable(run: ResponseRun) -> ClaimVerdict:
