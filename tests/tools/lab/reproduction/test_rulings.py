@@ -8,6 +8,7 @@ its comparisons count.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -16,6 +17,7 @@ from typing import Any
 
 import pytest
 
+from rack.boards.config import CONFIGS
 from rack.tools.lab.reproduction.experiments import (
     figures,
     partition,
@@ -91,6 +93,36 @@ for = "50ms"
 """Short scripts that replace the scripts of whole tasks."""
 
 
+WITHOUT_FORCE = """name = "without-force"
+extends = ["penn/three-poses"]
+"""
+WITHOUT_SCHEDULE = (
+    re.sub(
+        r"(?s)\n\[schedule\].*?\n\[protocol\].*?\n\n",
+        '\n[protocol]\ndefault = "lock"\n\n',
+        (CONFIGS / "hic/hic.toml").read_text().partition("format = 2\n")[2],
+    )
+    .replace('"../', f'"{CONFIGS}/')
+    .replace('"realtime"', '"lockstep"')
+)
+ONE_AHEAD = """
+[board.planning.params]
+ahead = 1
+"""
+ONLY_HOME = """
+[[task.step]]
+do = "home"
+"""
+EVERY_CYCLE = """
+[board.bridge.params.pass]
+sensors = { from = "arm.status", every = 1 }
+"""
+PERIODIC_REQUESTS = """
+[board.bridge.params.pass]
+requests = { from = "command.requests", asynchronous = false }
+"""
+
+
 Judge = Callable[[BreakingWorkshop, PaperClaim], ClaimVerdict]
 FOUND: dict[tuple[str, str], Any] = {}
 """Records by the names of experiment and rack, because claims share some of them."""
@@ -123,6 +155,12 @@ def by_one_system(name: str) -> Judge:
         workshop,
         replace(claim, experiments=(tasks.TASKS[name],), judge=partial(judge_systems, [name])),
     )
+
+
+def by_one_board(workshop: BreakingWorkshop, claim: PaperClaim) -> ClaimVerdict:
+    """Return the ruling on a rack of one board."""
+    run = workshop.run("fig2", workshop.load_config("fig2"), 0.3)
+    return judge_layers(["fig2"], tasks.summarize_task(*run))
 
 
 @dataclass(frozen=True)
@@ -161,13 +199,6 @@ ROWS = (
         ONE_LOSS,
     ),
     Breaking("nasrem", "servo_off_400_Hz_share", LATE_SERVO, alone=True),
-    Breaking(
-        "speedup",
-        "plans_on_two_processors",
-        {"fig4": "[board.level.params]\nplan_ms = 60.0\n"},
-        alone=True,
-    ),
-    Breaking("growth", "cycles_missed_share", {CHAIN: LATE_BOARD}, alone=True),
     Breaking("waiting", "polling_late_median_us", judge=with_polling_later, alone=True),
     Breaking(
         "update",
@@ -193,24 +224,24 @@ ROWS = (
         )
     ),
     *(
-        Breaking(
-            claim, f"{host}.{box}_messages", {name: f"[host.{host}]\nexternal = true\n" + LOCKSTEP}
-        )
-        for claim, name, host, box in (
-            ("chimera", "chimera", "command", "requests"),
-            ("condor", "condor", "workstation", "plan"),
-            ("host-services", "condor", "workstation", "plan"),
-            ("penn", "penn", "coordinator", "requests"),
+        Breaking(claim, unmet, {name: f"[host.{host}]\nexternal = true\n" + LOCKSTEP})
+        for claim, name, host, unmet in (
+            ("chimera", "chimera", "command", "requests 0, not >= 2"),
+            ("condor", "condor", "workstation", "fingers_on_planned_grasp 0, not >= 2"),
+            ("host-services", "condor", "workstation", "workstation.plan_messages"),
+            ("penn", "penn", "coordinator", "motion_requests 0, not >= 1"),
         )
     ),
-    Breaking(
-        "ibm",
-        "bridge.sensors_messages",
-        {
-            "ibm": '[board.bridge.params.pass]\nsensors = { from = "arm.status", every = 8 }\n'
-            + LOCKSTEP
-        },
-    ),
+    Breaking("penn", "force_requests 0, not >= 1", {"penn": WITHOUT_FORCE + LOCKSTEP}),
+    Breaking("hic", "frames 0, not >= 1", {"hic": WITHOUT_SCHEDULE}, 0.5),
+    Breaking("hic", "locked_mailboxes", {"hic": WITHOUT_SCHEDULE}, 0.5),
+    Breaking("hic", "ages_off_share", {"hic": DELAYED.format(board="joint", by=1) + LOCKSTEP}, 1.0),
+    Breaking("rccl", "requests_queued", {"rccl": ONLY_HOME + LOCKSTEP}),
+    Breaking("rccl", "live_goal_followed_m", {"rccl": ONLY_HOME + LOCKSTEP}),
+    Breaking("rccl", "slowest_in_blend_share", {"rccl": ONE_AHEAD + LOCKSTEP}),
+    Breaking("ibm", "entries_every_nth_cycle", {"ibm": EVERY_CYCLE + LOCKSTEP}),
+    Breaking("chimera", "entries_in_periodic", {"chimera": PERIODIC_REQUESTS + LOCKSTEP}),
+    Breaking("brown", "modifications_unanswered", {"brown": "command = []\n" + LOCKSTEP}),
     Breaking(
         "predictable-response",
         "lockstep_off_predicted_tick",
@@ -218,11 +249,7 @@ ROWS = (
         24.0,
         alone=True,
     ),
-    Breaking(
-        "two-levels",
-        "fig2_levels",
-        judge=lambda workshop, claim: judge_layers(["fig2"]),
-    ),
+    Breaking("two-levels", "fig2_levels 0, not >= 2", judge=by_one_board, alone=True),
 )
 
 
