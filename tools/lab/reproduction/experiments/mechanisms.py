@@ -11,8 +11,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from rack.backplane.layout import MailboxSpec
 from rack.boards.config import build_rack_timing
-from rack.boards.timing.trace_times import count_misses_and_skips, find_newest_visible
+from rack.boards.timing.trace_times import count_skipped_releases, find_newest_visible
 from rack.levels.systems.trajectory.messages import MotionKind
 from rack.tools.monitor.host_side import list_entries
 from rack.tools.recording.recording import Recording
@@ -24,6 +25,10 @@ FORCE_PERCENTILE = 90.0
 """Percentile of force errors. The rest of the path leads over an edge and to a wall."""
 MAX_IRREGULAR_SHARE = 0.02
 """Largest share of a periodic entry's steps that come at another distance than usual."""
+
+
+WAYS = ("entries_in", "entries_out")
+MODES = ("entries_asynchronous", "entries_every_cycle", "entries_every_nth_cycle")
 
 
 def measure_levels(recording: Recording) -> tuple[int, ...]:
@@ -56,64 +61,54 @@ def _measure_schedule(recording: Recording) -> dict[str, float]:
     layout = recording.layout
     rack = build_rack_timing(recording.rack_config, layout)
     minor = rack.schedule.minor if rack.schedule else 1
-    rows = {task.name: recording.read_trace(task.name) for task in layout.tasks}
-    outside = 0
-    for cycles in rows.values():
-        left_ns = (minor - cycles["tick"] % minor) * layout.clock_ns
-        # In lockstep a cycle may take any real time.
-        is_late = (cycles["end_ns"] > cycles["release_ns"] + left_ns) & (not rack.is_lockstep)
-        outside += int(is_late.sum()) + count_misses_and_skips(cycles)[1]
+    cycles = np.concatenate([recording.read_trace(task.name) for task in layout.tasks])
+    left_ns = (minor - cycles["tick"] % minor) * layout.clock_ns
+    # In lockstep a cycle may take any real time.
+    is_late = (cycles["end_ns"] > cycles["release_ns"] + left_ns) & (not rack.is_lockstep)
     levels = {board for chain in rack.chains for board in chain}
     ages = [
-        Counter(_compute_ages(recording, box.name, reader).tolist())
+        Counter(_list_ages(recording, box, reader))
         for box in layout.timed
-        for reader in box.readers
-        if {box.writer, reader} <= levels and box.writer != reader
+        for reader in levels.intersection(box.readers) - {box.writer}
+        if box.writer in levels
     ]
-    taken = sum(each.total() for each in ages)
-    usual = sum(max(each.values(), default=0) for each in ages)
     return {
-        "frames": recording.end_counts["outcome"]["ticks"] // minor * bool(rack.schedule),
-        "cycles_outside_frame_share": outside / max(sum(map(len, rows.values())), 1),
+        "frames": cycles["tick"].max(initial=0) // minor * bool(rack.schedule),
+        "cycles_outside_frame_share": (is_late | (count_skipped_releases(cycles) > 0)).mean(),
         "locked_mailboxes": sum(box.protocol == "lock" for box in layout.mailboxes),
-        "messages_taken_over": taken,
-        "ages_off_share": 1.0 - usual / max(taken, 1),
+        "ages_off_share": sum(each.total() - max(each.values(), default=0) for each in ages)
+        / max(sum(each.total() for each in ages), 1),
     }
 
 
-def _compute_ages(recording: Recording, mailbox: str, reader: str) -> np.ndarray:
+def _list_ages(recording: Recording, box: MailboxSpec, reader: str) -> list[int]:
     """Return the age in ticks of each message of a mailbox when a task first reads it."""
-    layout = recording.layout
-    every, phase = layout.find_read_grid(layout.find_mailbox(mailbox), reader)
+    every, phase = recording.layout.find_read_grid(box, reader)
     ticks = recording.read_trace(reader)["tick"]
-    ticks = ticks[(ticks - phase) % every == 0]
-    newest = find_newest_visible(ticks, recording.read_signal(mailbox, "visible_at"))
-    is_first = (newest >= 0) & (np.diff(newest, prepend=-1) > 0)
-    return np.asarray(ticks[is_first] - recording.read_signal(mailbox, "tick")[newest[is_first]])
+    ticks = ticks[ticks % every == phase]
+    newest = find_newest_visible(ticks, recording.read_signal(box.name, "visible_at"))
+    is_first = np.diff(newest, prepend=-1) > 0
+    made = recording.read_signal(box.name, "tick")[newest[is_first]]
+    return list((ticks[is_first] - made).tolist())
 
 
 def _measure_queue(recording: Recording) -> dict[str, float]:
     """Measure RCCL's queue, the speed between its motions, and the distance from a live goal."""
     numbers, kinds = (recording.read_signal("planning.plan", name) for name in ("id", "kind"))
-    moving = numbers[np.isin(kinds, MOTION_KINDS)]
     current, done, taken, velocity, tool, astray = (
-        recording.read_signal("trajectory.status", name)
+        recording.read_signal("trajectory.status", name).astype(float)
         for name in ("current", "done", "taken", "velocity", "tool", "astray")
     )
-    speed = np.linalg.norm(velocity, axis=1)
-    blends = []
-    for pair in pairwise(np.unique(current[current > 0]).tolist()):
-        if np.isin(pair, moving).all():
-            # From the fastest point of one motion to that of the next.
-            first, last = (np.where(current == each, speed, -1.0).argmax() for each in pair)
-            blends.append(speed[first : last + 1].min() / max(min(speed[[first, last]]), 1e-9))
-    steps_m = np.linalg.norm(np.diff(tool, axis=0, prepend=tool[:1]), axis=1)
+    is_moving = np.isin(current, numbers[np.isin(kinds, MOTION_KINDS)])
+    is_blend = is_moving[1:] & is_moving[:-1] & (np.diff(current) > 0)
+    speeds = np.linalg.norm(velocity[1:][is_blend], axis=1)
     is_tracking = astray > 0
+    steps_m = np.linalg.norm(np.diff(tool[is_tracking], axis=0), axis=1)
     return {
-        "requests_queued": (taken - np.maximum(current, done).astype(int)).max(initial=0),
-        "blends": len(blends),
-        "slowest_in_blend_share": min(blends, default=0.0),
-        "live_goal_followed_m": steps_m[is_tracking].sum(),
+        "requests_queued": (taken - np.maximum(current, done)).max(initial=0),
+        "blends": len(speeds),
+        "slowest_blend_rad_s": min(speeds, default=0.0),
+        "live_goal_followed_m": steps_m.sum(),
         "live_goal_astray_m": np.median(astray[is_tracking]) if is_tracking.any() else 0.0,
     }
 
@@ -140,25 +135,16 @@ def _measure_force(recording: Recording) -> dict[str, float]:
 
 def _measure_adapter(recording: Recording) -> dict[str, float]:
     """Count the entries of a bus adapter or bridge, by the cycles in which they pass messages."""
-    hosts = {host.name for host in recording.layout.hosts}
-    kinds: Counter[str] = Counter()
+    counts: dict[str, float] = dict.fromkeys((*WAYS, *MODES), 0)
     for status, name, source in list_entries(recording.layout, recording.config):
-        steps = np.flatnonzero(np.diff(recording.read_signal(status, f"{name}.passed"), prepend=0))
-        way = "in" if recording.layout.find_mailbox(source).writer in hosts else "out"
-        distances = Counter(np.diff(steps).tolist())
-        usual, count = max(distances.items(), key=lambda item: item[1], default=(0, 0))
-        is_periodic = count >= max((1.0 - MAX_IRREGULAR_SHARE) * distances.total(), 1)
-        when = "asynchronous" if not is_periodic else "every" if usual == 1 else "nth"
-        kinds.update({way: 1, when: 1, f"{when}_{way}": 1} if len(steps) else {})
-    return {
-        "entries_in": kinds["in"],
-        "entries_out": kinds["out"],
-        "entries_every_cycle": kinds["every"],
-        "entries_every_nth_cycle": kinds["nth"],
-        "entries_asynchronous": kinds["asynchronous"],
-        "entries_in_periodic": kinds["every_in"] + kinds["nth_in"],
-        "entries_out_periodic": kinds["every_out"] + kinds["nth_out"],
-    }
+        passed = recording.read_signal(status, f"{name}.passed")
+        distances = np.diff(np.flatnonzero(np.diff(passed, prepend=0)))
+        usual = np.median(distances) if len(distances) else 0
+        is_periodic = len(distances) and (distances != usual).mean() <= MAX_IRREGULAR_SHARE
+        if passed.any():
+            counts[WAYS[source in recording.mailboxes]] += 1
+            counts[MODES[min(int(usual), 2) if is_periodic else 0]] += 1
+    return counts
 
 
 def _measure_hosted_motion(recording: Recording) -> dict[str, float]:
@@ -175,18 +161,11 @@ def _measure_hosted_motion(recording: Recording) -> dict[str, float]:
 
 
 def _measure_hosted_grasp(recording: Recording) -> dict[str, float]:
-    """Measure CONDOR's adapter, and what its workstation and its boards did with the hand."""
+    """Measure CONDOR's adapter, and the effect of its workstation on the hand."""
     plan, touching = (
         recording.read_signal("coordinator.status", name) for name in ("plan", "touching")
     )
-    drives = [
-        recording.read_signal(name, "driven").any()
-        for name in recording.mailboxes
-        if "hand" in recording.layout.find_mailbox(name).readers
-        and "driven" in recording.list_fields(name)
-    ]
     return _measure_adapter(recording) | {
-        "boards_driving_hand": sum(drives),
         "fingers_on_planned_grasp": (touching.sum(axis=1) * (plan > 0)).max(initial=0),
     }
 
