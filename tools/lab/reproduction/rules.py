@@ -71,6 +71,8 @@ MAX_RATE_ERROR = 0.01
 MAX_FEW_SHARE = 0.01
 """Largest share of missed cycles or plans that counts as stray."""
 ROUNDING_MS = 1e-6
+MAX_RATE_RATIO = 1.2
+"""Largest ratio of the cycles of two levels at one rate, which missed cycles change."""
 MAX_OFF_PATH_RAD = 0.01
 """Largest distance of paths that count as the same, rad. A missed cycle shifts a path a little."""
 
@@ -536,7 +538,7 @@ def judge_layers(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimVe
         for name, run in zip(names, records, strict=True)
     }
     faster = sum(
-        upper > (1.0 + MAX_STRAY_SHARE) * lower
+        upper > MAX_RATE_RATIO * lower
         for cycles in levels.values()
         for upper, lower in pairwise(cycles)
     )

@@ -65,6 +65,7 @@ def _measure_schedule(recording: Recording) -> dict[str, float]:
     left_ns = (minor - cycles["tick"] % minor) * layout.clock_ns
     # In lockstep a cycle may take any real time.
     is_late = (cycles["end_ns"] > cycles["release_ns"] + left_ns) & (not rack.is_lockstep)
+    skipped = count_skipped_releases(cycles).sum()
     levels = {board for chain in rack.chains for board in chain}
     ages = [
         Counter(_list_ages(recording, box, reader))
@@ -74,7 +75,7 @@ def _measure_schedule(recording: Recording) -> dict[str, float]:
     ]
     return {
         "frames": cycles["tick"].max(initial=0) // minor * bool(rack.schedule),
-        "cycles_outside_frame_share": (is_late | (count_skipped_releases(cycles) > 0)).mean(),
+        "cycles_outside_frame_share": (is_late.sum() + skipped) / max(len(cycles) + skipped, 1),
         "locked_mailboxes": sum(box.protocol == "lock" for box in layout.mailboxes),
         "ages_off_share": sum(each.total() - max(each.values(), default=0) for each in ages)
         / max(sum(each.total() for each in ages), 1),

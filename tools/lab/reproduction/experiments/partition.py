@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -124,7 +123,7 @@ def _run_partitions(workshop: Workshop, name: str, seconds: float) -> tuple[Part
     # Check all configs before the first rack runs.
     racks = [partition.apply_to(config) for partition in PARTITIONS]
     runs = [
-        workshop.run(f"{Path(name).stem}-{partition.coupling}-{partition.cores}", rack, seconds)
+        workshop.run(f"partition-{seconds:g}-{partition.coupling}-{partition.cores}", rack, seconds)
         for partition, rack in zip(PARTITIONS, racks, strict=True)
     ]
     first = _read_path(runs[0].recording)

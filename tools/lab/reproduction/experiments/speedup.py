@@ -11,7 +11,6 @@ from rack.tools.lab.reproduction.experiments.experiment import Experiment, Works
 LEVELS = 4
 EXECUTOR_MS = 0.2
 PLAN_MS = 3.0
-MAX_CORES = 4
 SECONDS = 2.0
 LAUNCH_S = 2.5
 CLOCK = """
@@ -62,7 +61,7 @@ class SpeedupRun:
 
 def _measure_speedup(workshop: Workshop) -> SpeedupRun:
     """Run the levels as one sequential program, then concurrently on more and more processors."""
-    cores = min(len(os.sched_getaffinity(0)), MAX_CORES)
+    cores = min(len(os.sched_getaffinity(0)), LEVELS)
     by_cores = {}
     for count in range(1, cores + 1):
         boards = (LEVEL.format(number=n, slot=n + 2, core=n % count) for n in range(LEVELS))

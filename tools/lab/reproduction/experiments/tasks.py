@@ -18,10 +18,7 @@ from rack.boards.config import CONFIGS, RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.observed import UNVIEWED_SETTINGS, count_cycles
 from rack.tools.lab.reproduction.experiments.experiment import RUNS_FOLDER, Experiment, Workshop
-from rack.tools.lab.reproduction.experiments.mechanisms import (
-    measure_levels,
-    measure_mechanism,
-)
+from rack.tools.lab.reproduction.experiments.mechanisms import measure_levels, measure_mechanism
 from rack.tools.launch.launch import RunResult
 from rack.tools.monitor.host_side import list_entries
 from rack.tools.recording.history import list_fired_rows
@@ -263,17 +260,16 @@ def _measure_two_racks(later_ms: int, workshop: Workshop) -> NetworkRun:
         if not lost:
             response_ms = _compute_response_ms(general, servo)
             holding = servo.read_signal("supervisor.status", "holding")
-            run = NetworkRun(
-                **vars(summarize_task(result, general, servo)),
-                servo_missed=_compute_missed_share(servo),
-                response_ms=response_ms,
-            )
             # The joints hold without fresh references of the other rack.
             found = {
                 "modifications_unanswered": float(response_ms is None),
                 "references_lacking_share": holding.mean() if len(holding) else 1.0,
             }
-            return replace(run, mechanism=found)
+            return NetworkRun(
+                **vars(summarize_task(result, general, servo)) | {"mechanism": found},
+                servo_missed=_compute_missed_share(servo),
+                response_ms=response_ms,
+            )
     raise Failure(f"{' and '.join(lost)} lost records in each of {MAX_ATTEMPTS} runs")
 
 
