@@ -28,7 +28,7 @@ from rack.tools.lab.reproduction.experiments import (
 )
 from rack.tools.lab.reproduction.experiments.sharing import WAITS
 from rack.tools.lab.reproduction.page import PaperClaim
-from rack.tools.lab.reproduction.rules import judge_layers, judge_systems
+from rack.tools.lab.reproduction.system_rules import judge_layers, judge_systems
 from rack.tools.lab.reproduction.verdict import ClaimVerdict, Ruling, describe_unmet
 from tests.tools.lab.reproduction.breaking import CHAIN, BreakingWorkshop
 from tests.tools.lab.reproduction.test_figures import FIGURES

@@ -6,8 +6,8 @@ import pytest
 
 from rack.boards.config import list_names
 from rack.boards.config.files import CONFIGS
-from rack.tools.lab.reproduction.claims import SYSTEMS
 from rack.tools.lab.reproduction.experiments.mechanisms import measure_levels
+from rack.tools.lab.reproduction.system_claims import SYSTEMS
 from rack.tools.recording.recording import Recording
 from tests.shared_runs import nasrem_run
 
