@@ -14,6 +14,7 @@ from rack.tools.lab.reproduction.experiments import (
     partition,
     response,
     sharing,
+    speedup,
     switch,
     tasks,
 )
@@ -34,12 +35,12 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
     DEADLINE,
     DETERMINISM,
     KILLS,
-    NAME,
     NASREM,
     SENSORS,
     NasremRun,
 )
 from rack.tools.lab.reproduction.page import PaperClaim, Section
+from rack.tools.lab.reproduction.system_claims import SYSTEMS_SECTION, build_system_claim
 from rack.tools.lab.reproduction.verdict import ClaimVerdict
 
 
@@ -72,38 +73,6 @@ def _build_equation_claim(
     )
 
 
-def _build_system_claim(
-    name: str,
-    title: str,
-    quote: str,
-    rates_hz: dict[str, int],
-    judge: Callable[..., ClaimVerdict] = rules.judge_links,
-    rack: str = "",
-) -> PaperClaim:
-    """Build a claim about one of the paper's systems.
-
-    The default rule counts the messages between the parts of the system.
-
-    Args:
-        name: Anchor of the claim.
-        title: Heading.
-        quote: Sentence of the paper.
-        rates_hz: Rate of each mailbox between the parts, Hz.
-        judge: Rule of the claim.
-        rack: Rack that models the system. Empty if it has the name of the claim.
-    """
-    return PaperClaim(
-        name,
-        title,
-        quote,
-        "Both sides worked together until the task was done.",
-        (tasks.TASKS[rack or name],),
-        partial(judge, rates_hz),
-    )
-
-
-SYSTEMS = (NAME, tasks.STATE_TABLES, *tasks.TASKS)
-"""Racks that model the paper's systems."""
 SHORT_RESPONSE = ("timing.response_ms=1000",)
 """Setting that demands a response within 1 s, too short for NASREM's four levels."""
 SECTIONS = (
@@ -130,8 +99,8 @@ SECTIONS = (
                 "Speedup by processors",
                 "A robot controller will be characterized as a speedup-oriented multiprocessing"
                 " application.",
-                "A level makes more plans on two processors than on one.",
-                (FIG3.experiment, FIG4.experiment),
+                "Levels make more plans with each processor, and more than a sequential program.",
+                (speedup.SPEEDUP,),
                 rules.judge_speedup,
             ),
             PaperClaim(
@@ -139,9 +108,18 @@ SECTIONS = (
                 "Modular growth",
                 "Multiprocessor systems are beneficial for many reasons, including ... modular"
                 " growth.",
-                "After five boards were added to five, all cycles were in time.",
-                (sharing.CHAINS,),
+                "With a level more, all levels closed their loops and kept their cycles.",
+                (tasks.SMALL_TABLES, tasks.TABLES),
                 rules.judge_growth,
+            ),
+            PaperClaim(
+                "flexibility",
+                "Flexibility by partitioning",
+                "... and flexibility for testing alternative control strategies via different"
+                " partitioning.",
+                "The same task was done along the same path in every partition.",
+                (partition.TASKS,),
+                rules.judge_flexibility,
             ),
             PaperClaim(
                 "replication",
@@ -460,10 +438,11 @@ SECTIONS = (
                 (switch.SWITCH,),
                 rules.judge_switch,
             ),
-            _build_system_claim(
+            build_system_claim(
                 "host-services",
                 "Services of hosts, over the adapter",
                 "The hosts provide non-real-time services.",
+                "Both sides worked together until the task was done.",
                 {"workstation.plan": 1, "adapter.hand": 50, "adapter.world": 50},
                 rack="condor",
             ),
@@ -479,87 +458,7 @@ SECTIONS = (
             ),
         ),
     ),
-    Section(
-        "4.1",
-        "Comparison of Concurrent Hierarchical Control to Other Models",
-        (
-            PaperClaim(
-                "systems",
-                "The systems next to each other",
-                "These architectures share common characteristics with the concurrent,"
-                " hierarchical control model.",
-                "All systems do their tasks on one set of mechanisms, within their bounds.",
-                (NASREM, tasks.TABLES, *tasks.TASKS.values()),
-                partial(rules.judge_systems, SYSTEMS),
-            ),
-            PaperClaim(
-                "two-levels",
-                "At least two levels",
-                "Most systems have at least a two-level hierarchy.",
-                "From the configs alone: no level is faster than one below it.",
-                (),
-                partial(rules.judge_layers, [name for name in SYSTEMS if name != tasks.BROWN]),
-            ),
-            _build_system_claim(
-                "rccl",
-                "RCCL: a processor a joint",
-                "The joint control level operates at 1 kHz and assigns 1 processor per joint.",
-                {
-                    "planning.plan": 1,
-                    "trajectory.command": 50,
-                    **{f"joint{number}.command": 1000 for number in range(1, 7)},
-                },
-                rules.judge_rccl,
-            ),
-            _build_system_claim(
-                "hic",
-                "HIC: layers of servo loops",
-                "This model emphasis layers of servo loops with deterministic scheduling.",
-                {"tendon.command": 500, "joint.command": 500, "fingertip.command": 125},
-            ),
-            _build_system_claim(
-                "condor",
-                "CONDOR: boards, an adapter and a workstation",
-                "... Motorola 68020 based boards connected by VME bus to VME bus adapter to a"
-                " SUN-3 workstation controlling the Utah/MIT hand.",
-                {"workstation.plan": 1, "adapter.plan": 1},
-            ),
-            _build_system_claim(
-                "ibm",
-                "IBM: a real-time bridge",
-                "IBM extends the exchange of commands and status to include varying frequencies.",
-                {"bridge.requests": 1, "bridge.sensors": 50, "bridge.motion": 200},
-            ),
-            _build_system_claim(
-                "chimera",
-                "CHIMERA: motion control and commands",
-                "... low-level real-time motion control connected to a non-real-time AML/X"
-                " command environment.",
-                {"command.requests": 1, "bridge.requests": 1},
-            ),
-            _build_system_claim(
-                "penn",
-                "Pennsylvania: a server of forces and motions",
-                "... a robot coordinator issue force and motion commands to a real-time robot"
-                " force and motion server.",
-                {"coordinator.requests": 1, "bridge.requests": 1},
-            ),
-            # The servo rack starts later. It and the network pass on four of five messages.
-            _build_system_claim(
-                "brown",
-                "Brown: servo systems on a network",
-                "... high-speed networks connecting a real-time servo systems and general"
-                " computing resources.",
-                {
-                    "planning.plan": 1,
-                    "trajectory.command": 50,
-                    "lan.reference": 40,
-                    "lan.joints": 40,
-                    "supervisor.command": 400,
-                },
-            ),
-        ),
-    ),
+    SYSTEMS_SECTION,
     Section(
         "5",
         "Conclusion",

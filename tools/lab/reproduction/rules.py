@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from math import ceil, inf
 
 from rack.boards.config import build_rack_timing, load, resolve_layout
@@ -27,6 +28,7 @@ from rack.tools.lab.reproduction.experiments.nasrem import (
 from rack.tools.lab.reproduction.experiments.partition import Partition, PartitionFigures
 from rack.tools.lab.reproduction.experiments.response import ResponseRun
 from rack.tools.lab.reproduction.experiments.sharing import LEVELS, Chains, Waits
+from rack.tools.lab.reproduction.experiments.speedup import SpeedupRun
 from rack.tools.lab.reproduction.experiments.switch import PAPER_US, SwitchRun
 from rack.tools.lab.reproduction.experiments.tasks import (
     EXTRA_DELAY_MS,
@@ -68,7 +70,8 @@ MAX_RATE_ERROR = 0.01
 """Largest relative error of a measured rate, which skipped cycles lower."""
 MAX_FEW_SHARE = 0.01
 """Largest share of missed cycles or plans that counts as stray."""
-ROUNDING_MS = 1e-6
+MAX_OFF_PATH_RAD = 0.01
+"""Largest distance of paths that count as the same, rad. A missed cycle shifts a path a little."""
 
 
 def check_done(*runs: TaskRun) -> list[Check]:
@@ -100,20 +103,53 @@ def judge_determinism(runs: Sequence[ComparedRun]) -> ClaimVerdict:
     )
 
 
-def judge_speedup(on_one: FigureRun, on_two: FigureRun) -> ClaimVerdict:
-    """Check that a level makes more plans on two processors than on one."""
-    plans_on_one, plans_on_two = (run.tasks[PLANNER].jobs for run in (on_one, on_two))
-    needs = [compare_value("plans_on_one_processor", plans_on_one, ">=", 1)]
+def judge_speedup(run: SpeedupRun) -> ClaimVerdict:
+    """Check that concurrent levels make more plans than a sequential program, on each processor.
+
+    One processor may make fewer, because it also switches between the levels.
+    """
+    plans = list(run.by_cores.values())
+    steps = (
+        compare_value(f"plans_per_s_on_{number}_processors", now, ">", before)
+        for number, (before, now) in enumerate(pairwise(plans), 2)
+    )
     return rule_on(
-        compare_value("plans_on_two_processors", plans_on_two, ">", plans_on_one), needs=needs
+        *steps,
+        compare_value("plans_per_s", max(plans), ">", run.sequential),
+        needs=[
+            compare_value("sequential_plans_per_s", run.sequential, ">", 0),
+            compare_value("processors", len(plans), ">=", 2),
+        ],
     )
 
 
-def judge_growth(chains: Chains) -> ClaimVerdict:
-    """Check that a chain of boards misses no cycles after more boards were added."""
-    grown = chains.grown
-    on_time = compare_value("messages_on_time", grown.took.get(grown.boards, 0), ">=", 1)
-    return rule_on_rare_event("cycles_missed", grown.missed, grown.due, on_time)
+def judge_growth(small: TaskRun, grown: TableRuns) -> ClaimVerdict:
+    """Check that a rack with an additional level runs more closed loops and misses few cycles.
+
+    A level without work commands nothing, so it closes no loop.
+    """
+    run = grown.disturbed
+    return rule_on(
+        *check_done(run),
+        compare_value("levels", len(run.levels), ">", len(small.levels)),
+        ideal=check_none(missed_share=run.missed),
+        here=[compare_value("missed_share", run.missed, "<=", MAX_STRAY_SHARE)],
+        needs=[compare_value("levels_before", len(small.levels), ">=", 1)],
+    )
+
+
+def judge_flexibility(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
+    """Check that a task is done along the same path in every partition."""
+    return rule_on(
+        *check_none(tasks_not_done=sum(run.ended != TASK_DONE for run in partitions)),
+        compare_value(
+            "off_path_rad", max(run.off_path_rad for run in partitions), "<=", MAX_OFF_PATH_RAD
+        ),
+        needs=[
+            compare_value("partitions", len({run.partition for run in partitions}), ">=", 2),
+            compare_value("moved_rad", min(run.moved_rad for run in partitions), ">", 1.0),
+        ],
+    )
 
 
 def judge_locks(chains: Chains) -> ClaimVerdict:
@@ -457,85 +493,6 @@ def judge_figure_5(partitions: Sequence[PartitionFigures]) -> ClaimVerdict:
         ideal=[compare_value("fast_levels_missed_share", missed_share("tight"), ">", max_missed)],
         needs=[compare_value("fewest_plans", plans, ">=", 1)],
     )
-
-
-def judge_systems(names: Iterable[str], *records: TaskRun | TableRuns) -> ClaimVerdict:
-    """Check that the response of each system, measured in its whole task, is within its bound.
-
-    If a response is longer, the claim still holds within bounds, provided that every response
-    beyond the bound was delayed by a missed cycle.
-
-    Args:
-        names: Names of the systems.
-        records: Record of each system's whole task.
-    """
-    runs = [run.disturbed if isinstance(run, TableRuns) else run for run in records]
-    ways = {
-        f"{name}_{way}_ms": response
-        for name, run in zip(names, runs, strict=True)
-        if run.response is not None
-        for way, response in run.response.ways.items()
-        if response.longest_ms is not None
-    }
-    return rule_on(
-        *check_done(*runs),
-        ideal=[
-            compare_value(name, way.longest_ms or 0.0, "<=", way.bound_ms + ROUNDING_MS)
-            for name, way in ways.items()
-        ],
-        here=check_none(late_without_miss=sum(way.unexplained for way in ways.values())),
-    )
-
-
-def judge_layers(names: Iterable[str]) -> ClaimVerdict:
-    """Check that each system has at least two levels, none of them faster than a level below it."""
-    configs = {name: load(name) for name in names}
-    paths = {
-        name: build_rack_timing(one, resolve_layout(one)).hierarchy for name, one in configs.items()
-    }
-    faster = sum(sorted(path.cycles, reverse=True) != [*path.cycles] for path in paths.values())
-    levels = (
-        compare_value(f"{name}_levels", len(path.levels), ">=", 2) for name, path in paths.items()
-    )
-    return rule_on(*levels, *check_none(systems_with_a_faster_level_above=faster))
-
-
-def judge_links(
-    rates_hz: Mapping[str, int], run: TaskRun, ideal: Sequence[Check] = ()
-) -> ClaimVerdict:
-    """Check that the parts of a system exchange as many messages as the rates imply.
-
-    Args:
-        rates_hz: Rate of each mailbox, Hz. 1 requires at least one message.
-        run: Whole task of the system.
-        ideal: Further comparisons. If one fails, the claim holds only within bounds.
-    """
-    min_counts = {
-        box: (1.0 - MAX_STRAY_SHARE) * rate_hz * run.lasted_s if rate_hz > 1 else 1
-        for box, rate_hz in rates_hz.items()
-    }
-    return rule_on(
-        *check_done(run),
-        compare_value("missed_share", run.missed, "<=", MAX_STRAY_SHARE),
-        *(
-            compare_value(f"{box}_messages", run.messages.get(box, 0), ">=", count)
-            for box, count in min_counts.items()
-        ),
-        ideal=ideal,
-    )
-
-
-def judge_rccl(rates_hz: Mapping[str, int], run: TaskRun) -> ClaimVerdict:
-    """Check that the boards of RCCL exchange as many messages as the rates imply.
-
-    The checks are those of `judge_links`. If joints share processors, the verdict is
-    `Ruling.BOUNDED`.
-    """
-    joints = [
-        task.core for task in resolve_layout(load("rccl")).tasks if task.board.startswith("joint")
-    ]
-    cores = compare_value("processors_of_joints", len(set(joints)), ">=", len(joints))
-    return judge_links(rates_hz, run, [cores])
 
 
 def judge_predictable(run: ResponseRun) -> ClaimVerdict:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rack.boards.config import load
@@ -13,6 +14,7 @@ from rack.tools.lab.reproduction.experiments.partition import (
     PARTITION,
     PARTITIONS,
     PartitionFigures,
+    compute_distance,
 )
 from tests.boards.conftest import PLANNED
 from tests.machine import needs_fifo, needs_two_cores
@@ -67,3 +69,13 @@ def test_partitions_are_run_and_measured_one_after_another(
         assert 0 < cycles["wave", "executor"] <= 120
         assert 0 < cycles["wave", "planner"] < cycles["wave", "executor"]
         assert all(0.0 < load < 1.0 for load in one.loads.values())
+
+
+def test_paths_are_compared_whenever_their_points_were_passed() -> None:
+    path = np.linspace([0.0, 0.0], [1.0, 0.0], 801)
+    late = np.concatenate((path[:1].repeat(50, axis=0), path))
+    assert compute_distance(late, path) == 0.0
+    assert compute_distance(path + np.array((0.0, 0.1)), path) == pytest.approx(0.1)
+    # Half of a path lies on the whole one, but not the other way round.
+    assert compute_distance(path[:401], path) == 0.0
+    assert compute_distance(path, path[:401]) == pytest.approx(0.5)

@@ -29,6 +29,7 @@ from rack.tools.lab.reproduction.experiments.partition import (
     TaskFigures,
 )
 from rack.tools.lab.reproduction.experiments.sharing import ChainRun, Chains
+from rack.tools.lab.reproduction.experiments.speedup import SpeedupRun
 from rack.tools.lab.reproduction.experiments.switch import SwitchRun
 from rack.tools.lab.reproduction.experiments.tasks import (
     TASKS,
@@ -102,12 +103,12 @@ def determined(*runs: ComparedRun, second: str = "a") -> tuple[ComparedRun, ...]
 
 
 EQUAL = compared("realtime", "a")
-EMPTY = ChainRun(5, 9, 0, {})
+EMPTY = ChainRun(9, 0, {})
 
 
 def chains(lockstep: dict[int, int], realtime: dict[int, int]) -> Chains:
     """Return chains with the numbers of cycles that messages took."""
-    return Chains(replace(EMPTY, took=lockstep), replace(EMPTY, took=realtime), EMPTY, EMPTY)
+    return Chains(replace(EMPTY, took=lockstep), replace(EMPTY, took=realtime), EMPTY)
 
 
 def goto(refused: bool, done_s: float) -> GotoRuns:
@@ -151,11 +152,34 @@ def partitions(slow: int, fast: int, plans: int) -> tuple[PartitionFigures, ...]
     def figures(partition: Partition, missed: dict[str, int]) -> PartitionFigures:
         executors = [TaskFigures(level, "executor", 100, bad, 0) for level, bad in missed.items()]
         planners = [TaskFigures(level, "planner", plans, 0, 0) for level in missed]
-        return PartitionFigures(partition, (*executors, *planners), {0: 0.5})
+        return PartitionFigures(partition, (*executors, *planners), {0: 0.5}, TASK_DONE, 2.0, 0.0)
 
     tight = figures(Partition("tight", 1), {"task": slow, "servo": fast})
     loose = figures(Partition("loose", 2), {"task": slow, "servo": 0})
     return tight, loose
+
+
+def whole_partitions(**changes: Any) -> tuple[PartitionFigures, ...]:
+    """Return the same task in two partitions, of which the second has these changes."""
+    first, second = partitions(0, 0, 1)
+    return first, replace(second, **changes)
+
+
+def grown(levels: int, missed: float = 0.0, ended: str = TASK_DONE) -> tuple[TaskRun, TableRuns]:
+    """Return a run with three levels, and one with an additional board."""
+    small = TaskRun("time over", 3.0, 0.0, {}, None, levels=(9, 99, 99))
+    runs = tables("pick", ended=ended)
+    run = replace(runs.disturbed, missed=missed, levels=(9,) * levels)
+    return small, replace(runs, disturbed=run)
+
+
+def layers(*cycles: int) -> list[Any]:
+    """Return the whole tasks of all systems, one with other cycles of its levels."""
+    nasrem, table, network, first, *others = whole_tasks(5.0, 0)
+    levels = (9, 99)
+    table = replace(table, disturbed=replace(table.disturbed, levels=levels))
+    rest = [replace(run, levels=levels) for run in (nasrem, network, *others)]
+    return [rest[0], table, rest[1], replace(first, levels=cycles), *rest[2:]]
 
 
 def equation(name: str, holds: bool, mostly: bool) -> NasremRun:
@@ -209,6 +233,23 @@ RULINGS = [
     ("systems", whole_tasks(6.0, 0), BOUNDED),
     ("systems", whole_tasks(6.0, 1), FAILS),
     ("systems", whole_tasks(5.0, 0, "time over"), FAILS),
+    ("speedup", [SpeedupRun(260.0, {1: 190.0, 2: 410.0})], HOLDS),
+    ("speedup", [SpeedupRun(260.0, {1: 190.0, 2: 180.0})], FAILS),
+    ("speedup", [SpeedupRun(430.0, {1: 190.0, 2: 410.0})], FAILS),
+    ("speedup", [SpeedupRun(260.0, {1: 190.0})], Ruling.UNTESTABLE),
+    ("growth", grown(5), HOLDS),
+    ("growth", grown(5, missed=0.01), BOUNDED),
+    ("growth", grown(5, missed=0.03), FAILS),
+    ("growth", grown(3), FAILS),
+    ("growth", grown(5, ended="time over"), FAILS),
+    ("flexibility", [whole_partitions()], HOLDS),
+    ("flexibility", [whole_partitions(off_path_rad=0.1)], FAILS),
+    ("flexibility", [whole_partitions(ended="time over")], FAILS),
+    ("flexibility", [whole_partitions(moved_rad=0.0)], Ruling.UNTESTABLE),
+    ("two-levels", layers(9, 99), HOLDS),
+    ("two-levels", layers(9, 9), HOLDS),
+    ("two-levels", layers(99, 9), FAILS),
+    ("two-levels", layers(), FAILS),
     ("background", background(0, 9, 99), HOLDS),
     ("background", background(2, 9, 99), BOUNDED),
     ("background", background(3, 9, 99), FAILS),

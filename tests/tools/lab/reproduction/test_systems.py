@@ -1,15 +1,15 @@
-"""The systems of the paper, and the number of levels in their configs."""
+"""The systems of the paper, and the number of levels in their runs."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import pytest
 
 from rack.boards.config import list_names
 from rack.boards.config.files import CONFIGS
-from rack.tools.lab.reproduction.claims import SYSTEMS
-from rack.tools.lab.reproduction.rules import judge_layers
-from rack.tools.lab.reproduction.verdict import Ruling, describe_unmet
-from tests.boards.conftest import PLAIN
+from rack.tools.lab.reproduction.experiments.mechanisms import measure_levels
+from rack.tools.lab.reproduction.system_claims import SYSTEMS
+from rack.tools.recording.recording import Recording
+from tests.shared_runs import nasrem_run
 
 
 def test_the_systems_are_nasrem_and_every_bundled_rack_with_a_folder() -> None:
@@ -20,14 +20,7 @@ def test_the_systems_are_nasrem_and_every_bundled_rack_with_a_folder() -> None:
     assert len(set(SYSTEMS)) == len(SYSTEMS)
 
 
-def test_levels_are_read_from_a_config_alone() -> None:
-    levels, faster = judge_layers(["nasrem"]).checks
-    assert (levels.measured, faster.measured) == (4, 0)
-
-
-def test_a_rack_without_a_hierarchy_fails_the_claim_on_two_levels(tmp_path: Path) -> None:
-    path = tmp_path / "lone.toml"
-    path.write_text(PLAIN.replace('below = "wave"', 'reads = { below = "wave.status" }'))
-    verdict = judge_layers([str(path)])
-    assert verdict.ruling is Ruling.FAILS
-    assert "_levels 0, not >= 2" in describe_unmet(verdict.checks)
+@pytest.mark.slow
+def test_levels_are_closed_loops_of_a_run(tmp_path_factory: pytest.TempPathFactory) -> None:
+    levels = measure_levels(Recording(nasrem_run(tmp_path_factory)))
+    assert levels == (7, 26, 325, 2600)

@@ -20,7 +20,6 @@ from rack.tools.lab.reproduction.experiments.experiment import Experiment, Works
 
 LEVELS = 5
 """Number of levels of the pipeline: "it would take 5 control cycles"."""
-GROWN_BOARDS = 10
 RATE_HZ = 400
 SECONDS = 2.0
 LAUNCH_S = 2.0
@@ -32,13 +31,11 @@ class ChainRun:
     """A run of a chain of empty boards.
 
     Attributes:
-        boards: Number of boards.
         due: Number of due cycles.
         missed: Number of missed or skipped cycles.
         took: Dictionary from a number of cycles to the number of messages that took it.
     """
 
-    boards: int
     due: int
     missed: int
     took: dict[int, int]
@@ -46,24 +43,19 @@ class ChainRun:
 
 @dataclass(frozen=True)
 class Chains:
-    """Runs of the pipeline in lockstep, in real time, with locks, and with more boards."""
+    """Runs of the pipeline in lockstep, in real time, and with locks."""
 
     lockstep: ChainRun
     realtime: ChainRun
     locked: ChainRun
-    grown: ChainRun
 
 
 def _measure_chains(workshop: Workshop) -> Chains:
-    """Measure the pipeline in four runs: one in lockstep and three in real time.
-
-    Of those in real time, one uses locks and one has more boards.
-    """
+    """Measure the pipeline in three runs: in lockstep, in real time, and with locks."""
     return Chains(
         lockstep=_measure_chain("chain-lockstep", workshop, Chain(LEVELS, RATE_HZ, "lockstep")),
         realtime=_measure_chain("chain-realtime", workshop, Chain(LEVELS, RATE_HZ)),
         locked=_measure_chain("chain-locked", workshop, Chain(LEVELS, RATE_HZ), LOCK_PROTOCOL),
-        grown=_measure_chain("chain-grown", workshop, Chain(GROWN_BOARDS, RATE_HZ)),
     )
 
 
@@ -76,7 +68,7 @@ def _measure_chain(label: str, workshop: Workshop, chain: Chain, protocol: str =
     # Count a message once, even if a missed cycle repeats it. -1 is sent before the first message.
     sent, first = np.unique(sent, return_index=True)
     took = Counter((visible_at[first] - sent)[sent >= 0].tolist())
-    return ChainRun(chain.boards, due, missed, dict(sorted(took.items())))
+    return ChainRun(due, missed, dict(sorted(took.items())))
 
 
 def _run_chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "") -> ObservedRun:
@@ -87,8 +79,8 @@ def _run_chain(label: str, workshop: Workshop, chain: Chain, protocol: str = "")
 
 CHAINS = Experiment(
     "chains",
-    "a message down five levels, with locks too, and down ten",
-    4 * (SECONDS + LAUNCH_S),
+    "a message down five levels, with locks too",
+    3 * (SECONDS + LAUNCH_S),
     Chains,
     _measure_chains,
     cores=0,

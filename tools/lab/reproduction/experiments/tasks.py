@@ -8,16 +8,17 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import chdir
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from rack.boards.config import RackConfig, load
+from rack.boards.config import CONFIGS, RackConfig, load
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.observed import UNVIEWED_SETTINGS, count_cycles
 from rack.tools.lab.reproduction.experiments.experiment import RUNS_FOLDER, Experiment, Workshop
+from rack.tools.lab.reproduction.experiments.mechanisms import measure_levels, measure_mechanism
 from rack.tools.launch.launch import RunResult
 from rack.tools.monitor.host_side import list_entries
 from rack.tools.recording.history import list_fired_rows
@@ -45,6 +46,7 @@ UNDISTURBED_SETTINGS = ("scene.motion=[]", "clock.mode=lockstep")
 In lockstep, the rows that fire then depend on no clock.
 """
 TABLES_S = 55.0
+SMALL_S = 3.0
 BROWN = "brown"
 SERVO = "brown/servo"
 BROWN_S = 8.3
@@ -125,6 +127,8 @@ class TaskRun:
         missed: Fraction of all cycles that were missed or skipped.
         messages: Dictionary from mailboxes to numbers of messages.
         response: Response of the system. None if it has no bounded response.
+        levels: Numbers of cycles of its levels, from the highest down, see `measure_levels`.
+        mechanism: Measurements of what the paper says about this system, by name and unit.
     """
 
     ended: str
@@ -132,6 +136,8 @@ class TaskRun:
     missed: float
     messages: dict[str, int]
     response: SystemResponse | None
+    levels: tuple[int, ...] = field(default=(), kw_only=True)
+    mechanism: dict[str, float] = field(default_factory=dict, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -151,9 +157,8 @@ class NetworkRun(TaskRun):
 def _measure_task(name: str, workshop: Workshop) -> TaskRun:
     """Run the whole task of a system in real time."""
     label = f"task-{name.replace('/', '-')}"
-    return summarize_task(
-        *workshop.run(label, workshop.load_config(name), TIMEOUT_FACTOR * TASKS_S[name])
-    )
+    run = workshop.run(label, workshop.load_config(name), TIMEOUT_FACTOR * TASKS_S[name])
+    return replace(summarize_task(*run), mechanism=measure_mechanism(name, run.recording))
 
 
 def summarize_task(result: RunResult, *recordings: Recording) -> TaskRun:
@@ -171,6 +176,7 @@ def summarize_task(result: RunResult, *recordings: Recording) -> TaskRun:
         missed=_compute_missed_share(*recordings),
         messages=messages,
         response=parse_response(measure_system_response(first)),
+        levels=max(map(measure_levels, recordings), key=len),
     )
 
 
@@ -219,6 +225,21 @@ TABLES = Experiment(
 )
 
 
+def _measure_small_tables(workshop: Workshop) -> TaskRun:
+    """Run the controller of the state tables without its task level for `SMALL_S`."""
+    config = workshop.load_config(str(CONFIGS / STATE_TABLES / "direct.toml"))
+    return summarize_task(*workshop.run(f"{STATE_TABLES}-small", config, SMALL_S))
+
+
+SMALL_TABLES = Experiment(
+    f"{STATE_TABLES}-small",
+    "state tables without the task level",
+    SMALL_S + LAUNCH_S,
+    TaskRun,
+    _measure_small_tables,
+)
+
+
 def _compute_missed_share(*recordings: Recording) -> float:
     """Return the fraction of all cycles of some runs that were missed or skipped."""
     return count_cycles(
@@ -237,10 +258,17 @@ def _measure_two_racks(later_ms: int, workshop: Workshop) -> NetworkRun:
         result, general, servo = _record_two_racks(later_ms, workshop, attempt)
         lost = [each.layout.rack for each in (general, servo) if each.lost_rows]
         if not lost:
+            response_ms = _compute_response_ms(general, servo)
+            holding = servo.read_signal("supervisor.status", "holding")
+            # The joints hold without fresh references of the other rack.
+            found = {
+                "modifications_unanswered": float(response_ms is None),
+                "references_lacking_share": holding.mean() if len(holding) else 1.0,
+            }
             return NetworkRun(
-                **vars(summarize_task(result, general, servo)),
+                **vars(summarize_task(result, general, servo)) | {"mechanism": found},
                 servo_missed=_compute_missed_share(servo),
-                response_ms=_compute_response_ms(general, servo),
+                response_ms=response_ms,
             )
     raise Failure(f"{' and '.join(lost)} lost records in each of {MAX_ATTEMPTS} runs")
 
