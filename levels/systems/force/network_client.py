@@ -146,13 +146,15 @@ class RemoteServer:
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             if (frame := connection.take_frame()) is not None:
-                if frame.kind is FrameKind.END and frame.content:
-                    raise LevelError(f"{connection.peer}: {frame.content.decode()}")
-                return frame
+                if frame.kind is not FrameKind.END or not frame.content:
+                    return frame
+                connection.close()
+                raise LevelError(f"{connection.peer}: {frame.content.decode()}")
             left_s = None if deadline_s is None else max(0.0, deadline_s - time.monotonic())
             unsent = [] if connection.flush() else [connection.socket]
             ready, _, _ = select.select([connection.socket], unsent, [], left_s)
             if ready and not connection.receive():
+                connection.close()
                 raise LevelError(f"the server at {connection.peer} has closed the connection")
             if left_s == 0.0 and not ready:
                 return None

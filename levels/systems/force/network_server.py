@@ -194,13 +194,14 @@ class _Service:
             if self._client is not None and self._pending is None:
                 sockets.append(self._client.socket)
             ready, _, _ = select.select(sockets, [], [], POLL_S)
-            if self._listener in ready:
-                self._accept_client()
-            elif self._client is not None and self._client.socket in ready:
+            if self._client is not None and self._client.socket in ready:
                 self._heard_s = time.monotonic()
                 if not self._client.receive():
                     self._take_frames()
                     self.drop_client("the connection is closed")
+            # A client that has left makes room for the next one.
+            if self._listener in ready:
+                self._accept_client()
             timeout_s = self._take_frames()
             if self._child is not None and self._client is None and self._child.poll() is not None:
                 raise LevelError("the client has ended without saying how its script ended")
