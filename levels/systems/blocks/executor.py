@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rack.backplane.message import State, field
+from rack.backplane.message import AnyMessage, State, field
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor, Input, LevelContext, Mismatches, Output
 from rack.levels.operator import AnsweringStatus, OperatorCommand
@@ -129,7 +129,7 @@ class BlockExecutor(Executor):
                 self._live_orders.refuse_newest(str(error))
 
 
-def restore_network(network: BlockNetwork, status: BlockStatus) -> None:
+def restore_network(network: BlockNetwork, status: BlockStatus | AnyMessage) -> None:
     """Give a network the connections and values in a status."""
     network.values |= zip(network.results, status.values.tolist(), strict=False)
     outputs = list(network.outputs)

@@ -81,6 +81,7 @@ class BlockNetwork:
         sources: Type and unit of each value that comes from another board.
 
     Attributes:
+        blocks: Blocks by name.
         inputs: Type and unit of each input.
         outputs: Type and unit of each output.
         wires: Output connected to each input.
@@ -97,7 +98,7 @@ class BlockNetwork:
         wires: Mapping[str, str],
         sources: Mapping[str, Port],
     ) -> None:
-        self._blocks = blocks
+        self.blocks = blocks
         self.outputs = dict(sources)
         self.inputs = {STOP: Port("flag", "1")}
         for name, block in blocks.items():
@@ -144,11 +145,11 @@ class BlockNetwork:
                 for port in KINDS[block.kind].inputs
                 if block.kind != "delay" and (at := f"{name}.{port}") in wires
             }
-            for name, block in self._blocks.items()
+            for name, block in self.blocks.items()
         }
         try:
             order = TopologicalSorter(before).static_order()
-            self._order = [name for name in order if name in self._blocks]
+            self._order = [name for name in order if name in self.blocks]
         except CycleError as error:
             path = " > ".join(reversed(error.args[1]))
             raise LevelError(f"{target}={source} closes the cycle {path}; add a delay") from None
@@ -157,7 +158,7 @@ class BlockNetwork:
     def compute(self, period_s: float) -> bool:
         """Compute all blocks from `values` of the sources. Return the value of `stop.input`."""
         values = self.values
-        blocks = self._blocks
+        blocks = self.blocks
         delays = [name for name, block in blocks.items() if block.kind == "delay"]
         # The outputs of delays stand since the previous cycle.
         others = [name for name in self._order if name not in delays]
