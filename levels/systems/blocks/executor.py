@@ -16,7 +16,7 @@ from rack.backplane.message import AnyMessage, State, field
 from rack.levels.errors import LevelError
 from rack.levels.level import Executor, Input, LevelContext, Mismatches, Output
 from rack.levels.operator import AnsweringStatus, OperatorCommand
-from rack.levels.systems.blocks.network import STOP, BlockConfig, BlockNetwork, Port
+from rack.levels.systems.blocks.network import STOP, BlockConfig, BlockNetwork, BlockPort
 from rack.levels.systems.joint_boards.messages import ArmStatus
 from rack.levels.systems.trajectory import TrajectoryExecutor
 from rack.levels.systems.trajectory.messages import MotionKind
@@ -52,10 +52,10 @@ class BlockStatus(AnsweringStatus, version=1):
 def build_network(context: LevelContext) -> BlockNetwork:
     """Return the network of a board. Raises `LevelError` if a connection is not permitted."""
     params = read_params(BlockParams, context.params)
-    sources: dict[str, Port] = {}
+    sources: dict[str, BlockPort] = {}
     for declared in ArmStatus.message_type.fields:
         if declared.python in (bool, float, np.ndarray) and declared.kind in ("f8", "u1"):
-            port = Port("flag" if declared.python is bool else "number", str(declared.unit))
+            port = BlockPort("flag" if declared.python is bool else "number", str(declared.unit))
             joints = context.robot.joints if declared.shape == ("joints",) else ()
             names = [f"arm.{declared.name}.{joint}" for joint in joints]
             sources |= dict.fromkeys(names or [f"arm.{declared.name}"], port)

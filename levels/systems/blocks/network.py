@@ -15,7 +15,7 @@ from rack.levels.errors import LevelError
 from rack.levels.tables import Finite, Table
 
 
-class Port(NamedTuple):
+class BlockPort(NamedTuple):
     """Type and unit of the values at an input or output."""
 
     type: str
@@ -96,17 +96,17 @@ class BlockNetwork:
         self,
         blocks: Mapping[str, BlockConfig],
         wires: Mapping[str, str],
-        sources: Mapping[str, Port],
+        sources: Mapping[str, BlockPort],
     ) -> None:
         self.blocks = blocks
         self.outputs = dict(sources)
-        self.inputs = {STOP: Port("flag", "1")}
+        self.inputs = {STOP: BlockPort("flag", "1")}
         for name, block in blocks.items():
             if name in RESERVED or not name.isidentifier():
                 raise LevelError(f"a block cannot be called '{name}'")
             kind = KINDS[block.kind]
             taken, given = (
-                Port(type_, block.unit if type_ == "number" else "1")
+                BlockPort(type_, block.unit if type_ == "number" else "1")
                 for type_ in (kind.takes, kind.gives)
             )
             self.outputs[f"{name}.output"] = given

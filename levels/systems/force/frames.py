@@ -36,7 +36,7 @@ class FrameKind(IntEnum):
     END = 5  # text: why the side has failed; empty if all is well
 
 
-class Frame(NamedTuple):
+class NetworkFrame(NamedTuple):
     """A received frame."""
 
     kind: FrameKind
@@ -78,7 +78,7 @@ class Connection:
         self._received += data
         return bool(data)
 
-    def take_frame(self) -> Frame | None:
+    def take_frame(self) -> NetworkFrame | None:
         """Return the oldest frame that was received as a whole.
 
         Raises:
@@ -94,7 +94,7 @@ class Connection:
             return None
         content = bytes(self._received[HEAD.size : end])
         del self._received[:end]
-        return Frame(FrameKind(kind), content)
+        return NetworkFrame(FrameKind(kind), content)
 
     def send(self, kind: FrameKind, content: bytes = b"") -> None:
         """Send a frame, and keep what the network does not take yet for `flush`."""

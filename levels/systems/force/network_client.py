@@ -26,7 +26,13 @@ from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus
 from rack.levels.level import LevelContext, Reading, Verdict
 from rack.levels.systems.force.client import ForceClient
-from rack.levels.systems.force.frames import TICK_AND_TIME, TIMEOUT, Connection, Frame, FrameKind
+from rack.levels.systems.force.frames import (
+    TICK_AND_TIME,
+    TIMEOUT,
+    Connection,
+    FrameKind,
+    NetworkFrame,
+)
 from rack.levels.systems.force.messages import ServerRequest, ServerStatus
 from rack.levels.systems.force.network_server import parse_address
 from rack.levels.tables import RobotConfig, SceneConfig
@@ -136,7 +142,7 @@ class RemoteServer:
             frame = self._receive_frame(0.0)
         return has_arrived
 
-    def _receive_frame(self, timeout_s: float | None) -> Frame | None:
+    def _receive_frame(self, timeout_s: float | None) -> NetworkFrame | None:
         """Return the next frame. None if none arrives within `timeout_s`; None waits for ever.
 
         Raises:

@@ -11,7 +11,6 @@ Delays of the network then have no effect, and runs repeat.
 
 from __future__ import annotations
 
-import json
 import os
 import select
 import socket
@@ -24,6 +23,7 @@ from ipaddress import ip_address
 
 from pydantic import field_validator
 
+from rack.backplane.json_text import encode_json
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus
 from rack.levels.systems.force.client import ForceClient
@@ -31,9 +31,9 @@ from rack.levels.systems.force.frames import (
     TICK_AND_TIME,
     TIMEOUT,
     Connection,
-    Frame,
     FrameError,
     FrameKind,
+    NetworkFrame,
 )
 from rack.levels.systems.trajectory.commands import ScriptParams
 
@@ -144,7 +144,7 @@ class _Service:
         self._client: Connection | None = None
         self._had_client = False
         self._heard_s = 0.0  # time at which the client's newest frame arrived
-        self._pending: Frame | None = None  # a request for which the ring has no place
+        self._pending: NetworkFrame | None = None  # a request for which the ring has no place
         self._is_over = False  # the client has ended its program
         self._line = ""  # line that was printed last
 
@@ -245,7 +245,7 @@ class _Service:
             "task": dict(context.task),
             "sizes": dict(context.sizes),
         }
-        return json.dumps(known).encode()
+        return encode_json(known).encode()
 
     def _send_status(self, client: Connection) -> None:
         """Send tick, time and the newest status. A client that is slow to read misses some."""

@@ -8,7 +8,7 @@ import pytest
 
 from rack.levels.errors import LevelError
 from rack.levels.systems.blocks.executor import BlockStatus, restore_network
-from rack.levels.systems.blocks.network import BlockConfig, BlockNetwork, Port
+from rack.levels.systems.blocks.network import BlockConfig, BlockNetwork, BlockPort
 
 BLOCKS: Mapping[str, BlockConfig] = {
     "slow": BlockConfig(kind="smooth", unit="N m", value=0.1),
@@ -30,9 +30,9 @@ WIRES = {
     "stop.input": "any.output",
 }
 SOURCES = {
-    "arm.torque": Port("number", "N m"),
-    "arm.opening": Port("number", "m"),
-    "arm.braked": Port("flag", "1"),
+    "arm.torque": BlockPort("number", "N m"),
+    "arm.opening": BlockPort("number", "m"),
+    "arm.braked": BlockPort("flag", "1"),
 }
 PERIOD_S = 0.05
 
