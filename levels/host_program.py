@@ -47,6 +47,9 @@ M_co = TypeVar("M_co", bound=Message, covariant=True)
 class Bus(Protocol):
     """Access of a host program to the bus, in addition to its ports."""
 
+    is_paced: bool
+    """True in lockstep: time stands still except in `wait`, whose time-out is simulated time."""
+
     @property
     def tick(self) -> int:
         """Present tick. In lockstep, the tick of the adapter's cycle in which the program runs."""

@@ -1,5 +1,5 @@
-"""The rack ibm, with real processes in lockstep: what brakes the arm on the way down is no
-touch."""
+"""The rack ibm, with real processes in lockstep: what brakes the arm on the way down is no touch,
+and its blocks are wired anew while it runs."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rack.boards import Rack
 from rack.boards.config import load
+from rack.tools.commands.status import status
+from rack.tools.console.answer import Failure
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
+from rack.tools.plots.graph import build_graphs
 from rack.tools.recording.recording import Recording
 from rack.tools.report.report import write_report
 
@@ -57,3 +61,71 @@ def test_brakings_while_each_block_is_lowered_count_as_no_touch_and_each_is_put_
     assert (report["worked"], report["outcome"]["cause"]) == (True, "task done")
     assert [end["object"] for end in report["objects"]] == ["block1", "block2"]
     assert all(end["off_mm"] < 5.0 and end["drops"] == [] for end in report["objects"])
+
+
+REFUSED = {
+    "stop.input=size.output": "stop.input takes a flag; size.output is a number in N m",
+    "high.input=arm.velocity.j2": (
+        "high.input takes a number in N m; arm.velocity.j2 is a number in rad/s"
+    ),
+    "size.input=size.output": ("size.input=size.output closes the cycle size > size; add a delay"),
+    "stop.input=ligth.output": "no output 'ligth.output'; did you mean 'light.output'?",
+}
+"""Connections that the blocks refuse, and why."""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_connection_made_while_it_runs_ends_the_next_guarded_motion_sooner_and_repeats(
+    tmp_path: Path,
+) -> None:
+    # The stop of the first block is as before, that of the second listens to a lighter touch.
+    wires = dict(zip(REFUSED, (2.0, 4.0, 6.0, 8.0), strict=True)) | {"stop.input=light.output": 15}
+    commands = [
+        f"[[command]]\nlevel = 'blocks'\nwhat = 'set'\nname = 'wire=\"{wire}\"'\nat = {at}\n"
+        for wire, at in wires.items()
+    ]
+    file = tmp_path / "wired.toml"
+    file.write_text(f'format = 2\nname = "wired"\nextends = ["ibm"]\n{"".join(commands)}')
+    config = load(file, [f"name=test-ibm-wired-{os.getpid()}", "clock.mode=lockstep"])
+    assert run_rack(config, None, tmp_path / "run", Display()).recording == "complete"
+    recording = Recording(tmp_path / "run")
+    texts = [event["text"] for event in recording.events if event["kind"] == "printed"]
+    heights = [float(text.split()[-2]) for text in texts if "touched" in text]
+    assert heights[0] == pytest.approx(0.4737, abs=1e-4)
+    assert heights[1] == pytest.approx(0.5241, abs=1e-4)
+    objections = recording.read_signal("blocks.status", "objection").tolist()
+    assert [text for text in dict.fromkeys(objections) if text] == list(REFUSED.values())
+    # It takes effect in the first cycle after its tick.
+    wired = recording.read_signal("blocks.status", "wired")[:, 0]
+    tick = recording.read_signal("blocks.status", "tick")
+    assert tick[1:][np.diff(wired) != 0].tolist() == [15005]
+    with Rack(config) as again:
+        assert again.run().digest == write_report(recording.folder)[0]["digest"]
+
+
+def test_the_graph_shows_boards_rates_and_present_connections(tmp_path: Path) -> None:
+    settings = [f"name=test-ibm-graph-{os.getpid()}", "clock.mode=lockstep"]
+    with Rack(load("ibm/light-touch", settings)) as rack:
+        rack.run(7.5)
+        boards, blocks = build_graphs(rack.segment)
+        status(rack.segment.rack, tmp_path / "graph.svg")
+        with pytest.raises(Failure, match=r"--graph graph.pdf: the name .* end in .png or .svg"):
+            status(rack.segment.rack, Path("graph.pdf"))
+    assert boards.nodes["servo"] == "servo\n1000 Hz"
+    assert boards.nodes["program"] == "program\nhost, no rate"
+    assert boards.edges["motion", "servo"] == "command"
+    assert boards.rows == {
+        "program": 0,
+        "bridge": 1,
+        "motion": 2,
+        "servo": 3,
+        "blocks": 3,
+        "world": 3,
+        "arm": 4,
+    }
+    assert blocks.edges["light", "stop"] == "input"
+    assert ("high", "stop") not in blocks.edges
+    assert blocks.nodes["slow"].startswith("slow\nsmooth 0.1\n")
+    assert blocks.nodes["arm.torque.j2"] == "arm.torque.j2\nN m"
+    assert "</svg>" in (tmp_path / "graph.svg").read_text()

@@ -89,6 +89,7 @@ class HostBus:
 
     Attributes:
         block: Control block of the host board.
+        is_paced: Whether the program runs in turns, because the rack is in lockstep.
 
     Raises:
         MailboxError: Another process has claimed the board.
@@ -99,9 +100,8 @@ class HostBus:
         self._words = segment.words
         self._wiring = wiring
         layout = segment.layout
-        self._is_paced = self._words[System.LOCKSTEP] and layout.find_pacers(
-            layout.find_task(wiring.board)
-        )
+        pacers = layout.find_pacers(layout.find_task(wiring.board))
+        self.is_paced = bool(self._words[System.LOCKSTEP] and pacers)
         self.block = segment.get_block(wiring.board)
         self._claim = _claim_board(segment, wiring.board)
         self._writers: dict[str, HostWriter] = {}
@@ -130,12 +130,12 @@ class HostBus:
     @property
     def tick(self) -> int:
         """Tick of the clock. For a paced program, the tick of the cycle in which it runs."""
-        return self.block[Block.RELEASED] if self._is_paced else self._words[System.TICK]
+        return self.block[Block.RELEASED] if self.is_paced else self._words[System.TICK]
 
     @property
     def time_s(self) -> float:
         """Monotonic time in s, with an arbitrary origin. Simulated time for a paced program."""
-        return self.tick * self._wiring.context.tick_s if self._is_paced else time.monotonic()
+        return self.tick * self._wiring.context.tick_s if self.is_paced else time.monotonic()
 
     @property
     def is_over(self) -> bool:
@@ -151,7 +151,7 @@ class HostBus:
         Returns:
             True if a message has arrived. False after the time-out or at the end of the run.
         """
-        if self._is_paced:
+        if self.is_paced:
             ticks = round(min(timeout_s, LONGEST_S) / self._wiring.context.tick_s)
             self.block[Block.WAITS_UNTIL] = self.tick + max(1, ticks)
             self._end_turn()
@@ -175,7 +175,7 @@ class HostBus:
         # After a restart, the clock must first readmit the board. It clears LOST as its last step,
         # so LOST must be read first.
         while (
-            self._is_paced
+            self.is_paced
             and (block[Block.LOST] or block[Block.DONE] == block[Block.RELEASED])
             and not self.is_over
         ):
@@ -227,7 +227,7 @@ class HostBus:
     def finish(self) -> None:
         """Record that the program is finished. The board calls this when `run` returns."""
         self.block[Block.STATE] = TaskState.ENDED
-        if self._is_paced:
+        if self.is_paced:
             self._end_turn()
 
     def close(self) -> None:

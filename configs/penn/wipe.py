@@ -1,7 +1,7 @@
 """Wipes across a surface with constant force, over an unknown step, to a wall and back.
 
-The rack runs this script as its host board `coordinator`. If the wipe fails, the script ends with
-an error, and the run with status 1. By hand, at any time:
+A client process of the rack runs this script. If the wipe fails, the script ends with an error, and
+the run with status 1. Without the network, by hand, at any time:
     rack run penn --set host.coordinator.external=true
     rack prompt penn coordinator configs/penn/wipe.py
 """

@@ -15,7 +15,7 @@ from rack.tools.commands.watch import await_trigger, check_writable
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT
 from rack.tools.console.parameters import Json, argument, option
-from rack.tools.console.pictures import NO_PICTURES, PICTURE_FORMATS, can_draw
+from rack.tools.console.pictures import check_picture_path
 from rack.tools.console.tables import create_console
 from rack.tools.monitor.signals import SignalHistory
 from rack.tools.plots.curves import Plot, Series
@@ -73,10 +73,7 @@ def plot(
       rack plot nasrem servo.status.torque --when "servo.status.position[2] > -2.5"
     """
     if out is not None:
-        if out.suffix[1:] not in PICTURE_FORMATS:
-            raise Failure(f"--out {out}: the name of a picture must end in .png or .svg", 2)
-        if not can_draw():
-            raise Failure(NO_PICTURES)
+        check_picture_path("--out", out)
         check_writable(out)
     elif not as_json and find_spec("plotext") is None:
         raise Failure(f"{NO_CURVES}; --out FILE.png draws a picture")

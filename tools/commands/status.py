@@ -12,7 +12,8 @@ import typer
 from rack.backplane.segment import Segment, list_racks
 from rack.backplane.words import System
 from rack.tools.console.answer import Failure, print_json
-from rack.tools.console.parameters import Json, check_local_rack_name, complete_rack_name
+from rack.tools.console.parameters import Json, check_local_rack_name, complete_rack_name, option
+from rack.tools.console.pictures import check_picture_path
 from rack.tools.console.tables import create_console
 from rack.tools.monitor.display import RackView
 from rack.tools.monitor.snapshot import RackMonitor
@@ -30,11 +31,18 @@ OnlyRack = Annotated[
 ]
 
 
-def status(rack: OnlyRack = None, as_json: Json = False) -> None:
+def status(
+    rack: OnlyRack = None,
+    graph: Path | None = option(
+        "--graph FILE", "draw boards, mailboxes and function blocks, FILE.png or FILE.svg"
+    ),
+    as_json: Json = False,
+) -> None:
     """Show a running rack once: every task, its faults, what holds it, and its progress.
 
     Each task has a line with its cycles, misses, longest times and state. A hold is shown with its
-    time, its reason, and the command that releases it.
+    time, its reason, and the command that releases it. --graph draws a picture instead: who reads
+    what from whom, at which rates, and how function blocks are wired at present.
 
     Exit status: 0 shown; 1 there is no such rack; 2 RACK is missing and several racks are running.
 
@@ -42,8 +50,16 @@ def status(rack: OnlyRack = None, as_json: Json = False) -> None:
     Examples:
       rack status
       rack status nasrem --json
+      rack status ibm --graph wires.png
     """
+    if graph is not None:
+        check_picture_path("--graph", graph)
     with closing(Segment.attach(rack or find_only_rack())) as segment:
+        if graph is not None:
+            from rack.tools.plots.graph import build_graphs, save_graphs
+
+            save_graphs(build_graphs(segment), graph)
+            return
         snapshot = RackMonitor(segment).take_snapshot()
         run = find_run_folder(segment)
     if as_json:

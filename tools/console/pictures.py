@@ -12,6 +12,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rack.tools.console.answer import Failure
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -23,6 +25,19 @@ NO_PICTURES = "no pictures: they need matplotlib: pip install 'nasrem-rack[chart
 def can_draw() -> bool:
     """Return whether matplotlib is installed. If not, `NO_PICTURES` tells the user what to do."""
     return find_spec("matplotlib") is not None
+
+
+def check_picture_path(option: str, path: Path) -> None:
+    """Raise `Failure` if a picture cannot be drawn, or not into this file.
+
+    Args:
+        option: Option that gives the file, for the message.
+        path: The file.
+    """
+    if path.suffix[1:] not in PICTURE_FORMATS:
+        raise Failure(f"{option} {path}: the name of a picture must end in .png or .svg", 2)
+    if not can_draw():
+        raise Failure(NO_PICTURES)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ import runpy
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from rack.levels.errors import LevelError
 from rack.levels.host_program import (
@@ -242,11 +242,11 @@ class CommandEnvironment(HostProgram):
 
     motion = ProgramInput(MotionStatus, "below.motion")
     requests = ProgramOutput(MotionRequest)
-    params = ScriptParams
+    params: ClassVar[type[ScriptParams]] = ScriptParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._script = read_params(ScriptParams, context.params).script
+        self._script = read_params(self.params, context.params).script
 
     def run(self, bus: Bus) -> None:
         """Run the script. Raises `LevelError` if no folder of `sys.path` contains it."""
