@@ -104,6 +104,8 @@ ARGUMENTS: dict[str, Callable[[Spied], Sequence[Sequence[object]]]] = {
     "clean": lambda spied: [()],
     "replay": lambda spied: [(spied.run, "--out", spied.run / "again.rrd")],
     "export": lambda spied: [(spied.run,)],
+    "plot": lambda spied: [(spied.run, "lower.status.state")],
+    "picture": lambda spied: [(spied.run, "--help")],
     "report": lambda spied: [(spied.run,), (spied.run, "--against", spied.run)],
     "analyze": lambda spied: [(spied.run,), (spied.run, "--response")],
     "gantt": lambda spied: [(spied.run,)],

@@ -64,7 +64,9 @@ def new(
     document = {"kind": kind, "name": name, "folder": str(folder), "files": list(map(str, written))}
     lines = (
         *(f"wrote {path}" for path in written),
-        f"next: rack run {config} --lockstep --seconds 2; pytest {folder}",
+        "next:",
+        f"  rack run {config} --lockstep --seconds 2",
+        f"  pytest {folder}",
     )
     print_answer(document, lines, as_json)
 

@@ -8,7 +8,9 @@ sent as their bytes, so a client needs the same version of the project.
 
 from __future__ import annotations
 
+import select
 import socket
+from collections.abc import Sequence
 from contextlib import suppress
 from enum import IntEnum
 from struct import Struct
@@ -113,3 +115,24 @@ class Connection:
             self.socket.settimeout(timeout_s)
             self.socket.sendall(self._unsent)
         self.socket.close()
+
+
+def await_sockets(
+    sockets: Sequence[socket.socket], timeout_s: float | None, unsent: Sequence[socket.socket] = ()
+) -> list[socket.socket]:
+    """Wait until a socket can be read, or until one of `unsent` can be written.
+
+    Args:
+        sockets: Sockets to read.
+        timeout_s: Longest wait in s. None to wait for ever.
+        unsent: Those among `sockets` with data that is not sent yet.
+
+    Returns:
+        The sockets that can be read.
+    """
+    # Unlike `select.select`, a poll has no limit for the numbers of descriptors.
+    poll = select.poll()
+    for one in sockets:
+        poll.register(one, select.POLLIN | (select.POLLOUT if one in unsent else 0))
+    events = dict(poll.poll(None if timeout_s is None else 1e3 * timeout_s))
+    return [one for one in sockets if events.get(one.fileno(), 0) & ~select.POLLOUT]

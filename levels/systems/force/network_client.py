@@ -10,7 +10,6 @@ there is no server; 2 usage.
 from __future__ import annotations
 
 import json
-import select
 import signal
 import socket
 import sys
@@ -32,6 +31,7 @@ from rack.levels.systems.force.frames import (
     Connection,
     FrameKind,
     NetworkFrame,
+    await_sockets,
 )
 from rack.levels.systems.force.messages import ServerRequest, ServerStatus
 from rack.levels.systems.force.network_server import parse_address
@@ -158,7 +158,7 @@ class RemoteServer:
                 raise LevelError(f"{connection.peer}: {frame.content.decode()}")
             left_s = None if deadline_s is None else max(0.0, deadline_s - time.monotonic())
             unsent = [] if connection.flush() else [connection.socket]
-            ready, _, _ = select.select([connection.socket], unsent, [], left_s)
+            ready = await_sockets([connection.socket], left_s, unsent)
             if ready and not connection.receive():
                 connection.close()
                 raise LevelError(f"the server at {connection.peer} has closed the connection")

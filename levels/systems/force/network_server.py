@@ -12,7 +12,6 @@ Delays of the network then have no effect, and runs repeat.
 from __future__ import annotations
 
 import os
-import select
 import socket
 import subprocess
 import sys
@@ -34,6 +33,7 @@ from rack.levels.systems.force.frames import (
     FrameError,
     FrameKind,
     NetworkFrame,
+    await_sockets,
 )
 from rack.levels.systems.trajectory.commands import ScriptParams
 
@@ -193,7 +193,7 @@ class _Service:
             sockets = [self._listener]
             if self._client is not None and self._pending is None:
                 sockets.append(self._client.socket)
-            ready, _, _ = select.select(sockets, [], [], POLL_S)
+            ready = await_sockets(sockets, POLL_S)
             if self._client is not None and self._client.socket in ready:
                 self._heard_s = time.monotonic()
                 if not self._client.receive():

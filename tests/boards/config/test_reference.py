@@ -20,7 +20,7 @@ UNITS = {
     *("s", "ms", "us", "1/s", "Hz", "ticks", "cycles"),
     *("m", "mm", "m/s", "rad", "rad/s", "rad/s2", "rad/s3", "m or rad", "m/s or rad/s"),
     *("N", "N m", "N or N m", "N/m", "N m/rad", "N/m or N m/rad", "N s/m or N m s/rad"),
-    *("N/(m s)", "kg m2"),
+    *("1/N", "N/(m s)", "kg m2"),
 }
 DIMENSIONLESS = {
     *(
@@ -50,6 +50,7 @@ WHOLE = (
         "permit",
         "posture",
         "points",
+        "wires",
     ),
     *("wrench", "guard", "speed"),
 )

@@ -50,7 +50,7 @@ def test_it_writes_a_class_a_config_and_a_test_with_the_users_name(
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_written_files_run_and_pass_their_test(kind: str, name: str, tmp_path: Path) -> None:
     done = rack("new", kind, name, folder=tmp_path)
-    assert f"next: rack run {name}/{name}.toml --lockstep --seconds 2; pytest {name}" in done.stdout
+    assert f"  rack run {name}/{name}.toml --lockstep --seconds 2\n  pytest {name}\n" in done.stdout
     run = [*("run", f"{name}/{name}.toml", "--lockstep", "--seconds", "2", "--no-record")]
     done = rack(*run, folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
