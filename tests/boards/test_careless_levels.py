@@ -134,5 +134,5 @@ def test_the_command_and_its_report_say_that_torques_were_refused(
     assert "\nbrakes    engaged 5 times" in done.stdout
     page = (out / "report.md").read_text()
     assert "commands refused or cut in 5 cycles" in page
-    assert "\n- brakes engaged 5 times, " in page
+    assert "brakes: engaged 5 times, " in page
     assert len(report["outcome"]["brakings"]) == 5

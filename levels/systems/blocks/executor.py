@@ -22,6 +22,8 @@ from rack.levels.systems.trajectory import TrajectoryExecutor
 from rack.levels.systems.trajectory.messages import MotionKind
 from rack.levels.tables import Live, Table, read_params
 
+SETTLE_S = 0.3
+"""Time after a braking in which `stop` is not set."""
 MAX_PORTS = 32
 """Largest number of inputs, and of blocks, of a network."""
 
@@ -78,6 +80,7 @@ class BlockExecutor(Executor):
         super().__init__(context)
         self.network = build_network(context)
         self._is_restored = False
+        self._settled_tick = 0
 
     @classmethod
     def find_mismatches(
@@ -108,7 +111,10 @@ class BlockExecutor(Executor):
                 value = record[name][joints.index(joint)] if joint else record[name]
                 network.values[source] = float(value)
         status = self.status
-        status.stop = network.compute(self.context.period_s)
+        if self.arm.message.braked:
+            self._settled_tick = tick + round(SETTLE_S / self.context.tick_s)
+        # The brakes change the torques, too, which is no touch.
+        status.stop = network.compute(self.context.period_s) and tick >= self._settled_tick
         for number, name in enumerate(network.results):
             status.values[number] = network.values[name]
         outputs = list(network.outputs)

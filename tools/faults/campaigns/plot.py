@@ -10,6 +10,7 @@ from matplotlib.ticker import NullFormatter
 
 from rack.boards.faults.kind import KINDS
 from rack.tools.console.pictures import open_figure
+from rack.tools.faults.ending import EXTERNAL
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -75,7 +76,8 @@ def _draw_delays(axes: Axes, report: CampaignReport) -> None:
     axes.scatter([], [], label=f"later than {MAX_FRACTION:g}", **LATE)
     axes.axvline(1.0, color=BOUND, linewidth=1.2, label="longest permitted time")
     axes.set_xlim(-0.03, MAX_FRACTION)
-    labels = [f"{kind}: {KINDS[kind].means}" for kind in kinds]
+    means = {kind.name: kind.means for kind in KINDS} | {EXTERNAL: "SIGKILL from another process"}
+    labels = [f"{kind}: {means[kind]}" for kind in kinds]
     axes.set_yticks(range(len(kinds)), labels)
     axes.set_ylim(len(kinds) - 0.4, -0.6)
     axes.grid(axis="y", alpha=0.25)
