@@ -122,6 +122,6 @@ def _list_fault_clauses(
         first = f"{bad[0]['kind']} of {bad[0]['board']} at tick {bad[0]['struck']}"
         yield f"{len(bad)} not, first {first}"
     if unexplained:
-        yield f"{len(unexplained)} detections without a fault, first: {unexplained[0]['text']}"
+        yield f"detections without a fault: {len(unexplained)}, first: {unexplained[0]['text']}"
     if not (faults or unexplained):
         yield "none"
