@@ -122,8 +122,12 @@ class RackWriter:
         write_document(stream, ran.text, config, layout)
         rack = build_rack_timing(config, layout)
         names = name_lanes(layout, rack)
+        # A status refers to moves of a plan in the same block, so plans are written before it.
+        mailboxes = sorted(
+            layout.mailboxes, key=lambda box: box.message == MoveStatus.message_type.name
+        )
         parts_by_mailbox: dict[str, list[ViewPart]] = {
-            box.name: list(_build_mailbox_parts(stream, box, names)) for box in layout.mailboxes
+            box.name: list(_build_mailbox_parts(stream, box, names)) for box in mailboxes
         }
         marks = None
         if ran.cell is not None:
@@ -197,12 +201,15 @@ class RackWriter:
         """
         if (fastest := rows_by_ring.get(self._fastest)) is not None:
             self._times.add_stamps(fastest["tick"], fastest["start_ns"])
-        for ring, rows in rows_by_ring.items():
+        for ring, parts in self._parts.items():
+            if ring not in rows_by_ring:
+                continue
+            rows = rows_by_ring[ring]
             ticks = rows["tick"].astype(np.int64)
             silent = np.diff(ticks, prepend=self._last_ticks.get(ring, ticks[0]))
             self._last_ticks[ring] = int(ticks[-1])
             block = RowBlock(rows, self._times, silent > self._periods[ring])
-            for write in self._parts[ring]:
+            for write in parts:
                 write(block)
         for age in self._ages.values():
             age.write_ages(tick)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 
 from rack.boards.config import load
@@ -18,6 +19,8 @@ from rack.tools.recording.time_line import align_racks
 from rack.tools.viewer.merged import write_merged
 from rack.tools.viewer.pictures import NoViewerError, draw_picture
 from rack.tools.viewer.reading import read_component
+from rack.tools.viewer.sink import RackWriter, RunContext
+from rack.tools.viewer.stream import Stream, Timelines, open_recording
 from tests.boards.remembering_racks import REMEMBERING
 from tests.shared_runs import nasrem_run
 from tests.tools.command_line import rack
@@ -58,6 +61,25 @@ def test_a_view_built_from_files_equals_the_recorders_view(run: Recording, tmp_p
     for key, rows in live.items():
         if not key[0].endswith(loose):
             assert again[key] == rows, key
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", (1, -1))
+def test_the_goal_of_a_move_does_not_depend_on_how_the_recorder_reads_rings(
+    run: Recording, tmp_path: Path, step: int
+) -> None:
+    names = sorted((*run.mailboxes, *run.cycles))[::step]
+    rows = {name: run.read_rows(name) for name in names}
+    context = RunContext.from_config(run.layout, run.config, run.folder)
+    recording = open_recording("run", "run", tmp_path / "one.rrd", rrb.Blueprint())
+    grid = align_racks([run])[0].grid
+    stream = Stream(recording, Timelines(grid.clock_ns, grid.launch))
+    RackWriter(stream, context).write(rows, grid.ticks[1] + 1, {})
+    recording.disconnect()
+    goals = ("/cell/current_goal", "Points3D:labels")
+    one, live = read_contents(tmp_path / "one.rrd"), read_contents(run.folder / "run.rrd")
+    assert one[goals] == live[goals]
+    assert one[goals][-1][1] == "['move']"
 
 
 @pytest.fixture(scope="module")
