@@ -32,16 +32,19 @@ def start(segment: Segment, lead_ns: int = 3 * PERIOD_NS) -> None:
 
 
 def given_out(
-    segment: Segment, stop: int, meanwhile: Callable[[int], object] = id
+    segment: Segment,
+    stop: int,
+    meanwhile: Callable[[int], object] = id,
+    is_enough: Callable[[list[tuple[int, int]]], bool] = bool,
 ) -> list[tuple[int, int]]:
-    """Run the clock in real time up to `stop`; return every tick with the time at which it was
-    decided on."""
+    """Run the clock in real time up to `stop`, or later until the ticks are enough; return every
+    tick with the time at which it was decided on."""
     ticks: list[tuple[int, int]] = []
 
     def ended(tick: int) -> int | None:
         ticks.append((tick, time.monotonic_ns()))
         meanwhile(tick)
-        return stop if tick >= stop else None
+        return stop if tick >= stop and is_enough(ticks) else None
 
     RealtimeDriver(segment, ended).run()
     return ticks
@@ -74,9 +77,12 @@ def test_the_clock_works_ahead_for_tasks_that_sleep(make_bus: MakeBus) -> None:
             if post.acquire(BOUND_S):
                 made.append((sleeper[Block.RELEASED], waiter[Block.RELEASED], time.monotonic_ns()))
 
+    def is_ahead(ticks: list[tuple[int, int]]) -> bool:
+        return any(at < epoch + tick * PERIOD_NS for tick, at in ticks)
+
+    # On a busy machine the clock may be late for all of the first ticks.
     with in_thread(take):
-        ticks = given_out(segment, 40)
-    assert any(at < epoch + tick * PERIOD_NS for tick, at in ticks)
+        ticks = given_out(segment, 40, is_enough=is_ahead)
     # A task that waits for a signal is released at the grid point, where the others have found
     # their release.
     assert all(at >= epoch + second * PERIOD_NS and first >= second for first, second, at in made)
