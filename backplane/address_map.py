@@ -43,6 +43,7 @@ class AddressMap:
     """Bus addresses of everything on one backplane.
 
     Attributes:
+        windows: Address of each board's window, by board.
         size: Total size in bytes, without the texts (layout, config, published facts) that follow
             it in the segment.
     """
@@ -51,12 +52,14 @@ class AddressMap:
         self.blocks: dict[str, int] = {}
         self.traces: dict[str, int] = {}
         self.mailboxes: dict[str, int] = {}
+        self.windows = {CLOCK: HEAD_SIZE}
         self._end = HEAD_SIZE
         self.faults = self._reserve(FAULT_ENTRIES * FAULT_ENTRY_SIZE)
         self.operator = self._reserve(OPERATOR_ENTRIES * compute_operator_entry_size(layout))
         self.alarms = {CLOCK: self._reserve(ALARM_SIZE)}
         self._end_window({CLOCK}, layout)
         for board in dict.fromkeys(task.board for task in layout.processes):
+            self.windows[board] = self._end
             tasks = {task.name: task for task in layout.processes if task.board == board}
             for name, task in tasks.items():
                 self.blocks[name] = self._reserve(BLOCK_SIZE)

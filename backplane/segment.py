@@ -468,7 +468,4 @@ def _restore_value(kind: Any, plain: Any) -> Any:
     return plain
 
 
-@cache
-def _get_types(record: type) -> dict[str, Any]:
-    """Return a dictionary from the names of a dataclass's fields to their types."""
-    return get_type_hints(record)
+_get_types = cache(get_type_hints)

@@ -51,7 +51,7 @@ RULES: tuple[Rule, ...] = (
     mailboxes.check_writers,
     mailboxes.check_operator_mailboxes,
     mailboxes.check_read_mailboxes,
-    mailboxes.check_protocols,
+    mailboxes.check_protocol_tables,
     mailboxes.check_ending_status,
     mailboxes.check_sides,
     mailboxes.check_queues,

@@ -6,6 +6,7 @@ import re
 from bisect import bisect
 from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter
+from itertools import pairwise
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.system_clock import format_rate
@@ -117,14 +118,22 @@ def check_circles(wiring: Wiring) -> Mistakes:
     try:
         TopologicalSorter(above).prepare()
     except CycleError as error:
-        circle = error.args[1]
         # The last level is the first again. Each is above the next.
-        upper, lower = circle[:2]
-        key, board, other = ("below", upper, lower)
-        if lower not in config.board[upper].below:
-            key, board, other = ("above", lower, upper)
-        why = f"the levels form a circle, {' -> '.join(circle)}"
-        yield Mistake(f"board.{board}.{key}", other, why)
+        circle = error.args[1]
+        declared = [
+            keys
+            for upper, lower in pairwise(circle)
+            if (
+                keys := [
+                    (f"board.{board}.{key}", other)
+                    for board, key, other in ((upper, "below", lower), (lower, "above", upper))
+                    if other in getattr(config.board[board], key)
+                ]
+            )
+        ]
+        # Prefer to report a link that only one of its two boards names.
+        place, other = min(reversed(declared), key=len)[0]
+        yield Mistake(place, other, f"the levels form a circle, {' -> '.join(circle)}")
 
 
 def check_slots(wiring: Wiring) -> Mistakes:
