@@ -7,9 +7,9 @@ layout alone determines the map.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Collection
 
-from rack.backplane.layout import Layout, MailboxSpec, TaskSpec
+from rack.backplane.layout import Layout, MailboxSpec
 
 PAGE = 4096
 CACHE_LINE = 64
@@ -39,40 +39,33 @@ ALARM_SIZE = CACHE_LINE + ALARM_DEPTH * ALARM_RECORD_SIZE
 """Bytes of one alarm ring: a cache line for its head, followed by the records."""
 
 
-@dataclass(frozen=True)
-class Window:
-    """Part of the segment that belongs to one board. Address and size are in bytes."""
-
-    board: str
-    address: int
-    size: int
-
-
 class AddressMap:
     """Bus addresses of everything on one backplane.
 
     Attributes:
+        windows: Address of each board's window, by board.
         size: Total size in bytes, without the texts (layout, config, published facts) that follow
             it in the segment.
     """
 
     def __init__(self, layout: Layout) -> None:
-        self.windows: list[Window] = []
         self.blocks: dict[str, int] = {}
         self.traces: dict[str, int] = {}
         self.mailboxes: dict[str, int] = {}
+        self.windows = {CLOCK: HEAD_SIZE}
         self._end = HEAD_SIZE
         self.faults = self._reserve(FAULT_ENTRIES * FAULT_ENTRY_SIZE)
         self.operator = self._reserve(OPERATOR_ENTRIES * compute_operator_entry_size(layout))
         self.alarms = {CLOCK: self._reserve(ALARM_SIZE)}
-        self._end_window(CLOCK, {CLOCK}, layout)
+        self._end_window({CLOCK}, layout)
         for board in dict.fromkeys(task.board for task in layout.processes):
-            tasks = [task for task in layout.processes if task.board == board]
-            for task in tasks:
-                self.blocks[task.name] = self._reserve(BLOCK_SIZE)
-                self.traces[task.name] = self._reserve(compute_trace_size(task))
-                self.alarms[task.name] = self._reserve(ALARM_SIZE)
-            self._end_window(board, {task.name for task in tasks}, layout)
+            self.windows[board] = self._end
+            tasks = {task.name: task for task in layout.processes if task.board == board}
+            for name, task in tasks.items():
+                self.blocks[name] = self._reserve(BLOCK_SIZE)
+                self.traces[name] = self._reserve(task.depth * TRACE_RECORD_SIZE)
+                self.alarms[name] = self._reserve(ALARM_SIZE)
+            self._end_window(tasks, layout)
         # Semaphores follow the windows, each in a separate cache line.
         self.wake = {task.name: self._reserve(CACHE_LINE) for task in layout.processes}
         self.done = {task.name: self._reserve(CACHE_LINE) for task in layout.processes}
@@ -86,20 +79,14 @@ class AddressMap:
         self._end = _round_up(address + size, CACHE_LINE)
         return address
 
-    def _end_window(self, board: str, writers: set[str], layout: Layout) -> None:
-        """Reserve memory for the mailboxes of a board, and end its window on a page boundary.
-
-        Args:
-            board: Board that owns the window.
-            writers: Names of the board's tasks, which write these mailboxes.
-            layout: Layout of the backplane.
-        """
+    def _end_window(self, writers: Collection[str], layout: Layout) -> None:
+        """Reserve memory for the mailboxes of a board's tasks, and end its window on a page."""
         for mailbox in layout.mailboxes:
             if mailbox.writer in writers:
-                self.mailboxes[mailbox.name] = self._reserve(compute_mailbox_size(mailbox))
-        start = self.windows[-1].address + self.windows[-1].size if self.windows else HEAD_SIZE
+                self.mailboxes[mailbox.name] = self._reserve(
+                    MAILBOX_HEAD_SIZE + mailbox.depth * compute_slot_stride(mailbox)
+                )
         self._end = round_up_to_pages(self._end)
-        self.windows.append(Window(board, start, self._end - start))
 
 
 def round_up_to_pages(size: int) -> int:
@@ -107,19 +94,9 @@ def round_up_to_pages(size: int) -> int:
     return _round_up(size, PAGE)
 
 
-def compute_trace_size(task: TaskSpec) -> int:
-    """Return the size of a task's trace ring, in bytes."""
-    return task.depth * TRACE_RECORD_SIZE
-
-
 def compute_slot_stride(mailbox: MailboxSpec) -> int:
     """Return the distance from one slot of a mailbox to the next, in bytes."""
     return _round_up(SLOT_HEAD_SIZE + mailbox.size, CACHE_LINE)
-
-
-def compute_mailbox_size(mailbox: MailboxSpec) -> int:
-    """Return the size of a mailbox with its head and its slots, in bytes."""
-    return MAILBOX_HEAD_SIZE + mailbox.depth * compute_slot_stride(mailbox)
 
 
 def compute_oldest_intact(head: int, depth: int) -> int:

@@ -292,16 +292,14 @@ def fill_counts(record: Any, counts: Iterable[float]) -> None:
 
     A count that is too large for an integer field is stored as the largest value of the field.
     """
-    kinds = (kind for kind, *_ in record.dtype.fields.values())
-    record[...] = tuple(
-        min(count, _find_maximum(kind)) for count, kind in zip(counts, kinds, strict=True)
-    )
+    record[...] = tuple(map(min, counts, _find_maxima(record.dtype)))
 
 
 @cache
-def _find_maximum(kind: np.dtype) -> float:
-    """Return the largest value that a numpy type can store."""
-    return np.iinfo(kind).max if kind.kind in "iu" else np.inf
+def _find_maxima(group: np.dtype) -> tuple[float, ...]:
+    """Return the largest value that each field of a numpy record type can store."""
+    kinds = [kind for kind, *_ in (group.fields or {}).values()]
+    return tuple(np.iinfo(kind).max if kind.kind in "iu" else np.inf for kind in kinds)
 
 
 @cache

@@ -96,18 +96,6 @@ class RequestEntry:
         """True if the command was issued under a lease that has not been released."""
         return self.client == Client.LEASES and self.stage == RequestStage.GIVEN
 
-    def could_have_produced(self, issued: Request) -> bool:
-        """Check whether issuing this request could have produced a command of a recorded run.
-
-        Args:
-            issued: The command, with the tick at which it was issued.
-        """
-        return (
-            self.mailbox == issued.mailbox
-            and self.tick <= issued.tick
-            and self.message[: len(issued.message)] == issued.message
-        )
-
 
 class OperatorTable:
     """Operator table of one rack. `entries` contains all entries, including free ones."""
@@ -215,7 +203,17 @@ class OperatorTable:
         waiting = sorted(self.list_waiting(), key=lambda entry: entry.tick)
         missing = []
         for request in requests:
-            entry = next((entry for entry in waiting if entry.could_have_produced(request)), None)
+            message = request.message
+            entry = next(
+                (
+                    entry
+                    for entry in waiting
+                    if entry.mailbox == request.mailbox
+                    and entry.tick <= request.tick
+                    and entry.message[: len(message)] == message
+                ),
+                None,
+            )
             if entry is None:
                 missing.append(request)
             else:

@@ -26,15 +26,6 @@ STOPPED_STATES = "Tt"
 """States of a process stopped by a signal or a debugger."""
 
 
-def read_start_time(pid: int) -> int:
-    """Return the start time of a process, in kernel clock ticks since boot.
-
-    The result is 0 if the process does not exist or has ended.
-    """
-    fields = _read_stat(pid)
-    return int(fields[19]) if fields and fields[0] not in ENDED_STATES else 0
-
-
 def read_state(pid: int) -> str:
     """Return the kernel's letter for the state of a process.
 
@@ -66,16 +57,9 @@ def _read_stat(pid: int) -> list[str]:
     return stat.rpartition(")")[2].split()
 
 
-def is_alive(pid: int, started: int = 0) -> bool:
-    """Check whether a process is alive.
-
-    Args:
-        pid: Process id.
-        started: Start time of the expected process, to detect that the pid was reused. 0 accepts
-            any process.
-    """
-    start = read_start_time(pid) if pid > 0 else 0
-    return bool(start) and started in (0, start)
+def is_alive(pid: int) -> bool:
+    """Check whether a process is alive."""
+    return pid > 0 and read_state(pid) not in ENDED_STATES
 
 
 def wait_readable(fd: int, timeout_s: float) -> bool:

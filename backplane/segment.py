@@ -10,16 +10,12 @@ from __future__ import annotations
 import json
 import mmap
 import os
-import stat
-import sys
 import time
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self, get_args, get_type_hints
 from zlib import crc32
-
-import posix_ipc
 
 from rack.backplane.address_map import (
     BLOCK_SIZE,
@@ -32,7 +28,7 @@ from rack.backplane.byte_lock import ProcessLock, is_locked
 from rack.backplane.errors import SegmentError
 from rack.backplane.json_text import encode_json
 from rack.backplane.layout import Layout, TaskSpec
-from rack.backplane.semaphores import initialize_all
+from rack.backplane.semaphores import Semaphore
 from rack.backplane.words import Block, Head, Run, System
 
 if TYPE_CHECKING:
@@ -55,8 +51,6 @@ PROCESSOR = "x86_64"
 Rings and control blocks need this order, and so do mailboxes where Python accesses them (see
 `rack.backplane.mailbox.slots`). Racks have not been tested on other architectures.
 """
-TRY_VARIABLE = "RACK_TRY_PROCESSOR"
-"""Environment variable that permits a trial on other processors with 64 bits."""
 
 
 class Launch(NamedTuple):
@@ -146,13 +140,10 @@ class Segment:
                 supported.
         """
         if (machine := os.uname().machine) != PROCESSOR:
-            here = f"rack '{layout.rack}': the processor here is {machine}"
-            if sys.maxsize < 1 << 32:
-                raise SegmentError(f"{here}, without atomic access to 64 bits")
-            why = f"the backplane's memory order is proved for {PROCESSOR} alone"
-            if not os.environ.get(TRY_VARIABLE):
-                raise SegmentError(f"{here}; {why}; set {TRY_VARIABLE}=1 to try it")
-            sys.stderr.write(f"{here}; {why}, and this one is untested\n")
+            raise SegmentError(
+                f"rack '{layout.rack}': the processor here is {machine}, and the backplane's memory"
+                f" order is proved for {PROCESSOR} alone"
+            )
         texts = [encode_json(asdict(layout)).encode(), config.encode(), published.encode()]
         places = AddressMap(layout)
         size = round_up_to_pages(places.size + sum(len(t) for t in texts))
@@ -233,9 +224,10 @@ class Segment:
     def initialize_semaphores(self) -> None:
         """Initialize all semaphores. No process may be waiting on them."""
         places = self.map
-        initialize_all(
-            self.bytes, (*places.wake.values(), *places.done.values()), places.locks.values()
-        )
+        values = {0: (*places.wake.values(), *places.done.values()), 1: places.locks.values()}
+        for value, addresses in values.items():
+            for address in addresses:
+                Semaphore(self.bytes, address).initialize(value)
 
     @classmethod
     def attach(cls, rack: str) -> Self:
@@ -262,25 +254,24 @@ class Segment:
             SegmentError: There is no such segment, it belongs to another user, or it is not a
                 segment.
         """
-        if (kind := find_foreign_kind(rack)) is not None:
-            raise SegmentError(f"rack '{rack}': {get_shm_path(rack)} is a {kind}, not a segment")
+        path = get_shm_path(rack)
         try:
-            shm = posix_ipc.SharedMemory(_shm_name(rack))
-        except (posix_ipc.ExistentialError, posix_ipc.PermissionsError, ValueError) as error:
-            why = (
-                "belongs to another user"
-                if isinstance(error, posix_ipc.PermissionsError)
-                else "does not exist"
-            )
+            fd = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+        except (OSError, ValueError) as error:
+            why = "does not exist"
+            if isinstance(error, PermissionError):
+                why = "belongs to another user"
+            elif os.path.lexists(path):
+                why = f"has no segment: {error}"
             raise SegmentError(
                 f"rack '{rack}' {why}; racks: {', '.join(list_racks()) or 'none'}"
             ) from None
-        status = os.fstat(shm.fd)
+        status = os.fstat(fd)
         if os.getuid() not in (status.st_uid, 0) or status.st_size < HEAD_SIZE:
-            os.close(shm.fd)
+            os.close(fd)
             why = f"owner {status.st_uid}, {status.st_size} bytes: not a segment of this user"
             raise SegmentError(f"rack '{rack}': {why}")
-        return cls(rack, mmap.mmap(shm.fd, status.st_size), shm.fd)
+        return cls(rack, mmap.mmap(fd, status.st_size), fd)
 
     def read_head(self) -> None:
         """Read layout, config and published facts from the segment.
@@ -426,20 +417,6 @@ def list_racks() -> list[str]:
     return sorted(path.name.removeprefix(PREFIX) for path in SHM_FOLDER.glob(f"{PREFIX}*"))
 
 
-def find_foreign_kind(rack: str) -> str | None:
-    """Return the kind of an entry in /dev/shm that has a rack's name but is not a segment.
-
-    Returns:
-        The kind, such as "directory". None if the entry is a regular file or does not exist.
-    """
-    try:
-        mode = get_shm_path(rack).lstat().st_mode
-    except OSError:  # no such file, or an impossible name
-        return None
-    kinds = {stat.S_IFDIR: "directory", stat.S_IFLNK: "symbolic link"}
-    return None if stat.S_ISREG(mode) else kinds.get(stat.S_IFMT(mode), "special file")
-
-
 def unlink_segment(rack: str) -> None:
     """Remove a rack's segment by name. Does nothing if the segment does not exist.
 
@@ -447,10 +424,8 @@ def unlink_segment(rack: str) -> None:
         SegmentError: The segment belongs to another user.
     """
     try:
-        posix_ipc.unlink_shared_memory(_shm_name(rack))
-    except posix_ipc.ExistentialError:
-        return
-    except posix_ipc.PermissionsError:
+        get_shm_path(rack).unlink(missing_ok=True)
+    except PermissionError:
         raise SegmentError(
             f"rack '{rack}' belongs to another user: only that user may remove it"
         ) from None
@@ -464,11 +439,6 @@ def get_shm_path(rack: str) -> Path:
 def _pid_namespace() -> int:
     """Return the inode of this process's PID namespace, which identifies the namespace."""
     return Path("/proc/self/ns/pid").stat().st_ino
-
-
-def _shm_name(rack: str) -> str:
-    """Return the name of a rack's segment as `posix_ipc` expects it, with a leading slash."""
-    return f"/{PREFIX}{rack}"
 
 
 def restore_layout(plain: dict[str, Any]) -> Layout:
@@ -498,7 +468,4 @@ def _restore_value(kind: Any, plain: Any) -> Any:
     return plain
 
 
-@cache
-def _get_types(record: type) -> dict[str, Any]:
-    """Return a dictionary from the names of a dataclass's fields to their types."""
-    return get_type_hints(record)
+_get_types = cache(get_type_hints)

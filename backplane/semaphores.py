@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import ctypes
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
 from typing import Protocol
 
@@ -91,19 +91,6 @@ class Semaphore:
             if time.monotonic_ns() >= deadline_ns:
                 return False
         return True
-
-
-def initialize_all(memory: memoryview, wake_and_done: Iterable[int], locks: Iterable[int]) -> None:
-    """Create the semaphores of a rack.
-
-    Args:
-        memory: Memory of the segment.
-        wake_and_done: Bus addresses of the semaphores of tasks. Their initial value is 0.
-        locks: Bus addresses of the semaphores of locked mailboxes. Their initial value is 1.
-    """
-    for value, addresses in ((0, wake_and_done), (1, locks)):
-        for address in addresses:
-            Semaphore(memory, address).initialize(value)
 
 
 def get_wake_semaphore(segment: MappedMemory, task: str) -> Semaphore:

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal
 
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.message import AnyMessage, State, format_state, get_reason
@@ -247,7 +247,9 @@ class Journal:
         now_ns = time.time_ns()
         stamp_ns = now_ns if at_ns is None else now_ns - time.monotonic_ns() + at_ns
         if tick is None:
-            tick = self._tick
+            tick = -1
+            if self.segment is not None and self.segment.words[System.STATE] != Run.STARTING:
+                tick = self.segment.words[System.TICK]
         self.record_event(Event(stamp_ns, tick, kind, board, text, code, subject=subject))
 
     def record_event(self, event: Event) -> None:
@@ -255,13 +257,6 @@ class Journal:
         self.events.append(event)
         if self._on_event:
             self._on_event(event)
-
-    @property
-    def _tick(self) -> int:
-        """Current tick, -1 before the run."""
-        if self.segment is None or self.segment.words[System.STATE] == Run.STARTING:
-            return -1
-        return self.segment.words[System.TICK]
 
 
 def iterate_statuses(segment: Segment, field: str) -> Iterator[tuple[str, AnyMessage]]:
@@ -404,7 +399,13 @@ class Ending:
             ):
                 rows = scene.message.position
                 return tuple(
-                    ObjectEnd.compare_with_goal(goal, rows[row].tolist())
+                    ObjectEnd(
+                        goal.object,
+                        goal.position,
+                        (ended := rows[row].tolist()),
+                        round(1e3 * math.dist(ended, goal.position), 3),
+                        goal.tolerance_mm,
+                    )
                     for row, goal in goals.items()
                 )
         return ()
@@ -454,17 +455,6 @@ class ObjectEnd:
     ended: Sequence[float]
     off_mm: float
     tolerance_mm: float
-
-    @classmethod
-    def compare_with_goal(cls, goal: GoalConfig, ended: Sequence[float]) -> Self:
-        """Compare the final position of an object with its goal.
-
-        Args:
-            goal: Goal of the object.
-            ended: Final position in m.
-        """
-        off_mm = round(1e3 * math.dist(ended, goal.position), 3)
-        return cls(goal.object, goal.position, ended, off_mm, goal.tolerance_mm)
 
     def __str__(self) -> str:
         return (

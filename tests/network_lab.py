@@ -20,7 +20,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Self
 
-from rack.backplane.process import is_alive, read_start_time, wait_readable
+from rack.backplane.process import wait_readable
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.harness import run_program
 
@@ -38,6 +38,14 @@ LINK = "lan"
 _NUMBERS = count()
 
 
+def _read_start_time(pid: str) -> str:
+    """Start time of a process, in kernel clock ticks since boot; empty if there is none."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19]
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
+
+
 class Lab:
     """Machines 0 to `machines` - 1, each a network namespace. Raises `Failure` where a command for
     one fails."""
@@ -46,7 +54,7 @@ class Lab:
         if not 1 <= machines <= MOST_MACHINES:
             raise ValueError(f"{machines} machines: permitted are 1 to {MOST_MACHINES}")
         pid = os.getpid()
-        lab = f"{PREFIX}-{pid}-{read_start_time(pid)}-{next(_NUMBERS)}"
+        lab = f"{PREFIX}-{pid}-{_read_start_time(str(pid))}-{next(_NUMBERS)}"
         self._hub = f"{lab}-hub"
         self._names = [f"{lab}-{number}" for number in range(machines)]
         self._started: list[subprocess.Popen[Any]] = []
@@ -171,7 +179,7 @@ def _stale() -> list[str]:
     found = []
     for path in NAMESPACES.glob(f"{PREFIX}-*"):
         pid, started = path.name.removeprefix(f"{PREFIX}-").split("-")[:2]
-        if not is_alive(int(pid), int(started)):
+        if _read_start_time(pid) != started:
             found.append(path.name)
     return found
 

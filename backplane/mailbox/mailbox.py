@@ -25,7 +25,7 @@ from rack.backplane.address_map import SLOT_HEAD_SIZE
 from rack.backplane.byte_lock import ByteLock
 from rack.backplane.errors import MailboxError
 from rack.backplane.mailbox.slots import Slots, build_signature, get_epoch, get_pid
-from rack.backplane.message import AnyMessage, Message
+from rack.backplane.message import AnyMessage, Message, copy_message
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Word
 
@@ -307,7 +307,10 @@ class Reader:
         return self._accept(serial, tick)
 
     def _accept(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Return the reading of a message or, if it is bad, of an older one.
+        """Return the reading of a message or, if it is bad, of an older one as `_step_back` does.
+
+        If the slot of the bad message is being overwritten, the read is counted as timed out, and
+        the result is the last good message with verdict BUS_ERROR.
 
         Args:
             serial: Serial of the message found by the read. If it is the serial of the last good
@@ -317,14 +320,8 @@ class Reader:
         self.found = serial
         if serial == self.serial:
             return self._unchanged
-        return self._new if self._fetch_good(serial) else self._accept_older(serial, tick)
-
-    def _accept_older(self, serial: int, tick: int) -> Reading[AnyMessage]:
-        """Count message `serial` as bad, and return an older one as `_step_back` does.
-
-        If the slot of the bad message is being overwritten, the read is counted as timed out, and
-        the result is the last good message with verdict BUS_ERROR.
-        """
+        if self._fetch_good(serial):
+            return self._new
         if not self.slots.is_intact(serial):
             return self._count_timeout()
         self.statistics.bad_reads += 1
@@ -407,9 +404,18 @@ class Reader:
             reading: Result of a read.
             before: Serial of the last good message before that read.
         """
-        if self.serial <= before + 1:
+        slots = self.slots
+        newest = self.serial
+        if newest <= before + 1:
             return reading
-        return reading._replace(earlier=tuple(self.slots.iterate_between(before, self.serial)))
+        serials = range(max(before + 1, newest - slots.mask), newest)
+        return reading._replace(
+            earlier=tuple(
+                copy_message(slots.message)
+                for serial in serials
+                if slots.fetch_message(serial) and slots.is_from_claimant(0)
+            )
+        )
 
     def peek(self) -> Reading[AnyMessage]:
         """Return the newest complete message with its verdict, even if it is not visible yet."""

@@ -28,7 +28,7 @@ five times as long on 200 bytes).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from struct import Struct
 from time import monotonic_ns
 from typing import Any
@@ -43,7 +43,7 @@ from rack.backplane.address_map import (
     compute_slot_stride,
 )
 from rack.backplane.layout import FieldSpec, MailboxSpec
-from rack.backplane.message import AnyMessage, copy_message
+from rack.backplane.message import AnyMessage
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, Slot, Word
 
@@ -87,19 +87,15 @@ def build_message_dtype(fields: tuple[FieldSpec, ...], size: int) -> np.dtype:
     return np.dtype(
         {
             "names": [f.name for f in fields],
-            "formats": [_build_field_format(f) for f in fields],
+            "formats": [
+                # The kind of a group, "V<bytes>", contains its size.
+                (build_message_dtype(f.fields, int(f.kind[1:])) if f.fields else f.kind, f.shape)
+                for f in fields
+            ],
             "offsets": [f.offset for f in fields],
             "itemsize": size,
         }
     )
-
-
-def _build_field_format(field: FieldSpec) -> tuple[str | np.dtype, tuple[int, ...]]:
-    """Return the numpy type and the shape of one field."""
-    if not field.fields:
-        return field.kind, field.shape
-    # The kind of a group, "V<bytes>", contains its size.
-    return build_message_dtype(field.fields, int(field.kind[1:])), field.shape
 
 
 class Slots:
@@ -262,15 +258,6 @@ class Slots:
         """
         self.load_slot(serial)
         return self.serial == serial and self.passes_check
-
-    def iterate_between(self, before: int, newest: int) -> Iterator[AnyMessage]:
-        """Yield a copy of each good message between two serials, both excluded.
-
-        Messages whose slots have been reused are left out.
-        """
-        for serial in range(max(before + 1, newest - self.mask), newest):
-            if self.fetch_message(serial) and self.is_from_claimant(0):
-                yield copy_message(self.message)
 
     def copy_slot(self, serial: int) -> bool:
         """Copy the slot of a serial into the local record, and check that it was not reused.

@@ -19,7 +19,6 @@ from rack.backplane.errors import ClockError
 from rack.backplane.layout import Protocol
 from rack.backplane.message import Message
 from rack.backplane.message_type import MessageType
-from rack.boards.classes import find_class
 from rack.boards.config.schema import (
     LAN,
     ExchangeConfig,
@@ -35,6 +34,7 @@ from rack.levels.host_program import HostProgram
 from rack.levels.level import ConfiguredPorts, Executor, Output, Planner, Program
 from rack.levels.operator import OperatorCommand
 from rack.levels.ports import InputPort
+from rack.levels.references import find_class
 
 OWN_OPERATOR = "own.operator"
 LevelClass = type[Executor] | type[Planner] | type[HostProgram]
@@ -89,14 +89,6 @@ class TaskPorts:
     def writes(self) -> dict[str, str]:
         """Mailboxes that the task writes, by port."""
         return {port: f"{self.place.board}.{port}" for port in self.outputs}
-
-    def find_origin_mailboxes(self, output: str) -> tuple[str, ...]:
-        """Return the mailboxes on whose messages an output is based.
-
-        The result is empty if the output does not declare an input in `rests_on`.
-        """
-        source = self.outputs[output].rests_on
-        return () if source is None else list_mailboxes(self.reads.get(source.name, {}))
 
 
 def _connect_ports(
@@ -191,8 +183,10 @@ def _group_by_board(mailboxes: Sources) -> Source:
     If a board writes several of the mailboxes, each of them is keyed by its own name instead.
     """
     boards = [box.partition(".")[0] for box in mailboxes]
-    pairs = zip(boards, mailboxes, strict=True)
-    return {board if boards.count(board) == 1 else box: box for board, box in pairs}
+    return {
+        board if boards.count(board) == 1 else box: box
+        for board, box in zip(boards, mailboxes, strict=True)
+    }
 
 
 class Wiring:
@@ -299,11 +293,8 @@ class Wiring:
     @cached_property
     def mailboxes_to_host(self) -> set[str]:
         """Mailboxes that bus adapters write for host boards."""
-        return {
-            mailbox
-            for mailbox, box in self.passed_mailboxes.items()
-            if box not in self.mailboxes_from_host
-        }
+        passed = self.passed_mailboxes
+        return {box for box, source in passed.items() if source not in self.mailboxes_from_host}
 
     @property
     def host_side_mailboxes(self) -> set[str]:

@@ -261,31 +261,24 @@ def _read_config(
         known: Tables of the files that have been read, because several may extend the same file.
         mistakes: List to which mistakes are added.
     """
-    if path not in known:
-        with collect_mistakes(mistakes):
-            known[path] = _read_merged(path, chain, known, mistakes)
+    if path in known:
+        return known[path]
+    with collect_mistakes(mistakes):
+        why = ""
+        if path in chain:
+            loop = " -> ".join(p.name for p in (*chain[chain.index(path) :], path))
+            why = f"extends itself: {loop}"
+        elif len(chain) >= MAX_DEPTH:
+            why = f"the chain of extended files is longer than {MAX_DEPTH} files"
+        if why:
+            raise ConfigError([Mistake(f"{path.name}: extends", None, why)])
+        # A file without a format has format 1, even if it extends files of a newer format.
+        top = {"format": 1, **resolve_paths(_read_tables(path), path.parent)}
+        merged: Tables = {}
+        for base in _list_bases(top.pop("extends", []), path, mistakes):
+            merged = _merge_extension(merged, _read_config(base, (*chain, path), known, mistakes))
+        known[path] = _merge_extension(merged, top)
     return known.setdefault(path, {})
-
-
-def _read_merged(
-    path: Path, chain: tuple[Path, ...], known: dict[Path, Tables], mistakes: list[Mistake]
-) -> Tables:
-    """Read a file, merge it into the files that it extends, and return the tables.
-
-    Takes the same arguments as `_read_config`. Raises `ConfigError` if the file extends itself.
-    """
-    if path in chain:
-        loop = " -> ".join(p.name for p in (*chain[chain.index(path) :], path))
-        raise ConfigError([Mistake(f"{path.name}: extends", None, f"extends itself: {loop}")])
-    if len(chain) >= MAX_DEPTH:
-        why = f"the chain of extended files is longer than {MAX_DEPTH} files"
-        raise ConfigError([Mistake(f"{path.name}: extends", None, why)])
-    # A file without a format has format 1, even if it extends files of a newer format.
-    top = {"format": 1, **resolve_paths(_read_tables(path), path.parent)}
-    merged: Tables = {}
-    for base in _list_bases(top.pop("extends", []), path, mistakes):
-        merged = _merge_extension(merged, _read_config(base, (*chain, path), known, mistakes))
-    return _merge_extension(merged, top)
 
 
 def _merge_extension(base: Tables, top: Tables) -> Tables:

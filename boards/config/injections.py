@@ -89,70 +89,64 @@ class FaultCheck:
         if kind is None:
             yield self._build_mistake("kind", f"no such kind; kinds: {', '.join(KINDS.names)}")
         else:
-            yield from self._check_kind(kind)
+            yield from self._check_keys(kind)
         if fault.board != CLOCK and fault.board not in tasks:
             if fault.board.partition(".")[0] not in self.broken_boards:
                 yield self._build_mistake(
                     "board", f"no such task; tasks: {', '.join([*tasks, CLOCK])}"
                 )
         elif kind is not None:
-            yield from self._check_target(kind, tasks)
+            of_task = self._explain_unsuitable_task(kind, tasks)
+            if why := of_task or self._explain_unsuitable_mailbox(kind):
+                yield self._build_mistake("board" if of_task else "mailbox", why)
         if fault.when is not None and (layout := self._find_layout(fault.when)) is not None:
             try:
                 parse_condition(fault.when, layout)
             except LookupError as error:
                 yield self._build_mistake("when", str(error.args[0]))
 
-    def _check_kind(self, kind: Kind) -> Mistakes:
-        """Yield a mistake for each key that this kind of fault does not accept."""
-        if kind.realtime and self.config.is_lockstep:
-            why = (
-                f"{kind.name} needs real time: in lockstep time waits for every task; run without"
-                " --lockstep"
-            )
-            yield self._build_mistake("kind", why)
-        if kind.once:
-            yield from self._forbid_keys(
-                ("for", "cycles"), f"{kind.name} strikes once and has no duration; remove it"
-            )
-        if kind.where == "start":
-            yield from self._forbid_keys(
-                ("tick", "at", "when"), f"{kind.name} strikes as the board starts; remove it"
-            )
-        if self.fault.phase and not kind.within_tick:
-            takers = _format_names(other.name for other in KINDS if other.within_tick)
-            yield self._build_mistake(
-                "phase", f"{kind.name} cannot strike within a tick; kinds that can: {takers}"
-            )
-        if self.fault.mailbox is not None and not kind.takes_mailbox:
-            takers = _format_names(other.name for other in KINDS if other.takes_mailbox)
-            yield self._build_mistake(
-                "mailbox", f"{kind.name} does not affect mailboxes; kinds that do: {takers}"
-            )
-        yield from self._check_parameters(kind)
-
-    def _check_parameters(self, kind: Kind) -> Mistakes:
-        """Yield a mistake for each unknown, invalid or missing parameter of the kind."""
+    def _check_keys(self, kind: Kind) -> Mistakes:
+        """Yield a mistake for each key and parameter that this kind of fault does not accept."""
+        fault = self.fault
+        within_tick = _format_names(other.name for other in KINDS if other.within_tick)
+        of_mailboxes = _format_names(other.name for other in KINDS if other.takes_mailbox)
+        for is_refused, keys, why in (
+            (
+                kind.realtime and self.config.is_lockstep,
+                ("kind",),
+                "needs real time: in lockstep time waits for every task; run without --lockstep",
+            ),
+            (kind.once, ("for", "cycles"), "strikes once and has no duration; remove it"),
+            (
+                kind.where == "start",
+                ("tick", "at", "when"),
+                "strikes as the board starts; remove it",
+            ),
+            (
+                fault.phase and not kind.within_tick,
+                ("phase",),
+                f"cannot strike within a tick; kinds that can: {within_tick}",
+            ),
+            (
+                not kind.takes_mailbox,
+                ("mailbox",),
+                f"does not affect mailboxes; kinds that do: {of_mailboxes}",
+            ),
+        ):
+            for key in keys if is_refused else ():
+                if self._get_value(key) is not None:
+                    yield self._build_mistake(key, f"{kind.name} {why}")
         known = {parameter.name: parameter for parameter in kind.parameters}
-        for name, value in self.fault.parameters.items():
+        for name, value in fault.parameters.items():
             why = f"{kind.name} has no such parameter; parameters: {_format_names(known)}"
             if name in known:
                 why = _explain_invalid_value(known[name], value, self.config.robot)
             if why:
                 plain = int(value) if value.is_integer() else value
                 yield Mistake(format_place(self.place, name), plain, why)
-        for parameter in kind.parameters:
-            if parameter.default is None and parameter.name not in self.fault.parameters:
-                yield Mistake(
-                    format_place(self.place, parameter.name), None, f"missing; {parameter}"
-                )
-
-    def _check_target(self, kind: Kind, tasks: Mapping[str, Role]) -> Mistakes:
-        """Yield a mistake if this kind of fault cannot affect the task or mailbox that it names."""
-        if why := self._explain_unsuitable_task(kind, tasks):
-            yield self._build_mistake("board", why)
-        elif why := self._explain_unsuitable_mailbox(kind):
-            yield self._build_mistake("mailbox", why)
+        for name, parameter in known.items():
+            if parameter.default is None and name not in fault.parameters:
+                yield Mistake(format_place(self.place, name), None, f"missing; {parameter}")
 
     def _explain_unsuitable_task(self, kind: Kind, tasks: Mapping[str, Role]) -> str:
         """Return the reason why this kind of fault cannot affect the fault's task. Empty if it can.
@@ -182,10 +176,8 @@ class FaultCheck:
                 if name not in self.levels or kind.name in self.levels[name].struck_by
             ]
             if board not in able:
-                return (
-                    f"{kind.name} cannot strike this board; boards that it can: "
-                    f"{_format_names(able)}"
-                )
+                names = _format_names(able)
+                return f"{kind.name} cannot strike this board; boards that it can: {names}"
         return ""
 
     def _find_layout(self, place: str) -> Layout | None:
@@ -228,12 +220,6 @@ class FaultCheck:
             why = f"{kind.name} needs protocol lock; mailboxes of '{board}' that use it"
             return f"{why}: {_format_names(locked)}"
         return ""
-
-    def _forbid_keys(self, keys: Iterable[str], why: str) -> Mistakes:
-        """Yield a mistake, with `why` as its reason, for each of these keys that the fault has."""
-        for key in keys:
-            if self._get_value(key) is not None:
-                yield self._build_mistake(key, why)
 
     def _get_value(self, key: str) -> object:
         """Return the fault's value for a key of its `[[fault]]` table. None if it is not given."""
@@ -297,12 +283,20 @@ def _build_injection(
     """Return the fault table's entry for one fault of a checked config, or for a live fault."""
     kind = KINDS[fault.kind]
     names = [process.name for process in layout.processes]
-    task = -1 if fault.board == CLOCK else names.index(fault.board)
+    mailbox = -1
+    if fault.mailbox is not None:
+        mailbox = layout.find_mailbox_index(fault.mailbox)
+    elif kind.where == "bus":
+        # A forged message enters one mailbox, by default the first that has a reader.
+        mailbox = next(
+            at
+            for at, box in enumerate(layout.mailboxes)
+            if box.writer == fault.board and box.readers
+        )
     seed = fault.seed
     if seed is None:
         # Two faults of one config must draw different random numbers.
         seed = crc32(f"{config.seed} {place}".encode()) % SEEDS
-    when = None if fault.when is None else parse_condition(fault.when, layout)
     # Zero ticks mean that the fault lasts until the end of the run, or that it occurs only once.
     ticks = 0
     if fault.cycles is not None:
@@ -311,31 +305,14 @@ def _build_injection(
         ticks = max(1, round(fault.lasts * 1e9 / layout.clock_ns))
     return Injection(
         kind=kind.number,
-        task=task,
-        mailbox=_find_mailbox(fault, kind, layout),
+        task=-1 if fault.board == CLOCK else names.index(fault.board),
+        mailbox=mailbox,
         tick=compute_first_tick(fault, layout.clock_ns),
         ticks=ticks,
         phase=int(fault.phase * PHASES),
         seed=seed,
-        when=when,
+        when=None if fault.when is None else parse_condition(fault.when, layout),
         parameters=tuple(
             float(fault.parameters.get(p.name, p.default or 0.0)) for p in kind.parameters
         ),
     )
-
-
-def _find_mailbox(fault: FaultConfig, kind: Kind, layout: Layout) -> int:
-    """Return the index of the one mailbox that a fault affects.
-
-    Returns:
-        The index, or -1 if the fault affects all mailboxes of its task or none.
-    """
-    if fault.mailbox is not None:
-        return layout.find_mailbox_index(fault.mailbox)
-    # A bus fault forges one message in one mailbox, by default the first that has a reader.
-    candidates = (
-        at
-        for at, box in enumerate(layout.mailboxes)
-        if kind.where == "bus" and box.writer == fault.board and box.readers
-    )
-    return next(candidates, -1)

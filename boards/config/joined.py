@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 from rack.backplane.layout import Layout, TickGrid
 from rack.backplane.message import Command
@@ -13,21 +12,6 @@ from rack.boards.config.schema import LAN, RackConfig
 from rack.boards.config.timing import NS_PER_MS, build_rack_timing
 from rack.boards.errors import ConfigError, Mistake
 from rack.boards.timing.joined import JoinedRacks, RackLink, Station
-
-
-@dataclass(frozen=True)
-class JoinedMember:
-    """Config and layout of one of several racks that exchange messages."""
-
-    config: RackConfig
-    layout: Layout
-
-    def compute_exchange_grid(self, rate_hz: float) -> TickGrid:
-        """Return the times, in ns, of exchanges that the adapter makes at `rate_hz`."""
-        clock_ns = self.layout.clock_ns
-        adapter = self.layout.find_task(LAN).grid
-        cycles = round(1e9 / (rate_hz * adapter.every * clock_ns))
-        return TickGrid(cycles * adapter.every * clock_ns, adapter.phase * clock_ns)
 
 
 def load_partners(config: RackConfig) -> list[RackConfig]:
@@ -56,40 +40,47 @@ def join_racks(configs: Sequence[RackConfig]) -> JoinedRacks:
         ConfigError: An import from one of these racks names a mailbox that the rack does not
             export.
     """
-    members = {config.name: JoinedMember(config, resolve_layout(config)) for config in configs}
-    timings = {
-        name: build_rack_timing(member.config, member.layout) for name, member in members.items()
-    }
-    layouts = {name: member.layout for name, member in members.items()}
-    return JoinedRacks(timings, layouts, tuple(_list_links(members)))
+    members = {config.name: config for config in configs}
+    layouts = {name: resolve_layout(config) for name, config in members.items()}
+    timings = {name: build_rack_timing(members[name], layout) for name, layout in layouts.items()}
+    return JoinedRacks(timings, layouts, tuple(_list_links(members, layouts)))
 
 
-def _list_links(members: Mapping[str, JoinedMember]) -> Iterator[RackLink]:
+def _list_links(
+    members: Mapping[str, RackConfig], layouts: Mapping[str, Layout]
+) -> Iterator[RackLink]:
     """Yield a link for each mailbox that one of the racks imports from another."""
     for name, member in members.items():
-        table = member.config.adapter.lan
+        table = member.adapter.lan
         for port, entry in () if table is None else table.imports.items():
             source = members.get(entry.rack)
             if source is None:
                 continue
-            lan = source.config.adapter.lan
+            lan = source.adapter.lan
             exported = {} if lan is None else {e.source: e for e in lan.exports.values()}
             if entry.mailbox not in exported:
                 place = f"rack {name}: adapter.lan.import.{port}.from"
                 listed = ", ".join(exported) or "none"
                 why = f"rack '{entry.rack}' does not export this mailbox; its exports: {listed}"
                 raise ConfigError([Mistake(place, entry.source, why)])
-            clock_ns = member.layout.clock_ns
+            layout = layouts[name]
             yield RackLink(
-                source=Station(entry.rack, source.layout.find_mailbox(entry.mailbox).writer),
+                source=Station(entry.rack, layouts[entry.rack].find_mailbox(entry.mailbox).writer),
                 mailbox=entry.mailbox,
                 rack=name,
                 port=port,
-                readers=member.layout.find_mailbox(f"{LAN}.{port}").readers,
+                readers=layout.find_mailbox(f"{LAN}.{port}").readers,
                 is_command=issubclass(entry.find_message_class(), Command),
-                exported=source.compute_exchange_grid(exported[entry.mailbox].rate_hz),
-                imported=member.compute_exchange_grid(entry.rate_hz),
-                adapter_ns=member.layout.find_task(LAN).every * clock_ns,
+                exported=_compute_grid(layouts[entry.rack], exported[entry.mailbox].rate_hz),
+                imported=_compute_grid(layout, entry.rate_hz),
+                adapter_ns=layout.find_task(LAN).every * layout.clock_ns,
                 delay_ns=None if entry.delay_ms is None else round(entry.delay_ms * NS_PER_MS),
                 max_lost=entry.max_lost,
             )
+
+
+def _compute_grid(layout: Layout, rate_hz: float) -> TickGrid:
+    """Return the times, in ns, of exchanges that a rack's adapter makes at `rate_hz`."""
+    adapter = layout.find_task(LAN).grid
+    cycle_ns = adapter.every * layout.clock_ns
+    return TickGrid(round(1e9 / (rate_hz * cycle_ns)) * cycle_ns, adapter.phase * layout.clock_ns)

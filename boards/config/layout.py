@@ -91,8 +91,7 @@ class LayoutBuilder:
         self._config = wiring.config
         self._sizes = sizes
         self._retained_ticks = round(RETAINED_S * 1e9 / wiring.config.clock_ns)
-        self._tasks = {ports.task: self._build_task(ports.place) for ports in wiring.tasks}
-        self._hosts = {ports.task: self._build_host(ports.place) for ports in wiring.hosts}
+        self._tasks = {ports.task: self._build_task(ports.place) for ports in wiring.ports.values()}
 
     def build_layout(self) -> Layout:
         """Return the layout with all tasks, host boards and mailboxes of the segment."""
@@ -102,9 +101,14 @@ class LayoutBuilder:
             self._build_mailbox(name, writer=CLOCK, every=1, delay=1, depth=OPERATOR_DEPTH)
             for name in self._wiring.operator_mailboxes
         ]
-        tasks = tuple(self._tasks.values())
-        hosts = tuple(self._hosts.values())
-        return Layout(self._config.name, self._config.clock_ns, tasks, tuple(mailboxes), hosts)
+        specs = self._tasks.values()
+        return Layout(
+            rack=self._config.name,
+            clock_ns=self._config.clock_ns,
+            tasks=tuple(spec for spec in specs if spec.role != "host"),
+            mailboxes=tuple(mailboxes),
+            hosts=tuple(spec for spec in specs if spec.role == "host"),
+        )
 
     def _build_mailboxes(self, name: str) -> Iterator[MailboxSpec]:
         """Yield the mailbox `name` and, if it is a queue, the mailbox for its reader's position."""
@@ -122,8 +126,7 @@ class LayoutBuilder:
         delay = writer.slice
         # A message that is visible at the start of a reader's slice must not be overwritten before
         # the slice ends.
-        tasks_and_hosts = self._tasks | self._hosts
-        readers = [tasks_and_hosts[reader] for reader in self._wiring.list_readers(name)]
+        readers = [self._tasks[reader] for reader in self._wiring.list_readers(name)]
         slowest = max((reader.slice for reader in readers), default=0)
         box = self._build_mailbox(
             name,
@@ -131,10 +134,13 @@ class LayoutBuilder:
             every=every,
             delay=delay,
             depth=compute_depth(max(slowest + delay, self._retained_ticks), every),
+            # A message is based on those of the input that its output declares, if any.
             rests_on=tuple(
                 box
-                for box in ports.find_origin_mailboxes(name.partition(".")[2])
-                if self._wiring.find_protocol(box) != "queue"
+                for port, box in ports.sources
+                if output.rests_on is not None
+                and output.rests_on.name == port
+                and self._wiring.find_protocol(box) != "queue"
             ),
             phase=writer.phase,
             max_age=round(output.max_age_s * 1e9 / self._config.clock_ns),
@@ -220,39 +226,30 @@ class LayoutBuilder:
         return replace(box, delay=delay, depth=depth, interrupt=interrupt)
 
     def _build_task(self, place: TaskEntry) -> TaskSpec:
-        """Return the record of an executor or a planner."""
+        """Return the record of a task. A host board has no rate and no trace."""
+        common = {key: getattr(place, key) for key in ("name", "board", "role", "slot", "priority")}
+        if place.role == "host":
+            return TaskSpec(
+                core=place.core,
+                every=1,
+                within_cycles=1,
+                depth=0,
+                is_external=self._config.host[place.board].external,
+                **common,
+            )
         board = self._config.board[place.board]
         every = self._wiring.periods[place.board]
         wake = board.wake or self._config.clock.wake
         is_planner = place.role == "planner"
         return TaskSpec(
-            name=place.name,
-            board=place.board,
-            role=place.role,
-            slot=place.slot,
             core=find_core(place.core),
-            priority=place.priority,
             every=every,
             within_cycles=board.within_cycles if is_planner else 1,
             depth=compute_depth(self._retained_ticks, every),
             # Only the executor of a board may poll.
             wake="timer" if is_planner and wake == "poll" else wake,
             phase=board.phase,
-        )
-
-    def _build_host(self, place: TaskEntry) -> TaskSpec:
-        """Return the record of a host board, which has no rate and no trace."""
-        return TaskSpec(
-            name=place.name,
-            board=place.board,
-            role=place.role,
-            slot=place.slot,
-            core=place.core,
-            priority=0,
-            every=1,
-            within_cycles=1,
-            depth=0,
-            is_external=self._config.host[place.board].external,
+            **common,
         )
 
     def _build_mailbox(

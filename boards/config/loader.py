@@ -6,6 +6,7 @@ has mistakes, so that all mistakes are reported at once.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -13,7 +14,6 @@ from typing import TypeVar
 
 from pydantic import ValidationError
 
-from rack.boards.classes import extend_path
 from rack.boards.config.files import CONFIGS, Assembled, assemble, resolve_paths
 from rack.boards.config.mistakes import convert_errors
 from rack.boards.config.resolved import Examination
@@ -69,6 +69,11 @@ def read_stored(text: str) -> RackConfig:
         raise ConfigError(convert_errors(error, RackConfig, tables)) from None
 
 
+def extend_path(folders: Sequence[Path]) -> None:
+    """Append folders to Python's import path, except those that it already contains."""
+    sys.path += [str(folder) for folder in folders if str(folder) not in sys.path]
+
+
 def validate(assembly: Assembled) -> RackConfig:
     """Validate the tables of a config, and add the folders of its levels to the import path.
 
@@ -82,10 +87,11 @@ def validate(assembly: Assembled) -> RackConfig:
     try:
         config = RackConfig.model_validate(tables)
     except ValidationError as error:
-        broken |= _find_broken_tables(error)
+        found = convert_errors(error, RackConfig, tables)
+        broken |= {find_table_name(mistake.place) for mistake in found}
         mistakes += [
             mistake
-            for mistake in convert_errors(error, RackConfig, tables)
+            for mistake in found
             # Do not report a missing key that an unreadable file or setting may contain.
             if not mistake.why.startswith("missing")
             or (assembly.is_whole and find_table_name(mistake.place) not in assembly.broken)
@@ -119,14 +125,6 @@ def _iterate_valid_tables(tables: Tables, key: str, kind: type[T]) -> Iterator[t
     for at, entry in enumerate(entries):
         with suppress(ValidationError):
             yield f"{key}[{at}]", kind.model_validate(entry)
-
-
-def _find_broken_tables(error: ValidationError) -> frozenset[str]:
-    """Return the names of tables with mistakes, as in "robot", "board.servo" or "host.program"."""
-    places = [[str(key) for key in entry["loc"]] for entry in error.errors()]
-    return frozenset(
-        ".".join(keys[:2] if keys[0] in ("board", "host") else keys[:1]) for keys in places
-    )
 
 
 def _build_valid_part(tables: Tables, broken: frozenset[str]) -> RackConfig:

@@ -124,11 +124,6 @@ class Resolved:
         )
         return replace(self, tasks=tasks, hosts=self.hosts if entries is None else ())
 
-    @property
-    def is_replay(self) -> bool:
-        """Whether adapters repeat the messages that entered a recorded run from outside."""
-        return any(task.entries is not None for task in self.tasks)
-
     def build_clock_wiring(self, seconds: float | None) -> ClockWiring:
         """Return the wiring of the clock's board.
 
@@ -257,7 +252,20 @@ class Examination:
             self._build_task_wiring(layout, ports, ports.task in failing)
             for ports in self._wiring.tasks
         )
-        hosts = tuple(self._build_host_wiring(ports) for ports in self._wiring.hosts)
+        hosts = tuple(
+            HostWiring(
+                board=(name := ports.place.board),
+                target=ports.place.target,
+                inputs=dict(ports.sources),
+                outputs=ports.writes,
+                context=self._build_context(
+                    name, config.host[name].params, every=1, within_cycles=1
+                ),
+                is_external=config.host[name].external,
+                computing=round(config.host[name].computing_ms * 1e6 / config.clock_ns),
+            )
+            for ports in self._wiring.hosts
+        )
         # A goal in the config replaces the program's goal for the same object.
         rows = config.scene.objects.index
         programs = [program.model_validate(config.task) for program in self._wiring.programs]
@@ -266,20 +274,6 @@ class Examination:
         commands = build_requests(config, layout)
         return Resolved(
             config, layout, tasks, hosts, faults, commands, self._published, goal_by_row
-        )
-
-    def _build_host_wiring(self, ports: TaskPorts) -> HostWiring:
-        """Return the wiring of a host board."""
-        config = self._config
-        name = ports.place.board
-        return HostWiring(
-            board=name,
-            target=ports.place.target,
-            inputs=dict(ports.sources),
-            outputs=dict(ports.writes),
-            context=self._build_context(name, config.host[name].params, every=1, within_cycles=1),
-            is_external=config.host[name].external,
-            computing=round(config.host[name].computing_ms * 1e6 / config.clock_ns),
         )
 
     def _build_task_wiring(

@@ -66,20 +66,20 @@ def to_toml(tables: Mapping[str, Any]) -> str:
     return tomli_w.dumps(_drop_empty_values(tables))
 
 
-def _drop_empty_values(table: Mapping[str, Any]) -> Tables:
-    """Return a copy of a table without empty values. Tables in `FREE_FORM` are kept unchanged."""
-    filled = {key: value for key, value in table.items() if value not in ({}, [], ())}
-    return {
-        key: value if key in FREE_FORM else _drop_empty_items(value)
-        for key, value in filled.items()
-    }
+def _drop_empty_values(value: Any) -> Any:
+    """Return a copy of a value in which tables, also inside lists, have no empty values.
 
-
-def _drop_empty_items(value: Any) -> Any:
-    """Return a copy of a value in which tables, also inside lists, have no empty values."""
+    Tables in `FREE_FORM` are kept unchanged.
+    """
     if isinstance(value, list | tuple):
-        return [_drop_empty_items(item) for item in value]
-    return _drop_empty_values(value) if isinstance(value, Mapping) else value
+        return [_drop_empty_values(item) for item in value]
+    if not isinstance(value, Mapping):
+        return value
+    return {
+        key: item if key in FREE_FORM else _drop_empty_values(item)
+        for key, item in value.items()
+        if item not in ({}, [], ())
+    }
 
 
 def merge_tables(base: Tables, top: Tables) -> Tables:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,30 +19,16 @@ from rack.backplane.watch.alarms import MISSES, PEER, Alarm, open_alarm_ring
 from rack.backplane.words import Demand
 from rack.boards.config.cell import find_geom_name
 from rack.boards.config.loader import read_stored
-from rack.boards.config.published import Levels, PublishedRack
+from rack.boards.config.published import PublishedRack
 from rack.boards.events import DEMANDED, NO_TORQUE, Event, EventKind
 from rack.boards.faults.bounds import format_count
-from rack.boards.faults.describe import describe_fault as describe_fault
-from rack.boards.faults.describe import find_board, find_subject, format_joint
+from rack.boards.faults.describe import describe_fault, find_board, find_subject, format_joint
 from rack.boards.operator import copy_request_message, describe_command, find_level
 from rack.levels.errors import LevelError
 from rack.levels.messages import Error
 from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.tables import read_setting
 
-About = Literal[
-    "task",
-    "mailbox",
-    "joint",
-    "geom",
-    "name",
-    "brakes",
-    "fault",
-    "command",
-    "demand",
-    "finding",
-    "nothing",
-]
 ENGAGED_BY = ("the boards above", DEMANDED, NO_TORQUE, "")
 """Reasons why brakes engaged other than errors. Subject -n of an alarm refers to entry n."""
 EMERGENCY_STOP = "emergency stop"
@@ -78,7 +64,7 @@ EVENT_KINDS: Mapping[Alarm, EventKind] = {
     **dict.fromkeys(MISSES, "miss"),
 }
 """Kind of event for each alarm. All other alarms are detections."""
-TEXTS: Mapping[About, Mapping[Alarm, str]] = {
+TEXTS: Mapping[str, Mapping[Alarm, str]] = {
     "task": {
         Alarm.HANG: "'{subject}' is not responding: {releases} missed since tick {since}",
         Alarm.REJOINED: "'{subject}' rejoined after {span}",
@@ -162,7 +148,7 @@ class ReadAlarm(NamedTuple):
 
 
 class AlarmReader:
-    """Reader of all alarm rings of a rack.
+    """Reader of all alarm rings of a rack, which converts alarms to events.
 
     Attributes:
         lost: Number of alarms that were overwritten before they were read.
@@ -170,57 +156,37 @@ class AlarmReader:
 
     def __init__(self, segment: Segment) -> None:
         config = read_stored(segment.config)
+        self._layout = layout = segment.layout
         self._rings = {
             name: open_alarm_ring(segment, name)
-            for name in (CLOCK, *(t.name for t in segment.layout.tasks))
+            for name in (CLOCK, *(task.name for task in layout.tasks))
         }
+        self._faults = FaultTable(segment)
+        self._operator = OperatorTable(segment)
+        self._joints = config.joints
         # The cell is built only when the first collision is reported.
-        geom = str if config.robot is None else partial(find_geom_name, config)
-        levels = PublishedRack.read_from_segment(segment).levels
-        self._events = AlarmConverter(segment, config.joints, geom, levels)
+        self._geom = str if config.robot is None else partial(find_geom_name, config)
+        self._levels = PublishedRack.read_from_segment(segment).levels
+        # Values of live parameters that were set since the launch, by board and key.
+        self._live: dict[tuple[str, str], object] = {}
         self.lost = 0
 
     def read_alarms(self) -> list[ReadAlarm]:
         """Return all alarms raised since the last call, sorted by tick and then by time."""
         alarms: list[ReadAlarm] = []
         for owner, ring in self._rings.items():
-            if not ring.waiting_count:
-                continue
-            rows, lost = ring.read_new_rows()
-            self.lost += lost
-            for row in rows:
-                alarm = to_enum(Alarm, row["code"])
-                alarms.append(
-                    ReadAlarm(alarm, int(row["subject"]), self._events.build_event(row, owner))
-                )
+            if ring.waiting_count:
+                rows, lost = ring.read_new_rows()
+                self.lost += lost
+                alarms += [
+                    ReadAlarm(
+                        to_enum(Alarm, row["code"]),
+                        int(row["subject"]),
+                        self.build_event(row, owner),
+                    )
+                    for row in rows
+                ]
         return sorted(alarms, key=lambda alarm: (alarm.event.tick, alarm.event.time_ns))
-
-
-class AlarmConverter:
-    """Converter of a rack's alarms to events.
-
-    Args:
-        segment: Segment of the rack.
-        joints: Names of the robot's joints.
-        geom: Function that returns the name of a geom of the cell from its number.
-        levels: Levels that the rack has published.
-    """
-
-    def __init__(
-        self,
-        segment: Segment,
-        joints: Sequence[str],
-        geom: Callable[[int], str],
-        levels: Levels,
-    ) -> None:
-        self._layout = segment.layout
-        self._faults = FaultTable(segment)
-        self._operator = OperatorTable(segment)
-        self._joints = joints
-        self._geom = geom
-        self._levels = levels
-        # Values of live parameters that were set since the launch, by board and key.
-        self._live: dict[tuple[str, str], object] = {}
 
     def build_event(self, row: np.void, owner: str) -> Event:
         """Convert an alarm to an event.
@@ -243,15 +209,14 @@ class AlarmConverter:
         since = int(row["since"])
         kind = EVENT_KINDS.get(alarm, "detection")
         code = alarm.name.lower()
-        fault = -1
         words: dict[str, object] = {}
         if about == "fault":
-            fault = number
             entry = select_item(self._faults.entries, number, "fault")
-            subject = find_subject(entry, self._layout, self._joints)
-            board = find_board(entry, self._layout)
+            layout, joints = self._layout, self._joints
+            subject = find_subject(entry, layout, joints)
+            board = find_board(entry, layout)
             code = "begins" if alarm == Alarm.FAULT_BEGINS else "ends"
-            words["what"] = describe_fault(entry, self._layout, self._joints, with_board=False)
+            words["what"] = describe_fault(entry, layout, joints, with_board=False)
             words["lasts"] = f", for {self._format_span(entry.ticks)}" if entry.ticks else ""
             words["times"] = format_count(entry.count, "time")
         elif about == "command":
@@ -312,13 +277,13 @@ class AlarmConverter:
             board=board,
             text=text,
             code=code,
-            fault=fault,
+            fault=number if about == "fault" else -1,
             subject=subject,
             value=value,
             since=since,
         )
 
-    def _name_subject(self, about: About, number: int, owner: str) -> str:
+    def _name_subject(self, about: str, number: int, owner: str) -> str:
         """Return the name of an alarm's subject. Raises `DamageError` if there is no such subject.
 
         Args:

@@ -35,7 +35,6 @@ from rack.backplane.process import (
 from rack.backplane.segment import Segment
 from rack.backplane.semaphores import get_done_semaphore
 from rack.backplane.words import Block, Run, System, TaskState
-from rack.boards.classes import find_class
 from rack.boards.crate.line import receive_or_none
 from rack.boards.crate.output import HostOutput
 from rack.boards.crate.requests import (
@@ -43,7 +42,6 @@ from rack.boards.crate.requests import (
     Ended,
     Forked,
     ForkFailed,
-    HogWiring,
     Leave,
     Left,
     Open,
@@ -65,6 +63,7 @@ from rack.boards.wiring import ClockWiring, HostWiring, TaskWiring
 from rack.levels import compiled
 from rack.levels.errors import RobotError
 from rack.levels.level import Executor, Planner
+from rack.levels.references import find_class
 
 Source = Connection | socket | int
 """Object whose readiness the crate can wait for."""
@@ -163,7 +162,7 @@ class Crate:
                     name,
                     lambda segment: import_module(HOST_BOARD).run_host_board(segment, host, *lines),
                 )
-            case PowerOn(name, HogWiring(entry)):
+            case PowerOn(name, int() as entry):
                 self._fork_board(name, lambda segment: run_core_fault(segment, entry))
             case PowerOff(name):
                 self._kill_boards(name)

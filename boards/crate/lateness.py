@@ -38,7 +38,7 @@ def find_late_tasks(segment: Segment, config: RackConfig, end: int) -> tuple[lis
     excused = []
     layout = segment.layout
     fraction = config.supervision.max_missed_fraction
-    restart_s = config.supervision.find_restart_time(config.clock.mode == "lockstep")
+    restart_s = config.supervision.find_restart_time(config.is_lockstep)
     table = FaultTable(segment).list_entries((Stage.ACTIVE, Stage.OVER))
     faults = [fault for fault in table if fault.struck_tick >= 0]
     for task in layout.tasks:

@@ -51,9 +51,7 @@ def find_holders(ignored: str) -> dict[int, Holder]:
         ignored: Name of a rack that is left out.
     """
     occupied: dict[int, Holder] = {}
-    for name in list_racks():
-        if name == ignored:
-            continue
+    for name in set(list_racks()) - {ignored}:
         try:
             segment = Segment.attach(name)
         except SegmentError:
@@ -113,7 +111,7 @@ def move_boards(config: RackConfig, held: Mapping[int, Holder]) -> tuple[RackCon
         The changed config and a line for each moved board.
     """
     free = [core for core in sorted(os.sched_getaffinity(0)) if core not in held]
-    if not free or config.clock.mode == "lockstep":
+    if not free or config.is_lockstep:
         return config, []
     moved = {
         name: board
@@ -137,7 +135,7 @@ def find_conflicts(config: RackConfig, held: Mapping[int, Holder]) -> list[str]:
     for task, core, priority in tasks:
         if priority:
             requested.setdefault(find_core(core), []).append(task)
-    both = sorted(requested.keys() & held.keys()) if config.clock.mode == "realtime" else []
+    both = () if config.is_lockstep else sorted(requested.keys() & held.keys())
     return [
         f"core {core}, requested by {', '.join(requested[core])}: {held[core]}" for core in both
     ]

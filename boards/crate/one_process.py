@@ -25,11 +25,11 @@ from typing import Any, Self
 from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.message import AnyMessage, Message
-from rack.boards.classes import find_class
 from rack.boards.config import RackConfig, load, resolve
 from rack.boards.errors import LaunchError
 from rack.boards.wiring import TaskWiring
 from rack.levels.level import Executor, Planner, Reading, Verdict
+from rack.levels.references import find_class
 
 
 class OneProcess:
@@ -212,49 +212,35 @@ class PrivateTask:
         for port, source in wiring.inputs.items():
             message = level.inputs[port].message if port in level.inputs else AnyMessage
             table = level.find_input_table(port)
-            if isinstance(source, str):
-                self._add_reader(table, port, PrivateReader(boxes[source], message))
-                continue
-            table[port] = {}
-            for board, mailbox in source.items():
-                self._add_reader(table[port], board, PrivateReader(boxes[mailbox], message))
+            if not isinstance(source, str):
+                table[port] = table = {}
+            for key, mailbox in ({port: source} if isinstance(source, str) else source).items():
+                read = PrivateReader(boxes[mailbox], message).read
+                table[key] = read(-1)
+                self._readers.append((table, key, read))
         self._boxes = [boxes[name] for name in wiring.outputs.values()]
         for port, name in wiring.outputs.items():
             message = level.outputs[port].message if port in level.outputs else AnyMessage
             level.store_output(port, message(boxes[name].dtype, boxes[name].message.raw))
         self._busy_until = 0
-        self.cycle = self._run_executor if isinstance(level, Executor) else self._run_planner
 
-    def _add_reader(self, values: dict[str, Any], key: str, reader: PrivateReader) -> None:
-        """Add a reader. Each cycle stores its reading in `values[key]`."""
-        values[key] = reader.read(-1)
-        self._readers.append((values, key, reader.read))
+    def cycle(self, tick: int) -> None:
+        """Run the cycle released at `tick`: read every input, process, and write what is due.
 
-    def _run_executor(self, tick: int) -> None:
-        """Run the executor's cycle that is released at `tick`."""
-        self._read_inputs(tick)
-        assert isinstance(self.level, Executor), "a planner plans"
-        self.level.process(tick)
-        self.level.findings.clear()
-        self._write_outputs(tick)
-
-    def _run_planner(self, tick: int) -> None:
-        """Make a plan if the time slice of the last plan is over and `wanted` returns True."""
+        A planner makes a plan if the time slice of its last plan is over and it wants one.
+        """
         if tick < self._busy_until:
             return
-        self._read_inputs(tick)
-        assert isinstance(self.level, Planner), "an executor executes"
-        if self.level.wanted(tick):
-            self._busy_until = tick + self.spec.slice
-            self.level.plan(tick)
-            self._write_outputs(tick)
-
-    def _read_inputs(self, tick: int) -> None:
-        """Read every input and store the reading for the level."""
         for values, key, read in self._readers:
             values[key] = read(tick)
-
-    def _write_outputs(self, tick: int) -> None:
-        """Write all mailboxes that are due at the end of this cycle."""
+        level = self.level
+        if isinstance(level, Executor):
+            level.process(tick)
+            level.findings.clear()
+        elif level.wanted(tick):
+            self._busy_until = tick + self.spec.slice
+            level.plan(tick)
+        else:
+            return
         for box in self._boxes:
             box.write(tick, self.spec.every)

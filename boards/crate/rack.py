@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import atexit
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Thread
@@ -24,7 +24,7 @@ from rack.boards.crate.clean import remove_dead_rack, remove_own_racks
 from rack.boards.crate.line import CrateLine
 from rack.boards.crate.neighbours import find_conflicts, find_holders, move_boards
 from rack.boards.crate.patience import await_open_segment
-from rack.boards.crate.requests import CellConfig, HogWiring, Open, PowerOff, PowerOn, Preload
+from rack.boards.crate.requests import CellConfig, Open, PowerOff, PowerOn, Preload
 from rack.boards.crate.supervisor import STOP_S, Supervisor
 from rack.boards.errors import ConfigError, Mistake, SnapshotError
 from rack.boards.events import CONTINUATION_CODE, Event, Journal, Outcome
@@ -91,7 +91,11 @@ class Rack:
 
     @property
     def events(self) -> list[Event]:
-        """Events of the run, in the order in which they were recorded."""
+        """Events of the run, in the order in which they were recorded.
+
+        Before a continued run starts, the events that precede its snapshot may be added. The
+        outcome takes them into account.
+        """
         return self._journal.events
 
     @property
@@ -159,8 +163,9 @@ class Rack:
         plan = resolve(self.config).for_run(self._repeats, self._entries)
         if self._snapshots is not None:
             # In a replay there is no outside state: the wiring contains the recorded messages.
-            why = "" if plan.is_replay else self.config.outside_state
-            if self.config.clock.mode != "lockstep":
+            is_replay = any(task.entries is not None for task in plan.tasks)
+            why = "" if is_replay else self.config.outside_state
+            if not self.config.is_lockstep:
                 why = "they are taken in lockstep; add --lockstep"
             if why:
                 raise SnapshotError(f"rack '{self.config.name}' has no snapshots: {why}")
@@ -169,11 +174,10 @@ class Rack:
         segment = Segment.create(plan.layout, self.config.to_toml_text(), plan.published.to_json())
         self._journal.segment = segment
         words = segment.words
-        clock = self.config.clock
         # The emergency-stop latch is set first. The brakes stay engaged until it is reset.
         words[System.EMERGENCY_STOP] = 1
-        words[System.LOCKSTEP] = clock.mode == "lockstep"
-        words[System.PERIOD_NS] = round(self.config.clock_ns / clock.speed)
+        words[System.LOCKSTEP] = self.config.is_lockstep
+        words[System.PERIOD_NS] = self.config.tick_ns
         if (policy := self._snapshots) is not None:
             words[System.SNAPSHOT_PART] = policy.part
             words[System.SNAPSHOT_EVERY] = policy.every
@@ -203,7 +207,7 @@ class Rack:
         for injection in plan.faults[before.faults :]:
             entry = table.add_fault(injection)
             if KINDS[injection.kind].where == "core":
-                crate.send_request(PowerOn(f"hog {entry.index}", HogWiring(entry.index)))
+                crate.send_request(PowerOn(f"hog {entry.index}", entry.index))
         desk = OperatorTable(self.segment)
         # A snapshot contains pending commands, and also leases of clients that no longer exist.
         for lease in desk.list_leased():
@@ -213,13 +217,6 @@ class Rack:
             *desk.find_missing(self._requests),
         ):
             desk.add_request(request_entry)
-
-    def take_over_events(self, events: Iterable[Event]) -> None:
-        """Add the events of the continued run that precede the snapshot to the events of this run.
-
-        The outcome of this run takes them into account.
-        """
-        self._journal.events.extend(events)
 
     def start(self, seconds: float | None = None) -> None:
         """Power on the clock, which begins the run.

@@ -8,7 +8,7 @@ their loss has no effect on the arm.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import Layout
@@ -28,7 +28,7 @@ UP_STATES = (TaskState.READY, TaskState.RUNNING)
 
 
 class RestartPolicy:
-    """Decides whether lost tasks of a rack are restarted, and in which order.
+    """Decides whether and when lost tasks of a rack are restarted.
 
     Times are in ticks, so that a repeated lockstep run makes the same decisions.
     """
@@ -66,24 +66,17 @@ class RestartPolicy:
         self._restarts[task] = [*recent, tick]
         return f"restart {len(recent) + 1} of at most {max_restarts} in {within_s:g} s"
 
-    def sort_by_dependency(self, tasks: list[str]) -> list[str]:
-        """Return the tasks in the order in which they must be restarted.
-
-        The clock precedes all others, a lower level those above it, and an executor its planner.
-        """
-        # A task has more dependencies than any task it depends on, so sorting by count is enough.
-        return sorted(tasks, key=lambda task: len(self._needs[task]))
-
-    def must_wait(self, task: str, absent: list[str]) -> bool:
-        """Return True if a task on which this one depends is still absent.
+    def list_startable(self, waiting: Sequence[str], starting: Sequence[str]) -> list[str]:
+        """Return the waiting tasks that depend on no absent task.
 
         A task depends on the clock and on all tasks below it, and a planner also on its executor.
 
         Args:
-            task: The task.
-            absent: Names of the absent tasks.
+            waiting: Absent tasks that are to be restarted.
+            starting: Absent tasks that are being restarted.
         """
-        return not self._needs[task].isdisjoint(absent)
+        absent = {*waiting, *starting}
+        return [task for task in waiting if self._needs[task].isdisjoint(absent)]
 
 
 class Recovery:
@@ -150,7 +143,9 @@ class Recovery:
             return
         if end.status == UNRECOVERABLE_STATUS and not is_host:
             record_printed()
-            text = self._find_printed_reason(name) or text
+            # The reason is in the last line that the board has printed about itself.
+            printed = (event.text for event in reversed(self._journal.events))
+            text = next((line for line in printed if line.startswith(f"board '{name}': ")), text)
         elif restart := self._supervision.admit_restart(name, end.tick):
             self._waiting.append(name)
             self._journal.add_event("reaction", name, restart, "restart")
@@ -196,23 +191,19 @@ class Recovery:
             for name in self._starting
             if name != CLOCK and self._segment.get_block(name)[Block.STATE] not in UP_STATES
         ]
-        absent = [*self._waiting, *self._starting]
-        for board in self._supervision.sort_by_dependency(self._waiting):
-            if not self._supervision.must_wait(board, absent):
-                self._waiting.remove(board)
-                self._starting.append(board)
-                self._crate.try_request(PowerOn(board, self.wirings[board]))
-        hosts = {name for name, wiring in self.wirings.items() if isinstance(wiring, HostWiring)}
-        for name in hosts - self._stopped:
-            if read_state(self._segment.get_block(name)[Block.PID]) in STOPPED_STATES:
+        for board in self._supervision.list_startable(self._waiting, self._starting):
+            self._waiting.remove(board)
+            self._starting.append(board)
+            self._crate.try_request(PowerOn(board, self.wirings[board]))
+        for name, wiring in self.wirings.items():
+            if (
+                isinstance(wiring, HostWiring)
+                and name not in self._stopped
+                and read_state(self._segment.get_block(name)[Block.PID]) in STOPPED_STATES
+            ):
                 self._stopped.add(name)
                 self.report_hanging(name, ": stopped by a signal")
                 self._crate.try_request(PowerOff(name))
-
-    def _find_printed_reason(self, board: str) -> str:
-        """Return the last line that begins with "board '<board>': ". Empty if there is none."""
-        printed = (event.text for event in reversed(self._journal.events))
-        return next((text for text in printed if text.startswith(f"board '{board}': ")), "")
 
     def _record_final_loss(self, board: str, text: str, is_host: bool = False) -> None:
         """Record that a board will not be restarted, or that the crate has ended.

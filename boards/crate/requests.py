@@ -55,22 +55,17 @@ class Open:
 
 
 @dataclass(frozen=True)
-class HogWiring:
-    """Wiring of a hog, a process that occupies a core: index of its fault in the fault table."""
-
-    entry: int
-
-
-@dataclass(frozen=True)
 class PowerOn:
     """Request to fork one process: a task, the clock, a host board or a hog.
+
+    The wiring of a hog, which occupies a core, is the index of its fault in the fault table.
 
     If the rack continues from a snapshot and the wiring is unchanged, the board's copy continues
     instead.
     """
 
     name: str
-    wiring: TaskWiring | ClockWiring | HostWiring | HogWiring
+    wiring: TaskWiring | ClockWiring | HostWiring | int
 
 
 @dataclass(frozen=True)

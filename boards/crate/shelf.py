@@ -111,9 +111,7 @@ class HeldSnapshot:
         self.private_bytes = os.fstat(self.memory).st_size
         for copy in self.copies.values():
             with suppress(OSError):
-                text = Path(f"/proc/{copy.pid}/smaps_rollup").read_text()
-                sizes = re.findall(r"Private_Dirty: +(\d+)", text)
-                self.private_bytes += sum(int(kib) << 10 for kib in sizes)
+                self.private_bytes += _read_size(f"{copy.pid}/smaps_rollup", "Private_Dirty")
 
     def close(self) -> None:
         """Close the descriptors of the snapshot in this process."""
@@ -121,6 +119,12 @@ class HeldSnapshot:
             copy.line.close()
         if self.memory >= 0:
             os.close(self.memory)
+
+
+def _read_size(file: str, key: str) -> int:
+    """Return the size in bytes that a file of /proc states, in kB, under a key."""
+    text = Path("/proc", file).read_text()
+    return sum(int(kib) << 10 for kib in re.findall(rf"{key}: +(\d+)", text))
 
 
 class SnapshotShelf:
@@ -135,8 +139,7 @@ class SnapshotShelf:
         self.line, self.boards_line = socketpair(AF_UNIX, SOCK_SEQPACKET)
         # In the order in which they were taken. The last one may be incomplete.
         self._snapshots: list[HeldSnapshot] = []
-        sizes = re.findall(r"MemTotal: +(\d+)", Path("/proc/meminfo").read_text())
-        self._most_bytes = sum(int(kib) << 10 for kib in sizes) // MEMORY_PART
+        self._most_bytes = _read_size("meminfo", "MemTotal") // MEMORY_PART
 
     @property
     def _complete_snapshots(self) -> list[HeldSnapshot]:

@@ -42,11 +42,10 @@ def compute_last_read_ticks(mailboxes: tuple[str, ...], layout: Layout) -> int:
 
     The result is the maximum over the mailboxes, or 0 if no task reads them.
     """
-    boxes = [layout.find_mailbox(name) for name in mailboxes]
     return max(
         (
             box.delay + compute_read_interval(layout, box, reader)
-            for box in boxes
+            for box in map(layout.find_mailbox, mailboxes)
             for reader in box.readers
         ),
         default=0,
@@ -104,9 +103,8 @@ class BoundCase:
     def mailboxes(self) -> tuple[MailboxSpec, ...]:
         """Affected mailboxes that `reader` reads or, if it is None, that any task reads."""
         struck = list_affected_mailboxes(self.layout, self.injection.mailbox, self.board)
-        if self.reader:
-            return tuple(mailbox for mailbox in struck if self.reader in mailbox.readers)
-        return tuple(mailbox for mailbox in struck if mailbox.readers)
+        reader = self.reader
+        return tuple(box for box in struck if (reader in box.readers if reader else box.readers))
 
     @property
     def role(self) -> str:
@@ -160,8 +158,8 @@ class Bound:
     def __add__(self, other: Bound) -> Bound:
         def add_terms(case: BoundCase) -> int | None:
             """Return the sum of both bounds in ticks, or None if one of them is None."""
-            terms = self.ticks(case), other.ticks(case)
-            return None if None in terms else sum(term for term in terms if term is not None)
+            first, second = self.ticks(case), other.ticks(case)
+            return None if first is None or second is None else first + second
 
         return Bound(f"{self.text} + {other.text}", add_terms)
 
@@ -177,13 +175,10 @@ def cycle_bound(count: int) -> Bound:
 
     A fault of a host board has no such bound.
     """
-
-    def count_ticks(case: BoundCase) -> int | None:
-        """Return the bound in ticks. None for a host board."""
-        return None if case.role == "host" else count * case.cycle_ticks
-
-    text = format_count(count, "cycle") if count else "the same cycle"
-    return Bound(text, count_ticks)
+    return Bound(
+        format_count(count, "cycle") if count else "the same cycle",
+        lambda case: None if case.role == "host" else count * case.cycle_ticks,
+    )
 
 
 def cycle_and_time_bound(count: int, time_ns: int) -> Bound:
@@ -191,12 +186,10 @@ def cycle_and_time_bound(count: int, time_ns: int) -> Bound:
 
     The time is needed because a controller's gains, not its cycle, determine how fast it reacts.
     """
-
-    def count_ticks(case: BoundCase) -> int:
-        """Return the bound in ticks."""
-        return max(count * case.cycle_ticks, ceil(time_ns / case.layout.clock_ns))
-
-    return Bound(f"{format_count(count, 'cycle')}, at least {time_ns * 1e-6:g} ms", count_ticks)
+    return Bound(
+        f"{format_count(count, 'cycle')}, at least {time_ns * 1e-6:g} ms",
+        lambda case: max(count * case.cycle_ticks, ceil(time_ns / case.layout.clock_ns)),
+    )
 
 
 def tick_bound(count: int) -> Bound:

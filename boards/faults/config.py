@@ -32,12 +32,10 @@ def parse_seconds(value: Any) -> Any:
     return float(match[1]) * _UNIT_S[match[2]]
 
 
-def _to_number(value: Any) -> Any:
-    """Convert a boolean to 0 or 1, because all parameters are numbers: `random = true` means 1."""
-    return float(value) if isinstance(value, bool) else value
-
-
-Parameter = Annotated[Finite, BeforeValidator(_to_number)]
+# All parameters are numbers: `random = true` means 1.
+Parameter = Annotated[
+    Finite, BeforeValidator(lambda value: float(value) if isinstance(value, bool) else value)
+]
 Seconds = Annotated[float, BeforeValidator(parse_seconds), Field(gt=0, le=1e6, allow_inf_nan=False)]
 
 

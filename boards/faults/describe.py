@@ -16,11 +16,7 @@ ALL_JOINTS = "all joints"
 
 def find_board(entry: FaultEntry, layout: Layout) -> str:
     """Return the name of the task that a fault affects, or "clock"."""
-    return (
-        CLOCK
-        if (task_index := entry.task) < 0
-        else select_item(layout.processes, task_index, "task").name
-    )
+    return CLOCK if entry.task < 0 else select_item(layout.processes, entry.task, "task").name
 
 
 def find_subject(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> str:
@@ -60,9 +56,7 @@ def to_document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dic
     """
     kind = find_kind(entry)
     stage = to_enum(Stage, entry.stage)
-    until_tick = None
-    if stage in (Stage.ACTIVE, Stage.OVER) and entry.until != NEVER:
-        until_tick = entry.until
+    has_end = stage in (Stage.ACTIVE, Stage.OVER) and entry.until != NEVER
     return {
         "fault": entry.index,
         "kind": kind.name,
@@ -72,7 +66,7 @@ def to_document(entry: FaultEntry, layout: Layout, joints: Sequence[str]) -> dic
         "text": describe_fault(entry, layout, joints),
         "stage": stage.name.lower(),
         "begins": entry.tick,
-        "until": until_tick,
+        "until": entry.until if has_end else None,
         "ticks": entry.ticks,
         "struck_tick": entry.struck_tick,
         "acted": entry.count,

@@ -11,7 +11,7 @@ that observe the rack read the kinds that it publishes: see `rack.boards.config.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
@@ -237,7 +237,8 @@ class Kinds:
     """The kinds that this process knows, in the order in which they were added."""
 
     def __init__(self) -> None:
-        self._by_name: dict[str, Kind] = {}
+        self.names: dict[str, Kind] = {}
+        """Kinds by name."""
         self._by_number: dict[int, Kind] = {}
 
     def add(self, *kinds: Kind) -> None:
@@ -257,20 +258,17 @@ class Kinds:
                     f"kind '{kind.name}' has {len(kind.parameters)} parameters;"
                     f" at most {PARAMETERS} are allowed"
                 )
-            self._by_name[kind.name] = self._by_number[kind.number] = kind
+            self.names[kind.name] = self._by_number[kind.number] = kind
 
     def add_missing(self, kinds: Iterable[Kind]) -> None:
         """Add the kinds that a rack has published and that this process does not know."""
         self.add(*(kind for kind in kinds if kind.number not in self._by_number))
 
     def __iter__(self) -> Iterator[Kind]:
-        return iter(self._by_name.values())
+        return iter(self.names.values())
 
     def __len__(self) -> int:
-        return len(self._by_name)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._by_name
+        return len(self.names)
 
     def __getitem__(self, key: str | int) -> Kind:
         """Return the kind with a name, or with a number in the fault table.
@@ -281,12 +279,7 @@ class Kinds:
         Raises:
             KeyError: The name is unknown.
         """
-        return self._by_name[key] if isinstance(key, str) else self._by_number.get(key, UNKNOWN)
-
-    @property
-    def names(self) -> Mapping[str, Kind]:
-        """Dictionary from names to kinds."""
-        return self._by_name
+        return self.names[key] if isinstance(key, str) else self._by_number.get(key, UNKNOWN)
 
 
 KINDS = Kinds()

@@ -11,7 +11,7 @@ import os
 import random
 import signal
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from rack.backplane.fault_table import FaultEntry
 from rack.backplane.mailbox.mailbox import Writer
@@ -207,9 +207,7 @@ class FaultyWriter:
         """
         steps = {}
         for entry in faults:
-            kind = find_kind(entry).step
-            assert isinstance(kind, type), "it acts on messages"
-            assert issubclass(kind, MessageStep)
+            kind = cast("type[MessageStep]", find_kind(entry).step)
             running_step = self._steps.get(entry.index)
             steps[entry.index] = running_step or kind(entry, self._writer, self._index)
         for index, step in self._steps.items():

@@ -16,11 +16,11 @@ from types import FrameType
 from rack.backplane.errors import MailboxError
 from rack.backplane.process import adopt_orphans
 from rack.backplane.segment import Segment
-from rack.boards.classes import find_class
 from rack.boards.errors import MAX_REASON_LENGTH, to_one_line
 from rack.boards.host.bus import HostBus
 from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
+from rack.levels.references import find_class
 
 CLAIM_S = 2.0
 """Longest wait for the end of processes that the previous process of this board has forked."""

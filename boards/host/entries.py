@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
+import numpy as np
 from pydantic import Field as Key
 from pydantic import ValidationError, model_validator
 
@@ -20,6 +20,7 @@ from rack.backplane.words import Block
 from rack.boards.wiring import MessageRows
 from rack.levels.tables import LAST_TICK, Table
 
+C = TypeVar("C", bound=Message)
 NEVER = -1
 """Value in place of a tick for something that has not happened yet."""
 PORT = re.compile(r"[a-z][a-z0-9_]*")
@@ -30,6 +31,16 @@ RESERVED = ("status", "echo", "state", "error", "reason", "raw", "record", "clea
 def declare_counter(doc: str) -> Any:
     """Declare a counter, whose meaning is `doc`, in the status of an adapter."""
     return field("u4", unit="1", doc=doc)
+
+
+def zero_counts(group: type[C]) -> C:
+    """Return a group of counters with all values 0.
+
+    Its integers are 64 bits wide, so that they cannot overflow before `fill_counts` limits them to
+    the width of the status.
+    """
+    fields = group.message_type.fields
+    return group(np.dtype([(f.name, "f8" if f.python is float else "i8") for f in fields]))
 
 
 class AdapterEntry(Message, version=1):
@@ -48,9 +59,6 @@ class AdapterEntry(Message, version=1):
         unit="tick", doc="tick at which the newest message reached the other side (-1: none yet)"
     )
     age: int = field(unit="tick", doc="time since that message was written (-1: none yet)")
-
-
-_COUNTED = ("passed", "refused", "superseded", "full", "waiting", "arrived")
 
 
 class EntryConfig(Table):
@@ -107,21 +115,17 @@ class AdapterParams(Table):
             return {}
 
 
-@dataclass
 class EntryCounters:
-    """Counters of one entry. See the fields of `AdapterEntry`.
+    """Counters of one entry.
 
     Attributes:
+        count: The counters, as in the status.
         written: Tick at which the newest message was written. `NEVER` before the first.
     """
 
-    passed: int = 0
-    refused: int = 0
-    superseded: int = 0
-    full: int = 0
-    waiting: int = 0
-    arrived: int = NEVER
-    written: int = NEVER
+    def __init__(self) -> None:
+        self.count = zero_counts(AdapterEntry)
+        self.count.arrived = self.written = NEVER
 
     def restore_counts(self, record: Any, tick: int) -> None:
         """Restore the counters from the last status before a restart.
@@ -130,26 +134,19 @@ class EntryCounters:
             record: The entry's group of fields in that status.
             tick: Tick at which the status was written.
         """
-        age = int(record["age"])
-        for name in _COUNTED:
-            setattr(self, name, int(record[name]))
-        self.written = NEVER if age == NEVER else tick - age
+        self.count.record[...] = record
+        self.written = NEVER if self.count.age == NEVER else tick - self.count.age
 
     def count_passed(self, tick: int, written: int) -> None:
         """Count a message that was written at `written` and reaches the other side at `tick`."""
-        self.passed += 1
-        self.arrived = tick
+        self.count.passed += 1
+        self.count.arrived = tick
         self.written = written
 
     def write_counts(self, record: Any, tick: int) -> None:
-        """Write the counters to a status.
-
-        Args:
-            record: The entry's group of fields in the status.
-            tick: Tick at which the present cycle was released.
-        """
-        age = NEVER if self.written == NEVER else tick - self.written
-        fill_counts(record, (*(getattr(self, name) for name in _COUNTED), age))
+        """Write the counters to the entry's group of fields in the status of a cycle."""
+        self.count.age = NEVER if self.written == NEVER else tick - self.written
+        fill_counts(record, self.count.record.item())
 
 
 class InwardEntry:
@@ -169,8 +166,8 @@ class InwardEntry:
         self._port = port
         self._table = table
         self._count = count
-        self._ring.refused = count.refused
-        self._ring.superseded = count.superseded
+        self._ring.refused = count.count.refused
+        self._ring.superseded = count.count.superseded
         self._writer = segment.get_block(self._ring.spec.writer)
 
     def exchange_messages(
@@ -198,10 +195,11 @@ class InwardEntry:
         elif waiting and (message := ring.take_newest(self._table.most)) is not None:
             out.copy_from(message)
             count.count_passed(tick, ring.written_tick)
-        count.refused = ring.refused
-        count.superseded = ring.superseded
-        count.full = ring.full_count
-        count.waiting = ring.waiting_count
+        counts = count.count
+        counts.refused = ring.refused
+        counts.superseded = ring.superseded
+        counts.full = ring.full_count
+        counts.waiting = ring.waiting_count
 
 
 class OutwardEntry:

@@ -27,7 +27,7 @@ from rack.boards.host.entries import read_last_written
 from rack.boards.lan.clocks import Clocks
 from rack.boards.lan.config import LanTable
 from rack.boards.lan.entries import Export, Import
-from rack.boards.lan.envelope import Sealer
+from rack.boards.lan.envelope import Flaw, Sealer
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.link import RETRY_MS, LanLink
 from rack.boards.lan.lockstep import Barrier
@@ -180,10 +180,10 @@ class LanAdapter(Adapter):
         if self._replayed is not None:
             return
         self._link = link = LanLink(self._rack, self._table)
-        link.sealer.resume_counts(self._flaws)
+        link.sealer.flaws |= zip(Flaw, self._flaws, strict=False)
         barrier = self._barrier
         # A step is sealed as a whole, so the messages in it need no signatures.
-        sealer = Sealer(most_bytes=self._table.most_bytes) if barrier else link.sealer
+        sealer = Sealer() if barrier else link.sealer
         for entry in self._imports.values():
             entry.open(barrier or link, sealer)
         for export in self._exports.values():

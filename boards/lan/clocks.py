@@ -98,10 +98,10 @@ class ClockOffset:
         steps: Number of steps of either clock that were detected.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, steps: int = 0) -> None:
         self._recent: deque[RoundTrip] = deque(maxlen=MAX_ROUND_TRIPS)
         self.best: RoundTrip | None = None
-        self.steps = 0
+        self.steps = steps
 
     def __len__(self) -> int:
         return len(self._recent)
@@ -122,11 +122,6 @@ class ClockOffset:
         self._recent.append(trip)
         self.best = min(self._recent, key=lambda recent: recent.compute_uncertainty_ns(now_ns))
         return True
-
-    def discard_round_trips(self) -> None:
-        """Discard all round trips, so that the offset is unknown."""
-        self._recent.clear()
-        self.best = None
 
 
 @dataclass
@@ -164,20 +159,8 @@ class PeerClock:
             self.due_ns = 0
             self.epoch_ns = 0
             self.clock_ns = 0
-            self.offset.discard_round_trips()
+            self.offset = ClockOffset(self.offset.steps)
             self.sent.clear()
-
-    def to_simulated_ns(self, stamp_ns: int) -> int:
-        """Convert a CLOCK_MONOTONIC stamp of the other machine to the rack's simulated time.
-
-        Returns:
-            The simulated time in ns. 0 if the stamp is before tick 0, or if the epoch is unknown.
-        """
-        return (
-            max(0, stamp_ns - self.epoch_ns) * self.clock_ns // self.period_ns
-            if self.epoch_ns
-            else 0
-        )
 
 
 class Clocks:
@@ -342,6 +325,8 @@ class Clocks:
         out.offset = best.offset_ns * 1e-9
         out.round_trip = best.duration_ns * 1e-9
         out.uncertainty = best.compute_uncertainty_ns(self._now_ns) * 1e-9
-        theirs = clock.to_simulated_ns(self._grid.stamp_ns(tick) + best.offset_ns)
+        # The other rack's simulated time: 0 before its tick 0, or if its epoch is unknown.
+        real_ns = self._grid.stamp_ns(tick) + best.offset_ns - clock.epoch_ns
+        theirs = max(0, real_ns) * clock.clock_ns // clock.period_ns if clock.epoch_ns else 0
         out.ahead = (theirs - self._grid.time_ns(tick)) * 1e-9
         out.speed = clock.clock_ns / clock.period_ns

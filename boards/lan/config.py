@@ -123,8 +123,6 @@ class LanTable(Table):
     estop_from: tuple[PeerName, ...] = ()
     """names, proved by certificates, that may set the emergency stop from another machine, with
     rack estop HOST/RACK"""
-    most_bytes: int = Field(16_384, ge=64, le=1 << 20)
-    """length of the longest message that is accepted, bytes"""
     exports: dict[PortName, ExportConfig] = Field({}, alias="export")
     """mailboxes that others may import"""
     imports: dict[PortName, ImportConfig] = Field({}, alias="import")

@@ -11,7 +11,7 @@ from rack.backplane.mailbox.slots import build_message_dtype
 from rack.backplane.message import AnyMessage, fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.words import Box, encode_switch
-from rack.boards.host.entries import NEVER
+from rack.boards.host.entries import NEVER, zero_counts
 from rack.boards.lan.config import ExportConfig, ImportConfig
 from rack.boards.lan.envelope import Envelope, Flaw, Sealer, compute_kind
 from rack.boards.lan.grid import OwnGrid
@@ -19,7 +19,7 @@ from rack.boards.lan.keys import out_key
 from rack.boards.lan.link import LanLink, ReceivedMessage
 from rack.boards.lan.lockstep import Barrier
 from rack.boards.lan.peers import NO_LAUNCH, PeerRack
-from rack.boards.lan.status import LanExport, LanImport, zero_counts
+from rack.boards.lan.status import LanExport, LanImport
 from rack.levels.ports import Sender
 
 NUMBER_LIMIT = 1 << 62
@@ -44,11 +44,12 @@ class SequenceTracker:
         self.launch = NO_LAUNCH
         self._arrived = 0  # bit n is set if message `number` - n has arrived
 
-    def resume_from_counts(self) -> None:
-        """Resume tracking after the newest message recorded in `count`.
+    def restore_counts(self, record: Any) -> None:
+        """Resume tracking after the newest message that the previous adapter has counted.
 
         All earlier messages are treated as received.
         """
+        self.count.record[...] = record
         self.launch = self.count.launch
         self._arrived = _WHOLE
 
@@ -214,10 +215,9 @@ class Import:
 
     def restore_counts(self, record: Any, tick: int) -> None:
         """Restore the state from the status that the previous adapter wrote at `tick`."""
-        count = self.count
-        count.record[...] = record
-        self._order.resume_from_counts()
-        self._basis = None if count.age == NEVER else tick - count.age
+        self._order.restore_counts(record)
+        age = self.count.age
+        self._basis = None if age == NEVER else tick - age
 
     def open(self, carrier: LanLink | Barrier, sealer: Sealer) -> None:
         """Subscribe through a network link or, in lockstep, through a barrier."""
@@ -232,18 +232,17 @@ class Import:
         """Mark the mailbox as away if its rack was lost since the last call."""
         if self._peer.losses != self._losses:
             self._losses = self._peer.losses
-            if not self._is_away:
-                self._set_away(True, tick + self._delay if self._grid.is_lockstep else tick)
+            self._set_away(True, tick + self._delay if self._grid.is_lockstep else tick)
 
     def mark_present(self, tick: int) -> None:
         """Mark the mailbox as present from the tick at which this cycle's message is visible."""
-        if self._is_away:
-            self._set_away(False, tick + self._delay)
+        self._set_away(False, tick + self._delay)
 
     def _set_away(self, is_away: bool, tick: int) -> None:
-        """Mark the mailbox as away or as present from `tick` on."""
-        self._is_away = is_away
-        self._box[self._word] = encode_switch(tick, is_away)
+        """Mark the mailbox as away or as present from `tick` on, unless it already is."""
+        if is_away != self._is_away:
+            self._is_away = is_away
+            self._box[self._word] = encode_switch(tick, is_away)
 
     def deliver_newest(self, out: Sender[AnyMessage], tick: int) -> None:
         """Check the messages that have arrived, and write the newest valid one if recent enough.
@@ -266,7 +265,8 @@ class Import:
                 newest = head
         if newest is None:
             return
-        basis = self._grid.to_local_tick(newest, self._peer, tick)
+        # The uncertainty of the clocks may place it in the future.
+        basis = min(tick, self._grid.to_local_ns(newest, self._peer) // self._grid.clock_ns)
         if tick - basis > self._max_age:
             self.count.late += 1
             return
@@ -313,7 +313,7 @@ class Import:
         """
         if self._grid.is_lockstep:
             return True
-        if self._peer.is_superseded(head.launch) or tick - arrival_tick > self._max_age:
+        if head.launch in self._peer.superseded or tick - arrival_tick > self._max_age:
             self.count.unknown_launch += 1
             return False
         # Until the clocks have been compared, the age of the message is unknown.
@@ -353,5 +353,5 @@ class Import:
         count = self.count
         count.launch = NO_LAUNCH if self._grid.is_lockstep else self._order.launch
         count.age = NEVER if self._basis is None else tick - self._basis
-        count.age_s = NEVER if count.age == NEVER else count.age * self._grid.tick_s
+        count.age_s = NEVER if count.age == NEVER else count.age * self._grid.clock_ns * 1e-9
         fill_counts(record, count.record.item())

@@ -13,7 +13,6 @@ racks in each folder (all folders would change whenever one certificate is renew
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from enum import IntEnum
 from hashlib import sha256
 from hmac import compare_digest
@@ -31,6 +30,8 @@ if TYPE_CHECKING:
 
 _HEAD = Struct("<4sIHQQQQqqqq")
 _MAGIC = b"RLN3"
+MAX_MESSAGE_BYTES = 65_536
+"""Length of the longest message that is accepted, and of the longest step in lockstep."""
 MAX_SEAL_BYTES = 72
 """Length of the longest seal in bytes."""
 MAX_ENVELOPE_BYTES = _HEAD.size + MAX_CHAIN_BYTES + MAX_SEAL_BYTES
@@ -94,24 +95,13 @@ class Sealer:
         CredentialError: The files cannot be used.
     """
 
-    def __init__(self, credentials: Credentials | None = None, most_bytes: int = 1 << 20) -> None:
+    def __init__(self, credentials: Credentials | None = None) -> None:
         self._credentials = credentials
         self._pair = credentials.key_pair if credentials else None
         if credentials and self._pair:
             # Identify a sender once now, because the first identification takes as long as a cycle.
             credentials.identify_sender(self._pair.chain)
-        self._most_bytes = most_bytes
         self.flaws = dict.fromkeys(Flaw, 0)
-
-    def with_limit(self, most_bytes: int) -> Sealer:
-        """Return a sealer with the same credentials and counters but another length limit."""
-        sealer = Sealer(self._credentials, most_bytes)
-        sealer.flaws = self.flaws
-        return sealer
-
-    def resume_counts(self, flaws: Iterable[int]) -> None:
-        """Set the counts to those of the previous adapter, given in the order of `Flaw`."""
-        self.flaws |= zip(Flaw, flaws, strict=False)
 
     def seal(self, key: str, head: Envelope, payload: bytes | memoryview) -> bytes:
         """Seal a message and return its envelope.
@@ -137,7 +127,7 @@ class Sealer:
         Returns:
             The head, or the flaw for which the message must be rejected.
         """
-        if len(payload) > self._most_bytes:
+        if len(payload) > MAX_MESSAGE_BYTES:
             return self._count_flaw(Flaw.OVERSIZED)
         if (
             envelope is None

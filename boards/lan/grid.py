@@ -21,15 +21,14 @@ class OwnGrid:
 
     Attributes:
         is_lockstep: Whether the rack runs in lockstep.
-        tick_s: Length of one tick in s of simulated time.
+        clock_ns: Length of one tick in ns of simulated time.
     """
 
     def __init__(self, segment: Segment, every: int = 1) -> None:
         self._clock = SystemClock(segment)
-        self._clock_ns = segment.layout.clock_ns
-        self._cycle_ns = every * self._clock_ns
+        self.clock_ns = segment.layout.clock_ns
+        self._cycle_ns = every * self.clock_ns
         self.is_lockstep = self._clock.is_lockstep
-        self.tick_s = self._clock_ns * 1e-9
 
     def compute_period_cycles(self, rate_hz: float) -> int:
         """Return the period of an exchange in cycles of the adapter.
@@ -45,23 +44,11 @@ class OwnGrid:
 
     def time_ns(self, tick: int) -> int:
         """Return the simulated time of a tick in ns."""
-        return tick * self._clock_ns
+        return tick * self.clock_ns
 
     def stamp_ns(self, tick: int) -> int:
         """Return the CLOCK_MONOTONIC time of a tick in ns. In lockstep, its simulated time."""
         return self.time_ns(tick) if self.is_lockstep else self._clock.compute_time_ns(tick)
-
-    def to_local_tick(self, head: Envelope, peer: PeerRack, tick: int) -> int:
-        """Convert the time at which another rack wrote a message to a tick of this rack.
-
-        The result is never later than the true time: see `to_local_ns`.
-
-        Args:
-            head: Envelope of the message.
-            peer: The rack that wrote it. In real time its clock offset must be known.
-            tick: Current tick, the upper limit of the result.
-        """
-        return min(tick, self.to_local_ns(head, peer) // self._clock_ns)
 
     def to_local_ns(self, head: Envelope, peer: PeerRack, age_ns: int = 0) -> int:
         """Convert the time of a message of another rack to simulated time of this rack in ns.
@@ -78,4 +65,4 @@ class OwnGrid:
             return head.time_ns - age_ns
         here_ns = head.stamp_ns - age_ns - (peer.offset_ns or 0) - peer.uncertainty_ns
         real_ns = here_ns - self._clock.compute_time_ns(0)
-        return real_ns * self._clock_ns // self._clock.period_ns
+        return real_ns * self.clock_ns // self._clock.period_ns

@@ -15,6 +15,7 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -24,7 +25,7 @@ from rack.backplane.json_text import encode_json
 from rack.boards.lan.access import build_access_control
 from rack.boards.lan.config import CredentialError, LanTable
 from rack.boards.lan.endpoint import Endpoint, has_tls, list_endpoints
-from rack.boards.lan.envelope import MAX_ENVELOPE_BYTES, Sealer
+from rack.boards.lan.envelope import MAX_ENVELOPE_BYTES, MAX_MESSAGE_BYTES, Sealer
 from rack.boards.lan.keys import ALL_ALIVE, alive_key, parse_alive_key
 from rack.levels.errors import LevelError
 
@@ -41,8 +42,6 @@ KEEP_ALIVES = 4
 """Number of keep-alive messages within a lease."""
 HANDSHAKE_MS = 3000
 """Maximum time to open a connection."""
-MAX_STEP_BYTES = 65_536
-"""Maximum length of a step in bytes, in lockstep."""
 ZENOH_BYTES = 1024
 """Maximum overhead that zenoh adds to a message: key expression, lengths and options."""
 SOCKET = "unixsock-stream"
@@ -64,13 +63,13 @@ class ReceivedMessage(NamedTuple):
 
 
 class Question(NamedTuple):
-    """A received query. `reply` sends a payload and its envelope as an answer.
+    """A received query. `reply` sends a payload, with its envelope as `attachment`, as an answer.
 
     The query stays open until the next question is taken or the channel is found empty.
     """
 
     asked: ReceivedMessage
-    reply: Callable[[bytes, bytes], None]
+    reply: Callable[..., None]
 
 
 class LanLink:
@@ -98,7 +97,7 @@ class LanLink:
 
             credentials = Credentials(Path(table.certificates), rack)
         try:
-            self.sealer = Sealer(credentials, table.most_bytes)
+            self.sealer = Sealer(credentials)
             self.session = zenoh.open(_build_settings(rack, table, credentials, is_operator))
         except zenoh.ZError as error:
             why = " ".join(str(error).split())
@@ -157,18 +156,13 @@ class LanLink:
 
     def call_on_arrival(self, key: str, callback: Callable[[ReceivedMessage], None]) -> None:
         """Call a function for each message under a key expression, in a thread of zenoh."""
-
-        def pass_sample(sample: zenoh.Sample) -> None:
-            """Convert a sample to a message and pass it to the callback."""
-            callback(ReceivedMessage.from_sample(sample))
-
         # Indirect callbacks would add the wake-up of another thread and an unbounded queue.
-        handler = zenoh.handlers.Callback(pass_sample, indirect=False)
+        handler: Any = zenoh.handlers.Callback(
+            lambda sample: callback(ReceivedMessage.from_sample(sample)), indirect=False
+        )
         self._declared.append(self.session.declare_subscriber(key, handler))
 
-    def open_questions(
-        self, key: str, unread: int = MAX_UNREAD
-    ) -> Callable[[], Iterator[Question]]:
+    def open_questions(self, key: str, unread: int) -> Callable[[], Iterator[Question]]:
         """Return a function that yields the new questions under a key expression, oldest first.
 
         A query with a wildcard in its key is dropped unanswered.
@@ -184,7 +178,7 @@ class LanLink:
                         str(query.key_expr), _to_bytes(query.attachment), content
                     )
                     if "*" not in question.key:
-                        yield Question(question, _build_reply(query))
+                        yield Question(question, partial(query.reply, query.key_expr))
 
         return take_questions
 
@@ -226,11 +220,6 @@ def _to_bytes(content: zenoh.ZBytes | None) -> bytes | None:
     return None if content is None else content.to_bytes()
 
 
-def _build_reply(query: zenoh.Query) -> Callable[[bytes, bytes], None]:
-    """Return a function that answers a query under the query's own key."""
-    return lambda payload, envelope: query.reply(query.key_expr, payload, attachment=envelope)
-
-
 def _build_settings(
     rack: str, table: LanTable, credentials: Credentials | None, is_operator: bool
 ) -> zenoh.Config:
@@ -264,7 +253,7 @@ def _build_settings(
         "transport/unicast/accept_timeout": HANDSHAKE_MS,
         "transport/unicast/open_timeout": HANDSHAKE_MS,
         "transport/link/rx/max_message_size": (
-            max(table.most_bytes, MAX_STEP_BYTES) + MAX_ENVELOPE_BYTES + ZENOH_BYTES
+            MAX_MESSAGE_BYTES + MAX_ENVELOPE_BYTES + ZENOH_BYTES
         ),
         "transport/link/tx/lease": round(table.lease_ms),
         "transport/link/tx/keep_alive": KEEP_ALIVES,

@@ -19,6 +19,7 @@ A rack that ends says so, and counts as lost from the next cycle on.
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -33,9 +34,9 @@ from zenoh.ext import Int64, ZDeserializeError, z_deserialize, z_serialize
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System
 from rack.boards.lan.awaited import GIVE_UP_S, WaitReason, encode_wait
-from rack.boards.lan.envelope import Envelope, Flaw
+from rack.boards.lan.envelope import MAX_MESSAGE_BYTES, Envelope, Flaw
 from rack.boards.lan.keys import ALL_ALIVE, parse_alive_key, step_key
-from rack.boards.lan.link import MAX_STEP_BYTES, LanLink, ReceivedMessage
+from rack.boards.lan.link import LanLink, ReceivedMessage
 from rack.boards.lan.peers import NO_LAUNCH
 from rack.levels.errors import CannotGoOn
 
@@ -133,14 +134,6 @@ class Partner:
         why = WaitReason.UNSEEN if self.launch == NO_LAUNCH else WaitReason.SLOWER
         return encode_wait(self.place, why if self.gone_s is None else WaitReason.GONE)
 
-    def is_gone_for(self, time_s: float) -> bool:
-        """Return True if the rack's adapter has been gone for more than `time_s` seconds."""
-        return self.gone_s is not None and time.monotonic() - self.gone_s > time_s
-
-    def has_reached(self, now_ns: int) -> bool:
-        """Return True if the step of time `now_ns` has arrived or the rack no longer takes part."""
-        return self.time_ns >= now_ns or self.is_out
-
     def add_step(self, step: Step) -> None:
         """Store a step if it is newer than all earlier ones. Update `is_out` from its flags."""
         self.gone_s = None
@@ -148,11 +141,6 @@ class Partner:
             self.time_ns = step.head.time_ns
             self.steps.append(step)
         self.is_out = bool(step.head.flags & StepFlag.OVER)
-
-    def take_steps(self, now_ns: int) -> Iterator[Step]:
-        """Remove and yield the steps up to simulated time `now_ns`."""
-        while self.steps and self.steps[0].head.time_ns <= now_ns:
-            yield self.steps.popleft()
 
 
 class Barrier:
@@ -207,7 +195,7 @@ class Barrier:
         """Start to receive steps. Call it before the token of this launch is declared."""
         self._rack = link.rack
         self._launch = launch
-        self._sealer = link.sealer.with_limit(MAX_STEP_BYTES)
+        self._sealer = link.sealer
         self._key = step_key(link.rack)
         self._put = link.publish(self._key, reliable=True)
         # The handler is called in a thread of zenoh, so it only queues the sample.
@@ -249,10 +237,10 @@ class Barrier:
         awaited = [partner.rack for partner in self._partners.values() if not partner.is_out]
         content = pack_step(self.cycle_ns, awaited, self._exports)
         self._exports = []
-        if len(content) > MAX_STEP_BYTES:
+        if len(content) > MAX_MESSAGE_BYTES:
             self._refuse_lockstep(
                 f"a cycle exports {len(content)} bytes; in lockstep at most "
-                f"{MAX_STEP_BYTES} are allowed"
+                f"{MAX_MESSAGE_BYTES} are allowed"
             )
         self._steps.append((tick * self._tick_ns, content))
 
@@ -272,7 +260,9 @@ class Barrier:
         else:
             self._send_step(*self._steps[-1], StepFlag(0))
         while late_partners := [
-            partner for partner in self._partners.values() if not partner.has_reached(now_ns)
+            partner
+            for partner in self._partners.values()
+            if partner.time_ns < now_ns and not partner.is_out
         ]:
             try:
                 self._process_sample(self._events.get(timeout=CHECK_INTERVAL_S))
@@ -282,7 +272,8 @@ class Barrier:
                 # Show which rack is awaited. Stop waiting if its adapter has been gone too long.
                 awaited = late_partners[0]
                 self._block[Block.AWAITS] = awaited.wait_word
-                awaited.is_out |= awaited.is_gone_for(GIVE_UP_S)
+                gone_s = time.monotonic() - (awaited.gone_s or math.inf)
+                awaited.is_out |= gone_s > GIVE_UP_S
         self._block[Block.AWAITS] = 0
         for partner in self._partners.values():
             self._deliver_exports(partner)
@@ -420,7 +411,8 @@ class Barrier:
 
     def _deliver_exports(self, partner: Partner) -> None:
         """Deliver a rack's exports up to this cycle, and record a change of its presence."""
-        for step in partner.take_steps(self._now_ns):
+        while partner.steps and partner.steps[0].head.time_ns <= self._now_ns:
+            step = partner.steps.popleft()
             # Skip steps that were delivered before this adapter was restarted. They arrive again.
             for export in step.exports if step.head.time_ns > self._passed_ns else ():
                 if export.key.split("/")[1] == partner.rack and export.key in self._imports:

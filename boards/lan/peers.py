@@ -51,6 +51,7 @@ class PeerRack:
         confirm_by: Tick by which the token must appear, if the rack was present when this adapter
             was restarted. -1 if nothing is to be confirmed.
         findings: Findings that are not yet reported.
+        superseded: Launches that another one has replaced and whose tokens have expired.
     """
 
     rack: str
@@ -66,21 +67,19 @@ class PeerRack:
     tokens: list[int] = field(default_factory=list)
     confirm_by: int = -1
     findings: list[Finding] = field(default_factory=list)
+    superseded: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_LAUNCHES))
     _seen: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_LAUNCHES))
-    _over: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_LAUNCHES))
 
     @property
     def is_present(self) -> bool:
         """Whether the rack is present."""
         return self.presence is Presence.THERE
 
-    def is_superseded(self, launch: int) -> bool:
-        """Return True if another launch has replaced `launch`, whose token has expired."""
-        return launch in self._over
-
     def add_token(self, launch: int, tick: int) -> None:
-        """Process a new token. Make `launch` the present launch unless `is_superseded(launch)`."""
-        if launch in self._over or (launch not in self.tokens and len(self.tokens) == MAX_LAUNCHES):
+        """Process a new token. Make `launch` the present launch unless it is superseded."""
+        if launch in self.superseded or (
+            launch not in self.tokens and len(self.tokens) == MAX_LAUNCHES
+        ):
             return
         if launch not in self.tokens:
             self.tokens.append(launch)
@@ -102,7 +101,7 @@ class PeerRack:
         elif launch != self.launch:
             return
         if launch != self.launch:
-            self._over.append(launch)
+            self.superseded.append(launch)
         elif self.tokens:
             self._mark_present(self.tokens[-1], tick)
         else:
@@ -135,19 +134,6 @@ class PeerRack:
         self.presence = Presence.THERE
         self.launch = launch
         self.since = tick
-        self.confirm_by = -1
-
-    def join_lockstep(self, launch: int, tick: int) -> None:
-        """Mark the rack as present in lockstep.
-
-        Call this when the rack joins at the start of the run, and when it is still present after
-        this adapter was restarted.
-        """
-        if self.presence is Presence.AWAITED:
-            self.presence = Presence.THERE
-            self.launches = 1
-            self.since = tick
-        self.launch = launch
         self.confirm_by = -1
 
     def restore_state(self, message: PeerPresence | AnyMessage, confirm_by: int) -> None:
@@ -213,10 +199,16 @@ class Peers:
                 continue
             if not self._is_lockstep:
                 (peer.add_token if has_appeared else peer.remove_token)(launch, tick)
-            elif has_appeared:
-                peer.join_lockstep(launch, tick)
-            else:
+            elif not has_appeared:
                 peer.mark_lost(tick)
+            else:
+                # It joins at the start of the run, or is present after a restart of this adapter.
+                if peer.presence is Presence.AWAITED:
+                    peer.presence = Presence.THERE
+                    peer.launches = 1
+                    peer.since = tick
+                peer.launch = launch
+                peer.confirm_by = -1
         findings: list[Finding] = []
         for peer in self:
             if 0 <= peer.confirm_by <= tick:

@@ -16,11 +16,12 @@ from rack.backplane.lines import UtilityLines
 from rack.backplane.message import fill_counts
 from rack.backplane.segment import Segment
 from rack.backplane.watch.alarms import Alarm
+from rack.boards.host.entries import zero_counts
 from rack.boards.lan.envelope import Envelope, Flaw
 from rack.boards.lan.grid import OwnGrid
 from rack.boards.lan.keys import estop_answer_key, estop_key
 from rack.boards.lan.link import LanLink, Question
-from rack.boards.lan.status import LanDesk, zero_counts
+from rack.boards.lan.status import LanDesk
 from rack.levels.level import Finding
 
 ESTOP_KIND = xxh3(b"rack estop 1")
@@ -81,7 +82,8 @@ class EstopResponder:
                 self._lines.latch_emergency_stop()
             # Echo session and number of the request, so that the answer fits no other request.
             answer = Envelope(ESTOP_KIND, self._launch, head.serial, head.launch, tick, 0, 0)
-            reply(b"", self._sealer.seal(estop_answer_key(self._rack, asker), answer, b""))
+            seal = self._sealer.seal(estop_answer_key(self._rack, asker), answer, b"")
+            reply(b"", attachment=seal)
 
     def restore_counts(self, record: Any) -> None:
         """Restore the counters from the last status of the previous adapter."""

@@ -3,24 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TypeVar
-
-import numpy as np
 
 from rack.backplane.message import Message, Status, field, make_message
 from rack.boards.host.entries import declare_counter
-
-C = TypeVar("C", bound=Message)
-
-
-def zero_counts(group: type[C]) -> C:
-    """Return a group of counters with all values 0.
-
-    Its integers are 64 bits wide, so that they cannot overflow before `fill_counts` limits them to
-    the width of the status.
-    """
-    fields = group.message_type.fields
-    return group(np.dtype([(f.name, "f8" if f.python is float else "i8") for f in fields]))
+from rack.boards.lan.envelope import MAX_MESSAGE_BYTES
 
 
 class LanExport(Message, version=1):
@@ -71,7 +57,7 @@ class LanFlaws(Message, version=1):
     unsigned: int = declare_counter(
         "changed on the way, under another key or not sealed by its sender, always 0 in lockstep"
     )
-    oversized: int = declare_counter("longer than most_bytes, always 0 in lockstep")
+    oversized: int = declare_counter(f"longer than {MAX_MESSAGE_BYTES} bytes, always 0 in lockstep")
 
 
 class LanClocks(Message, version=1):

@@ -24,7 +24,6 @@ from rack.backplane.process import (
 )
 from rack.backplane.segment import Segment
 from rack.backplane.words import Block, System, TaskState
-from rack.boards.classes import find_class
 from rack.boards.errors import UNRECOVERABLE_STATUS
 from rack.boards.host.adapter import Adapter
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
@@ -34,6 +33,7 @@ from rack.boards.run.system_controller import run_clock
 from rack.boards.wiring import ClockWiring, TaskWiring
 from rack.levels.errors import CannotGoOn, LevelError
 from rack.levels.level import Executor, Planner
+from rack.levels.references import find_class
 
 SELF_TEST_FAILED = 3
 """Exit status of a board that failed its self-test or could not set up its level."""

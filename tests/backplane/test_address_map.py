@@ -13,12 +13,13 @@ from rack.backplane.address_map import (
     FAULT_ENTRIES,
     FAULT_ENTRY_SIZE,
     HEAD_SIZE,
+    MAILBOX_HEAD_SIZE,
     OPERATOR_ENTRIES,
     PAGE,
+    TRACE_RECORD_SIZE,
     AddressMap,
-    compute_mailbox_size,
     compute_operator_entry_size,
-    compute_trace_size,
+    compute_slot_stride,
 )
 from rack.backplane.layout import Layout, TaskSpec, compute_depth
 from rack.backplane.words import Block, Head, System
@@ -38,20 +39,24 @@ def full() -> Layout:
 
 def test_windows_follow_each_other_on_pages(full: Layout) -> None:
     places = AddressMap(full)
-    assert [window.board for window in places.windows] == ["clock", "writer", "reader"]
-    assert places.windows[0].address == HEAD_SIZE
-    assert all(window.address % PAGE == window.size % PAGE == 0 for window in places.windows)
-    assert all(
-        first.address + first.size == second.address for first, second in pairwise(places.windows)
-    )
+    starts = [places.faults, places.blocks["writer"], places.blocks["reader"]]
+    assert starts[0] == HEAD_SIZE
+    assert starts == sorted(starts)
+    assert all(start % PAGE == 0 for start in starts)
     # The semaphores follow.
-    assert places.size == places.windows[-1].address + places.windows[-1].size + PAGE
+    first_semaphore = min(places.wake.values())
+    assert first_semaphore % PAGE == 0
+    assert places.size == first_semaphore + PAGE
 
 
 def test_no_two_writers_share_a_cache_line(full: Layout) -> None:
     places = AddressMap(full)
-    areas = [(places.blocks[t.name], BLOCK_SIZE + compute_trace_size(t)) for t in full.tasks]
-    areas += [(places.mailboxes[m.name], compute_mailbox_size(m)) for m in full.mailboxes]
+    areas = [(places.blocks[t.name], BLOCK_SIZE) for t in full.tasks]
+    areas += [(places.traces[t.name], t.depth * TRACE_RECORD_SIZE) for t in full.tasks]
+    areas += [
+        (places.mailboxes[m.name], MAILBOX_HEAD_SIZE + m.depth * compute_slot_stride(m))
+        for m in full.mailboxes
+    ]
     areas += [(address, ALARM_SIZE) for address in places.alarms.values()]
     areas += [(places.faults, FAULT_ENTRIES * FAULT_ENTRY_SIZE)]
     areas += [(places.operator, OPERATOR_ENTRIES * compute_operator_entry_size(full))]
@@ -65,9 +70,9 @@ def test_everything_that_a_board_writes_is_in_its_window(full: Layout) -> None:
     boxes, blocks = places.mailboxes, places.blocks
     of_writer = (boxes["writer.a"], boxes["writer.c"], blocks["writer"], blocks["writer.planner"])
     of_clock = (places.operator, boxes["reader.operator"])
-    for window, addresses in zip(places.windows, (of_clock, of_writer), strict=False):
-        for address in addresses:
-            assert window.address <= address < window.address + window.size
+    starts = [HEAD_SIZE, places.blocks["writer"], places.blocks["reader"]]
+    for (start, end), addresses in zip(pairwise(starts), (of_clock, of_writer), strict=True):
+        assert all(start <= address < end for address in addresses)
     assert compute_operator_entry_size(full) >= full.find_mailbox("reader.operator").size
 
 

@@ -6,7 +6,6 @@ import os
 import random
 import signal
 import stat
-import sys
 import time
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -152,28 +151,11 @@ def test_a_processor_that_reorders_stores_is_refused_before_anything_is_made(
     monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine="aarch64"))
     before = descriptors()
     assert refusal(lambda: Segment.create(layout(rack_name, []), "")) == (
-        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is proved"
-        " for x86_64 alone; set RACK_TRY_PROCESSOR=1 to try it"
+        f"rack '{rack_name}': the processor here is aarch64, and the backplane's memory order is"
+        " proved for x86_64 alone"
     )
     assert descriptors() == before
     assert rack_name not in list_racks()
-
-
-def test_another_processor_is_tried_on_demand_if_its_words_have_64_bits(
-    rack_name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(os, "uname", lambda: SimpleNamespace(machine="aarch64"))
-    monkeypatch.setenv("RACK_TRY_PROCESSOR", "1")
-    Segment.create(layout(rack_name, []), "").close()
-    unlink_segment(rack_name)
-    assert capsys.readouterr().err == (
-        f"rack '{rack_name}': the processor here is aarch64; the backplane's memory order is proved"
-        " for x86_64 alone, and this one is untested\n"
-    )
-    monkeypatch.setattr(sys, "maxsize", (1 << 31) - 1)
-    assert refusal(lambda: Segment.create(layout(rack_name, []), "")) == (
-        f"rack '{rack_name}': the processor here is aarch64, without atomic access to 64 bits"
-    )
 
 
 def test_a_lack_of_shared_memory_is_reported_at_creation(rack_name: str) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.classes import extend_path, find_class
+from rack.boards.config.loader import extend_path, find_class
 from rack.levels.level import Executor, Planner
 from rack.levels.servo import ServoExecutor
 

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from rack.backplane.segment import Segment
-from rack.boards.classes import find_class
 from rack.boards.config.loader import load_text
 from rack.boards.config.resolved import resolve
 from rack.boards.host.bus import HostBus
 from rack.boards.wiring import HostWiring
 from rack.levels.host_program import HostProgram
+from rack.levels.references import find_class
 from rack.tools.console.answer import Failure
 from rack.tools.console.interrupt import INTERRUPT, SIGNALS
 from rack.tools.console.parameters import RackName, argument

@@ -31,7 +31,7 @@ def find_record(kind: str) -> Kind:
         Failure: The kind is unknown.
     """
     name = "kill" if kind == EXTERNAL else kind
-    if name not in KINDS:
+    if name not in KINDS.names:
         why = "no level that is imported here adds it, and the run has no published.json that does"
         raise Failure(f"a fault is of the unknown kind '{kind}': {why}; run the rack again", 2)
     return KINDS[name]

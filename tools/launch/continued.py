@@ -23,8 +23,7 @@ import numpy as np
 from rack.backplane.mailbox.history import find_chains
 from rack.backplane.segment import Segment
 from rack.boards import Rack
-from rack.boards.classes import extend_path
-from rack.boards.config.loader import load
+from rack.boards.config.loader import extend_path, load
 from rack.boards.config.resolved import list_class_names
 from rack.boards.config.schema import RackConfig
 from rack.boards.crate.line import WarmCrate

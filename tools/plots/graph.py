@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment
-from rack.boards.classes import find_class
 from rack.boards.config.loader import load_text
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
+from rack.levels.references import find_class
 from rack.levels.systems.blocks.executor import BlockExecutor, build_network, restore_network
 from rack.levels.systems.blocks.network import STOP, BlockNetwork
 from rack.tools.console.pictures import open_figure

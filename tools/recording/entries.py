@@ -13,12 +13,12 @@ from rack.backplane.address_map import CLOCK
 from rack.backplane.layout import MailboxSpec
 from rack.backplane.message import COMMAND_ID
 from rack.backplane.operator_table import Request
-from rack.boards.classes import find_class
 from rack.boards.config.commands import build_requests
 from rack.boards.config.resolved import resolve
 from rack.boards.config.schema import RackConfig
 from rack.boards.host.adapter import Adapter
 from rack.boards.wiring import MessageRows, RecordedEntries
+from rack.levels.references import find_class
 from rack.tools.console.answer import Failure
 from rack.tools.recording.recording import Recording
 

@@ -11,11 +11,11 @@ from typing import Any
 
 from rack.backplane.address_map import AddressMap
 from rack.backplane.layout import Layout
-from rack.boards.classes import find_class
 from rack.boards.config.cell import build_rack_cell
 from rack.boards.config.schema import CLOCK_SLOT, LAN, RackConfig
 from rack.boards.timing.chains import format_names
 from rack.levels.level import Executor
+from rack.levels.references import find_class
 from rack.levels.tables import read_params
 from rack.tools.console.answer import Document
 from rack.tools.console.tables import Blocks, Cell, TextTable
@@ -82,7 +82,7 @@ def build_inventory(config: RackConfig, layout: Layout, notes: list[str]) -> Doc
         "clock_core": config.clock.core,
         "clock_priority": config.clock.priority,
         "segment_bytes": addresses.size,
-        "windows": {window.board: window.address for window in addresses.windows},
+        "windows": addresses.windows,
         "tasks": tasks,
         "hosts": [
             {

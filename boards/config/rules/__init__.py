@@ -34,11 +34,9 @@ def _check_network(wiring: Wiring) -> Mistakes:
 Rule = Callable[[Wiring], Mistakes]
 RULES: tuple[Rule, ...] = (
     boards.check_boards,
-    boards.check_hosts,
     boards.check_circles,
     boards.check_slots,
     boards.check_run_end,
-    boards.check_record_windows,
     _check_network,
     levels.check_scene,
     levels.check_robot,
@@ -53,7 +51,7 @@ RULES: tuple[Rule, ...] = (
     mailboxes.check_writers,
     mailboxes.check_operator_mailboxes,
     mailboxes.check_read_mailboxes,
-    mailboxes.check_protocols,
+    mailboxes.check_protocol_tables,
     mailboxes.check_ending_status,
     mailboxes.check_sides,
     mailboxes.check_queues,
@@ -64,20 +62,22 @@ RULES: tuple[Rule, ...] = (
     levels.check_cell,
 )
 """All rules, in the order in which their mistakes are listed."""
-NEEDS: Mapping[Rule, set[str]] = {
-    levels.check_scene: {"scene"},
-    levels.check_robot: {"robot"},
-    boards.check_clock: {"clock"},
-    boards.check_rates: {"clock"},
-    boards.check_polling: {"clock"},
-    boards.check_reservations: {"clock"},
-    boards.check_schedule: {"clock"},
-    levels.check_programs: {"robot", "scene", "task"},
+NEEDS: Mapping[str, tuple[Rule, ...]] = {
+    "clock": (
+        boards.check_clock,
+        boards.check_rates,
+        boards.check_polling,
+        boards.check_reservations,
+        boards.check_schedule,
+    ),
+    "robot": (levels.check_robot, levels.check_programs),
+    "scene": (levels.check_scene, levels.check_programs),
+    "task": (levels.check_programs,),
 }
-"""Tables that a rule depends on. The rule is skipped if one of them is broken."""
+"""Rules that depend on a table. They are skipped if the table is broken."""
 
 
 def apply_rules(wiring: Wiring) -> list[Mistake]:
     """Return all mistakes that the rules find in a wiring."""
-    rules = (rule for rule in RULES if not wiring.broken & NEEDS.get(rule, set()))
-    return [mistake for rule in rules for mistake in rule(wiring)]
+    skipped = {rule for table in wiring.broken for rule in NEEDS.get(table, ())}
+    return [mistake for rule in RULES if rule not in skipped for mistake in rule(wiring)]

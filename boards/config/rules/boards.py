@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect
 from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter
+from itertools import pairwise
 
 from rack.backplane.address_map import CLOCK
 from rack.backplane.clock.system_clock import format_rate
@@ -12,13 +14,11 @@ from rack.backplane.errors import ClockError
 from rack.boards.config.connections import Wiring
 from rack.boards.config.files import LAN_ADAPTER
 from rack.boards.config.mistakes import report_repeated_names
-from rack.boards.config.record import RecordConfig
 from rack.boards.config.schema import (
     LAN,
     LONGEST_EVERY,
     SHORTEST_MS,
     BoardConfig,
-    RackConfig,
     ScheduleConfig,
 )
 from rack.boards.config.timing import PLANNER_BUDGET, compute_frames
@@ -31,24 +31,23 @@ BOARD_NAME = re.compile(r"[a-z][a-z0-9_]{0,30}")
 
 
 def check_boards(wiring: Wiring) -> Mistakes:
-    """Check that boards have valid names, neighbours that exist, and consistent planner keys."""
-    known = [*wiring.config.board, *wiring.broken_boards]
-    for name, board in wiring.config.board.items():
+    """Check that boards have valid names, neighbours that exist, and consistent planner keys.
+
+    Host boards must also have unused names.
+    """
+    config = wiring.config
+    known = [*config.board, *wiring.broken_boards]
+    for name, board in config.board.items():
         place = f"board.{name}"
         yield from _check_name(place, name)
         others = [other for other in known if other != name]
         for key, neighbours in (("above", board.above), ("below", board.below)):
             yield from _check_neighbours(f"{place}.{key}", neighbours, others, "other board")
         yield from _check_planner(place, board)
-        if board.executor == LAN_ADAPTER and (name != LAN or wiring.config.adapter.lan is None):
+        if board.executor == LAN_ADAPTER and (name != LAN or config.adapter.lan is None):
             why = "this class needs the table [adapter.lan], which adds its board"
             yield Mistake(f"{place}.executor", board.executor, why)
-
-
-def check_hosts(wiring: Wiring) -> Mistakes:
-    """Check that host boards have valid, unused names, and neighbours that exist."""
-    known = [*wiring.config.board, *wiring.broken_boards]
-    for name, host in wiring.config.host.items():
+    for name, host in config.host.items():
         place = f"host.{name}"
         yield from _check_name(place, name)
         if name in known:
@@ -90,14 +89,11 @@ def _check_planner(place: str, board: BoardConfig) -> Mistakes:
         valid = '"tight" or "loose" with a planner' if has_planner else '"none" without a planner'
         yield Mistake(f"{place}.coupling", board.coupling, f"must be {valid}")
     if is_loose and board.planner_slot is None:
-        yield Mistake(
-            f"{place}.planner_slot", None, "missing; a loosely coupled planner has its own board"
-        )
-    for key in ("planner_slot", "planner_core"):
-        if not is_loose and getattr(board, key) is not None:
-            yield Mistake(
-                f"{place}.{key}", getattr(board, key), 'only for a planner with coupling = "loose"'
-            )
+        why = "missing; a loosely coupled planner has its own board"
+        yield Mistake(f"{place}.planner_slot", None, why)
+    for key in () if is_loose else ("planner_slot", "planner_core"):
+        if (value := getattr(board, key)) is not None:
+            yield Mistake(f"{place}.{key}", value, 'only for a planner with coupling = "loose"')
     if board.coupling == "tight" and board.planner_priority >= max(board.priority, 1):
         why = (
             f"must be below the executor's priority, {board.priority}, with a tightly coupled"
@@ -109,47 +105,35 @@ def _check_planner(place: str, board: BoardConfig) -> Mistakes:
         for table, keys in (("budget", PLANNER_BUDGET), ("transfer", PLANNER_TRANSFER)):
             for key in keys:
                 if value := getattr(getattr(board, table), key, None):
-                    yield Mistake(
-                        f"{place}.{table}.{key}",
-                        value,
-                        "the board has no planner; remove it, or add one",
-                    )
+                    why = "the board has no planner; remove it, or add one"
+                    yield Mistake(f"{place}.{table}.{key}", value, why)
 
 
 def check_circles(wiring: Wiring) -> Mistakes:
     """Check that no level is above itself, directly or through other levels."""
     config = wiring.config
-    links = list(config.list_links())
+    above: dict[str, list[str]] = {name: [] for name in config.board}
+    for upper, lower in config.list_links():
+        above[lower].append(upper)
     try:
-        TopologicalSorter(
-            {name: [upper for upper, lower in links if lower == name] for name in config.board}
-        ).prepare()
+        TopologicalSorter(above).prepare()
     except CycleError as error:
-        circle = error.args[1][:-1]
-        pairs = list(zip(circle, [*circle[1:], circle[0]], strict=True))
+        # The last level is the first again. Each is above the next.
+        circle = error.args[1]
+        declared = [
+            keys
+            for upper, lower in pairwise(circle)
+            if (
+                keys := [
+                    (f"board.{board}.{key}", other)
+                    for board, key, other in ((upper, "below", lower), (lower, "above", upper))
+                    if other in getattr(config.board[board], key)
+                ]
+            )
+        ]
         # Prefer to report a link that only one of its two boards names.
-        upper, lower = min(reversed(pairs), key=lambda link: len(_find_declarations(config, *link)))
-        board, key, end = _find_declarations(config, upper, lower)[0]
-        at = circle.index(lower)
-        walk = " -> ".join([*circle[at:], *circle[:at], lower])
-        why = f"the levels form a circle, {walk}; the {end} level has no {key}"
-        other = upper if board == lower else lower
-        yield Mistake(f"board.{board}.{key}", other, why)
-
-
-def _find_declarations(config: RackConfig, upper: str, lower: str) -> list[tuple[str, str, str]]:
-    """Return the keys of the config that put board `upper` above board `lower`.
-
-    Returns:
-        For each key: the board in whose table it is, its name ("above" or "below"), and which level
-        must not have it ("highest" or "lowest").
-    """
-    tables = ((upper, "below", "lowest", lower), (lower, "above", "highest", upper))
-    return [
-        (board, key, end)
-        for board, key, end, other in tables
-        if other in getattr(config.board[board], key)
-    ]
+        place, other = min(reversed(declared), key=len)[0]
+        yield Mistake(place, other, f"the levels form a circle, {' -> '.join(circle)}")
 
 
 def check_slots(wiring: Wiring) -> Mistakes:
@@ -173,17 +157,6 @@ def check_run_end(wiring: Wiring) -> Mistakes:
             True,
             f"only one board can end the run; '{ending[0]}' already does",
         )
-
-
-def check_record_windows(wiring: Wiring) -> Mistakes:
-    """Check that `before` and `after` are given only together with `keep`."""
-    table = wiring.config.record
-    if table.keep is None:
-        for key in ("before", "after"):
-            if (value := getattr(table, key)) != RecordConfig.model_fields[key].default:
-                yield Mistake(
-                    f"record.{key}", value, "this needs record.keep; without it everything is kept"
-                )
 
 
 LONGEST_MAJOR = 10_000
@@ -280,36 +253,30 @@ def check_reservations(wiring: Wiring) -> Mistakes:
 
 
 def check_schedule(wiring: Wiring) -> Mistakes:
-    """If the rack has a static schedule, check its frames and the boards' cycles in them."""
-    table = wiring.config.schedule
-    if table is not None:
-        mistakes = list(_check_frames(table, wiring.config.clock_ns))
-        yield from mistakes or _check_cycles(wiring, table)
+    """If the rack has a static schedule, check its frames and the boards' cycles in them.
 
-
-def _check_frames(table: ScheduleConfig, clock_ns: int) -> Mistakes:
-    """Check that the minor frame is a whole number of ticks and divides the major frame.
-
-    The major frame must also not exceed `LONGEST_MAJOR`.
+    The minor frame must be a whole number of ticks, the major frame a multiple of it and at most
+    `LONGEST_MAJOR`. Each board's cycle must be a multiple of the minor frame and divide the major.
     """
-    tick_ms = clock_ns * 1e-6
-    minor, major = compute_frames(table, clock_ns)
+    table = wiring.config.schedule
+    if table is None:
+        return
+    tick_ms = wiring.config.clock_ns * 1e-6
+    minor, major = compute_frames(table, wiring.config.clock_ns)
     if minor < 1 or abs(minor * tick_ms - table.minor_ms) > 1e-6 * tick_ms:
-        why = (
-            f"not a whole number of ticks of {tick_ms:g} ms; nearest:"
-            f" {_format_nearest(table.minor_ms, tick_ms)} ms"
-        )
+        near = _format_nearest(table.minor_ms, tick_ms)
+        why = f"not a whole number of ticks of {tick_ms:g} ms; nearest: {near} ms"
         yield Mistake("schedule.minor_ms", table.minor_ms, why)
     elif major % minor or not major or abs(major * tick_ms - table.major_ms) > 1e-6 * tick_ms:
         near = _format_nearest(table.major_ms, table.minor_ms)
         why = f"not a multiple of minor_ms, {table.minor_ms:g} ms; nearest: {near} ms"
         yield Mistake("schedule.major_ms", table.major_ms, why)
     elif major > LONGEST_MAJOR:
-        why = (
-            f"{major} ticks are too long; the longest major frame is {LONGEST_MAJOR} ticks,"
-            f" {LONGEST_MAJOR * tick_ms:g} ms"
-        )
+        longest = f"{LONGEST_MAJOR} ticks, {LONGEST_MAJOR * tick_ms:g} ms"
+        why = f"{major} ticks are too long; the longest major frame is {longest}"
         yield Mistake("schedule.major_ms", table.major_ms, why)
+    else:
+        yield from _check_cycles(wiring, table, minor, major)
 
 
 def _format_nearest(value: float, step: float) -> str:
@@ -318,25 +285,20 @@ def _format_nearest(value: float, step: float) -> str:
     return " or ".join(f"{number * step:.12g}" for number in (below, below + 1) if number)
 
 
-def _check_cycles(wiring: Wiring, table: ScheduleConfig) -> Mistakes:
+def _check_cycles(wiring: Wiring, table: ScheduleConfig, minor: int, major: int) -> Mistakes:
     """Check that each board's cycle is a multiple of the minor frame and divides the major."""
-    clock_ns = wiring.config.clock_ns
-    minor, major = compute_frames(table, clock_ns)
-    tick_ms = clock_ns * 1e-6
-    fitting = [
-        minor * number for number in range(1, major // minor + 1) if major % (minor * number) == 0
-    ]
+    tick_ms = wiring.config.clock_ns * 1e-6
+    fitting = [cycle for cycle in range(minor, major + 1, minor) if major % cycle == 0]
     for name, every in wiring.periods.items():
         if every in fitting:
             continue
         board = wiring.config.board[name]
         key = "rate_hz" if board.every is None else "every"
-        below = [cycle for cycle in fitting if cycle < every]
-        above = [cycle for cycle in fitting if cycle > every]
+        at = bisect(fitting, every)
         rates = " or ".join(
             f"{(ms := cycle * tick_ms):g} ms, "
             + (f"{format_rate(1e3 / ms)} Hz" if key == "rate_hz" else f"every {cycle}")
-            for cycle in (*below[-1:], *above[:1])
+            for cycle in fitting[max(0, at - 1) : at + 1]
         )
         why = (
             f"a cycle of {every * tick_ms:g} ms does not fit the schedule; it must be a multiple of"

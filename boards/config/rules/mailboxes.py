@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from rack.backplane.layout import TICK_PROTOCOLS
 from rack.backplane.mailbox.queue import get_position_mailbox
 from rack.backplane.message import State
@@ -196,15 +198,18 @@ def check_operator_mailboxes(wiring: Wiring) -> Mistakes:
             )
 
 
-def check_protocols(wiring: Wiring) -> Mistakes:
-    """Check that every mailbox with a protocol in the config exists."""
-    for mailbox in wiring.config.protocol.mailbox:
-        if not wiring.is_known(mailbox):
-            yield Mistake(
-                f"protocol.mailbox.{mailbox}",
-                None,
-                f"no such mailbox; mailboxes: {wiring.mailbox_names}",
-            )
+def check_protocol_tables(wiring: Wiring) -> Mistakes:
+    """Check that every mailbox in the tables of `[protocol]` exists."""
+    table = wiring.config.protocol
+    entries: list[tuple[str, Mapping[str, object]]] = [
+        ("mailbox", table.mailbox),
+        ("depth", table.depth),
+    ]
+    for key, listed in entries:
+        for mailbox, value in listed.items():
+            if not wiring.is_known(mailbox):
+                why = f"no such mailbox; mailboxes: {wiring.mailbox_names}"
+                yield Mistake(f"protocol.{key}.{mailbox}", value, why)
 
 
 def check_queues(wiring: Wiring) -> Mistakes:
@@ -221,13 +226,7 @@ def check_queues(wiring: Wiring) -> Mistakes:
         elif wiring.find_protocol(mailbox) == "queue":
             yield from _check_queue(wiring, mailbox)
     for mailbox, depth in table.depth.items():
-        if not wiring.is_known(mailbox):
-            yield Mistake(
-                f"protocol.depth.{mailbox}",
-                depth,
-                f"no such mailbox; mailboxes: {wiring.mailbox_names}",
-            )
-        elif wiring.find_protocol(mailbox) != "queue":
+        if wiring.is_known(mailbox) and wiring.find_protocol(mailbox) != "queue":
             queues = [name for name in wiring.writers if wiring.find_protocol(name) == "queue"]
             why = f"it is not a queue and holds one message; queues: {', '.join(queues) or 'none'}"
             yield Mistake(f"protocol.depth.{mailbox}", depth, why)

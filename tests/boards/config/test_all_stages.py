@@ -31,7 +31,7 @@ STAGES = {
     "board.five.params.nothing": board("five", 8, f"every = 1\n{FIGURE}\nparams.nothing = 1"),
     "board.six.above": board("six", 9, f'every = 1\n{FIGURE}\nabove = "nobody"'),
     "protocol.strict_": "[protocol]\nstrict_ = true\n",
-    "record.before": '[record]\nbefore = "1s"\n',
+    "record": '[record]\nbefore = "1s"\n',
     "fault.kind": '[[fault]]\nkind = "bogus"\nboard = "lower"\n',
     "fault.mailbox": '[[fault]]\nkind = "drop"\nboard = "lower"\nmailbox = "upper.command"\n',
     "fault.when": '[[fault]]\nkind = "kill"\nboard = "lower"\nwhen = "lower.status.gone == 1"\n',

@@ -39,5 +39,5 @@ def test_windows_around_events_need_a_flight_recorder(small: Path) -> None:
     with pytest.raises(ConfigError) as refused:
         resolve(load(small, ["record={ before = '2 s' }"]))
     assert str(refused.value) == (
-        "record.before = 2.0: this needs record.keep; without it everything is kept"
+        "record: before and after need keep; without it everything is kept"
     )

@@ -24,7 +24,7 @@ from rack.boards.config import load, resolve_layout
 from rack.boards.config.cell import find_geom_name
 from rack.boards.config.injections import build_injections
 from rack.boards.config.published import PublishedFinding, PublishedLevel
-from rack.boards.crate.alarm_events import AlarmConverter
+from rack.boards.crate.alarm_events import AlarmReader
 from rack.boards.events import Event
 from rack.levels.messages import Error
 from rack.levels.robot.cell import build_cell
@@ -77,9 +77,11 @@ def alarm_events(
     segment: Segment,
     geom: Callable[[int], str] = str,
     names: tuple[str, ...] = ("first", "second"),
-) -> AlarmConverter:
+) -> AlarmReader:
     wave = PublishedLevel(names=names, findings=FINDINGS)
-    return AlarmConverter(segment, JOINTS, geom, {"wave": wave})
+    reader = AlarmReader(segment)
+    reader._joints, reader._geom, reader._levels = JOINTS, geom, {"wave": wave}
+    return reader
 
 
 def heard(

@@ -11,13 +11,13 @@ import pytest
 from rack.backplane.mailbox.protocols import open_observer
 from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.watch.alarms import AlarmWriter
-from rack.boards.classes import find_class
 from rack.boards.config import resolve
 from rack.boards.config.resolved import Resolved
 from rack.boards.host.bus import HostBus
 from rack.boards.host.bus_adapter import BusAdapter
 from rack.boards.host.entries import OutwardEntry
 from rack.boards.run.ports import InputPorts, OutputPorts
+from rack.levels.references import find_class
 from tests.boards.conftest import MakeConfig
 from tests.boards.host.test_board import HOSTED
 from tests.boards.host_programs import Host

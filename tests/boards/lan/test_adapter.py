@@ -12,13 +12,13 @@ import pytest
 from rack.backplane.message import Message, State, field
 from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.words import System, is_switched_on
-from rack.boards.classes import find_class
 from rack.boards.config import resolve
 from rack.boards.lan.adapter import LanAdapter
 from rack.boards.lan.clocks import REPORT_UNKNOWN_NS
 from rack.boards.lan.envelope import Flaw, Sealer
 from rack.boards.lan.status import build_status_class
 from rack.levels.peer import PeerPresence
+from rack.levels.references import find_class
 from tests.boards.lan.racks import configs, rack_text
 
 EVERY = 8
@@ -164,7 +164,7 @@ def test_in_real_time_the_status_counts_messages_with_flaws(make: MakeAdapter) -
 
         sealer = Sealer()
 
-    Link.sealer.resume_counts([3] * len(Flaw))
+    Link.sealer.flaws = dict.fromkeys(Flaw, 3)
     out = build_status_class(adapter._table.exports, adapter._table.imports).zeros({})
     adapter.store_output("status", out)
     adapter.store_output("peer_b", PeerPresence.zeros({}))

@@ -113,23 +113,21 @@ def step(time_ns: int, flags: int = 0) -> Step:
     return Step(HEAD._replace(launch=7, time_ns=time_ns, flags=flags), 8, ["a"], [])
 
 
-def test_steps_are_delivered_once_and_up_to_a_time() -> None:
+def test_steps_are_kept_once_and_in_order() -> None:
     partner = Partner("b", 3)
     for time_ns in (8, 16, 16, 8, 24):
         partner.add_step(step(time_ns))
-    assert [passed.head.time_ns for passed in partner.take_steps(16)] == [8, 16]
-    assert [passed.head.time_ns for passed in partner.take_steps(16)] == []
-    assert [partner.has_reached(time_ns) for time_ns in (24, 25)] == [True, False]
-    assert [passed.head.time_ns for passed in partner.take_steps(100)] == [24]
+    assert [kept.head.time_ns for kept in partner.steps] == [8, 16, 24]
+    assert partner.time_ns == 24
 
 
 def test_a_rack_that_has_ended_is_not_awaited_until_it_sends_again() -> None:
     partner = Partner("b", 3)
     partner.gone_s = 1.0
     partner.add_step(step(8, StepFlag.OVER))
-    assert (partner.has_reached(1000), partner.gone_s) == (True, None)
+    assert (partner.is_out, partner.gone_s) == (True, None)
     partner.add_step(step(16))
-    assert not partner.has_reached(1000)
+    assert not partner.is_out
 
 
 def test_the_word_says_why_it_is_awaited() -> None:
@@ -150,7 +148,7 @@ def test_a_partner_that_is_reset_is_awaited_as_at_first() -> None:
     partner.reset_state()
     assert (partner.launch, partner.time_ns, partner.gone_s) == (NO_LAUNCH, NEVER, None)
     assert not partner.steps
-    assert [partner.is_out, partner.is_present, partner.has_reached(0)] == [False] * 3
+    assert [partner.is_out, partner.is_present] == [False] * 2
 
 
 HEAD = Envelope(STEP_KIND, 11, 1, 1, 40, 100_000_000, 0, StepFlag.OVER)

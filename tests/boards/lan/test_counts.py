@@ -5,9 +5,10 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rack.boards.host.entries import zero_counts
 from rack.boards.lan.entries import WINDOW_MESSAGES, SequenceTracker
 from rack.boards.lan.envelope import Envelope
-from rack.boards.lan.status import LanImport, zero_counts
+from rack.boards.lan.status import LanImport
 
 
 def head(number: int, launch: int = 7, serial: int = 0) -> Envelope:
@@ -22,7 +23,7 @@ def order(launch: int = 0, number: int = 0, serial: int = 0) -> tuple[SequenceTr
     found = SequenceTracker(count)
     if serial:
         count.launch, count.number, count.serial = launch, number, serial
-        found.resume_from_counts()
+        found.restore_counts(count.record.copy())
     return found, count
 
 

@@ -39,8 +39,8 @@ def test_a_new_launch_replaces_one_whose_token_has_not_expired() -> None:
     assert alarms(peer) == [Alarm.PEER_LOST, Alarm.PEER_RESTARTED]
     peer.remove_token(OLD, 40)
     assert (peer.launch, peer.is_present, peer.losses) == (NEW, True, 1)
-    assert peer.is_superseded(OLD)
-    assert not peer.is_superseded(NEW)
+    assert OLD in peer.superseded
+    assert NEW not in peer.superseded
     # A late token, as over another way through the network.
     peer.add_token(OLD, 41)
     assert (peer.launch, peer.launches) == (NEW, 2)
@@ -137,14 +137,14 @@ def test_a_rack_is_present_exactly_if_a_current_launch_is(
 ) -> None:
     peer, tokens = PeerRack("b"), set[int]()
     for tick, (launch, has_come) in enumerate(steps):
-        was_over = [old for old in range(1, 5) if peer.is_superseded(old)]
+        was_over = [old for old in range(1, 5) if old in peer.superseded]
         (peer.add_token if has_come else peer.remove_token)(launch, tick)
         (tokens.add if has_come else tokens.discard)(launch)
-        living = {token for token in tokens if not peer.is_superseded(token)}
+        living = {token for token in tokens if token not in peer.superseded}
         assert peer.is_present == bool(living)
         assert not peer.is_present or peer.launch in living
         # What is over stays over.
-        assert all(peer.is_superseded(old) for old in was_over)
+        assert all(old in peer.superseded for old in was_over)
         assert peer.launches <= 4
         assert len(peer.tokens) <= MAX_LAUNCHES
     back = sum(alarm in (Alarm.PEER_BACK, Alarm.PEER_RESTARTED) for alarm in alarms(peer))

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import pytest
 
 from rack.boards.lan.credentials import Credentials
+from rack.boards.lan.envelope import MAX_MESSAGE_BYTES
 from rack.boards.lan.keys import out_key
 from rack.tools.network.certificates import make_credentials
 from rack.tools.viewer.window import find_free_port
 from tests.processes import BOUND_S, wait_until
 
 ROOT = Path(__file__).resolve().parents[3]
-MOST = 1000
 IMPORTED = (
     "friend/pulse.status",
     "liar/pulse.status",
@@ -124,7 +124,6 @@ def at_home(folder: Path, protocol: str = "tls") -> Iterator[Site]:
         # Over quic zenoh does one handshake at a time, and that to nobody takes 3 s.
         "connect": [] if protocol == "quic" else [f"{protocol}/127.0.0.1:{friends_port}"],
         "certificates": str(folder / "set"),
-        "most_bytes": MOST,
         "estop_from": ["viewer", "friend"],
         "export": {"pulse": {"from": "pulse.status"}},
         "import": {f"port{at}": {"from": source, **entry} for at, source in enumerate(IMPORTED)},
@@ -163,7 +162,13 @@ def sessions(site: Site) -> dict[str, dict[str, Any]]:
     }
     own = [(pulse(name), 99, pulse(name)) for name in ("nobody", "viewer", "home")]
     liar, second = pulse("liar"), out_key("liar", "second.status")
-    lies = [(liar, 100, None), (liar, MOST + 1, liar), (second, 100, liar), *eager["puts"], *own]
+    lies = [
+        (liar, 100, None),
+        (liar, MAX_MESSAGE_BYTES + 1, liar),
+        (second, 100, liar),
+        *eager["puts"],
+        *own,
+    ]
     heavy = [(pulse("heavy"), size, pulse("heavy")) for size in (100, 1 << 20)]
     impostor = site.mutual("impostor") | {"connect/endpoints": []}
     impostor["listen/endpoints"] = [f"tls/127.0.0.1:{site.friends_port}"]

@@ -14,12 +14,12 @@ from rack.backplane.segment import Segment, unlink_segment
 from rack.backplane.trace import Flag, open_trace_ring
 from rack.backplane.watch.alarms import Alarm, open_alarm_ring
 from rack.backplane.words import Block, Slot, System
-from rack.boards.classes import find_class
 from rack.boards.config import Resolved, resolve
 from rack.boards.faults.kind import KINDS
 from rack.boards.run import control_loop
 from rack.boards.run.control_loop import PlannerLoop, VirtualControlLoop
 from rack.levels.level import Executor, Planner
+from rack.levels.references import find_class
 from tests.boards.conftest import MakeConfig
 from tests.processes import FORKS
 

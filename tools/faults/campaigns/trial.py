@@ -216,7 +216,7 @@ def run_trial(
     try:
         with rack:
             start = start.resolve_snapshot(rack.begins_at)
-            rack.take_over_events(start.events)
+            rack.events.extend(start.events)
             killer = Killer(rack.segment, plan.kills)
             joints = config.robot.joints if config.robot is not None else ()
             certainty = None

@@ -12,12 +12,12 @@ from rack.backplane.mailbox.mailbox import Reading, Verdict
 from rack.backplane.mailbox.protocols import open_writer
 from rack.backplane.message import Message
 from rack.backplane.segment import Segment, unlink_segment
-from rack.boards.classes import find_class
 from rack.boards.config import load
 from rack.boards.config.resolved import Resolved, resolve
 from rack.boards.run.control_loop import VirtualControlLoop
 from rack.levels.level import Executor
 from rack.levels.messages import WorldState
+from rack.levels.references import find_class
 from rack.levels.systems.state_table.elemental_move import MAX_REST_SPEED_M_S, MoveTable
 from rack.levels.systems.state_table.level import WordCommand
 from rack.levels.systems.state_table.primitive import JointMoveStatus
