@@ -28,7 +28,6 @@ from rack.levels.operator import (
     HELD_FROM_ABOVE,
     HOLD_COMMANDS,
     OperatorCommand,
-    Orders,
 )
 
 
@@ -58,7 +57,6 @@ class ElementalMoveExecutor(Executor):
         super().__init__(context)
         self._gripper = context.robot.gripper
         self._plans = PlanStore()
-        self._orders = Orders(self.commands)
         self._started = False
         self._done = 0  # id of the newest move done
         self._handed_down = 0  # id of the newest move handed down

@@ -20,7 +20,7 @@ from rack.levels.messages import (
     WorldState,
 )
 from rack.levels.motion import path as paths
-from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLD_COMMANDS, OperatorCommand, Orders
+from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLD_COMMANDS, OperatorCommand
 from rack.levels.planning import collision
 from rack.levels.primitive.motion_segment import (
     Memory,
@@ -30,14 +30,13 @@ from rack.levels.primitive.motion_segment import (
     read_segment,
     restore_memory,
 )
-from rack.levels.primitive.path_guard import PathGuard, SceneWatch
+from rack.levels.primitive.path_guard import PathGuard
 from rack.levels.primitive.path_motion import JointSetPoint
 from rack.levels.primitive.planner import Plans
 from rack.levels.primitive.segment_work import (
     GripperWork,
     PathWork,
     PrimitiveParams,
-    WorkCycle,
     WorkRules,
 )
 from rack.levels.primitive.tracking import (
@@ -85,20 +84,20 @@ class PrimitiveExecutor(Executor):
         cell = build_level_cell(context)
         self._rules = WorkRules(context.robot.joints, cell.limits, params, context.period_s)
         self._guard = PathGuard(
-            cell, context.scene, params.lookahead, DELAY_CYCLES * context.period_s
+            cell,
+            context.scene,
+            params.lookahead,
+            DELAY_CYCLES * context.period_s,
+            round(params.blind / context.tick_s),
         )
         self._gripper = context.robot.gripper
         self._bring_up = context.robot.bring_up or 1.0
-        self._sight = SceneWatch(
-            self._guard, round(params.blind / context.tick_s), bool(context.scene.bodies)
-        )
         self._tracking = Tracking()
         self._straying = DeviationMonitor(
             context.robot.joints, params.following, self._rules.count_cycles(params.straying)
         )
         self._silent_cycles = self._rules.count_cycles(params.silent)
         self._plans = Plans()
-        self._orders = Orders(self.commands)
         self._memory = Memory()
         self._work: Work | None = None
         self._fault: SegmentFault | None = None
@@ -127,7 +126,7 @@ class PrimitiveExecutor(Executor):
                 self._position[:] = servo.position
         if self._tracking.update_status(self.below):
             self._resume_motion(servo, tick)
-        self._sight.update_scene(self.world, servo.position, tick)
+        self._guard.update_scene(self.world, servo.position, tick)
         if self._tracking.in_step:
             self._run_segment(serials, tick, passed_s)
         elif self._tracking.silent_cycles > self._silent_cycles:
@@ -163,7 +162,7 @@ class PrimitiveExecutor(Executor):
             row: Row of the object, or -1 for none.
             tick: Tick of the cycle.
         """
-        self._sight.carry_object(row, tick - SEEN_CYCLES * self.context.every)
+        self._guard.carry_object(row, tick - SEEN_CYCLES * self.context.every)
 
     def _run_segment(self, serials: list[int], tick: int, passed_s: float) -> None:
         """Run one cycle of the current segment: finish, withdraw, begin or advance it.
@@ -193,12 +192,12 @@ class PrimitiveExecutor(Executor):
                 or withdrawn
                 or self._fault is not None
                 or self._straying.is_straying
-                or bool(self._sight.wait_reason)
+                or bool(self._guard.wait_reason)
             )
             plan = self._plans.find_trajectory(work.segment.id, work.motion.s)
             due_s = (tick + (LEAD_CYCLES - 1) * self.context.every) * self.context.tick_s
             speed_scale = self._bring_up if self.below.message.slowed else 1.0
-            work.step(WorkCycle(hold, plan, self.world.message, due_s, passed_s, speed_scale))
+            work.step(hold, plan, self.world.message, due_s, passed_s, speed_scale)
             self._position[:] = work.motion.set_point.position
 
     def _finish_segment(self, servo: ServoStatus, tick: int) -> None:
@@ -364,7 +363,7 @@ class PrimitiveExecutor(Executor):
             return self._orders.format_reason(self.context.board)
         if work is not None:
             blocked = f"blocked: {work.obstacle}" if work.blocked else ""
-            if reason := self._straying.description or blocked or self._sight.wait_reason:
+            if reason := self._straying.description or blocked or self._guard.wait_reason:
                 return reason
         if command.is_lost:
             return ABOVE_LOST

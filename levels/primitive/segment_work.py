@@ -8,7 +8,6 @@ when the gripper is at rest.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -125,17 +124,6 @@ class SettlingCounter:
         return self._cycles > self._most_cycles
 
 
-class WorkCycle(NamedTuple):
-    """Inputs of a path segment in one cycle."""
-
-    hold: bool
-    plan: Trajectory | None  # begins where the motion rests
-    world: WorldState
-    due_s: float  # simulated time of the set point commanded last
-    passed_s: float  # time since the cycle before
-    speed_scale: float = 1.0  # part of full speed for a trajectory that begins
-
-
 class PathWork:
     """Execution of one PATH segment.
 
@@ -194,20 +182,39 @@ class PathWork:
         self.astray = self.blocked = distance > self._rules.params.astray
         self.obstacle = f"the arm is {distance:.3f} rad off its path"
 
-    def step(self, cycle: WorkCycle) -> None:
-        """Run one cycle: check the path, start or hold the motion, and advance it."""
+    def step(
+        self,
+        hold: bool,
+        plan: Trajectory | None,
+        world: WorldState,
+        due_s: float,
+        passed_s: float,
+        speed_scale: float,
+    ) -> None:
+        """Run one cycle: check the path, start or hold the motion, and advance it.
+
+        Args:
+            hold: True to hold the motion.
+            plan: Trajectory that begins where the motion rests, or None.
+            world: Newest world model.
+            due_s: Simulated time of the set point commanded last.
+            passed_s: Time since the cycle before.
+            speed_scale: Part of full speed for a trajectory that begins.
+        """
         motion = self.motion
         waits = self.wanted_begin is not None
         if motion.trajectory is not None and not motion.stopping:
             self._set_blocked(
-                not self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, cycle.world)
+                not self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, world)
             )
-            if cycle.hold or self.blocked:
+            if hold or self.blocked:
                 motion.begin_hold()
-        elif waits and cycle.plan is not None:
-            self._start(cycle, cycle.plan)
-        self.unplanned_cycles = self.unplanned_cycles + 1 if waits and cycle.plan is None else 0
-        motion.advance_by(cycle.passed_s)
+        elif waits and plan is not None:
+            if speed_scale < 1.0:
+                plan = plan.stretch_by(1.0 / speed_scale)
+            self._start(plan, hold, world, due_s)
+        self.unplanned_cycles = self.unplanned_cycles + 1 if waits and plan is None else 0
+        motion.advance_by(passed_s)
 
     def check_done(self, status: DrivenArm) -> bool:
         """Return True if set point and arm are at rest at the end of the path.
@@ -253,20 +260,18 @@ class PathWork:
             return 0.0
         return due_s + self.motion.remaining_s + self._rules.latency_s
 
-    def _start(self, cycle: WorkCycle, plan: Trajectory) -> None:
+    def _start(self, plan: Trajectory, hold: bool, world: WorldState, due_s: float) -> None:
         """Start the trajectory, unless motion must hold or the path has not been clear long enough.
 
-        It is stretched to the permitted speed and to the deadline of the segment.
+        It is stretched to the deadline of the segment. See `step` for the arguments.
         """
-        if cycle.speed_scale < 1.0:
-            plan = plan.stretch_by(1.0 / cycle.speed_scale)
-        clear = self._guard.is_clear(self.motion.path, plan, 0.0, cycle.world)
+        clear = self._guard.is_clear(self.motion.path, plan, 0.0, world)
         self._clear_cycles = self._clear_cycles + 1 if clear else 0
         wanted = self._rules.count_cycles(self._rules.params.clear) if self.blocked else 1
         self._set_blocked(self._clear_cycles < wanted)
-        if cycle.hold or self.blocked:
+        if hold or self.blocked:
             return
-        timed = self._stretch_to_deadline(plan, cycle.due_s)
+        timed = self._stretch_to_deadline(plan, due_s)
         if timed is not None:
             self.motion.follow_trajectory(timed)
             self._fresh = False

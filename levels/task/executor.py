@@ -14,10 +14,8 @@ from rack.levels.operator import (
     Goal,
     Operation,
     OperatorCommand,
-    Orders,
     find_answered_serial,
 )
-from rack.levels.tables import read_params
 from rack.levels.task.program import ROUNDING_S, AnyAction, TaskConfig, TaskParams, read_program
 from rack.levels.task.window import Detour, ShownWindow
 
@@ -42,14 +40,13 @@ class TaskExecutor(Executor):
         Operation.GOTO: (Goal.JOINTS, Goal.POSE, Goal.DIRECTION, Goal.HOME),
     }
     params: ClassVar[type[TaskParams]] = TaskParams
+    settings: TaskParams
     program: ClassVar[type[Program] | None] = TaskConfig
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._actions = self._read_first_actions()
         self._ahead_s = 0.0  # s: time on the clock of the actions' `by`, minus simulated time
-        self._stalled_s = read_params(self.params, context.params).stalled_s
-        self._orders = Orders(self.commands)
         self._window = ShownWindow()
         self._detour = Detour(context.robot, self._orders, self._window)
         self._started = False
@@ -170,10 +167,10 @@ class TaskExecutor(Executor):
         if operated or progress != self._progress:
             self._progress = progress
             self._moved_at = tick
-        elif (tick - self._moved_at) * self.context.tick_s > self._stalled_s:
+        elif (tick - self._moved_at) * self.context.tick_s > self.settings.stalled_s:
             self._error = Error.STALLED
             self._reason = (
-                f"nothing has moved for {self._stalled_s:g} s: "
+                f"nothing has moved for {self.settings.stalled_s:g} s: "
                 f"{waits or _format_awaited(plan, below)}"
             )
 

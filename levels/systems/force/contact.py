@@ -168,11 +168,9 @@ class WristLevel(Executor):
     """Base of executors for arms with a wrist sensor."""
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
         """Yield the mismatches of the base class, and one if the arm has no wrist sensor."""
-        yield from super().find_mismatches(context, above, below)
+        yield from super().find_mismatches(context)
         if context.robot.wrist is None:
             yield (
                 "executor",

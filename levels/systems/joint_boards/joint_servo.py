@@ -24,7 +24,7 @@ from rack.levels.servo.modification import (
     find_unsuitable_modifications,
     list_names,
 )
-from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
+from rack.levels.servo.modified_law import ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
 from rack.levels.systems.joint_boards import joint_control
@@ -89,7 +89,7 @@ class JointServo(Executor):
         self._servo = partial(servo_joints.load_machine_code(), constants, self.loads.table)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         self.operator_control = OperatorControl(
-            self.commands, robot.joints, cell.limits.position, self._driven, obey=self._obey_command
+            self._orders, robot.joints, cell.limits.position, self._driven, obey=self._obey_command
         )
         # Output of the law when modifications call it.
         self._unmodified: Array = np.zeros(7 * len(robot.joints))
@@ -111,9 +111,7 @@ class JointServo(Executor):
         return list_names(params)
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
         """Yield a mismatch for each invalid joint and modification, or if nothing is driven."""
         params = read_params(JointServoParams, context.params)
         known = context.robot.joints
@@ -211,8 +209,10 @@ class JointServo(Executor):
             return torque[:joints]
 
         inertia, load = table[AT] + times[0] * (table[DUE] - table[AT])
-        inputs = LawInputs(wanted, self._sample.reshape(2, joints), inertia, load, tick)
-        modified = self._modified.compute_torque(compute_unmodified, inputs)
+        state = self._sample.reshape(2, joints)
+        modified = self._modified.compute_torque(
+            compute_unmodified, wanted, state, inertia, load, tick
+        )
         np.copyto(command[:joints], modified, where=self._driven)
         np.copyto(shown_status[3 * joints :], modified, where=self._driven)
 

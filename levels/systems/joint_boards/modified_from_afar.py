@@ -13,7 +13,7 @@ from pydantic import Field, StringConstraints
 
 from rack.backplane.message import Command, State, Status, field
 from rack.levels.level import Executor, Input, Inputs, LevelContext, Output
-from rack.levels.operator import AnsweringStatus, Goal, Operation, OperatorCommand, Orders
+from rack.levels.operator import AnsweringStatus, Goal, Operation, OperatorCommand
 from rack.levels.systems.joint_boards.joint_servo import JointServo
 from rack.levels.tables import Table
 
@@ -74,7 +74,6 @@ class ModificationSender(Executor):
         super().__init__(context)
         self._known = self.settings.known
         self._wanted: set[str] = set()
-        self._orders = Orders(self.commands)
         self._pending: list[int] = []  # serials of commands that not all boards have answered
 
     @classmethod

@@ -5,7 +5,7 @@ Its plan is a static list of steps, each with an object and the place for it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from pydantic import Field as Key
@@ -98,28 +98,24 @@ class TaskTable(StateTableExecutor):
         ]
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
         """Yield every mistake in every table, and steps whose place the level below lacks.
 
-        Args:
-            context: Context of this level.
-            above: Contexts of the levels above.
-            below: Contexts of the levels below, whose tables name the places.
+        The tables of the level below name the places.
         """
-        own_mismatches = [*super().find_mismatches(context, above, below)]
+        own_mismatches = [*super().find_mismatches(context)]
         yield from own_mismatches
         tables = read_params(StateTableParams, context.params).tables
-        for other in below:
-            if own_mismatches or [*MoveTable.find_mismatches(other, (), ())]:
+        for other, pace in context.below.items():
+            params = pace.params
+            if own_mismatches or [*MoveTable.find_mismatches(replace(context, params=params))]:
                 continue
-            commands = MoveTable.list_operation_names(Operation.DO, other.params, context.scene)
+            commands = MoveTable.list_operation_names(Operation.DO, params, context.scene)
             for name, path in tables.items():
                 for index, step in enumerate(cls.read(path, context.scene).plan.step):
                     if f"place {step.place}" not in commands:
                         why = (
-                            f"plan.step[{index}].place: unknown '{step.place}'; '{other.board}'"
+                            f"plan.step[{index}].place: unknown '{step.place}'; '{other}'"
                             f" knows: {', '.join(commands)}"
                         )
                         yield f"params.tables.{name}", path.name, why
