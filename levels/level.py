@@ -364,6 +364,8 @@ class LevelSection:
         """Release resources of the level. Called once, after the last cycle or plan."""
 
 
+OPERATOR = Input(OperatorCommand, "own.operator")
+"""Port of a level that an operator may command: `operator = OPERATOR`."""
 OPERATOR_PORT = Input(OperatorCommand, "own.operator")
 """Port by which a board sets live parameters of a level that does not declare `operator`."""
 OPERATOR_PORT.name = "operator"

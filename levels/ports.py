@@ -17,6 +17,7 @@ to a `Reading` for an input, to the message for an output.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Generic, NamedTuple, Self, TypeVar, overload
 
@@ -160,6 +161,7 @@ class Output(OutputPort[M, M]):
         return self.message.zeros(level.context.sizes)
 
 
+@dataclass(slots=True)
 class Sender(Generic[M]):
     """A message and the function to send it, for a port that is not written in every cycle.
 
@@ -169,15 +171,13 @@ class Sender(Generic[M]):
             queue is full. Its optional argument is the tick of the information on which the message
             is based.
         room: Returns how many more messages can be sent in this cycle.
+
+    Slots make it an error to set a field here instead of in the message.
     """
 
-    # Slots make it an error to set a field here instead of in the message.
-    __slots__ = ("message", "room", "send")
-
-    def __init__(self, message: M, send: Callable[..., bool], room: Callable[[], int]) -> None:
-        self.message = message
-        self.send = send
-        self.room = room
+    message: M
+    send: Callable[..., bool]
+    room: Callable[[], int]
 
 
 class QueuedOutput(OutputPort[M, Sender[M]]):

@@ -120,7 +120,7 @@ class SetPointLaw:
 
     A set point is the motion wanted at the end of the cycle. Velocity drives do not control the
     position, so their set point also contains a term that corrects the position error, as fast as
-    `ComputedTorque` would.
+    `ServoExecutor` would by torques.
     """
 
     def __init__(self, cell: Cell, params: LoopGains, period_s: float) -> None:

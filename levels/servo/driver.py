@@ -3,7 +3,7 @@
 A cycle has three phases:
 
 - Check: `ArmDriver._check_arm` checks the samples of the sensors, and decides how to react. Before
-  that, `Takeover` takes over the arm at the start of the board and after the drives are enabled.
+  that, `Enabling` takes over the arm at the start of the board and after the drives are enabled.
 - Drive: `ArmDriver._drive_arm` drives the arm, or `ArmDriver.brake_arm` brakes it.
 - Report: `ArmReport` fills the status and the state.
 """
@@ -284,7 +284,7 @@ class ArmDriver(Executor):
             self.stopping.register_blow(cause, finding, tick)
         self.sense_contact(tick)
         if serial := enabling.pop_finished_command():
-            self._orders.report_drives_done(serial)
+            self._orders.report_completed(serial)
         if enabling.is_enabled:
             return self.stopping.decide_reaction(self.demand, self.sensors, tick)
         error = Error.DRIVES if self.arm.state is DriveState.FAULT else Error.DISABLED

@@ -25,7 +25,7 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.errors import LevelError
-from rack.levels.level import Input, LevelContext, Mismatches, Output, Verdict
+from rack.levels.level import OPERATOR, Input, LevelContext, Mismatches, Output, Verdict
 from rack.levels.messages import ArmState, JointCommand, ServoPlan, ServoStatus
 from rack.levels.operator import DRIVE_OPERATIONS, Goal, Operation, OperatorCommand
 from rack.levels.robot.dynamics import Payload
@@ -64,7 +64,7 @@ class ServoLaw(ArmDriver):
     above = Input(JointCommand, "above.command")
     plan = Input(ServoPlan, "own.plan")
     before = Input(ArmState, "own.state")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     status = Output(ServoStatus)
     state = Output(ArmState)
     scene = SCENES
@@ -192,11 +192,7 @@ class ServoLaw(ArmDriver):
             reference.restart_if_astray(sensors.position, sensors.velocity, tick)
         if reaction:
             return reference.ramp_to_rest(tick)
-        return (
-            self.operator_control.compute_motion(reference, tick)
-            if self.operator_control.is_in_control
-            else reference.compute_motion(tick)
-        )
+        return self.operator_control.compute_motion(reference, tick)
 
     def compute_efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
         """Return the torques in N m, and the force of the gripper in N."""
@@ -296,4 +292,5 @@ class ServoExecutor(ServoLaw):
         """Return the torques, (joints,), N m. The array is valid until the next call."""
         inertia = self.terms.inertia if self._inertia is None else self._inertia
         self._set_torque(set_point.table, sensed.table, inertia, self.terms.bias)
-        return self._constants[3]
+        torque: Array = self._constants[3]
+        return torque

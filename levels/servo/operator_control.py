@@ -107,7 +107,9 @@ class OperatorControl:
                 self._goal[self._driven] = positions
 
     def compute_motion(self, reference: Reference, tick: int) -> Motion:
-        """Return the motion wanted at `tick` while the level follows the operator."""
+        """Return the motion wanted at `tick`, from the operator or, else, from the set points."""
+        if not self.is_in_control:
+            return reference.compute_motion(tick)
         returns = self._return_path and not self.orders.is_in_force
         goal = self._return_path[-1] if returns else None
         if self.orders.standing is Operation.SETPOINT:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from rack.backplane.message import State
-from rack.levels.level import Executor, Input, LevelContext, Output, Program, Reading
+from rack.levels.level import OPERATOR, Executor, Input, LevelContext, Output, Program, Reading
 from rack.levels.messages import Error, MoveStatus, TaskCommand, TaskPlan, TaskStatus
 from rack.levels.operator import (
     BELOW_LOST,
@@ -32,7 +32,7 @@ class TaskExecutor(Executor):
     plan = Input(TaskPlan, "own.plan")
     last_command = Input(TaskCommand, "own.command")
     last_status = Input(TaskStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(TaskCommand)
     status = Output(TaskStatus, rests_on=below)
     commands = {
@@ -60,12 +60,7 @@ class TaskExecutor(Executor):
         """Track progress, obey the operator, and hand down the next moves of the plan."""
         if not self._started:
             self._restore_state()
-        self._orders.take_commands(
-            self.operator,
-            lambda command: self._check_command(
-                command, find_answered_serial(self.last_status.message)
-            ),
-        )
+        self._orders.take_commands(self.operator, self._check_command)
         plan = self._find_plan(tick)
         below = self.below.message
         if not self._error:
@@ -107,13 +102,13 @@ class TaskExecutor(Executor):
             self._window = ShownWindow(last.first, self.last_command.message.id, before)
             self._detour = Detour(self.context.robot, self._orders, self._window, last.detour)
 
-    def _check_command(self, command: OperatorCommand, answered: int) -> None:
+    def _check_command(self, command: OperatorCommand) -> None:
         """Accept or refuse a goto. Other commands need no check.
 
-        A goto with a serial up to `answered` was answered before this board was restarted, so it is
-        not new.
+        A goto that was answered before this board was restarted is not new.
         """
         if self._orders.standing is Operation.GOTO:
+            answered = find_answered_serial(self.last_status.message)
             self._detour.accept_command(command, command.id > answered)
 
     def _track_progress(self, plan: TaskPlan, below: MoveStatus) -> None:

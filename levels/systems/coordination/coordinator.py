@@ -13,6 +13,7 @@ from pydantic import Field, StringConstraints, ValidationError
 
 from rack.backplane.message import Message, State, fill_counts
 from rack.levels.level import (
+    OPERATOR,
     ConfiguredPorts,
     Executor,
     Input,
@@ -23,7 +24,7 @@ from rack.levels.level import (
     Reading,
 )
 from rack.levels.messages import Error, TaskStatus
-from rack.levels.operator import HOLD_COMMANDS, MAX_JOINTS, OperatorCommand
+from rack.levels.operator import HOLD_COMMANDS, MAX_JOINTS
 from rack.levels.systems.coordination.actions import write_action
 from rack.levels.systems.coordination.agreement import Agreement
 from rack.levels.systems.coordination.messages import (
@@ -155,7 +156,7 @@ class Coordinator(Executor):
     """
 
     last_progress = Input(CellProgress, "own.progress")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     # The progress is written first: a board that is killed before it has written its orders will
     # write them after its restart.
     progress = Output(CellProgress)

@@ -71,7 +71,7 @@ class OrderedTaskExecutor(TaskExecutor):
         super().__init__(context)
         rack = self.settings.coordinator
         self._source = f"rack '{rack}'" if rack else "the coordinator"
-        self._taken = TakenOrder()
+        self._taken = TakenOrder(CellReport.zeros({}))
         # Id of the request whose plan is followed. 0 if none is.
         self._begun = 0
         self._orders_begun = 0

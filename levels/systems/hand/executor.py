@@ -14,6 +14,7 @@ from rack.levels.arm import substeps
 from rack.levels.arm.commands_above import CommandsAbove
 from rack.levels.fault_steps import TendonStep
 from rack.levels.level import (
+    OPERATOR,
     Executor,
     Fault,
     Finding,
@@ -25,7 +26,7 @@ from rack.levels.level import (
     Reading,
 )
 from rack.levels.messages import ArmState, Error
-from rack.levels.operator import HOLD_COMMANDS, OperatorCommand
+from rack.levels.operator import HOLD_COMMANDS
 from rack.levels.robot.cell import build_level_cell
 from rack.levels.robot.hand import Hand
 from rack.levels.robot.limits import MotorPatience
@@ -52,7 +53,7 @@ class HandExecutor(Executor):
 
     tensions = Inputs(TensionCommand, "above.command")
     before = Input(ArmState, "own.state")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     status = Output(HandStatus)
     state = Output(ArmState)
     scene = SCENES

@@ -10,9 +10,18 @@ import numpy as np
 from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
-from rack.levels.level import Executor, Input, Inputs, LevelContext, Mismatches, Output, Reading
+from rack.levels.level import (
+    OPERATOR,
+    Executor,
+    Input,
+    Inputs,
+    LevelContext,
+    Mismatches,
+    Output,
+    Reading,
+)
 from rack.levels.messages import Error, WorldState
-from rack.levels.operator import HOLD_COMMANDS, OperatorCommand
+from rack.levels.operator import HOLD_COMMANDS
 from rack.levels.planning.pose import Pose
 from rack.levels.robot.cell import build_level_cell
 from rack.levels.systems.hand.grasp_program import (
@@ -56,7 +65,7 @@ class GraspExecutor(Executor):
     plan = Inputs(GraspPlan, "above.plan", optional=True)
     last_command = Input(GraspTarget, "own.command")
     last_status = Input(GraspStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(GraspTarget, rests_on=fingers)
     status = Output(GraspStatus, rests_on=fingers)
     commands = HOLD_COMMANDS

@@ -13,7 +13,7 @@ import numpy as np
 
 from rack.backplane.message import State
 from rack.levels.algebra import Mask
-from rack.levels.level import Executor, Input, LevelContext, Mismatches, Output, Reading
+from rack.levels.level import OPERATOR, Executor, Input, LevelContext, Mismatches, Output, Reading
 from rack.levels.operator import (
     BELOW_LOST,
     HOLD_COMMANDS,
@@ -218,7 +218,7 @@ class FingertipLoop(HandLoop):
     above = Input(GraspTarget, "above.command")
     hand = Input(HandStatus, "hand.status")
     below = Input(LoopStatus, "below.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     last = Input(FingerTarget, "own.command")
     command = Output(FingerTarget, rests_on=above)
     status = Output(FingerStatus)
@@ -254,7 +254,7 @@ class JointLoop(HandLoop):
     above = Input(FingerTarget, "above.command")
     hand = Input(HandStatus, "hand.status")
     below = Input(LoopStatus, "below.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(TendonTorque, rests_on=above)
     status = Output(LoopStatus)
     followed: FingerTarget
@@ -294,7 +294,7 @@ class TendonLoop(HandLoop):
 
     above = Input(TendonTorque, "above.command")
     hand = Input(HandStatus, "below.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(TensionCommand, rests_on=above)
     status = Output(LoopStatus)
     followed: TendonTorque
@@ -336,7 +336,7 @@ class FingerExecutor(HandLoop):
 
     above = Input(GraspTarget, "above.command")
     hand = Input(HandStatus, "below.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(TensionCommand, rests_on=above)
     status = Output(FingerStatus)
     followed: GraspTarget

@@ -9,7 +9,7 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.arm.commands_above import CommandsAbove
-from rack.levels.level import Input, Inputs, LevelContext, Mismatches, Output, Reading
+from rack.levels.level import OPERATOR, Input, Inputs, LevelContext, Mismatches, Output, Reading
 from rack.levels.messages import ArmState
 from rack.levels.operator import DRIVE_OPERATIONS, HOLD_COMMANDS, OperatorCommand
 from rack.levels.robot.cell import Cell
@@ -80,7 +80,7 @@ class ArmExecutor(ArmDriver):
 
     joint_torques = Inputs(JointTorque, "above.command")
     before = Input(ArmState, "own.state")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     status = Output(ArmStatus)
     state = Output(ArmState)
     scene = SCENES

@@ -16,7 +16,16 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 from pydantic import Field as Key
 
 from rack.backplane.message import State, field, integer_field
-from rack.levels.level import Executor, Input, Inputs, LevelContext, Mismatches, Output, Reading
+from rack.levels.level import (
+    OPERATOR,
+    Executor,
+    Input,
+    Inputs,
+    LevelContext,
+    Mismatches,
+    Output,
+    Reading,
+)
 from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
@@ -143,7 +152,7 @@ class StateTableExecutor(Executor):
     commands: ClassVar[Commands] = {**OPERATIONS, Operation.DO: ()}
     above = Inputs(TableCommand, "above.command", optional=True)
     last_status = Input(TableStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     status = Output(TableStatus)
     command: RelayedCommand
     """Command to the level below, if there is one."""

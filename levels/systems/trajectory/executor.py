@@ -13,9 +13,9 @@ import numpy as np
 
 from rack.backplane.message import State
 from rack.levels.algebra import Array
-from rack.levels.level import Executor, Input, Inputs, LevelContext, Output, Reading
+from rack.levels.level import OPERATOR, Executor, Input, Inputs, LevelContext, Output, Reading
 from rack.levels.messages import WorldState
-from rack.levels.operator import HOLD_COMMANDS, OperatorCommand
+from rack.levels.operator import HOLD_COMMANDS
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import build_level_cell
@@ -58,7 +58,7 @@ class TrajectoryExecutor(Executor):
     last_command = Input(JointReference, "own.command")
     last_status = Input(MotionStatus, "own.status")
     last_state = Input(MotionState, "own.state")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(JointReference)
     status = Output(MotionStatus, rests_on=boards)
     state = Output(MotionState)
