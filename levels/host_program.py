@@ -32,13 +32,13 @@ elsewhere for 30 s ends the run. Lockstep does not wait for interactive prompts.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Protocol, Self, TypeVar, overload
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from rack.backplane.mailbox.mailbox import Reading
 from rack.backplane.message import Message
 from rack.levels.errors import LevelError
 from rack.levels.level import LevelContext, Program
-from rack.levels.ports import InputPort, M, Output, collect_ports
+from rack.levels.ports import InputPort, M, OutputPort, collect_ports
 from rack.levels.tables import Table
 
 M_co = TypeVar("M_co", bound=Message, covariant=True)
@@ -130,7 +130,7 @@ class HostSender(Protocol[M_co]):
         """Number of messages sent by this process and earlier processes of this board."""
 
 
-class ProgramInput(InputPort[M]):
+class ProgramInput(InputPort[M, HostReceiver[M]]):
     """A port that a host program reads; the attribute is a `HostReceiver`.
 
     Args:
@@ -139,35 +139,12 @@ class ProgramInput(InputPort[M]):
             one.
     """
 
-    @overload
-    def __get__(self, program: None, owner: type) -> Self: ...
-    @overload
-    def __get__(self, program: Any, owner: type) -> HostReceiver[M]: ...
-    def __get__(self, program: Any, owner: type) -> Self | HostReceiver[M]:
-        """Return the declaration. Raises `LevelError` if no board has connected the program."""
-        if program is None:
-            return self
-        raise self.build_connection_error()
 
-
-class ProgramOutput(Output[M]):
+class ProgramOutput(OutputPort[M, HostSender[M]]):
     """A port that a host program writes; the attribute is a `HostSender`.
 
     A bus adapter reads its mailbox, `<board>.<port>`.
     """
-
-    def __init__(self, message: type[M]) -> None:
-        super().__init__(message)
-
-    @overload  # type: ignore[override]
-    def __get__(self, program: None, owner: type) -> Self: ...
-    @overload
-    def __get__(self, program: Any, owner: type) -> HostSender[M]: ...
-    def __get__(self, program: Any, owner: type) -> Self | HostSender[M]:
-        """Return the declaration. Raises `LevelError` if no board has connected the program."""
-        if program is None:
-            return self
-        raise self.build_connection_error()
 
 
 class HostProgram:
@@ -188,7 +165,7 @@ class HostProgram:
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls.inputs = collect_ports(cls, "inputs", (InputPort,))
-        cls.outputs = collect_ports(cls, "outputs", (Output,))
+        cls.outputs = collect_ports(cls, "outputs", (OutputPort,))
         for port in (*cls.inputs.values(), *cls.outputs.values()):
             if not isinstance(port, ProgramInput | ProgramOutput):
                 raise LevelError(

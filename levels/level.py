@@ -90,7 +90,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any, ClassVar, NamedTuple, Self
 
 from pydantic import ValidationError, model_validator
@@ -118,6 +118,7 @@ from rack.levels.ports import (
     InputPort,
     Inputs,
     Output,
+    OutputPort,
     QueuedOutput,
     Sender,
     TimedOutput,
@@ -214,10 +215,11 @@ class Program(Table):
 
 
 class Pace(NamedTuple):
-    """Cycle of a level and the time allowed for a plan."""
+    """Cycle of a neighbouring level, the time allowed for a plan, and its parameters."""
 
     every: int  # ticks from cycle to cycle
     within_cycles: int  # cycles that one plan may take
+    params: Mapping[str, Any] = MappingProxyType({})  # as in `LevelContext`
 
 
 class Finding(NamedTuple):
@@ -263,9 +265,9 @@ class LevelContext:
 class LevelSection:
     """Common base class of executors and planners."""
 
-    inputs: ClassVar[Mapping[str, InputPort[Any]]] = {}
+    inputs: ClassVar[Mapping[str, InputPort[Any, Any]]] = {}
     """The ports that it reads, by name, collected from the class and its bases."""
-    outputs: ClassVar[Mapping[str, Output[Any]]] = {}
+    outputs: ClassVar[Mapping[str, OutputPort[Any, Any]]] = {}
     """The ports that it writes, by name, collected in the same way.
 
     A planner has the single port "plan".
@@ -296,7 +298,7 @@ class LevelSection:
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         cls.inputs = collect_ports(cls, "inputs", (InputPort,))
-        cls.outputs = collect_ports(cls, "outputs", (Output,))
+        cls.outputs = collect_ports(cls, "outputs", (OutputPort,))
 
     def __init__(self, context: LevelContext) -> None:
         self.context = context
@@ -362,6 +364,8 @@ class LevelSection:
         """Release resources of the level. Called once, after the last cycle or plan."""
 
 
+OPERATOR = Input(OperatorCommand, "own.operator")
+"""Port of a level that an operator may command: `operator = OPERATOR`."""
 OPERATOR_PORT = Input(OperatorCommand, "own.operator")
 """Port by which a board sets live parameters of a level that does not declare `operator`."""
 OPERATOR_PORT.name = "operator"
@@ -406,7 +410,7 @@ class Executor(LevelSection, ABC):
         self.acted: dict[int, bool] = {}
         # Callbacks of the driven arm or hand, called at the end of each cycle with its `ArmState`.
         self.complete_cycle: list[Callable[[ArmState | None], None]] = []
-        self._live_orders = Orders(self.commands)
+        self._orders = Orders(self.commands)
         Executor.last_constructed = self
 
     def __init_subclass__(cls) -> None:
@@ -465,18 +469,16 @@ class Executor(LevelSection, ABC):
         Called by the board before `process`. There is no answer if the status does not derive from
         `AnsweringStatus`.
         """
-        self._live_orders.take_commands(
-            OPERATOR_PORT.__get__(self, type(self)), self._set_parameter
-        )
+        self._orders.take_commands(OPERATOR_PORT.__get__(self, type(self)), self._set_parameter)
         status = vars(self).get("status")
         if isinstance(status, AnsweringStatus):
-            self._live_orders.fill_status(status)
+            self._orders.fill_status(status)
 
     def _set_parameter(self, command: OperatorCommand) -> None:
         """Set the live parameter that a command names, or refuse the command."""
         self.settings, why = set_live(self.settings, command.name)
         if why:
-            self._live_orders.refuse_newest(why)
+            self._orders.refuse_newest(why)
 
     @classmethod
     def list_names(cls, params: Mapping[str, Any]) -> Sequence[str]:
@@ -488,20 +490,11 @@ class Executor(LevelSection, ABC):
         return ()
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
-        """Yield each parameter that is inconsistent with a neighbouring level.
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
+        """Yield key of `[board.<name>]`, value and reason of each inconsistent parameter.
 
-        Called before the launch, with parameters that are valid by themselves.
-
-        Args:
-            context: The level.
-            above: The levels above it.
-            below: The levels below it.
-
-        Returns:
-            Key of `[board.<name>]`, value and reason of each inconsistency.
+        Called before the launch, with parameters that are valid by themselves. `context.above` and
+        `context.below` give the parameters of the neighbouring levels.
         """
         return ()
 

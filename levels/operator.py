@@ -294,14 +294,11 @@ class Orders:
             self._answer_command_in_force(Answer.DONE)
 
     def report_setting_started(self) -> None:
-        """Report that the newest setting takes time. Call `report_drives_done` when it is done."""
+        """Report that the newest setting takes time. Call `report_completed` afterwards."""
         self._queue_answer(_CommandAnswer(self.serial, Answer.TAKEN))
 
-    def report_drives_done(self, serial: int) -> None:
-        """Report that command `serial` is done.
-
-        It is a command to the drives, or a setting that took time.
-        """
+    def report_completed(self, serial: int) -> None:
+        """Report that command `serial` is done: one to the drives, or a setting that took time."""
         self._queue_answer(_CommandAnswer(serial, Answer.DONE))
 
     def format_reason(self, board: str) -> str:

@@ -17,6 +17,7 @@ to a `Reading` for an input, to the message for an output.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Generic, NamedTuple, Self, TypeVar, overload
 
@@ -26,9 +27,10 @@ from rack.backplane.watch.alarms import Alarm
 from rack.levels.errors import LevelError
 
 M = TypeVar("M", bound=Message)
+V = TypeVar("V")
 
 
-class Port(Generic[M]):
+class Port(Generic[M, V]):
     """A port of a level, named after its attribute in the class."""
 
     message: type[M]
@@ -37,12 +39,25 @@ class Port(Generic[M]):
     def __set_name__(self, owner: type, name: str) -> None:
         self.name = name
 
-    def build_connection_error(self) -> LevelError:
-        """Return the error to raise if the port is used before a board has connected it."""
-        return LevelError(f"port '{self.name}': no board has connected it to a mailbox")
+    @overload
+    def __get__(self, level: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, level: Any, owner: type) -> V: ...
+    def __get__(self, level: Any, owner: type) -> Self | V:
+        """Return the declaration, or the value of a port that no board has connected."""
+        if level is None:
+            return self
+        return vars(level).setdefault(self.name, self.build_unconnected(level))  # type: ignore[no-any-return]
+
+    def build_unconnected(self, level: Any) -> V:
+        """Return the value of the port before a board has connected it.
+
+        Raises `LevelError` for a port that needs a board.
+        """
+        raise LevelError(f"port '{self.name}': no board has connected it to a mailbox")
 
 
-class InputPort(Port[M]):
+class InputPort(Port[M, V]):
     """A port that a level reads.
 
     Attributes:
@@ -59,7 +74,7 @@ class InputPort(Port[M]):
         self.source = source
 
 
-class Input(InputPort[M]):
+class Input(InputPort[M, Reading[M]]):
     """A port that a level reads; the attribute is a `Reading` of a message class.
 
     Args:
@@ -68,19 +83,12 @@ class Input(InputPort[M]):
             "below.status", "own.plan". A config may connect another mailbox.
     """
 
-    @overload
-    def __get__(self, level: None, owner: type) -> Self: ...
-    @overload
-    def __get__(self, level: Any, owner: type) -> Reading[M]: ...
-    def __get__(self, level: Any, owner: type) -> Self | Reading[M]:
-        """Return the declaration, or an empty reading if no board has connected the level."""
-        if level is None:
-            return self
-        empty = Reading(self.message.zeros(level.context.sizes), Verdict.NONE)
-        return vars(level).setdefault(self.name, empty)  # type: ignore[no-any-return]
+    def build_unconnected(self, level: Any) -> Reading[M]:
+        """Return an empty reading."""
+        return Reading(self.message.zeros(level.context.sizes), Verdict.NONE)
 
 
-class Inputs(InputPort[M]):
+class Inputs(InputPort[M, Mapping[str, Reading[M]]]):
     """A port that reads the mailbox of every neighbour; the attribute maps boards to readings.
 
     The boards are in the order of the config. If the config names several mailboxes of one board,
@@ -98,19 +106,13 @@ class Inputs(InputPort[M]):
         super().__init__(message, source)
         self.optional = optional
 
-    @overload
-    def __get__(self, level: None, owner: type) -> Self: ...
-    @overload
-    def __get__(self, level: Any, owner: type) -> Mapping[str, Reading[M]]: ...
-    def __get__(self, level: Any, owner: type) -> Self | Mapping[str, Reading[M]]:
-        """Return the declaration, or no readings if no board has connected the level."""
-        return self if level is None else vars(level).setdefault(self.name, {})
+    def build_unconnected(self, level: Any) -> Mapping[str, Reading[M]]:
+        """Return no readings."""
+        return {}
 
 
-class Output(Port[M]):
-    """A port that a level writes; the attribute is a message, written at the end of each cycle.
-
-    Fields keep their values from cycle to cycle.
+class OutputPort(Port[M, V]):
+    """A port that a level writes.
 
     Args:
         message: The class of its messages.
@@ -131,22 +133,11 @@ class Output(Port[M]):
         message: type[M],
         *,
         cycles: int = 1,
-        rests_on: InputPort[Any] | None = None,
+        rests_on: InputPort[Any, Any] | None = None,
     ) -> None:
         self.message = message
         self.cycles = cycles
         self.rests_on = rests_on
-
-    @overload
-    def __get__(self, level: None, owner: type) -> Self: ...
-    @overload
-    def __get__(self, level: Any, owner: type) -> M: ...
-    def __get__(self, level: Any, owner: type) -> Self | M:
-        """Return the declaration, or an empty message if no board has connected the level."""
-        if level is None:
-            return self
-        message = self.message.zeros(level.context.sizes)
-        return vars(level).setdefault(self.name, message)  # type: ignore[no-any-return]
 
     def is_due(self, tick: int, every: int, phase: int) -> bool:
         """Return True if the cycle released at `tick` writes the port.
@@ -159,6 +150,18 @@ class Output(Port[M]):
         return (tick - phase + every) % (self.cycles * every) == 0
 
 
+class Output(OutputPort[M, M]):
+    """A port that a level writes; the attribute is a message, written at the end of each cycle.
+
+    Fields keep their values from cycle to cycle. See `OutputPort` for the arguments.
+    """
+
+    def build_unconnected(self, level: Any) -> M:
+        """Return an empty message."""
+        return self.message.zeros(level.context.sizes)
+
+
+@dataclass(slots=True)
 class Sender(Generic[M]):
     """A message and the function to send it, for a port that is not written in every cycle.
 
@@ -168,39 +171,28 @@ class Sender(Generic[M]):
             queue is full. Its optional argument is the tick of the information on which the message
             is based.
         room: Returns how many more messages can be sent in this cycle.
+
+    Slots make it an error to set a field here instead of in the message.
     """
 
-    # Slots make it an error to set a field here instead of in the message.
-    __slots__ = ("message", "room", "send")
-
-    def __init__(self, message: M, send: Callable[..., bool], room: Callable[[], int]) -> None:
-        self.message = message
-        self.send = send
-        self.room = room
+    message: M
+    send: Callable[..., bool]
+    room: Callable[[], int]
 
 
-class SentOutput(Output[M]):
-    """A port whose messages the level sends explicitly; the attribute is a `Sender`."""
+class QueuedOutput(OutputPort[M, Sender[M]]):
+    """A port that sends any number of messages in a cycle through a queue, so none is missed.
 
-    @overload  # type: ignore[override]
-    def __get__(self, level: None, owner: type) -> Self: ...
-    @overload
-    def __get__(self, level: Any, owner: type) -> Sender[M]: ...
-    def __get__(self, level: Any, owner: type) -> Self | Sender[M]:
-        """Return the declaration. Raises `LevelError` if no board has connected the level."""
-        if level is None:
-            return self
-        raise self.build_connection_error()
-
-
-class QueuedOutput(SentOutput[M]):
-    """A port that sends any number of messages in a cycle through a queue, so none is missed."""
+    The attribute is a `Sender`.
+    """
 
     queued = True
 
 
-class TimedOutput(SentOutput[M]):
+class TimedOutput(OutputPort[M, Sender[M]]):
     """A port that is written only in the cycles in which the level sends its message.
+
+    The attribute is a `Sender`.
 
     Args:
         message: The class of its messages.
@@ -219,8 +211,8 @@ class ConfiguredPorts(NamedTuple):
     `is_complete` is False if the parameters are invalid, so that some ports are unknown.
     """
 
-    inputs: Mapping[str, InputPort[Any]] = MappingProxyType({})
-    outputs: Mapping[str, Output[Any]] = MappingProxyType({})
+    inputs: Mapping[str, InputPort[Any, Any]] = MappingProxyType({})
+    outputs: Mapping[str, OutputPort[Any, Any]] = MappingProxyType({})
     is_complete: bool = True
 
 

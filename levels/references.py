@@ -1,4 +1,4 @@
-"""Import of classes that a config names as "package.module:Name", including their former names."""
+"""Import of classes that a config names as "package.module:Name"."""
 
 from __future__ import annotations
 
@@ -22,38 +22,6 @@ MAX_IMPORT_S = 60.0
 IMPORTED_STATUS = 117
 """Exit status of a child that has completed an import. Few modules exit with it themselves."""
 
-MOVED_REFERENCES = {
-    "rack.boards.adapters": "rack.boards.host",
-    "rack.levels.arm.sharing": "rack.levels.systems.coordination.sharing_arm",
-    "rack.levels.cell": "rack.levels.systems.coordination",
-    "rack.levels.figures": "rack.levels.systems.figures",
-    "rack.levels.force": "rack.levels.systems.force",
-    "rack.levels.hand": "rack.levels.systems.hand",
-    "rack.levels.servo:ArmExecutor": "rack.levels.systems.joint_boards:ArmExecutor",
-    "rack.levels.servo:JointGateway": "rack.levels.systems.joint_boards:JointGateway",
-    "rack.levels.servo:JointServo": "rack.levels.systems.joint_boards:JointServo",
-    "rack.levels.servo:SharingServoExecutor": (
-        "rack.levels.systems.coordination:SharingServoExecutor"
-    ),
-    "rack.levels.shared_bodies": "rack.levels.systems.coordination.shared_bodies",
-    "rack.levels.state_table": "rack.levels.systems.state_table",
-    "rack.levels.systems.cell": "rack.levels.systems.coordination",
-    "rack.levels.trajectory": "rack.levels.systems.trajectory",
-}
-"""Packages, modules and classes that have moved, with their new places.
-
-Configs of users and of recorded runs name the old places.
-"""
-
-
-def resolve_moved(reference: str) -> str:
-    """Return a reference "package.module:Name", changed if its module or class has moved."""
-    for old, new in MOVED_REFERENCES.items():
-        remainder = reference.removeprefix(old)
-        if remainder != reference and remainder[:1] in ("", ".", ":"):
-            return new + remainder
-    return reference
-
 
 def import_reference(reference: str, in_child_first: bool = True) -> tuple[ModuleType, str]:
     """Import the module of a reference "package.module:Name".
@@ -69,7 +37,7 @@ def import_reference(reference: str, in_child_first: bool = True) -> tuple[Modul
     Raises:
         LookupError: The module cannot be imported.
     """
-    module, _, name = resolve_moved(reference).partition(":")
+    module, _, name = reference.partition(":")
     is_new = module not in sys.modules and not module.startswith("rack.")
     try:
         if in_child_first and is_new and (reason := _try_import(module)):

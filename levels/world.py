@@ -9,7 +9,7 @@ import numpy as np
 from rack.levels.algebra import Array, apply_elementwise
 from rack.levels.level import Executor, Input, LevelContext, Output
 from rack.levels.messages import Scene, WorldState
-from rack.levels.tables import Positive, Table, read_params
+from rack.levels.tables import Positive, Table
 
 
 class WorldParams(Table):
@@ -37,10 +37,10 @@ class WorldModel(Executor):
     last = Input(WorldState, "own.model")
     model = Output(WorldState)
     params = WorldParams
+    settings: WorldParams
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._params = read_params(WorldParams, context.params)
         bodies = context.sizes["bodies"]
         # Poses in the last scene, and poses in which bodies last rested: position in m, quaternion.
         self._last, self._rest = np.zeros((2, bodies, 7))
@@ -85,7 +85,7 @@ class WorldModel(Executor):
         Returns:
             True if a body has started or stopped moving.
         """
-        p = self._params
+        p = self.settings
         slow_turn = p.turned / p.resting * elapsed_s
         is_slow = (compute_distances(poses, self._last) / elapsed_s < p.slow) & (
             compute_angles(poses, self._last) < slow_turn

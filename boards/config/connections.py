@@ -33,7 +33,7 @@ from rack.boards.wiring import Source, list_mailboxes
 from rack.levels.host_program import HostProgram
 from rack.levels.level import ConfiguredPorts, Executor, Output, Planner, Program
 from rack.levels.operator import OperatorCommand
-from rack.levels.ports import InputPort
+from rack.levels.ports import InputPort, OutputPort
 from rack.levels.references import find_class
 
 OWN_OPERATOR = "own.operator"
@@ -59,8 +59,8 @@ class TaskPorts:
 
     place: TaskEntry
     kind: LevelClass
-    inputs: Mapping[str, InputPort[Any]]
-    outputs: Mapping[str, Output[Any]]
+    inputs: Mapping[str, InputPort[Any, Any]]
+    outputs: Mapping[str, OutputPort[Any, Any]]
     reads: Mapping[str, Source]
     exchange: Mapping[str, ExchangeConfig]
     mistakes: Sequence[Mistake]
@@ -145,7 +145,7 @@ def _find_class(place: TaskEntry) -> LevelClass:
 def _connect_inputs(
     config: RackConfig,
     place: TaskEntry,
-    inputs: Mapping[str, InputPort[Any]],
+    inputs: Mapping[str, InputPort[Any, Any]],
     mistakes: list[Mistake],
 ) -> Iterator[tuple[str, Source]]:
     """Yield each connected input port with the mailbox or mailboxes that it reads.
@@ -241,9 +241,9 @@ class Wiring:
         return [ports for ports in self.ports.values() if ports.place.role == "host"]
 
     @cached_property
-    def writers(self) -> dict[str, tuple[TaskPorts, Output[Any]]]:
+    def writers(self) -> dict[str, tuple[TaskPorts, OutputPort[Any, Any]]]:
         """For each mailbox, the first task that writes it and the declaration of its output."""
-        writers: dict[str, tuple[TaskPorts, Output[Any]]] = {}
+        writers: dict[str, tuple[TaskPorts, OutputPort[Any, Any]]] = {}
         for ports in self.ports.values():
             for port, mailbox in ports.writes.items():
                 writers.setdefault(mailbox, (ports, ports.outputs[port]))

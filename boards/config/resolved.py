@@ -316,7 +316,10 @@ class Examination:
         """Return a dictionary from board to the context of its level."""
         every = wiring.periods
         boards = wiring.config.board
-        paces = {name: Pace(every[name], board.within_cycles) for name, board in boards.items()}
+        paces = {
+            name: Pace(every[name], board.within_cycles, board.params)
+            for name, board in boards.items()
+        }
         return {
             name: self._build_context(
                 name,

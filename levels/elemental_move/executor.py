@@ -11,7 +11,7 @@ from rack.levels.elemental_move.pipeline import (
     SegmentWindow,
     can_join,
 )
-from rack.levels.level import Executor, Input, LevelContext, Output
+from rack.levels.level import OPERATOR, Executor, Input, LevelContext, Output
 from rack.levels.messages import (
     Error,
     MoveCommand,
@@ -27,8 +27,6 @@ from rack.levels.operator import (
     BELOW_LOST,
     HELD_FROM_ABOVE,
     HOLD_COMMANDS,
-    OperatorCommand,
-    Orders,
 )
 
 
@@ -45,7 +43,7 @@ class ElementalMoveExecutor(Executor):
     plan = Input(MovePlan, "own.plan")
     last_command = Input(MoveCommand, "own.command")
     last_status = Input(MoveStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     # The status is written first. A board killed between the two finds done moves in its window
     # after the restart, and removes them again.
     status = Output(MoveStatus, rests_on=below)
@@ -58,12 +56,10 @@ class ElementalMoveExecutor(Executor):
         super().__init__(context)
         self._gripper = context.robot.gripper
         self._plans = PlanStore()
-        self._orders = Orders(self.commands)
         self._started = False
         self._done = 0  # id of the newest move done
         self._handed_down = 0  # id of the newest move handed down
         self._request = 0  # open request for another path, or 0
-        self._replans = 0  # number of other paths taken
         self._replans_of_move = 0  # number of other paths taken by the present move
         self._waiting_since: int | None = None  # tick of the first refusal of the awaited path
         self._error = Error.NONE
@@ -107,7 +103,7 @@ class ElementalMoveExecutor(Executor):
             last = self.last_status.message
             self.command.copy_from(self.last_command.message)
             self._done = last.done
-            self._replans = last.replans
+            self.status.replans = last.replans
             if last.state == State.ERROR:
                 self._set_error(Error(last.error), last.reason)
             self._handed_down = max(last.done, *self.command.segments["move"].tolist())
@@ -185,7 +181,7 @@ class ElementalMoveExecutor(Executor):
                 segments.replace_first(plan)
                 self._handed_down = plan.move
                 self._close_request()
-                self._replans += 1
+                self.status.replans += 1
                 self._replans_of_move += 1
 
     def _open_request(self, tick: int) -> None:
@@ -297,7 +293,6 @@ class ElementalMoveExecutor(Executor):
         under_way = segments.first
         report.done = self._done
         report.held = status.held
-        report.replans = self._replans
         report.current = int(under_way["move"])
         is_begun = segments.count and under_way["id"] == status.current
         report.progress = status.progress if is_begun else 0.0

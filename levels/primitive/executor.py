@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from rack.backplane.message import State
-from rack.levels.level import Executor, Input, LevelContext, Output
+from rack.levels.level import OPERATOR, Executor, Input, LevelContext, Output
 from rack.levels.messages import (
     Error,
     JointCommand,
@@ -20,24 +20,21 @@ from rack.levels.messages import (
     WorldState,
 )
 from rack.levels.motion import path as paths
-from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLD_COMMANDS, OperatorCommand, Orders
+from rack.levels.operator import ABOVE_LOST, HELD_FROM_ABOVE, HOLD_COMMANDS
 from rack.levels.planning import collision
 from rack.levels.primitive.motion_segment import (
-    Memory,
     MotionSegment,
     SegmentFault,
     list_serials,
     read_segment,
-    restore_memory,
 )
-from rack.levels.primitive.path_guard import PathGuard, SceneWatch
+from rack.levels.primitive.path_guard import PathGuard
 from rack.levels.primitive.path_motion import JointSetPoint
 from rack.levels.primitive.planner import Plans
 from rack.levels.primitive.segment_work import (
     GripperWork,
     PathWork,
     PrimitiveParams,
-    WorkCycle,
     WorkRules,
 )
 from rack.levels.primitive.tracking import (
@@ -71,7 +68,7 @@ class PrimitiveExecutor(Executor):
     world = Input(WorldState, "world.model")
     last_command = Input(JointCommand, "own.command")
     last_status = Input(PrimitiveStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(JointCommand, rests_on=above)
     status = Output(PrimitiveStatus, rests_on=below)
     commands = HOLD_COMMANDS
@@ -85,21 +82,24 @@ class PrimitiveExecutor(Executor):
         cell = build_level_cell(context)
         self._rules = WorkRules(context.robot.joints, cell.limits, params, context.period_s)
         self._guard = PathGuard(
-            cell, context.scene, params.lookahead, DELAY_CYCLES * context.period_s
+            cell,
+            context.scene,
+            params.lookahead,
+            DELAY_CYCLES * context.period_s,
+            round(params.blind / context.tick_s),
         )
         self._gripper = context.robot.gripper
         self._bring_up = context.robot.bring_up or 1.0
-        self._sight = SceneWatch(
-            self._guard, round(params.blind / context.tick_s), bool(context.scene.bodies)
-        )
         self._tracking = Tracking()
         self._straying = DeviationMonitor(
             context.robot.joints, params.following, self._rules.count_cycles(params.straying)
         )
         self._silent_cycles = self._rules.count_cycles(params.silent)
         self._plans = Plans()
-        self._orders = Orders(self.commands)
-        self._memory = Memory()
+        # The state with which the executor continues after a restart is in its last messages.
+        self._is_known = False  # the level was in step with the servo, perhaps before a restart
+        self._interrupted = 0  # serial of the interrupted segment, or 0
+        self._progress = 0.0  # part of that segment's path done, 0 to 1
         self._work: Work | None = None
         self._fault: SegmentFault | None = None
         self._begun = 0  # serial of the last segment that was begun
@@ -113,7 +113,7 @@ class PrimitiveExecutor(Executor):
         """Run one cycle: read all inputs, advance the segment, write set point and status."""
         if self._tick is None:
             self._tick = tick - self.context.every
-            self._memory = restore_memory(self.last_status, self.last_command)
+            self._restore_state()
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
         servo = self.below.message
@@ -123,11 +123,11 @@ class PrimitiveExecutor(Executor):
         if servo.error == Error.DISABLED:
             # An arm that is not enabled may be moved by hand, so plan from its sensed position.
             self._displaced = True
-            if not self._memory.is_known:
+            if not self._is_known:
                 self._position[:] = servo.position
         if self._tracking.update_status(self.below):
             self._resume_motion(servo, tick)
-        self._sight.update_scene(self.world, servo.position, tick)
+        self._guard.update_scene(self.world, servo.position, tick)
         if self._tracking.in_step:
             self._run_segment(serials, tick, passed_s)
         elif self._tracking.silent_cycles > self._silent_cycles:
@@ -139,17 +139,31 @@ class PrimitiveExecutor(Executor):
         self._write_status(self.status, serials, tick)
         self._answer_operator(self.above.message.operator)
 
+    def _restore_state(self) -> None:
+        """Continue from the last status and command, after a restart of the board."""
+        last = self.last_status.message
+        self.status.held = -1
+        if not self.last_status.has_message or not self.last_command.message.id:
+            return
+        self._is_known = True
+        self._interrupted = last.current
+        self._progress = last.progress
+        self.status.copy_from(last)
+        self.command.copy_from(self.last_command.message)
+
     def _resume_motion(self, servo: ServoStatus, tick: int) -> None:
         """Continue the segment from the position at which the servo holds the arm."""
         work = self._work
-        self._displaced |= self._memory.is_known
-        if not self._memory.is_known:
+        self._displaced |= self._is_known
+        if not self._is_known:
             force = self._gripper.force if self._gripper is not None else 0.0
-            self._memory = Memory(is_known=True, opening=servo.opening, force=force)
+            self._is_known = True
+            self.command.opening = servo.opening
+            self.command.force = force
         self._fault = None
         self._straying.reset_count()
         self._position[:] = servo.target
-        self._carry_object(self._memory.held, tick)
+        self._carry_object(self.status.held, tick)
         if isinstance(work, PathWork):
             work.begin_near(self._position, work.progress)
             self._displaced = False
@@ -163,7 +177,7 @@ class PrimitiveExecutor(Executor):
             row: Row of the object, or -1 for none.
             tick: Tick of the cycle.
         """
-        self._sight.carry_object(row, tick - SEEN_CYCLES * self.context.every)
+        self._guard.carry_object(row, tick - SEEN_CYCLES * self.context.every)
 
     def _run_segment(self, serials: list[int], tick: int, passed_s: float) -> None:
         """Run one cycle of the current segment: finish, withdraw, begin or advance it.
@@ -193,13 +207,13 @@ class PrimitiveExecutor(Executor):
                 or withdrawn
                 or self._fault is not None
                 or self._straying.is_straying
-                or bool(self._sight.wait_reason)
+                or bool(self._guard.wait_reason)
             )
-            plan = self._plans.find_trajectory(work.segment.id, work.motion.s)
+            plan = self._plans.find_trajectory(work.segment.id, work.s)
             due_s = (tick + (LEAD_CYCLES - 1) * self.context.every) * self.context.tick_s
             speed_scale = self._bring_up if self.below.message.slowed else 1.0
-            work.step(WorkCycle(hold, plan, self.world.message, due_s, passed_s, speed_scale))
-            self._position[:] = work.motion.set_point.position
+            work.step(hold, plan, self.world.message, due_s, passed_s, speed_scale)
+            self._position[:] = work.set_point.position
 
     def _finish_segment(self, servo: ServoStatus, tick: int) -> None:
         """Finish the current segment if the servo shows that it is done."""
@@ -207,9 +221,9 @@ class PrimitiveExecutor(Executor):
         if work is None or self._fault is not None or not work.check_done(servo):
             return
         if isinstance(work, GripperWork):
-            self._memory.held = work.held_after
+            self.status.held = work.held_after
             self._carry_object(work.held_after, tick)
-        self._memory.done = work.segment.id
+        self.status.done = work.segment.id
         self._work = None
 
     def _withdraw_segment(self, serials: list[int]) -> bool:
@@ -222,19 +236,18 @@ class PrimitiveExecutor(Executor):
         if serial in serials:
             return False
         if isinstance(self._work, PathWork):
-            if not self._work.motion.is_resting:
+            if not self._work.is_resting:
                 return True
             # Messages may arrive out of order, so a withdrawn segment may return and continue.
-            self._memory.interrupted = serial
-            self._memory.progress = self._work.progress
+            self._interrupted = serial
+            self._progress = self._work.progress
         self._work = None
         self._fault = None
         return False
 
     def _begin_segment(self, serials: list[int], hold: bool) -> None:
         """Begin the oldest unfinished segment. During a `hold`, a gripper segment must wait."""
-        memory = self._memory
-        serial = next((s for s in serials if s > memory.done), 0)
+        serial = next((s for s in serials if s > self.status.done), 0)
         if not serial:
             return
         self._begun = serial
@@ -243,33 +256,29 @@ class PrimitiveExecutor(Executor):
             if hold and segment.kind is SegmentKind.GRIPPER:
                 return
             if segment.kind is SegmentKind.PATH:
-                self._work = self._begin_path(segment, memory)
+                self._work = self._begin_path(segment)
             elif self._gripper is None:
                 raise ValueError(f"segment {serial}: the arm has no gripper; valid: paths")
             else:
-                memory.opening = segment.opening
-                memory.force = segment.force
+                self.command.opening = segment.opening
+                self.command.force = segment.force
                 self._work = GripperWork(segment, self._gripper, self._rules)
         except ValueError as error:
             self._fault = SegmentFault(Error.LIMIT, str(error))
-        memory.interrupted = 0
+        self._interrupted = 0
 
-    def _begin_path(self, segment: MotionSegment, memory: Memory) -> PathWork:
+    def _begin_path(self, segment: MotionSegment) -> PathWork:
         """Begin a path segment.
 
         The motion begins at the start of the path. If the path was interrupted, or the arm may have
         been moved away from its start, the motion begins at the point of the path nearest to the
         arm.
-
-        Args:
-            segment: The segment.
-            memory: State with the interrupted segment and its progress.
         """
         path = segment.build_path()
         self._guard.watch_path(segment, path, self.below.message.opening, self.world.message)
         work = PathWork(segment, path, self._guard, self._rules)
-        if segment.id == memory.interrupted:
-            work.begin_near(self._position, memory.progress)
+        if segment.id == self._interrupted:
+            work.begin_near(self._position, self._progress)
         elif self._displaced:
             work.begin_near(self._position, 0.0)
         else:
@@ -291,9 +300,10 @@ class PrimitiveExecutor(Executor):
             if work is not None and serial == work.segment.id:
                 begin = work.wanted_begin if isinstance(work, PathWork) else None
             if (
-                serial > self._memory.done
+                serial > self.status.done
                 and begin is not None
-                and self._plans.is_unplanned(serial, begin)
+                and not self._plans.find_trajectory(serial, begin)
+                and not self._plans.find_refusal(serial)
             ):
                 return serial, begin
         return 0, 0.0
@@ -305,23 +315,19 @@ class PrimitiveExecutor(Executor):
     def _write_set_point(self, command: JointCommand, tick: int) -> None:
         """Write the set point. `due` is 0 while the servo is out of step and must not follow it."""
         work = self._work
-        memory = self._memory
         in_step = self._tracking.in_step
-        command.id = tick // self.context.every + 1 if memory.is_known else 0
+        command.id = tick // self.context.every + 1 if self._is_known else 0
         # While out of step, the position of the arm is uncertain, and a set point could be wrong.
         command.due = self._compute_due_tick(tick) if in_step else 0
-        set_point = work.motion.set_point if in_step and isinstance(work, PathWork) else self._rest
+        set_point = work.set_point if in_step and isinstance(work, PathWork) else self._rest
         command.position[:] = self._position
         command.velocity[:] = set_point.velocity
         command.acceleration[:] = set_point.acceleration
-        if memory.is_known:
-            command.opening = memory.opening
-            command.force = memory.force
-            command.held = memory.held
+        if self._is_known:
+            command.held = self.status.held
 
     def _write_status(self, status: PrimitiveStatus, serials: list[int], tick: int) -> None:
         """Fill the status: state, current segment and the trajectory requested from the planner."""
-        memory = self._memory
         work = self._work
         status.echo = self.above.message.id
         status.state = self._find_state(serials)
@@ -329,14 +335,12 @@ class PrimitiveExecutor(Executor):
         if reason:
             status.state = State.HOLDING
         status.error, status.reason, status.earliest = self._fault or (0, reason, 0.0)
-        status.done = memory.done
-        status.held = memory.held
-        interrupted = memory.interrupted if memory.interrupted in serials else 0
+        interrupted = self._interrupted if self._interrupted in serials else 0
         status.current = work.segment.id if work is not None else interrupted
         if self.below.has_message:
             status.opening = self.below.message.opening
         status.position[:] = self._position
-        status.progress = memory.progress * bool(interrupted)
+        status.progress = self._progress * bool(interrupted)
         servo = self.below.message
         status.operated = (
             self._orders.is_in_force or servo.standing > 0 or servo.error == Error.DISABLED
@@ -348,7 +352,7 @@ class PrimitiveExecutor(Executor):
             status.progress = work.progress
             # If the servo is out of step, that is the reason for the hold, not an obstacle.
             status.blocked = work.blocked and self._tracking.in_step
-            status.resting = work.motion.is_resting
+            status.resting = work.is_resting
             status.ends = work.compute_end_s(self._compute_due_tick(tick) * self.context.tick_s)
         status.wants, status.begin = self._find_wanted_trajectory(serials)
 
@@ -364,7 +368,7 @@ class PrimitiveExecutor(Executor):
             return self._orders.format_reason(self.context.board)
         if work is not None:
             blocked = f"blocked: {work.obstacle}" if work.blocked else ""
-            if reason := self._straying.description or blocked or self._sight.wait_reason:
+            if reason := self._straying.description or blocked or self._guard.wait_reason:
                 return reason
         if command.is_lost:
             return ABOVE_LOST
@@ -389,6 +393,6 @@ class PrimitiveExecutor(Executor):
         """Return the state of the segments. `_write_status` reports HOLDING during a wait."""
         if self._fault is not None:
             return State.ERROR
-        if self._work is not None or any(serial > self._memory.done for serial in serials):
+        if self._work is not None or any(serial > self.status.done for serial in serials):
             return State.EXECUTING
         return State.DONE if serials else State.IDLE

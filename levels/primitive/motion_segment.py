@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import ceil
 from typing import NamedTuple
 
 import numpy as np
 
-from rack.backplane.mailbox.mailbox import Reading
 from rack.levels.messages import (
     Error,
-    JointCommand,
     MoveCommand,
     MoveSegment,
-    PrimitiveStatus,
     SegmentKind,
 )
 from rack.levels.motion.path import BlendedPath
@@ -73,34 +69,3 @@ def read_segment(command: MoveCommand, serial: int) -> MotionSegment:
     if not np.isfinite([segment.by, segment.opening, segment.force]).all():
         raise ValueError(f"segment {serial}: by, opening or force is not finite")
     return segment
-
-
-@dataclass
-class Memory:
-    """The state with which the executor continues after a restart of its board.
-
-    It is read back from the executor's own last messages.
-    """
-
-    is_known: bool = False  # the level was in step with the servo, perhaps before a restart
-    done: int = 0  # serial of the newest segment done
-    interrupted: int = 0  # serial of the interrupted segment, or 0
-    progress: float = 0.0  # part of that segment's path done, 0 to 1
-    held: int = -1  # row of the object in the gripper, or -1
-    opening: float = 0.0  # commanded, m
-    force: float = 0.0  # commanded, N
-
-
-def restore_memory(status: Reading[PrimitiveStatus], command: Reading[JointCommand]) -> Memory:
-    """Return the state in the level's last messages. Without them, `is_known` is False."""
-    if not (status.has_message and command.has_message and command.message.id):
-        return Memory()
-    return Memory(
-        is_known=True,
-        done=status.message.done,
-        interrupted=status.message.current,
-        progress=status.message.progress,
-        held=status.message.held,
-        opening=command.message.opening,
-        force=command.message.force,
-    )

@@ -42,7 +42,14 @@ class PathGuard:
         obstacle: Last pair of geoms found too close, with their distance and the required distance.
     """
 
-    def __init__(self, cell: Cell, scene: SceneConfig, lookahead_s: float, delay_s: float) -> None:
+    def __init__(
+        self,
+        cell: Cell,
+        scene: SceneConfig,
+        lookahead_s: float,
+        delay_s: float,
+        blind_ticks: int,
+    ) -> None:
         """Guard the paths of an arm.
 
         Args:
@@ -50,6 +57,7 @@ class PathGuard:
             scene: Bodies and clearance.
             lookahead_s: Time ahead of the arm that is checked in every cycle.
             delay_s: Time from the sensing of the world to the set point commanded last.
+            blind_ticks: Age from which a scene with bodies is stale.
         """
         self._checker = CollisionChecker(cell, scene)
         self._clearance = CLEARANCE_PART * scene.clearance
@@ -63,24 +71,23 @@ class PathGuard:
         self._obstructed: float | None = None
         self._least = self._clearance
         self._extrapolated = np.zeros((self._rows, 3))
+        self._blind_ticks = blind_ticks
+        self._blind = self._rows > 0
+        self._waiting: tuple[int, int] | None = (
+            None  # awaited object, and tick as in `carry_object`
+        )
         self.obstacle = ""
 
-    def carry_object(self, row: int, q: Array, world: WorldState) -> None:
-        """Attach an object to the tool in the model that is checked.
+    def carry_object(self, row: int, since: int) -> None:
+        """Attach an object to the tool in the model, as soon as a new scene shows its pose.
 
         Args:
-            row: Row of the object in the world model.
-            q: Position of the arm, (joints,), rad.
-            world: World model that shows the object in the gripper.
+            row: Row of the object, or -1 for none.
+            since: Earliest tick at which that scene may have been sensed.
         """
-        object_pose = Pose(world.position[row], world.quaternion[row])
-        self._checker.hold_object(
-            row, *(self._checker.compute_tool_pose(q).inverse() @ object_pose)
-        )
-
-    def carry_nothing(self) -> None:
-        """Detach the object from the tool in the model that is checked."""
-        self._checker.hold_object(None)
+        self._waiting = (row, since) if row >= 0 else None
+        if row < 0:
+            self._checker.hold_object(None)
 
     def watch_path(
         self, segment: MotionSegment, path: BlendedPath, opening: float, world: WorldState
@@ -182,41 +189,11 @@ class PathGuard:
         self.obstacle = self._checker.describe_worst_pair()
         return False
 
-
-class SceneWatch:
-    """Checks that the world model is fresh, and passes the pose of a held object to the guard.
-
-    The age of the model is the time since its scene was sensed. It also grows if the board of the
-    model runs but receives no scene.
-    """
-
-    def __init__(self, guard: PathGuard, blind_ticks: int, has_bodies: bool) -> None:
-        """Watch the world model.
-
-        Args:
-            guard: Guard that needs the pose of a held object.
-            blind_ticks: Age from which a scene is stale.
-            has_bodies: False for a scene without bodies, which is never stale.
-        """
-        self._guard = guard
-        self._blind_ticks = blind_ticks
-        self._has_bodies = has_bodies
-        self._blind = has_bodies
-        self._waiting: tuple[int, int] | None = None
-
-    def carry_object(self, row: int, since: int) -> None:
-        """Let the guard attach an object to the tool, as soon as a new scene shows its pose.
-
-        Args:
-            row: Row of the object, or -1 for none.
-            since: Earliest tick at which that scene may have been sensed.
-        """
-        self._waiting = (row, since) if row >= 0 else None
-        if row < 0:
-            self._guard.carry_nothing()
-
     def update_scene(self, world: Reading[WorldState], q: Array, tick: int) -> None:
         """Check the age of the world model, and attach a newly held object that it shows.
+
+        The age is the time since its scene was sensed. It also grows if the board of the model runs
+        but receives no scene.
 
         Args:
             world: Newest world model and its verdict.
@@ -225,9 +202,12 @@ class SceneWatch:
         """
         model = world.message
         is_seen = world.has_message and model.revision > 0
-        self._blind = self._has_bodies and (not is_seen or tick - model.sensed > self._blind_ticks)
+        is_late = not is_seen or tick - model.sensed > self._blind_ticks
+        self._blind = self._rows > 0 and is_late
         if self._waiting is not None and is_seen and model.sensed >= self._waiting[1]:
-            self._guard.carry_object(self._waiting[0], q, model)
+            row = self._waiting[0]
+            pose = Pose(model.position[row], model.quaternion[row])
+            self._checker.hold_object(row, *(self._checker.compute_tool_pose(q).inverse() @ pose))
             self._waiting = None
 
     @property

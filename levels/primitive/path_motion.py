@@ -70,16 +70,23 @@ class PathMotion:
         """Time until the present trajectory ends, in s. 0 without a trajectory."""
         return self.trajectory.duration - self.time_s if self.trajectory is not None else 0.0
 
-    def reset_to_start(self, position: Array) -> float:
-        """Reset the motion to rest at the start of the path, with the set point at the arm.
+    def reset_to(self, s: float, position: Array) -> float:
+        """Reset the motion to rest at path parameter `s`, with the set point at the arm.
 
         Args:
+            s: Path parameter in rad.
             position: Position of the arm, (joints,), rad.
 
         Returns:
-            Largest distance of a joint of the arm from the start of the path, rad.
+            Largest distance of a joint from the path in rad. It is removed during the motion.
         """
-        return self._reset_to(0.0, position)
+        self.s = s
+        self._clear_trajectory()
+        np.subtract(position, self.path.evaluate(s).q, out=self._offset)
+        distance = float(np.abs(self._offset).max())
+        self._bridged_s = 0.0 if distance > COINCIDENT_RAD else self._bridging_s
+        self.set_point.position[:] = position
+        return distance
 
     def reset_to_nearest(self, position: Array, progress: float) -> float:
         """Reset the motion to rest at the point of the path that is nearest to the arm.
@@ -106,7 +113,7 @@ class PathMotion:
         # `linspace` returns the exact end. A value beyond it would permit no trajectory.
         places = np.linspace(0.0, self.path.length, len(points))[minima]
         nearest = np.argmin(np.abs(places - progress * self.path.length))
-        return self._reset_to(float(places[nearest]), position)
+        return self.reset_to(float(places[nearest]), position)
 
     def follow_trajectory(self, trajectory: Trajectory) -> None:
         """Start to follow a trajectory. It must begin at rest at the present path parameter."""
@@ -153,24 +160,6 @@ class PathMotion:
                 value += np.multiply(self._offset, factor, out=self._scratch)
         if self.time_s >= self.trajectory.duration:
             self._come_to_rest()
-
-    def _reset_to(self, s: float, position: Array) -> float:
-        """Reset the motion to rest at path parameter `s`, with the set point at the arm.
-
-        Args:
-            s: Path parameter, rad.
-            position: Position of the arm, (joints,), rad.
-
-        Returns:
-            Largest distance of a joint of the arm from that point of the path, rad.
-        """
-        self.s = s
-        self._clear_trajectory()
-        np.subtract(position, self.path.evaluate(s).q, out=self._offset)
-        distance = float(np.abs(self._offset).max())
-        self._bridged_s = 0.0 if distance > COINCIDENT_RAD else self._bridging_s
-        self.set_point.position[:] = position
-        return distance
 
     def _come_to_rest(self) -> None:
         """End the trajectory, unless an offset from the path remains to be removed."""

@@ -127,10 +127,6 @@ class Plans:
         plan = self._plans.get(serial)
         return plan if isinstance(plan, Trajectory) and plan.begin == begin else None
 
-    def is_unplanned(self, serial: int, begin: float) -> bool:
-        """Return True if a segment has neither a trajectory from `begin` nor a refusal."""
-        return self.find_trajectory(serial, begin) is None and self.find_refusal(serial) is None
-
     def find_refusal(self, serial: int) -> SegmentFault | None:
         """Return the fault with which the planner has refused a segment, or None."""
         plan = self._plans.get(serial)

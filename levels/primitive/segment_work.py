@@ -8,7 +8,6 @@ when the gripper is at rest.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -72,18 +71,6 @@ class WorkRules:
     params: PrimitiveParams
     period_s: float  # the level's cycle
 
-    @property
-    def braking_limits(self) -> Limits:
-        """Limits of the ramp to rest when motion must hold.
-
-        They exceed the planned limits, which motion along a curve may already use up.
-        """
-        planned = self.limits
-        factor = self.params.braking
-        return replace(
-            planned, acceleration=factor * planned.acceleration, jerk=factor * planned.jerk
-        )
-
     def count_cycles(self, time_s: float) -> int:
         """Convert a time to a number of cycles, at least 1."""
         return max(1, round(time_s / self.period_s))
@@ -125,23 +112,11 @@ class SettlingCounter:
         return self._cycles > self._most_cycles
 
 
-class WorkCycle(NamedTuple):
-    """Inputs of a path segment in one cycle."""
-
-    hold: bool
-    plan: Trajectory | None  # begins where the motion rests
-    world: WorldState
-    due_s: float  # simulated time of the set point commanded last
-    passed_s: float  # time since the cycle before
-    speed_scale: float = 1.0  # part of full speed for a trajectory that begins
-
-
-class PathWork:
-    """Execution of one PATH segment.
+class PathWork(PathMotion):
+    """Execution of one PATH segment: a guarded motion along its path.
 
     Attributes:
         segment: The segment.
-        motion: Motion of the set point along its path.
         fault: Why the segment cannot be done, or None.
         blocked: True if an obstacle is on the path, or the arm is too far from the path.
         astray: True if the arm is too far from the path.
@@ -153,8 +128,13 @@ class PathWork:
     def __init__(
         self, segment: MotionSegment, path: BlendedPath, guard: PathGuard, rules: WorkRules
     ) -> None:
+        planned = rules.limits
+        factor = rules.params.braking
+        braking = replace(
+            planned, acceleration=factor * planned.acceleration, jerk=factor * planned.jerk
+        )
+        super().__init__(path, braking, rules.params.bridging)
         self.segment = segment
-        self.motion = PathMotion(path, rules.braking_limits, rules.params.bridging)
         self.fault: SegmentFault | None = None
         self.blocked = False
         self.astray = False
@@ -173,7 +153,7 @@ class PathWork:
             position: Position of the arm, (joints,), rad.
         """
         permitted = self._rules.params.astray
-        distance = self.motion.reset_to_start(position)
+        distance = self.reset_to(0.0, position)
         if distance > permitted:
             begins = f"segment {self.segment.id} begins {distance:.4f} rad from where the arm rests"
             self.fault = SegmentFault(Error.LIMIT, f"{begins}; valid: at most {permitted} rad")
@@ -190,33 +170,51 @@ class PathWork:
         self._fresh = False
         self._clear_cycles = 0
         self._quiet = SettlingCounter(self._rules)
-        distance = self.motion.reset_to_nearest(position, progress)
+        distance = self.reset_to_nearest(position, progress)
         self.astray = self.blocked = distance > self._rules.params.astray
         self.obstacle = f"the arm is {distance:.3f} rad off its path"
 
-    def step(self, cycle: WorkCycle) -> None:
-        """Run one cycle: check the path, start or hold the motion, and advance it."""
-        motion = self.motion
+    def step(
+        self,
+        hold: bool,
+        plan: Trajectory | None,
+        world: WorldState,
+        due_s: float,
+        passed_s: float,
+        speed_scale: float,
+    ) -> None:
+        """Run one cycle: check the path, start or hold the motion, and advance it.
+
+        Args:
+            hold: True to hold the motion.
+            plan: Trajectory that begins where the motion rests, or None.
+            world: Newest world model.
+            due_s: Simulated time of the set point commanded last.
+            passed_s: Time since the cycle before.
+            speed_scale: Part of full speed for a trajectory that begins.
+        """
         waits = self.wanted_begin is not None
-        if motion.trajectory is not None and not motion.stopping:
+        if self.trajectory is not None and not self.stopping:
             self._set_blocked(
-                not self._guard.is_clear(motion.path, motion.trajectory, motion.time_s, cycle.world)
+                not self._guard.is_clear(self.path, self.trajectory, self.time_s, world)
             )
-            if cycle.hold or self.blocked:
-                motion.begin_hold()
-        elif waits and cycle.plan is not None:
-            self._start(cycle, cycle.plan)
-        self.unplanned_cycles = self.unplanned_cycles + 1 if waits and cycle.plan is None else 0
-        motion.advance_by(cycle.passed_s)
+            if hold or self.blocked:
+                self.begin_hold()
+        elif waits and plan is not None:
+            if speed_scale < 1.0:
+                plan = plan.stretch_by(1.0 / speed_scale)
+            self._start(plan, hold, world, due_s)
+        self.unplanned_cycles = self.unplanned_cycles + 1 if waits and plan is None else 0
+        self.advance_by(passed_s)
 
     def check_done(self, status: DrivenArm) -> bool:
         """Return True if set point and arm are at rest at the end of the path.
 
         Call this once for each new status. It sets `fault` if the arm does not settle in time.
         """
-        if not self.motion.is_finished:
+        if not self.is_finished:
             return False
-        distances = np.abs(status.position - self.motion.set_point.position)
+        distances = np.abs(status.position - self.set_point.position)
         settled = self._quiet.count_cycle(bool((distances < self._rules.params.settled).all()))
         if self._quiet.is_overdue and not settled:
             joint = int(distances.argmax())
@@ -232,16 +230,13 @@ class PathWork:
     @property
     def wanted_begin(self) -> float | None:
         """Path parameter in rad at which a trajectory must begin. None if the motion needs none."""
-        motion = self.motion
-        return (
-            motion.s if motion.is_resting and not motion.is_finished and not self.astray else None
-        )
+        return self.s if self.is_resting and not self.is_finished and not self.astray else None
 
     @property
     def progress(self) -> float:
         """Fraction of the path that is done, 0 to 1."""
-        length = self.motion.path.length
-        return self.motion.s / length if length > 0.0 else 1.0
+        length = self.path.length
+        return self.s / length if length > 0.0 else 1.0
 
     def compute_end_s(self, due_s: float) -> float:
         """Return the simulated time at which the segment will be done, or 0 if it is not known.
@@ -249,26 +244,24 @@ class PathWork:
         Args:
             due_s: Simulated time at which the set point commanded last is due.
         """
-        if self.motion.stopping or (self.motion.is_resting and not self.motion.is_finished):
+        if self.stopping or (self.is_resting and not self.is_finished):
             return 0.0
-        return due_s + self.motion.remaining_s + self._rules.latency_s
+        return due_s + self.remaining_s + self._rules.latency_s
 
-    def _start(self, cycle: WorkCycle, plan: Trajectory) -> None:
+    def _start(self, plan: Trajectory, hold: bool, world: WorldState, due_s: float) -> None:
         """Start the trajectory, unless motion must hold or the path has not been clear long enough.
 
-        It is stretched to the permitted speed and to the deadline of the segment.
+        It is stretched to the deadline of the segment. See `step` for the arguments.
         """
-        if cycle.speed_scale < 1.0:
-            plan = plan.stretch_by(1.0 / cycle.speed_scale)
-        clear = self._guard.is_clear(self.motion.path, plan, 0.0, cycle.world)
+        clear = self._guard.is_clear(self.path, plan, 0.0, world)
         self._clear_cycles = self._clear_cycles + 1 if clear else 0
         wanted = self._rules.count_cycles(self._rules.params.clear) if self.blocked else 1
         self._set_blocked(self._clear_cycles < wanted)
-        if cycle.hold or self.blocked:
+        if hold or self.blocked:
             return
-        timed = self._stretch_to_deadline(plan, cycle.due_s)
+        timed = self._stretch_to_deadline(plan, due_s)
         if timed is not None:
-            self.motion.follow_trajectory(timed)
+            self.follow_trajectory(timed)
             self._fresh = False
             self._clear_cycles = 0
 

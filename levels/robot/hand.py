@@ -17,7 +17,7 @@ import numpy as np
 from rack.levels.algebra import Array, Ints, Mask
 from rack.levels.errors import RobotError
 from rack.levels.robot import lookup
-from rack.levels.robot.model import format_names, is_arm_drive, remove_actuators
+from rack.levels.robot.model import is_arm_drive, remove_actuators
 from rack.levels.tables import FingerConfig, HandConfig, RobotConfig
 
 ARM_TOLERANCE = 1e-6
@@ -64,10 +64,7 @@ def check_hand(robot: RobotConfig, hand: HandConfig) -> None:
         RobotError: The table is invalid.
     """
     if robot.gripper is not None:
-        raise RobotError(
-            "robot.hand: a hand takes the place of an arm and cannot have a gripper; remove"
-            " robot.gripper"
-        )
+        raise RobotError("robot.hand: a hand has no gripper; remove robot.gripper")
     if robot.torque is not None:
         raise RobotError("robot.torque: torques of a hand follow from its tendons; remove the key")
     for row in ROWS:
@@ -77,46 +74,22 @@ def check_hand(robot: RobotConfig, hand: HandConfig) -> None:
                 f"robot.hand.{row}: has {len(names)} values but needs {len(robot.joints)},"
                 " one per joint"
             )
-    both = hand.flexors + hand.extensors
-    for name in both:
-        if both.count(name) > 1:
-            raise RobotError(
-                f"robot.hand: actuator '{name}' is named {both.count(name)} times instead of once"
-            )
-    _check_fingers(robot, hand)
+    joints = [joint for finger in hand.finger for joint in finger.joints]
+    for key, named in (
+        ("", hand.flexors + hand.extensors),
+        (".finger.name", [finger.name for finger in hand.finger]),
+        (".finger.joints", joints),
+    ):
+        if repeated := {name for name in named if named.count(name) > 1}:
+            raise RobotError(f"robot.hand{key}: '{min(repeated)}' is named more than once")
+    if strays := {*joints} ^ {*robot.joints}:
+        raise RobotError(
+            f"robot.hand.finger.joints: '{min(strays)}' must be in robot.joints and of a finger"
+        )
     if not hand.least < hand.rest:
         raise RobotError(
             f"robot.hand.rest: {hand.rest:g} N must be above robot.hand.least, {hand.least:g} N"
         )
-
-
-def _check_fingers(robot: RobotConfig, hand: HandConfig) -> None:
-    """Check that fingers have distinct names, and that each joint belongs to exactly one finger."""
-    names = [finger.name for finger in hand.finger]
-    for finger in hand.finger:
-        if names.count(finger.name) > 1:
-            raise RobotError(
-                f"robot.hand.finger: {names.count(finger.name)} fingers are named '{finger.name}'"
-            )
-        for joint in finger.joints:
-            if joint not in robot.joints:
-                have = format_names(list(robot.joints))
-                raise RobotError(
-                    f"robot.hand.finger: '{joint}' of '{finger.name}' is not in robot.joints:"
-                    f" {have}"
-                )
-    for joint in robot.joints:
-        owners = [
-            finger.name
-            for finger in hand.finger
-            for finger_joint in finger.joints
-            if finger_joint == joint
-        ]
-        if len(owners) != 1:
-            named = ", ".join(f"'{name}'" for name in owners) or "none"
-            raise RobotError(
-                f"robot.hand.finger: joint '{joint}' must belong to one finger, not to {named}"
-            )
 
 
 def fit_tendons(
@@ -273,22 +246,17 @@ def _find_moment_arms(model: mujoco.MjModel, robot: RobotConfig, actuators: Ints
     moments = np.array([compute_moments(model, joints, place)[actuators] for place in places])
     # (places, 2, joints), m: moment arms of flexors, and of extensors with the sign reversed.
     arms = np.diagonal(moments, axis1=2, axis2=3) * np.array([[1.0], [-1.0]])
-    for number, joint in enumerate(robot.joints):
-        least = float(arms[:, :, number].min()) + 0.0  # avoids -0
-        peak = float(arms[:, :, number].max())
-        if least < ARM_TOLERANCE or peak - least > ARM_TOLERANCE * peak:
+    others = np.abs(moments * (1.0 - np.eye(len(joints)))).max(axis=(0, 1, 3))
+    least = arms.min(axis=(0, 1)) + 0.0  # avoids -0
+    peak = arms.max(axis=(0, 1))
+    for joint, low, high, other in zip(robot.joints, least, peak, others, strict=True):
+        if low < ARM_TOLERANCE or max(high - low, other) > ARM_TOLERANCE * low:
             raise RobotError(
-                f"robot.hand: arms of the tendons on joint '{joint}' are {least:g} to {peak:g} m;"
-                " the flexor must turn it in positive direction and the extensor in negative"
-                " direction, with equal arms that do not vary"
+                f"robot.hand: arms of the tendons on joint '{joint}' are {low:g} to {high:g} m,"
+                f" and on others up to {other:g} m; the flexor must turn it alone in positive"
+                " direction and the extensor in negative direction, with equal arms that do not"
+                " vary"
             )
-        turned = np.abs(moments[:, :, number]).max(axis=(0, 1)) > ARM_TOLERANCE * least
-        for other in np.flatnonzero(turned):
-            if other != number:
-                raise RobotError(
-                    f"robot.hand: a tendon of joint '{joint}' also turns joint"
-                    f" '{robot.joints[other]}'"
-                )
     return np.array(arms[0, 1])
 
 

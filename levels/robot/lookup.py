@@ -74,7 +74,7 @@ def find_all(
 
 
 def find_unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
-    """Yield an error line for each name in the config that the model does not contain.
+    """Yield an error line for each name of an arm's config that the model does not contain.
 
     Raises:
         RobotError: The model is invalid.
@@ -83,25 +83,15 @@ def find_unknown_names(robot: RobotConfig, scene: SceneConfig) -> Iterator[str]:
     kind = mujoco.mjtObj
     is_body = mujoco.mj_name2id(model, kind.mjOBJ_BODY, robot.tool) >= 0
     gripper = robot.gripper
-    expected = [
+    for element_kind, names, place in (
         (kind.mjOBJ_JOINT, robot.joints, "robot.joints"),
         (kind.mjOBJ_SITE, () if is_body else (robot.tool,), "robot.tool"),
-        (kind.mjOBJ_BODY, tuple(chain(*robot.exclude)), "robot.exclude"),
+        (kind.mjOBJ_BODY, chain(*robot.exclude), "robot.exclude"),
         (kind.mjOBJ_JOINT, () if gripper is None else (gripper.joint,), "robot.gripper.joint"),
-    ]
-    if robot.hand is not None:
-        tips = tuple(finger.tip for finger in robot.hand.finger)
-        expected += [
-            (kind.mjOBJ_SITE, tips, "robot.hand.finger.tip"),
-            (kind.mjOBJ_ACTUATOR, robot.hand.flexors, "robot.hand.flexors"),
-            (kind.mjOBJ_ACTUATOR, robot.hand.extensors, "robot.hand.extensors"),
-        ]
-    expected += [
         (kind.mjOBJ_BODY, scene.objects, "scene.objects"),
         (kind.mjOBJ_BODY, scene.obstacles, "scene.obstacles"),
         (kind.mjOBJ_GEOM, scene.supports, "scene.supports"),
-    ]
-    for element_kind, names, place in expected:
+    ):
         for name in names:
             try:
                 find(model, element_kind, name, place)

@@ -105,13 +105,11 @@ def check_joint_count(joints: Sequence[str]) -> None:
 
 
 def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
-    """Check that the arm's joints are valid, and that each list has one value per joint.
+    """Check that the model has the arm's joints, and that each is scalar.
 
     Raises:
-        RobotError: A list has the wrong length, or a joint is missing, not scalar or named twice.
+        RobotError: A joint is missing or not scalar.
     """
-    for key, _, why in robot.find_length_mismatches():
-        raise RobotError(f"robot.{key}: {why}")
     for name in robot.joints:
         joint = spec.joint(name)
         if joint is None:
@@ -120,10 +118,6 @@ def check_joints(robot: RobotConfig, spec: mujoco.MjSpec) -> None:
         if joint.type not in SCALAR_JOINTS:
             kind = joint.type.name.removeprefix("mjJNT_").lower()
             raise RobotError(f"robot.joints: '{name}' is a {kind} joint, must be hinge or slide")
-        if robot.joints.count(name) > 1:
-            raise RobotError(
-                f"robot.joints: '{name}' is named {robot.joints.count(name)} times instead of once"
-            )
 
 
 def prepare_spec(spec: mujoco.MjSpec, robot: RobotConfig, clock_ns: int) -> None:

@@ -5,8 +5,7 @@ Your own law derives from `ServoLaw`.
 
 from rack.levels.servo.control import LawParams
 from rack.levels.servo.curves import Motion, SensedMotion
-from rack.levels.servo.executor import ServoExecutor
-from rack.levels.servo.law import ServoLaw
+from rack.levels.servo.law import ServoExecutor, ServoLaw
 from rack.levels.servo.modification import Hook, LawContext, LawSample, Modification
 from rack.levels.servo.planner import ServoPlanner
 

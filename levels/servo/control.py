@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Literal
 
-import numpy as np
 from pydantic import Field, field_validator
 
 from rack.levels.algebra import Array
@@ -14,8 +12,8 @@ from rack.levels.arm import JointTarget, find_arm
 from rack.levels.compiled import compiled_for
 from rack.levels.messages import ArmSetPoint
 from rack.levels.robot.cell import Cell
-from rack.levels.robot.dynamics import FRICTION_SPEED, Terms
-from rack.levels.servo.curves import Motion, SensedMotion
+from rack.levels.robot.dynamics import FRICTION_SPEED
+from rack.levels.servo.curves import Motion
 from rack.levels.servo.modification import ModifiableParams
 from rack.levels.tables import GripperConfig, Live, Positive, Table
 
@@ -70,53 +68,6 @@ class ServoParams(LawParams, LoopGains):
     """`[board.servo.params]`: the arm, gains of the joint loop, and the reactions to faults."""
 
 
-class ComputedTorque:
-    """The computed-torque law, with the planner's inertia M.
-
-    torque = M (qdd + 2 d w (qd_wanted - qd) + w^2 (q_wanted - q)) + bias(q, qd) + dry friction
-
-    In any pose and motion, the error of every joint decays like a damped oscillator.
-
-    Attributes:
-        inertia: Planned inertia, (joints, joints), kg m2. None uses the inertia at the sensed
-            state.
-    """
-
-    def __init__(self, friction: Array, gains: LoopGains) -> None:
-        """Create the law.
-
-        Args:
-            friction: Dry friction to compensate, (joints,), N m.
-            gains: Gains of the joint loop.
-        """
-        table = np.zeros((4, len(friction)))  # in the rows of `set_torque`
-        self._constants = table
-        self.set_gains(gains)
-        table[2] = friction
-        self._torque: Array = table[3]
-        self._set = partial(set_torque.load_machine_code(), table)
-        self.inertia: Array | None = None
-
-    def set_gains(self, gains: LoopGains) -> None:
-        """Replace the gains."""
-        gains.fill_constants(self._constants)
-
-    def compute_torque(self, wanted: Motion, sensed: SensedMotion, terms: Terms) -> Array:
-        """Return the torques for the wanted motion.
-
-        Args:
-            wanted: Motion to follow.
-            sensed: Sensed positions and velocities.
-            terms: Inertia and bias at the sensed state.
-
-        Returns:
-            Torques, (joints,), N m. The array is valid until the next call.
-        """
-        inertia = terms.inertia if self.inertia is None else self.inertia
-        self._set(wanted.table, sensed.table, inertia, terms.bias)
-        return self._torque
-
-
 @compiled_for("f8[:,::1], f8[:,::1], f8[:,::1], f8[:,::1], f8[::1]")
 def set_torque(
     table: Array,  # (4, joints): rows as below
@@ -125,7 +76,7 @@ def set_torque(
     inertia: Array,  # (joints, joints), kg m2
     bias: Array,  # (joints,), N m
 ) -> None:
-    """Set the torques of `ComputedTorque` in the last row of `table`.
+    """Set the torques of `ServoExecutor` in the last row of `table`.
 
     Args:
         table: Stiffness, damping, dry friction and, as output, torques.
@@ -169,7 +120,7 @@ class SetPointLaw:
 
     A set point is the motion wanted at the end of the cycle. Velocity drives do not control the
     position, so their set point also contains a term that corrects the position error, as fast as
-    `ComputedTorque` would.
+    `ServoExecutor` would by torques.
     """
 
     def __init__(self, cell: Cell, params: LoopGains, period_s: float) -> None:

@@ -3,7 +3,7 @@
 A cycle has three phases:
 
 - Check: `ArmDriver._check_arm` checks the samples of the sensors, and decides how to react. Before
-  that, `Takeover` takes over the arm at the start of the board and after the drives are enabled.
+  that, `Enabling` takes over the arm at the start of the board and after the drives are enabled.
 - Drive: `ArmDriver._drive_arm` drives the arm, or `ArmDriver.brake_arm` brakes it.
 - Report: `ArmReport` fills the status and the state.
 """
@@ -33,7 +33,7 @@ from rack.levels.level import (
     Reading,
 )
 from rack.levels.messages import ArmState, DrivenArm, Error, Scene
-from rack.levels.operator import Operation, OperatorCommand, Orders
+from rack.levels.operator import Operation, OperatorCommand
 from rack.levels.robot.cell import build_level_cell, replace_encoders
 from rack.levels.robot.dynamics import Payload, Terms
 from rack.levels.servo import actuator_monitor, sensor_monitor
@@ -41,7 +41,7 @@ from rack.levels.servo.actuator_monitor import ActuatorMonitor
 from rack.levels.servo.arm_report import ArmReport, SetPointStatus
 from rack.levels.servo.control import ArmParams, SetPointLaw
 from rack.levels.servo.curves import Motion
-from rack.levels.servo.enabling import Enabling, Takeover
+from rack.levels.servo.enabling import Enabling
 from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import Cause, Reaction, Stopping
 from rack.levels.tables import read_params
@@ -76,14 +76,16 @@ class ArmDriver(Executor):
     """True if the level can also drive an arm by set points. Its torques are then predictions."""
     set_point_law: SetPointLaw | None = None
     """Computes set points for position or velocity drives. None for torque drives."""
-    orders: Orders
-    """Commands of the operator."""
     before: Reading[ArmState]
     status: DrivenArm
     state: ArmState
     scene: Scene
     terms: Terms
     """Equation of motion in this cycle."""
+    payload: Payload | None = None
+    """Payload in the gripper. None if the gripper is empty or the payload is unknown."""
+    holds_part = False
+    """True if the gripper holds a part."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
@@ -103,13 +105,12 @@ class ArmDriver(Executor):
         is_reported = cell.interface == "torque" or self.arm.reports_torque
         self.motors = ActuatorMonitor(cell, params.following, context.period_s, is_reported)
         self.stopping = Stopping(params, robot.joints, context.tick_s, every)
-        self.enabling = Enabling(self.arm, context)
+        self.enabling = Enabling(self.arm, self.sensors, self.stopping, context)
         # One list keeps the findings in order of time.
         self.sensors.findings = self.stopping.findings = self.findings
         # First rows of the motion wanted in the last cycle: (joints,), rad and rad/s.
         self._wanted = np.zeros((2, len(cell.home)))
         self._wanted[0] = cell.home
-        self.takeover = Takeover(self.arm, self.sensors, self.stopping, self.enabling)
         self.abandoned = True
         self.followed = self.rests_on = 0
 
@@ -121,9 +122,7 @@ class ArmDriver(Executor):
         compiled.preload(sensor_monitor, actuator_monitor)
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
         """Yield a mismatch if the robot is a hand, or an arm that the level cannot drive or guard.
 
         A hand with tendons needs a board of another kind. An arm that needs a guard must have
@@ -191,16 +190,6 @@ class ArmDriver(Executor):
             Torques, (joints,), N m, and force of the gripper, N.
         """
 
-    @property
-    @abstractmethod
-    def payload(self) -> Payload | None:
-        """Payload in the gripper. None if the gripper is empty or the payload is unknown."""
-
-    @property
-    @abstractmethod
-    def holds_part(self) -> bool:
-        """True if the gripper holds a part."""
-
     @abstractmethod
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
         """Return the section of the status that reports on the set points."""
@@ -253,7 +242,7 @@ class ArmDriver(Executor):
         self.motors.torque[:] = self.arm.torque
         self._report.write_numbers(sensed, self._wanted)
         self._report.write_fields(self.report_set_points(reaction), self.demand, self.speed_scale)
-        self.orders.fill_status(self.status, self.rests_on)
+        self._orders.fill_status(self.status, self.rests_on)
         self.arm.save(self.state)
         self.stopping.save_state(self.state)
         if SCENES.is_due(tick, self.context.every, self.context.phase):
@@ -265,8 +254,8 @@ class ArmDriver(Executor):
         Returns:
             True if cycles were missed since the last one.
         """
-        is_first = not self.takeover.is_started
-        if is_first and self.takeover.start(self.before):
+        is_first = not self.enabling.is_started
+        if is_first and self.enabling.start(self.before):
             self.on_restored()
         ticks = tick - self.arm.tick
         self.arm.step(ticks)
@@ -279,27 +268,27 @@ class ArmDriver(Executor):
     def _check_arm(self, sensed: Sensed, missed: bool, tick: int) -> Reaction:
         """Check sample, contacts, limits and drives, and return the reaction of this cycle."""
         contact = self.arm.contact
-        takeover = self.takeover
-        was_complete = takeover.is_complete
-        if takeover.adopt_pose(sensed, tick):
+        enabling = self.enabling
+        was_taken_over = enabling.is_taken_over
+        if enabling.adopt_pose(sensed, tick):
             wanted = None if missed or self.abandoned else self._wanted
             self.sensors.check_sample(sensed, tick, wanted, contact is not None)
-        if takeover.is_complete and not was_complete:
+        if enabling.is_taken_over and not was_taken_over:
             self.on_adopted()
         if contact is not None:
             blow = Cause(Error.TOUCHED, f"unintended contact: {self.arm.describe_contact(contact)}")
             self.stopping.register_blow(blow, Finding(Alarm.COLLISION, *contact), tick)
-        if takeover.is_complete and self.arm.exceeded is not None:
+        if enabling.is_taken_over and self.arm.exceeded is not None:
             finding, text = self.arm.exceeded
             cause = Cause(Error.LIMIT, text, finding.subject, finding.value)
             self.stopping.register_blow(cause, finding, tick)
         self.sense_contact(tick)
-        if serial := self.enabling.pop_finished_command():
-            self.orders.report_drives_done(serial)
-        if self.enabling.is_enabled:
+        if serial := enabling.pop_finished_command():
+            self._orders.report_completed(serial)
+        if enabling.is_enabled:
             return self.stopping.decide_reaction(self.demand, self.sensors, tick)
         error = Error.DRIVES if self.arm.state is DriveState.FAULT else Error.DISABLED
-        return self.stopping.wait_for_enabling(error, self.enabling.reason, tick)
+        return self.stopping.wait_for_enabling(error, enabling.reason, tick)
 
     def brake_arm(self) -> None:
         """Engage the brakes, and abandon the set points."""

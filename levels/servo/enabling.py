@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 
 from rack.levels.arm import DrivableArm, DriveState, Sensed
 from rack.levels.level import LevelContext, Reading
@@ -19,11 +18,27 @@ class Enabling:
     Whoever enables an arm must be able to see it. An operator must therefore enable it again after
     a fault, or after the drives have switched off by themselves. A restart of the board does not
     change the state of the drives.
+
+    An arm that is not enabled may be moved by hand, and its drives may give no samples. Samples are
+    therefore compared with earlier ones only after the arm was enabled and its pose adopted.
+
+    Attributes:
+        is_started: True once the first cycle has begun.
+        is_taken_over: True if the arm is enabled, and its pose was adopted since.
     """
 
-    def __init__(self, arm: DrivableArm, context: LevelContext) -> None:
+    def __init__(
+        self,
+        arm: DrivableArm,
+        sensors: SensorMonitor,
+        stopping: Stopping,
+        context: LevelContext,
+    ) -> None:
         robot = context.robot
         self._arm = arm
+        self._sensors = sensors
+        self._stopping = stopping
+        self.is_started = self.is_taken_over = False
         self._at_start = robot.enable == "at-start" or (robot.enable is None and arm.keeps_limits)
         self._command = f"rack command {context.rack} {context.board}"
         speed = f"{robot.bring_up or 1.0:.0%} of full speed"
@@ -36,11 +51,36 @@ class Enabling:
         self._leaves = False  # an operator has disabled the arm, which its drives may not show yet
         self._goal: Collection[DriveState] = ()  # states in which the command is done
 
-    def start(self, restarted: bool) -> None:
-        """Enable the arm, unless an operator must enable it or the board was restarted."""
-        self._restarted = restarted
-        if self._at_start and not (restarted or self._guessed):
+    def start(self, before: Reading[ArmState]) -> bool:
+        """Take over the arm in the first cycle. Return True if it was restored after a restart.
+
+        The arm is enabled, unless an operator must enable it or the board was restarted.
+        """
+        self.is_started = True
+        self._restarted = before.has_message
+        if self._restarted:
+            state = before.message
+            self._arm.restore(state)
+            self._sensors.restore_estimate(state)
+            self._stopping.restore_state(state)
+            self.is_taken_over = self.is_enabled
+        elif self._at_start and not self._guessed:
             self._arm.enable()
+        return self._restarted
+
+    def adopt_pose(self, sensed: Sensed, tick: int) -> bool:
+        """Adopt the sensed pose unless the arm is taken over.
+
+        Returns:
+            True if the sample of this cycle can be checked: either the arm is enabled, or its pose
+            was just adopted.
+        """
+        is_enabled = self.is_enabled
+        if self.is_taken_over and is_enabled:
+            return True
+        is_adopted = self._sensors.adopt_pose(sensed, tick)
+        self.is_taken_over = is_adopted and is_enabled
+        return is_adopted or is_enabled
 
     def obey_command(self, command: OperatorCommand) -> str:
         """Carry out one of `rack.levels.operator.DRIVE_OPERATIONS`.
@@ -103,45 +143,3 @@ class Enabling:
         if self._guessed:
             return f"confirm, then remove from robot.guessed, before it is enabled: {self._guessed}"
         return f"disabled; to enable: {self._command} enable"
-
-
-@dataclass
-class Takeover:
-    """Restores an arm after a restart, and adopts its pose while it is not enabled.
-
-    An arm that is not enabled may be moved by hand, and its drives may give no samples. Samples are
-    therefore compared with earlier ones only after the arm was enabled and its pose adopted.
-    """
-
-    arm: DrivableArm
-    sensors: SensorMonitor
-    stopping: Stopping
-    enabling: Enabling
-    is_started: bool = False  # the first cycle has begun
-    is_complete: bool = False  # the arm is enabled, and its pose was adopted since
-
-    def start(self, before: Reading[ArmState]) -> bool:
-        """Take over the arm in the first cycle. Return True if it was restored after a restart."""
-        self.is_started = True
-        self.enabling.start(before.has_message)
-        if before.has_message:
-            state = before.message
-            self.arm.restore(state)
-            self.sensors.restore_estimate(state)
-            self.stopping.restore_state(state)
-            self.is_complete = self.enabling.is_enabled
-        return before.has_message
-
-    def adopt_pose(self, sensed: Sensed, tick: int) -> bool:
-        """Adopt the sensed pose unless the takeover is complete.
-
-        Returns:
-            True if the sample of this cycle can be checked: either the arm is enabled, or its pose
-            was just adopted.
-        """
-        is_enabled = self.enabling.is_enabled
-        if self.is_complete and is_enabled:
-            return True
-        is_adopted = self.sensors.adopt_pose(sensed, tick)
-        self.is_complete = is_adopted and is_enabled
-        return is_adopted or is_enabled

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,17 +25,24 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.errors import LevelError
-from rack.levels.level import Input, LevelContext, Mismatches, Output, Verdict
+from rack.levels.level import OPERATOR, Input, LevelContext, Mismatches, Output, Verdict
 from rack.levels.messages import ArmState, JointCommand, ServoPlan, ServoStatus
 from rack.levels.operator import DRIVE_OPERATIONS, Goal, Operation, OperatorCommand
 from rack.levels.robot.dynamics import Payload
 from rack.levels.servo import control, curves, reference
 from rack.levels.servo.arm_report import SetPointStatus
-from rack.levels.servo.control import Grip, LawParams, limit_torques
+from rack.levels.servo.control import (
+    Grip,
+    LawParams,
+    ServoParams,
+    SetPointLaw,
+    limit_torques,
+    set_torque,
+)
 from rack.levels.servo.curves import Motion, SensedMotion
 from rack.levels.servo.driver import SCENES, ArmDriver
 from rack.levels.servo.modification import find_unsuitable_modifications, list_names
-from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
+from rack.levels.servo.modified_law import ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
 from rack.levels.servo.stopping import Reaction
@@ -56,7 +64,7 @@ class ServoLaw(ArmDriver):
     above = Input(JointCommand, "above.command")
     plan = Input(ServoPlan, "own.plan")
     before = Input(ArmState, "own.state")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     status = Output(ServoStatus)
     state = Output(ArmState)
     scene = SCENES
@@ -83,14 +91,11 @@ class ServoLaw(ArmDriver):
         self._limit = limit_torques.load_machine_code()
         self._cut = 0  # cycles in which a limit cut a torque of the law
         self._sensed = SensedMotion(self.sensors.state)
-        self._holds = False
-        self._payload: Payload | None = None
         self._modified = ModifiedLaw(context, self.settings, self._limits, self.findings)
         joints = context.robot.joints
         self.operator_control = OperatorControl(
-            self.commands, joints, cell.limits.position, obey=self._obey_command
+            self._orders, joints, cell.limits.position, obey=self._obey_command
         )
-        self.orders = self.operator_control.orders
         self._grip = None if context.robot.gripper is None else Grip(context.robot.gripper)
 
     @classmethod
@@ -99,11 +104,9 @@ class ServoLaw(ArmDriver):
         return list_names(params)
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
         """Yield control modifications that do not suit the law, and mismatches of `ArmDriver`."""
-        yield from super().find_mismatches(context, above, below)
+        yield from super().find_mismatches(context)
         yield from find_unsuitable_modifications(context)
         interface = context.robot.interface
         if interface != "torque" and (names := cls.list_names(context.params)):
@@ -140,8 +143,8 @@ class ServoLaw(ArmDriver):
 
     def take_plan(self, plan: ServoPlan) -> None:
         """Adopt the payload in the gripper from a new plan."""
-        self._holds = plan.held >= 0
-        self._payload = Payload(plan.payload_mass, plan.payload_offset.copy())
+        self.holds_part = plan.held >= 0
+        self.payload = Payload(plan.payload_mass, plan.payload_offset.copy())
 
     def _obey_command(self, command: OperatorCommand) -> str:
         """Carry out a setting or a drive command, neither of which ends a HOLD or SETPOINT.
@@ -189,11 +192,7 @@ class ServoLaw(ArmDriver):
             reference.restart_if_astray(sensors.position, sensors.velocity, tick)
         if reaction:
             return reference.ramp_to_rest(tick)
-        return (
-            self.operator_control.compute_motion(reference, tick)
-            if self.operator_control.is_in_control
-            else reference.compute_motion(tick)
-        )
+        return self.operator_control.compute_motion(reference, tick)
 
     def compute_efforts(self, wanted: Motion, sensed: Sensed) -> tuple[Array, float]:
         """Return the torques in N m, and the force of the gripper in N."""
@@ -206,11 +205,13 @@ class ServoLaw(ArmDriver):
         if not self._modified.has_modifications:
             return self._compute_limited_torque(wanted, state), grip_force
         terms = self.terms
-        inputs = LawInputs(
-            wanted, state.table, np.diagonal(terms.inertia), terms.bias, self.arm.tick
-        )
         return self._modified.compute_torque(
-            lambda motion, seen: self._compute_limited_torque(motion, SensedMotion(seen)), inputs
+            lambda motion, seen: self._compute_limited_torque(motion, SensedMotion(seen)),
+            wanted,
+            state.table,
+            np.diagonal(terms.inertia),
+            terms.bias,
+            self.arm.tick,
         ), grip_force
 
     def _compute_limited_torque(self, set_point: Motion, sensed: SensedMotion) -> Array:
@@ -236,16 +237,6 @@ class ServoLaw(ArmDriver):
         super().brake_arm()
         self._modified.forget_torque()
 
-    @property
-    def payload(self) -> Payload | None:
-        """Payload in the gripper according to the plan."""
-        return self._payload
-
-    @property
-    def holds_part(self) -> bool:
-        """True if the gripper holds a part according to the plan."""
-        return self._holds
-
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
         """Return the section of the status that reports on the set points."""
         operator = self.operator_control
@@ -260,3 +251,46 @@ class ServoLaw(ArmDriver):
         return SetPointStatus(
             self.followed, holding, stopped, cut, reason, has_work=self.followed > 0, note=note
         )
+
+
+class ServoExecutor(ServoLaw):
+    """Follows joint set points by computed torque: M (qdd + K e + D de) + bias + friction.
+
+    M is the planner's inertia, or the arm's own before the first plan. Drives that close a position
+    or velocity loop themselves get set points instead of torques.
+    """
+
+    params: ClassVar[type[ServoParams]] = ServoParams
+    settings: ServoParams
+    gives_set_points = True
+
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        dry = self.arm.dynamics.dry
+        self._constants = np.zeros((4, len(dry)))  # in the rows of `set_torque`
+        self._constants[2] = dry
+        self._set_torque = partial(set_torque.load_machine_code(), self._constants)
+        self._inertia: Array | None = None
+        if self.cell.interface != "torque":
+            self.set_point_law = SetPointLaw(self.cell, self.settings, context.period_s)
+        self.settings.fill_constants(self._constants)
+
+    def take_plan(self, plan: ServoPlan) -> None:
+        """Adopt the payload in the gripper and the planned inertia."""
+        super().take_plan(plan)
+        self._inertia = plan.inertia.copy()
+
+    def _obey_command(self, command: OperatorCommand) -> str:
+        """Carry out a command, and update the gains of the loops, which it may have changed."""
+        refusal = super()._obey_command(command)
+        self.settings.fill_constants(self._constants)
+        if self.set_point_law is not None:
+            self.set_point_law.set_gains(self.settings)
+        return refusal
+
+    def torques(self, set_point: Motion, sensed: SensedMotion) -> Array:
+        """Return the torques, (joints,), N m. The array is valid until the next call."""
+        inertia = self.terms.inertia if self._inertia is None else self._inertia
+        self._set_torque(set_point.table, sensed.table, inertia, self.terms.bias)
+        torque: Array = self._constants[3]
+        return torque

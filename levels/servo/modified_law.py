@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -34,16 +33,6 @@ from rack.levels.servo.modification import (
 
 Law = Callable[[Motion, Array], Array]
 """Returns torques, (joints,), N m, for a wanted motion at a state, (2, joints), rad, rad/s."""
-
-
-class LawInputs(NamedTuple):
-    """Inputs of a law in one sample. Vectors are (joints,); see `LawSample`."""
-
-    motion: Motion  # wanted
-    state: Array  # (2, joints): rad, rad/s
-    inertia: Array  # kg m2
-    load: Array  # N m
-    tick: int
 
 
 @dataclass
@@ -159,20 +148,36 @@ class ModifiedLaw:
         """Forget the last torque of an arm that is now braked. The next switch is not blended."""
         self._is_driving = False
 
-    def compute_torque(self, law: Law, inputs: LawInputs) -> Array:
-        """Return the torques of the modified law.
+    def compute_torque(
+        self, law: Law, wanted: Motion, state: Array, inertia: Array, load: Array, tick: int
+    ) -> Array:
+        """Return the torques of the law with all active modifications applied.
 
         Args:
             law: Unmodified law.
-            inputs: Its inputs in this sample.
+            wanted: Motion to follow.
+            state: Sensed positions and velocities, (2, joints), rad, rad/s.
+            inertia: Diagonal of the joint-space inertia, (joints,), kg m2.
+            load: Torques of gravity and velocities, (joints,), N m.
+            tick: Tick of the sample.
 
         Returns:
             Torques, (joints,), N m. The array is valid until the next call.
         """
-        torque = (
-            self._compute_modified(law, inputs) if self._in else law(inputs.motion, inputs.state)
-        )
-        tick = inputs.tick
+        sample = self._sample
+        sample.tick = tick
+        sample.inertia = inertia
+        sample.load = load
+        sample.seen[:3] = wanted.table
+        sample.seen[3:] = state
+        torque = sample.torque
+        torque[:] = np.nan
+        for before in self._before:
+            self._apply_modification(before, sample.seen)
+        if not any(self._apply_modification(instead, torque) for instead in self._instead):
+            torque[:] = law(sample.motion, sample.seen[3:])
+        for after in self._after:
+            self._apply_modification(after, torque)
         if self._switched:
             self._switched = False
             self._since = tick if self._is_driving else None
@@ -182,23 +187,6 @@ class ModifiedLaw:
         np.minimum(np.maximum(torque, -self._torque), self._torque, out=self._last)  # keeps NaN
         self._is_driving = True
         return self._last
-
-    def _compute_modified(self, law: Law, inputs: LawInputs) -> Array:
-        """Return the torques of the law with all active modifications applied."""
-        sample = self._sample
-        sample.tick = inputs.tick
-        sample.inertia = inputs.inertia
-        sample.load = inputs.load
-        sample.seen[:3] = inputs.motion.table
-        sample.seen[3:] = inputs.state
-        sample.torque[:] = np.nan
-        for state in self._before:
-            self._apply_modification(state, sample.seen)
-        if not any(self._apply_modification(state, sample.torque) for state in self._instead):
-            sample.torque = law(sample.motion, sample.seen[3:])
-        for state in self._after:
-            self._apply_modification(state, sample.torque)
-        return sample.torque
 
     def _apply_modification(self, state: ModificationState, changed: Array) -> bool:
         """Apply one modification, and switch it off if it fails. Return True if it succeeded."""

@@ -11,7 +11,6 @@ from rack.levels.algebra import Array, Mask
 from rack.levels.operator import (
     DRIVE_OPERATIONS,
     SETTINGS,
-    Commands,
     Operation,
     OperatorCommand,
     Orders,
@@ -36,7 +35,7 @@ class OperatorControl:
 
     def __init__(
         self,
-        commands: Commands,
+        orders: Orders,
         joints: Sequence[str],
         ranges: Array,
         driven: Mask | None = None,
@@ -46,14 +45,14 @@ class OperatorControl:
         """Permit set points of some joints.
 
         Args:
-            commands: Commands that the level accepts.
+            orders: Operator's commands to the level.
             joints: Names of all joints.
             ranges: Permitted positions, (joints, 2), rad.
             driven: Joints that the operator may move, (joints,). None permits all.
             obey: Carries out a setting or a command to the drives. Returns why it is refused, or an
                 empty text.
         """
-        self.orders = Orders(commands)
+        self.orders = orders
         self.is_in_control = False
         self._driven = np.full(len(joints), True) if driven is None else driven
         self._joints = [name for name, drives in zip(joints, self._driven, strict=True) if drives]
@@ -108,7 +107,9 @@ class OperatorControl:
                 self._goal[self._driven] = positions
 
     def compute_motion(self, reference: Reference, tick: int) -> Motion:
-        """Return the motion wanted at `tick` while the level follows the operator."""
+        """Return the motion wanted at `tick`, from the operator or, else, from the set points."""
+        if not self.is_in_control:
+            return reference.compute_motion(tick)
         returns = self._return_path and not self.orders.is_in_force
         goal = self._return_path[-1] if returns else None
         if self.orders.standing is Operation.SETPOINT:

@@ -13,7 +13,7 @@ from pydantic import Field as Parameter
 from rack.backplane.message import Message, State, Status, field
 from rack.backplane.process import busy_wait_until
 from rack.levels.level import Executor, Input, LevelContext, Output, Planner
-from rack.levels.tables import Table, read_params
+from rack.levels.tables import Table
 
 
 class FigurePlan(Message, version=1):
@@ -53,13 +53,14 @@ class FigureLoop(Executor):
 
     status = Output(FigureStatus)
     params = FigureParams
+    settings: FigureParams
     plan_in_use = -1
     """Release for which the plan in use was computed; -1 before the first plan."""
 
     def __init__(self, context: LevelContext) -> None:
         """Read the parameters. Raises `LevelError` if one of them is invalid."""
         super().__init__(context)
-        times_ms = read_params(FigureParams, context.params).process_ms
+        times_ms = self.settings.process_ms
         if not isinstance(times_ms, tuple):
             times_ms = (times_ms,)
         self._times_ns = [round(ms * NS_PER_MS) for ms in times_ms]
@@ -92,11 +93,12 @@ class FigurePlanner(Planner):
     status = Input(FigureStatus, "own.status")
     output = Output(FigurePlan)
     params = FigureParams
+    settings: FigureParams
 
     def __init__(self, context: LevelContext) -> None:
         """Read the parameters. Raises `LevelError` if one of them is invalid."""
         super().__init__(context)
-        self._time_ns = round(read_params(FigureParams, context.params).plan_ms * NS_PER_MS)
+        self._time_ns = round(self.settings.plan_ms * NS_PER_MS)
 
     def wanted(self, tick: int) -> bool:
         """Return True, so that the next plan begins as soon as the last one is finished."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from rack.backplane.message import State
-from rack.levels.level import Executor, Input, LevelContext, Output, Program, Reading
+from rack.levels.level import OPERATOR, Executor, Input, LevelContext, Output, Program, Reading
 from rack.levels.messages import Error, MoveStatus, TaskCommand, TaskPlan, TaskStatus
 from rack.levels.operator import (
     BELOW_LOST,
@@ -14,10 +14,8 @@ from rack.levels.operator import (
     Goal,
     Operation,
     OperatorCommand,
-    Orders,
     find_answered_serial,
 )
-from rack.levels.tables import read_params
 from rack.levels.task.program import ROUNDING_S, AnyAction, TaskConfig, TaskParams, read_program
 from rack.levels.task.window import Detour, ShownWindow
 
@@ -34,7 +32,7 @@ class TaskExecutor(Executor):
     plan = Input(TaskPlan, "own.plan")
     last_command = Input(TaskCommand, "own.command")
     last_status = Input(TaskStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(TaskCommand)
     status = Output(TaskStatus, rests_on=below)
     commands = {
@@ -42,14 +40,13 @@ class TaskExecutor(Executor):
         Operation.GOTO: (Goal.JOINTS, Goal.POSE, Goal.DIRECTION, Goal.HOME),
     }
     params: ClassVar[type[TaskParams]] = TaskParams
+    settings: TaskParams
     program: ClassVar[type[Program] | None] = TaskConfig
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._actions = self._read_first_actions()
         self._ahead_s = 0.0  # s: time on the clock of the actions' `by`, minus simulated time
-        self._stalled_s = read_params(self.params, context.params).stalled_s
-        self._orders = Orders(self.commands)
         self._window = ShownWindow()
         self._detour = Detour(context.robot, self._orders, self._window)
         self._started = False
@@ -63,12 +60,7 @@ class TaskExecutor(Executor):
         """Track progress, obey the operator, and hand down the next moves of the plan."""
         if not self._started:
             self._restore_state()
-        self._orders.take_commands(
-            self.operator,
-            lambda command: self._check_command(
-                command, find_answered_serial(self.last_status.message)
-            ),
-        )
+        self._orders.take_commands(self.operator, self._check_command)
         plan = self._find_plan(tick)
         below = self.below.message
         if not self._error:
@@ -110,13 +102,13 @@ class TaskExecutor(Executor):
             self._window = ShownWindow(last.first, self.last_command.message.id, before)
             self._detour = Detour(self.context.robot, self._orders, self._window, last.detour)
 
-    def _check_command(self, command: OperatorCommand, answered: int) -> None:
+    def _check_command(self, command: OperatorCommand) -> None:
         """Accept or refuse a goto. Other commands need no check.
 
-        A goto with a serial up to `answered` was answered before this board was restarted, so it is
-        not new.
+        A goto that was answered before this board was restarted is not new.
         """
         if self._orders.standing is Operation.GOTO:
+            answered = find_answered_serial(self.last_status.message)
             self._detour.accept_command(command, command.id > answered)
 
     def _track_progress(self, plan: TaskPlan, below: MoveStatus) -> None:
@@ -170,10 +162,10 @@ class TaskExecutor(Executor):
         if operated or progress != self._progress:
             self._progress = progress
             self._moved_at = tick
-        elif (tick - self._moved_at) * self.context.tick_s > self._stalled_s:
+        elif (tick - self._moved_at) * self.context.tick_s > self.settings.stalled_s:
             self._error = Error.STALLED
             self._reason = (
-                f"nothing has moved for {self._stalled_s:g} s: "
+                f"nothing has moved for {self.settings.stalled_s:g} s: "
                 f"{waits or _format_awaited(plan, below)}"
             )
 

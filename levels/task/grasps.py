@@ -69,9 +69,12 @@ def find_grasps(cell: Cell, situation: Situation, row: int) -> Iterator[list[Pos
     """
     seen = situation.object_pose(row)
     yaws = [compute_yaw(seen.quaternion) + quarter * np.pi / 2.0 for quarter in QUARTER_TURNS]
+    data = cell.build_start_data()
+    _place_bodies(cell, data, situation)
+    top = compute_extent(cell.model, data, cell.list_geoms(row), UP)
     height = 0.0
     heights = []
-    while height == 0.0 or seen.position[2] + height < _find_top(cell, situation, row):
+    while height == 0.0 or seen.position[2] + height < top:
         heights.append(height)
         yield [
             Pose(seen.raise_by(height).position, build_pointing_quaternion(DOWN, -yaw))
@@ -201,10 +204,3 @@ def _place_bodies(cell: Cell, data: mujoco.MjData, situation: Situation) -> None
     """Set the poses of the bodies in `data` to their poses in `situation`."""
     place_bodies(cell, data, situation.positions, situation.quaternions)
     mujoco.mj_kinematics(cell.model, data)
-
-
-def _find_top(cell: Cell, situation: Situation, row: int) -> float:
-    """Return the height of the top of object `row` in m, computed from bounding boxes."""
-    data = cell.build_start_data()
-    _place_bodies(cell, data, situation)
-    return compute_extent(cell.model, data, cell.list_geoms(row), UP)

@@ -13,7 +13,6 @@ from rack.levels.level import Input, LevelContext, Output, Planner, Program
 from rack.levels.messages import MOVES, Error, ServoStatus, TaskPlan, TaskStatus, WorldState
 from rack.levels.planning.moves import Situation
 from rack.levels.robot.cell import build_level_cell
-from rack.levels.tables import read_params
 from rack.levels.task.program import ROUNDING_S, TaskConfig, TaskParams, read_program
 from rack.levels.task.rehearsal import Rehearsal, Rehearsed, compute_finish_times
 
@@ -35,6 +34,7 @@ class TaskPlanner(Planner):
     world = Input(WorldState, "world.model")
     output = Output(TaskPlan)
     params: ClassVar[type[TaskParams]] = TaskParams
+    settings: TaskParams
     program: ClassVar[type[Program] | None] = TaskConfig
 
     @classmethod
@@ -52,7 +52,6 @@ class TaskPlanner(Planner):
         self._program = self._read_first_program()
         self._id = FIRST_PLAN_ID
         self._ahead_s = 0.0  # s: time on the clock of the actions' `by`, minus simulated time
-        self._needs = read_params(self.params, context.params)
         cell = build_level_cell(context)
         self._motion = MotionPlanner(cell, context.scene, context.seed)
         self._plan: TaskPlan | None = None  # plan made by this process
@@ -171,7 +170,7 @@ class TaskPlanner(Planner):
         Raises:
             Refused: An action cannot meet its deadline. The text has the earliest possible time.
         """
-        finish_s = compute_finish_times(moves, visible_s, self.context, self._needs)
+        finish_s = compute_finish_times(moves, visible_s, self.context, self.settings)
         for (move, _), finished_s in zip(moves, finish_s, strict=True):
             action = self._program.action[move.action]
             earliest_s = finished_s + self._ahead_s

@@ -20,7 +20,7 @@ from rack.levels.level import (
     Executor,
     InputPort,
     LevelContext,
-    Output,
+    OutputPort,
     Pace,
     Planner,
 )
@@ -273,11 +273,11 @@ def made_ports(board: BoardSpec, level: Executor | Planner) -> ConfiguredPorts:
     )
 
 
-def outputs_of(board: BoardSpec) -> dict[str, Output[Any]]:
+def outputs_of(board: BoardSpec) -> dict[str, OutputPort[Any, Any]]:
     return {**board.executor.outputs, **board.executor.build_ports(board.params, {}).outputs}
 
 
-def sources(port: InputPort[Any], board: BoardSpec) -> list[str]:
+def sources(port: InputPort[Any, Any], board: BoardSpec) -> list[str]:
     place, _, rest = port.source.partition(".")
     neighbours = {"own": board.name, "above": board.above, "below": board.below}
     return [f"{name}.{rest}" for name in listed(neighbours.get(place, place))]

@@ -154,7 +154,7 @@ def test_drives_that_finish_late_answer_the_command_that_started_them() -> None:
     ]
     orders.report_done()
     assert read_answer(orders) == (5, Answer.DONE, "")
-    orders.report_drives_done(6)
+    orders.report_completed(6)
     assert read_answer(orders) == (6, Answer.DONE, "")
 
 

@@ -9,50 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from rack.boards.config import CONFIGS, load, load_text, resolve_layout
-from rack.boards.config.schema import RackConfig
-from rack.levels.references import MOVED_REFERENCES, import_reference, resolve_moved
+from rack.levels.references import import_reference
 from tests.processes import BOUND_S, FORKS, children_of, descriptors
-
-SYSTEMS = ("fig2", "nist-state-table", "rccl", "hic", "penn", "chimera", "cell/puma", "cell")
-
-
-def use_old_names(config: RackConfig) -> tuple[RackConfig, list[str]]:
-    """Return a config as a run of an earlier version saved it, and the old names in it."""
-    text, used = config.to_toml_text(), []
-    for old, new in MOVED_REFERENCES.items():
-        if (
-            changed := text.replace(f'"{new}:', f'"{old}:')
-            if ":" not in old
-            else text.replace(new, old)
-        ) != text:
-            text, used = changed, [*used, old]
-    return load_text(text), used
-
-
-def test_each_old_reference_resolves_to_an_existing_object() -> None:
-    for old in MOVED_REFERENCES:
-        module, name = import_reference(old if ":" in old else f"{old}:")
-        assert not name or hasattr(module, name), old
-
-
-def test_references_that_only_start_like_a_moved_one_are_unchanged() -> None:
-    assert resolve_moved("rack.levels.handle:Grip") == "rack.levels.handle:Grip"
-    assert resolve_moved("rack.levels.servo:ServoExecutor") == "rack.levels.servo:ServoExecutor"
-    assert (
-        resolve_moved("rack.levels.hand.workstation:Workstation")
-        == "rack.levels.systems.hand.workstation:Workstation"
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_a_config_of_an_earlier_version_is_wired_like_a_present_one(name: str) -> None:
-    config = load(CONFIGS / f"{name}.toml" if "/" in name else name)
-    saved, used = use_old_names(config)
-    assert used
-    assert resolve_layout(saved) == resolve_layout(config)
-
 
 ENDING = {
     "leaves": ("import os; os._exit(5)", "ImportError: it ended the process: exit status 5"),

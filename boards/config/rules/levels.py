@@ -85,10 +85,7 @@ def check_neighbours(wiring: Wiring, contexts: Mapping[str, LevelContext]) -> Mi
         board = wiring.config.board[ports.place.board]
         involved = {ports.task, *board.above, *board.below}
         if issubclass(ports.kind, Executor) and involved <= contexts.keys():
-            above, below = (
-                [contexts[other] for other in others] for others in (board.above, board.below)
-            )
-            for key, value, why in ports.kind.find_mismatches(contexts[ports.task], above, below):
+            for key, value, why in ports.kind.find_mismatches(contexts[ports.task]):
                 yield Mistake(f"board.{ports.task}.{key}", value, why)
 
 

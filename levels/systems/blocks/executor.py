@@ -8,8 +8,6 @@ and refuses a connection with the reason.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from rack.backplane.message import AnyMessage, State, field
@@ -83,9 +81,7 @@ class BlockExecutor(Executor):
         self._settled_tick = 0
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
         """Yield a connection that is not permitted. See `Executor.find_mismatches`."""
         try:
             build_network(context)
@@ -132,7 +128,7 @@ class BlockExecutor(Executor):
                 self.network.connect(target.strip(), source.strip())
             except LevelError as error:
                 self.settings = before
-                self._live_orders.refuse_newest(str(error))
+                self._orders.refuse_newest(str(error))
 
 
 def restore_network(network: BlockNetwork, status: BlockStatus | AnyMessage) -> None:

@@ -281,21 +281,14 @@ class TakenOrder:
         stops: Whether the order is being carried out and must be interrupted.
     """
 
-    def __init__(self, report: CellReport | None = None) -> None:
-        """Create it without an order or, after a restart of the board, from the last report."""
-        self.program = 0
-        self.order = 0
-        self.response = Response.NONE
-        self.error = Error.NONE
-        self.reason = ""
+    def __init__(self, report: CellReport) -> None:
+        """Continue from the arm's last report, which is empty at first."""
+        self.program = report.program
+        self.order = report.echo
+        self.response = Response(report.response)
+        self.error = Error(report.error)
+        self.reason = report.reason if report.error else ""
         self.stops = False
-        if report is not None and report.echo:
-            self.program = report.program
-            self.order = report.echo
-            self.response = report.response
-            if report.error:
-                self.error = report.error
-                self.reason = report.reason
 
     @property
     def needs_answer(self) -> bool:

@@ -6,13 +6,14 @@ Its program, `[task]`, consists of steps, in which one or more arms act at the s
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 from pydantic import Field, StringConstraints, ValidationError
 
 from rack.backplane.message import Message, State, fill_counts
 from rack.levels.level import (
+    OPERATOR,
     ConfiguredPorts,
     Executor,
     Input,
@@ -23,7 +24,7 @@ from rack.levels.level import (
     Reading,
 )
 from rack.levels.messages import Error, TaskStatus
-from rack.levels.operator import HOLD_COMMANDS, MAX_JOINTS, OperatorCommand, Orders
+from rack.levels.operator import HOLD_COMMANDS, MAX_JOINTS
 from rack.levels.systems.coordination.actions import write_action
 from rack.levels.systems.coordination.agreement import Agreement
 from rack.levels.systems.coordination.messages import (
@@ -155,25 +156,26 @@ class Coordinator(Executor):
     """
 
     last_progress = Input(CellProgress, "own.progress")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     # The progress is written first: a board that is killed before it has written its orders will
     # write them after its restart.
     progress = Output(CellProgress)
     status = Output(TaskStatus)
     commands = HOLD_COMMANDS
     params = CoordinatorParams
+    settings: CoordinatorParams
     program = CellProgram
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._table = read_params(CoordinatorParams, context.params)
         program = CellProgram.model_validate(context.task)
         self._steps = [step.actions for step in program.step]
         margin_s = 2.0 * context.period_s
-        self._agreement = Agreement(program.checksum, self._steps, margin_s, self._table.farewell_s)
+        self._agreement = Agreement(
+            program.checksum, self._steps, margin_s, self.settings.farewell_s
+        )
         # Reports of the arms in this cycle.
         self._readings: Mapping[str, Reading[CellReport]] = {}
-        self._operated = Orders(self.commands)
         self._started = False
         # Number of moves of the steps that are done.
         self._moves = 0
@@ -194,16 +196,8 @@ class Coordinator(Executor):
         return ConfiguredPorts(reports, {f"order_{arm}": Output(CellOrder) for arm in arms})
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
-        """Yield a mistake for each action whose arm is not among the parameters.
-
-        Args:
-            context: Context of this level.
-            above: Contexts of the levels above. Not used.
-            below: Contexts of the levels below. Not used.
-        """
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
+        """Yield a mistake for each action whose arm is not among the parameters."""
         known_arms = read_params(CoordinatorParams, context.params).arms
         for k, step in enumerate(CellProgram.model_validate(context.task).step):
             for n, action in enumerate(step.do):
@@ -219,8 +213,8 @@ class Coordinator(Executor):
             if self.last_progress.has_message:
                 self._agreement.restore_progress(self.last_progress.message)
                 self._moves = self.last_progress.message.moves
-        self._operated.take_commands(self.operator)
-        self._readings = {arm: self.ports[f"report_{arm}"] for arm in self._table.arms}
+        self._orders.take_commands(self.operator)
+        self._readings = {arm: self.ports[f"report_{arm}"] for arm in self.settings.arms}
         hold_reason = self._find_reason_to_hold()
         if self._steps:
             agreement = self._agreement
@@ -232,7 +226,7 @@ class Coordinator(Executor):
         wait_reason = hold_reason or self._find_reason_to_wait()
         if self._steps:
             self._check_progress(wait_reason, tick)
-        for arm in self._table.arms:
+        for arm in self.settings.arms:
             self._write_order(arm, hold_reason, self.ports[f"order_{arm}"])
         self._agreement.save_progress(self.progress)
         fill_counts(self.progress.record[["moves"]], (self._moves,))
@@ -250,8 +244,8 @@ class Coordinator(Executor):
 
     def _find_reason_to_hold(self) -> str:
         """Return why the arms must stop on their paths, or an empty string."""
-        if self._operated.is_holding:
-            return self._operated.format_reason(self.context.board)
+        if self._orders.is_holding:
+            return self._orders.format_reason(self.context.board)
         if self._agreement.phase in (Phase.ENDING, Phase.OVER):
             return ""
         for arm, reading in self._readings.items():
@@ -281,7 +275,7 @@ class Coordinator(Executor):
         """
         agreement = self._agreement
         reports = [reading.message for reading in self._readings.values()]
-        operated = self._operated.is_in_force or any(report.operated for report in reports)
+        operated = self._orders.is_in_force or any(report.operated for report in reports)
         stage = (
             agreement.phase,
             agreement.order_id,
@@ -293,9 +287,9 @@ class Coordinator(Executor):
         if operated or stage != self._stage:
             self._stage = stage
             self._moved_at = tick
-        elif (tick - self._moved_at) * self.context.tick_s > self._table.stalled_s:
+        elif (tick - self._moved_at) * self.context.tick_s > self.settings.stalled_s:
             awaited = wait_reason or f"step {agreement.step}: {', '.join(agreement.partners)}"
-            reason = f"nothing has happened for {self._table.stalled_s:g} s: {awaited}"
+            reason = f"nothing has happened for {self.settings.stalled_s:g} s: {awaited}"
             agreement.end_program(Error.STALLED, reason)
 
     def _write_order(self, arm: str, hold_reason: str, order: CellOrder) -> None:
@@ -332,6 +326,6 @@ class Coordinator(Executor):
         fill_counts(
             status.record[["moves_done", "moves"]], (self._moves + done, self._moves + moves)
         )
-        if self._operated.is_holding:
-            self._operated.report_done()
-        self._operated.fill_status(status)
+        if self._orders.is_holding:
+            self._orders.report_done()
+        self._orders.fill_status(status)

@@ -26,7 +26,7 @@ from rack.levels.systems.coordination.messages import (
     MailboxName,
     Response,
 )
-from rack.levels.tables import Positive, read_params
+from rack.levels.tables import Positive
 from rack.levels.task.executor import TaskExecutor
 from rack.levels.task.planner import TaskPlanner
 from rack.levels.task.program import AnyAction, TaskConfig, TaskParams
@@ -64,14 +64,14 @@ class OrderedTaskExecutor(TaskExecutor):
     request = Output(CellRequest)
     report = Output(CellReport)
     params = OrderedTaskParams
+    settings: OrderedTaskParams
     program = None
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        self._table = read_params(OrderedTaskParams, context.params)
-        rack = self._table.coordinator
+        rack = self.settings.coordinator
         self._source = f"rack '{rack}'" if rack else "the coordinator"
-        self._taken = TakenOrder()
+        self._taken = TakenOrder(CellReport.zeros({}))
         # Id of the request whose plan is followed. 0 if none is.
         self._begun = 0
         self._orders_begun = 0
@@ -190,7 +190,7 @@ class OrderedTaskExecutor(TaskExecutor):
             return
         order: CellOrder = self.ports["order"].message
         # The coordinator's simulated time minus the one of this rack.
-        ahead_s = float(self.ports["peer"].message.ahead) if self._table.coordinator else 0.0
+        ahead_s = float(self.ports["peer"].message.ahead) if self.settings.coordinator else 0.0
         now_s = tick * self.context.tick_s
         try:
             action = read_action(order, self.context)
@@ -206,7 +206,7 @@ class OrderedTaskExecutor(TaskExecutor):
         request.ahead = ahead_s
         copy_action(order, request)
         planned_s = (self.context.within_cycles + 1) * self.context.period_s
-        self._request_plan(request, now_s + planned_s + self._table.decision)
+        self._request_plan(request, now_s + planned_s + self.settings.decision)
 
     def _request_plan(self, request: CellRequest, begin_s: float) -> None:
         """Request a plan for the action in `request` that can begin at simulated time `begin_s`."""
@@ -221,7 +221,7 @@ class OrderedTaskExecutor(TaskExecutor):
             return "the arm does not rest yet"
         if not self.world.message.revision:
             return "the world model knows nothing yet"
-        if self.ports["order"].message.by and self._table.coordinator:
+        if self.ports["order"].message.by and self.settings.coordinator:
             peer = self.ports["peer"]
             if not (peer.has_message and peer.message.uncertainty >= 0.0):
                 return f"the clock of {self._source} has not been compared yet"
@@ -406,6 +406,6 @@ class OrderedTaskPlanner(TaskPlanner):
         super()._check_deadlines(moves, visible_s)
         unhurried = [Rehearsed(move._replace(by_s=0.0), duration_s) for move, duration_s in moves]
         self.output.earliest = (
-            compute_finish_times(unhurried, visible_s, self.context, self._needs)[-1]
+            compute_finish_times(unhurried, visible_s, self.context, self.settings)[-1]
             + self._ahead_s
         )

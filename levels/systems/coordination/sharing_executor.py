@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from pydantic import Field, field_validator
 
 from rack.levels.arm import find_arm
 from rack.levels.level import Input, Inputs, LevelContext, Mismatches, Output
 from rack.levels.servo.control import ServoParams
-from rack.levels.servo.executor import ServoExecutor
+from rack.levels.servo.law import ServoExecutor
 from rack.levels.systems.coordination.shared_bodies import (
     MAX_SHARED,
     NAME_BYTES,
@@ -66,16 +64,8 @@ class SharingServoExecutor(ServoExecutor):
         }
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
-        """Yield the mistakes in the list of shared objects and in the rest of the servo level.
-
-        Args:
-            context: Context of this level.
-            above: Contexts of the levels above.
-            below: Contexts of the levels below.
-        """
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
+        """Yield the mistakes in the list of shared objects and in the rest of the servo level."""
         names = context.params["shared"]
         scene = context.scene
         for name in dict.fromkeys(names):
@@ -91,11 +81,11 @@ class SharingServoExecutor(ServoExecutor):
                 why = f"does not fit into a message: at most {NAME_BYTES} ASCII characters"
             if why:
                 yield "params.shared", name, why
-        yield from super().find_mismatches(context, above, below)
+        yield from super().find_mismatches(context)
 
     def process(self, tick: int) -> None:
         """Run a cycle of a servo level, and write the shared objects if they are due."""
-        if not self.takeover.is_started and self.last.has_message:
+        if not self.enabling.is_started and self.last.has_message:
             for body in self._shared.values():
                 body.restore_state(self.last.message)
         super().process(tick)

@@ -17,7 +17,6 @@ from rack.levels.level import Finding, Input, LevelContext, Output
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Dynamics, Terms
-from rack.levels.robot.wrist import Wrist
 from rack.levels.servo.control import ArmParams, Reacting
 from rack.levels.servo.stopping import Cause, Reaction
 from rack.levels.systems.force.contact import HALVES, WristLevel
@@ -31,67 +30,43 @@ BY_AXIS = [0, 3, 1, 4, 2, 5]
 """Order in which the torques of the components of a wrench are added up."""
 
 
-class ContactWrench:
-    """Computes the wrench of a contact from samples of the wrist sensor and the arm's motion.
+def compute_contact(
+    cell: Cell, dynamics: Dynamics, raw: Array, state: Array, acceleration: Array
+) -> tuple[Array, Array]:
+    """Compute the wrench of a contact from a sample of the wrist sensor and the arm's motion.
 
-    Attributes:
+    Args:
+        cell: Model of the arm.
+        dynamics: Equation of motion of the arm, which may already be evaluated at the same state.
         raw: Sample in the frame of the sensor, (6,), N, N m.
-        wrench: Wrench of the contact on the tool, at the tool, in the world frame, (6,), N, N m.
-        torque: Torques of the contact on the joints, (joints,), N m.
-        saturated: True if a value of the sample is NaN or at the end of the range, so that the
-            contact may be stronger.
+        state: Sensed positions and velocities, (2, joints), rad, rad/s.
+        acceleration: Accelerations, (joints,), rad/s2.
+
+    Returns:
+        Wrench on the tool, at the tool, in the world frame, (6,), N, N m, and its torques on the
+        joints, (joints,), N m.
     """
-
-    def __init__(self, cell: Cell, wrist: Wrist, dynamics: Dynamics) -> None:
-        """Use the arm's dynamics, which may already be evaluated at the same state.
-
-        Args:
-            cell: Model of the arm.
-            wrist: The wrist sensor.
-            dynamics: Equation of motion of the arm.
-        """
-        self._cell = cell
-        self._site = wrist.site
-        self._dynamics = dynamics
-        self._range = np.repeat(wrist.range, 3)
-        self._jacobian = np.zeros((AXES, cell.model.nv))
-        self.raw = np.zeros(AXES)
-        self.wrench = np.zeros(AXES)
-        self.torque = np.zeros(len(cell.dof))
-        self.saturated = True
-
-    def take_sample(self, raw: Array, state: Array, acceleration: Array) -> None:
-        """Compute the wrench of the contact from a sample of the sensor.
-
-        Args:
-            raw: Sample, (6,), N, N m.
-            state: Sensed positions and velocities, (2, joints), rad, rad/s.
-            acceleration: Accelerations, (joints,), rad/s2.
-        """
-        self.raw[:] = raw
-        # The comparison is written so that NaN counts as saturated.
-        self.saturated = not bool((np.abs(raw) < self._range).all())
-        if not np.isfinite(raw).all():
-            return
-        self._dynamics.terms(*state)
-        model, data = self._dynamics.evaluated
-        data.qacc[self._cell.dof] = acceleration
-        mujoco.mj_rnePostConstraint(model, data)
-        body = model.site_bodyid[self._site]
-        place = data.site_xpos[self._site]
-        # MuJoCo stores torque before force, about the centre of mass of the body's tree.
-        inner = data.cfrc_int[body]
-        expected = np.concatenate((inner[3:], inner[:3]))
-        moment = np.zeros(3)
-        mujoco.mju_cross(moment, place - data.subtree_com[model.body_rootid[body]], expected[:3])
-        expected[3:] -= moment
-        self.wrench[:] = expected - rotate_halves(data.site_xmat[self._site].reshape(3, 3), raw)
-        mujoco.mju_cross(moment, place - data.site_xpos[self._cell.tool], self.wrench[:3])
-        self.wrench[3:] += moment
-        jacobian = self._jacobian
-        mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], self._cell.tool)
-        torques = jacobian[:, self._cell.dof] * self.wrench[:, None]
-        self.torque[:] = torques[BY_AXIS].sum(axis=0)
+    assert cell.wrist is not None, "`find_mismatches` refuses an arm without a sensor"
+    site = cell.wrist.site
+    dynamics.terms(*state)
+    model, data = dynamics.evaluated
+    data.qacc[cell.dof] = acceleration
+    mujoco.mj_rnePostConstraint(model, data)
+    body = model.site_bodyid[site]
+    place = data.site_xpos[site]
+    # MuJoCo stores torque before force, about the centre of mass of the body's tree.
+    inner = data.cfrc_int[body]
+    expected = np.concatenate((inner[3:], inner[:3]))
+    moment = np.zeros(3)
+    mujoco.mju_cross(moment, place - data.subtree_com[model.body_rootid[body]], expected[:3])
+    expected[3:] -= moment
+    wrench = expected - rotate_halves(data.site_xmat[site].reshape(3, 3), raw)
+    mujoco.mju_cross(moment, place - data.site_xpos[cell.tool], wrench[:3])
+    wrench[3:] += moment
+    jacobian = np.zeros((AXES, model.nv))
+    mujoco.mj_jacSite(model, data, jacobian[:3], jacobian[3:], cell.tool)
+    torques = jacobian[:, cell.dof] * wrench[:, None]
+    return wrench, torques[BY_AXIS].sum(axis=0)
 
 
 class ForceArmParams(ArmParams):
@@ -128,7 +103,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         assert self.cell.wrist is not None, "`find_mismatches` refuses an arm without a sensor"
         self._contact_limits = self.cell.wrist.contact_limits
         self._on_limit = Reaction[self.settings.on_force_limit.upper()]
-        self.contact = ContactWrench(self.cell, self.cell.wrist, self.arm.dynamics)
+        self._range = np.repeat(self.cell.wrist.range, 3)
+        self._contact_torque: Array = np.zeros(len(self.cell.dof))
         self._exact = self.cell.encoders.is_exact
         # (joints,), rad/s: velocities of the last sample.
         self._before = np.zeros(len(self.cell.dof))
@@ -151,13 +127,8 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         if self._since is None and self.felt.has_message:
             self._exceeded = self.felt.message.exceeded
         super().process(tick)
-        wrench = self.wrench
-        contact = self.contact
-        wrench.tick = tick
-        wrench.saturated = contact.saturated
-        wrench.exceeded = self._exceeded
-        wrench.wrench = contact.wrench
-        wrench.sample = contact.raw
+        self.wrench.tick = tick
+        self.wrench.exceeded = self._exceeded
 
     def sense_contact(self, tick: int) -> None:
         """Sense the contact, and stop the arm if it is too strong."""
@@ -168,7 +139,14 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
         is_velocity_known = not self.sensors.faulty and (self._exact or not self.abandoned)
         if is_velocity_known and self._since is not None:
             acceleration = (velocity - self._before) / (self.context.tick_s * (tick - self._since))
-        self.contact.take_sample(raw, self.sensors.state, acceleration)
+        wrench = self.wrench
+        wrench.sample = raw
+        # The comparison is written so that NaN counts as saturated.
+        wrench.saturated = not (np.abs(raw) < self._range).all()
+        if np.isfinite(raw).all():
+            wrench.wrench, self._contact_torque = compute_contact(
+                self.cell, self.arm.dynamics, raw, self.sensors.state, acceleration
+            )
         self._before[:] = velocity
         self._since = tick
         self._check_limits(tick)
@@ -181,9 +159,9 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
 
     def _check_limits(self, tick: int) -> None:
         """Stop the arm if the contact exceeds a limit, or if the sensor is saturated."""
-        contact = self.contact
+        contact = self.wrench
         if contact.saturated:
-            finding = Finding(Alarm.FORCE_LIMIT, -1, norm(contact.raw[:3]))
+            finding = Finding(Alarm.FORCE_LIMIT, -1, norm(contact.sample[:3]))
             text = "contact too strong: the wrist sensor is at the end of its range"
             self._stop_arm(finding, text, tick)
             return
@@ -216,5 +194,5 @@ class ForceArmExecutor(WristLevel, ArmExecutor):
     def find_terms(self) -> Terms:
         """Return the equation of motion at the sensed state, with payload and contact."""
         terms = super().find_terms()
-        terms.bias[:] -= self.contact.torque
+        terms.bias[:] -= self._contact_torque
         return terms

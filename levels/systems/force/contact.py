@@ -12,7 +12,7 @@ import numpy as np
 
 from rack.levels.algebra import Array, Mask, norm
 from rack.levels.level import Executor, LevelContext, Mismatches
-from rack.levels.systems.force.messages import AXES, Compliance
+from rack.levels.systems.force.messages import Compliance
 
 Axis = Literal["x", "y", "z", "rx", "ry", "rz"]
 AXIS_NAMES: tuple[Axis, ...] = get_args(Axis)
@@ -45,25 +45,12 @@ class WantedContact(NamedTuple):
         return wanted._replace(selected=wanted.selected.astype(bool))
 
 
-class Contact:
-    """The contact that a server commands: the content of its `Compliance` message.
+class Contact(Compliance):
+    """The contact that a server commands, as the `Compliance` message that it sends.
 
     On an axis of force the wrench is controlled, on an axis of motion the arm follows the motion.
-
-    Attributes:
-        id: Number that increases with every change.
-        frame: Orientation of the task frame, as w, x, y, z.
-        selected: True for axes of force, (6,).
-        wrench: Wanted wrench of the tool, (6,), N, N m.
-        speed: Largest velocity on axes of force, (6,), m/s, rad/s.
-        guard: Wrench that ends a motion, (6,), N, N m. 0 for axes without a guard.
+    `id` increases with every change.
     """
-
-    def __init__(self) -> None:
-        self.id = 0
-        self.frame = np.array([1.0, 0.0, 0.0, 0.0])
-        self.selected = np.zeros(AXES, dtype=bool)
-        self.wrench, self.speed, self.guard = np.zeros((3, AXES))
 
     @property
     def is_compliant(self) -> bool:
@@ -127,19 +114,6 @@ class Contact:
         """Return True if `frame` equals the present task frame. q and -q count as equal."""
         return bool(1.0 - abs(float((frame * self.frame).sum())) / norm(frame) < SAME)
 
-    def fill_message(self, compliance: Compliance) -> None:
-        """Write the contact to a `Compliance`."""
-        compliance.id = self.id
-        compliance.active = self.is_compliant or bool(self.guard.any())
-        for name in WantedContact._fields:
-            setattr(compliance, name, getattr(self, name))
-
-    def restore_contact(self, compliance: Compliance) -> None:
-        """Restore the contact from the last message after a restart."""
-        self.id = compliance.id
-        for name in WantedContact._fields:
-            getattr(self, name)[:] = getattr(compliance, name)
-
 
 def check_frame_and_wrenches(
     frame: Array, vectors: Sequence[Array], most: tuple[float, float]
@@ -168,11 +142,9 @@ class WristLevel(Executor):
     """Base of executors for arms with a wrist sensor."""
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
         """Yield the mismatches of the base class, and one if the arm has no wrist sensor."""
-        yield from super().find_mismatches(context, above, below)
+        yield from super().find_mismatches(context)
         if context.robot.wrist is None:
             yield (
                 "executor",

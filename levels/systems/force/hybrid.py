@@ -34,141 +34,6 @@ NO_FORCE = np.zeros((2, AXES))
 """Wanted wrench and selected axes without axes of force."""
 
 
-class ComplianceWatch:
-    """Checks the commanded contact against the newest wrench in every cycle.
-
-    A guard is struck when the wrench on its axis exceeds the limit. This ends the motion, but only
-    once for each command.
-
-    Attributes:
-        task: Axes of force, or None if there are none.
-        struck: Id of the newest command whose guard was struck.
-        axis: Axis of that guard, or -1.
-        sensed: Tick of the newest wrench, or -1.
-        felt: Wrench of the contact on the tool, in the task frame, (6,), N, N m.
-        must_rest: True if the motion must end.
-        reason: Why the motion must end, or why the applied force is not the wanted one. Empty if
-            neither is the case.
-    """
-
-    def __init__(self, most: tuple[float, float], every: int) -> None:
-        """Watch the contact of an arm.
-
-        Args:
-            most: Limits on a contact, N and N m.
-            every: Ticks from cycle to cycle.
-        """
-        self._wrench_limits = most
-        self._oldest = MAX_WRENCH_AGE_CYCLES * every
-        self.task: ForceTask | None = None
-        self.struck = 0
-        self.axis = -1
-        self.sensed = -1
-        self.felt = np.zeros(AXES)
-        self.must_rest = False
-        self.reason = ""
-
-    def restore_guard(self, last: Reading[ForceStatus]) -> None:
-        """After a restart, restore which guard was struck last.
-
-        It must not end the motion a second time.
-
-        Args:
-            last: Last `ForceStatus` of this board.
-        """
-        if last.has_message:
-            self.struck = last.message.struck
-            self.axis = last.message.axis
-
-    def check_cycle(
-        self,
-        compliance: Reading[Compliance],
-        wrench: Reading[Wrench],
-        above_is_lost: bool,
-        tick: int,
-    ) -> None:
-        """Check command and wrench of one cycle, and set the attributes accordingly.
-
-        Args:
-            compliance: Command and its verdict.
-            wrench: Wrench and its verdict.
-            above_is_lost: True if the level above is lost.
-            tick: Tick of the cycle.
-        """
-        wanted = compliance.message
-        self.task = None
-        self.must_rest = False
-        self.reason = ""
-        self.sensed = wrench.message.tick if wrench.has_message else -1
-        reason = find_command_error(wanted) if wanted.active else ""
-        rotation = (
-            compute_rotation(wanted.frame) if wanted.frame.any() and not reason else np.eye(3)
-        )
-        self.felt = rotate_halves(rotation.T, wrench.message.wrench)
-        if reason:
-            self._require_rest(reason)
-        elif wanted.active:
-            # Rest if the contact is not known or a level above is lost.
-            blind = self._explain_missing_wrench(wrench, tick)
-            if blind or above_is_lost or compliance.is_lost:
-                self._require_rest(blind or ABOVE_LOST)
-            self._take_force_axes(wanted, rotation)
-            if not blind:
-                self._check_guards(wanted)
-
-    def _require_rest(self, reason: str) -> None:
-        """Require that the motion ends, and set `reason`."""
-        self.must_rest = True
-        self.reason = reason
-
-    def _explain_missing_wrench(self, wrench: Reading[Wrench], tick: int) -> str:
-        """Return why the present contact is unknown, or an empty string if it is known."""
-        if not wrench.has_message or wrench.is_lost:
-            return "no wrench from the board of the arm: waiting for it"
-        if tick - self.sensed > self._oldest:
-            return f"wrench is stale, {tick - self.sensed} ticks: waiting for the board of the arm"
-        return "the wrist sensor is at the end of its range" if wrench.message.saturated else ""
-
-    def _take_force_axes(self, compliance: Compliance, rotation: Array) -> None:
-        """Set `task` to the axes of force of a command.
-
-        If the motion must end, these axes come to rest too.
-
-        Args:
-            compliance: Command.
-            rotation: Task frame in the world, (3, 3).
-        """
-        selected = compliance.selected.astype(bool)
-        if selected.any():
-            wanted = self._limit_wrench(np.where(selected, compliance.wrench, 0.0))
-            exerted = None if self.must_rest else -self.felt
-            self.task = ForceTask(rotation, selected, wanted, exerted, compliance.speed)
-
-    def _limit_wrench(self, wanted: Array) -> Array:
-        """Return the wanted wrench, reduced to the arm's limits. If reduced, set `reason`."""
-        for (half, name, unit), limit in zip(HALVES, self._wrench_limits, strict=True):
-            size = norm(wanted[half])
-            if size > limit:
-                wanted[half] *= limit / size
-                text = (
-                    f"{name} of {size:.3g} {unit} is wanted, {limit:g} applied: the arm's limit on"
-                    " contacts"
-                )
-                self.reason = self.reason or text
-        return wanted
-
-    def _check_guards(self, compliance: Compliance) -> None:
-        """End the motion if the wrench exceeds a guard, once for each command."""
-        beyond: Mask = (compliance.guard > 0.0) & (np.abs(self.felt) > compliance.guard)
-        if beyond.any() and self.struck != compliance.id:
-            self.struck = compliance.id
-            self.axis = int(beyond.argmax())
-        if self.struck == compliance.id:
-            self._require_rest(
-                f"guard of axis {AXIS_NAMES[self.axis]} was struck: held until another command"
-            )
-
-
 def find_command_error(compliance: Compliance) -> str:
     """Return the reason why a command is invalid, or an empty string if it is valid."""
     numbers = np.concatenate(
@@ -220,7 +85,9 @@ class HybridExecutor(WristLevel):
         super().__init__(context)
         cell = build_level_cell(context)
         assert cell.wrist is not None, "`find_mismatches` refuses an arm without a sensor"
-        self._watch = ComplianceWatch(cell.wrist.contact_limits, context.every)
+        self._wrench_limits = cell.wrist.contact_limits
+        self._task: ForceTask | None = None  # axes of force, or None if there are none
+        self._must_rest = False  # the motion must end
         self._law = HybridLaw(cell, self.settings)
         self._reference = Reference(cell.bounds, cell.limits, context.tick_s)
         self._boards = JointBoards(context.robot.joints, cell.bounds.position)
@@ -232,8 +99,13 @@ class HybridExecutor(WristLevel):
 
     def process(self, tick: int) -> None:
         """Run one cycle: follow references and forces, and report."""
+        force = self.force
         if self._tick is None:
-            self._watch.restore_guard(self.last_force)
+            # A guard that was struck before a restart must not end the motion a second time.
+            force.axis = -1
+            if self.last_force.has_message:
+                force.struck = self.last_force.message.struck
+                force.axis = self.last_force.message.axis
             self._tick = tick - self.context.every
         passed_s = (tick - self._tick) * self.context.tick_s
         self._tick = tick
@@ -241,7 +113,7 @@ class HybridExecutor(WristLevel):
             self._begin_at_rest(self._boards.position, tick)
         if self.above.is_new:
             self._reference.take_command(self.above.message)
-        self._watch.check_cycle(self.compliance, self.wrench, self.above.is_lost, tick)
+        self._check_contact(tick)
         self.command.id = tick // self.context.every + 1
         for name in FORWARDED_FIELDS:
             setattr(self.command, name, getattr(self.above.message, name))
@@ -251,20 +123,87 @@ class HybridExecutor(WristLevel):
             self.command.due = 0
             self._moving[:] = 0.0
         self._write_status(self.status)
-        force = self.force
-        watch = self._watch
         force.echo = self.compliance.message.id
         force.operator = self.compliance.message.operator
-        force.sensed = watch.sensed
-        force.wrench = watch.felt
         force.offset = self._law.offset
-        force.struck = watch.struck
-        force.axis = watch.axis
-        task = watch.task
+        task = self._task
         force.wanted, force.selected = (task.wanted, task.selected) if task else NO_FORCE
         resting = State.EXECUTING if task else State.IDLE
-        force.state = State.HOLDING if watch.reason else resting
-        force.reason = watch.reason
+        force.state = State.HOLDING if force.reason else resting
+
+    def _check_contact(self, tick: int) -> None:
+        """Check the commanded contact against the newest wrench.
+
+        `force.reason` tells why the motion must end, or why the applied force is not as wanted.
+        """
+        compliance = self.compliance
+        wrench = self.wrench
+        force = self.force
+        wanted = compliance.message
+        self._task = None
+        self._must_rest = False
+        force.sensed = wrench.message.tick if wrench.has_message else -1
+        force.reason = reason = find_command_error(wanted) if wanted.active else ""
+        rotation = (
+            compute_rotation(wanted.frame) if wanted.frame.any() and not reason else np.eye(3)
+        )
+        force.wrench = rotate_halves(rotation.T, wrench.message.wrench)
+        if reason:
+            self._must_rest = True
+        elif wanted.active:
+            # Rest if the contact is not known or a level above is lost.
+            blind = self._explain_missing_wrench(wrench, tick)
+            if blind or self.above.is_lost or compliance.is_lost:
+                self._must_rest = True
+                force.reason = blind or ABOVE_LOST
+            self._take_force_axes(wanted, rotation)
+            if not blind:
+                self._check_guards(wanted)
+
+    def _explain_missing_wrench(self, wrench: Reading[Wrench], tick: int) -> str:
+        """Return why the present contact is unknown, or an empty string if it is known."""
+        if not wrench.has_message or wrench.is_lost:
+            return "no wrench from the board of the arm: waiting for it"
+        age = tick - self.force.sensed
+        if age > MAX_WRENCH_AGE_CYCLES * self.context.every:
+            return f"wrench is stale, {age} ticks: waiting for the board of the arm"
+        return "the wrist sensor is at the end of its range" if wrench.message.saturated else ""
+
+    def _take_force_axes(self, compliance: Compliance, rotation: Array) -> None:
+        """Set the axes of force of a command. If the motion must end, they come to rest too.
+
+        A wanted wrench beyond the arm's limits is reduced, for a reason in `force.reason`.
+
+        Args:
+            compliance: Command.
+            rotation: Task frame in the world, (3, 3).
+        """
+        selected = compliance.selected.astype(bool)
+        if not selected.any():
+            return
+        wanted = np.where(selected, compliance.wrench, 0.0)
+        for (half, name, unit), limit in zip(HALVES, self._wrench_limits, strict=True):
+            size = norm(wanted[half])
+            if size > limit:
+                wanted[half] *= limit / size
+                self.force.reason = self.force.reason or (
+                    f"{name} of {size:.3g} {unit} is wanted, {limit:g} applied: the arm's limit on"
+                    " contacts"
+                )
+        exerted = None if self._must_rest else -self.force.wrench
+        self._task = ForceTask(rotation, selected, wanted, exerted, compliance.speed)
+
+    def _check_guards(self, compliance: Compliance) -> None:
+        """End the motion if the wrench exceeds a guard, once for each command."""
+        force = self.force
+        beyond: Mask = (compliance.guard > 0.0) & (np.abs(force.wrench) > compliance.guard)
+        if beyond.any() and force.struck != compliance.id:
+            force.struck = compliance.id
+            force.axis = int(beyond.argmax())
+        if force.struck == compliance.id:
+            self._must_rest = True
+            axis = AXIS_NAMES[force.axis]
+            force.reason = f"guard of axis {axis} was struck: held until another command"
 
     def _begin_at_rest(self, position: Array, tick: int) -> None:
         """Start at rest at `position`, with no offset from the references."""
@@ -274,11 +213,10 @@ class HybridExecutor(WristLevel):
 
     def _write_reference(self, command: JointReference, tick: int, passed_s: float) -> None:
         """Write the reference that is due `LEAD_CYCLES` cycles later."""
-        watch = self._watch
         reference = self._reference
-        motion = reference.ramp_to_rest(tick) if watch.must_rest else reference.compute_motion(tick)
+        motion = reference.ramp_to_rest(tick) if self._must_rest else reference.compute_motion(tick)
         payload = Payload(command.payload_mass, command.payload_offset)
-        joints = self._law.step(motion, watch.task, passed_s, payload)
+        joints = self._law.step(motion, self._task, passed_s, payload)
         command.due = tick + LEAD_CYCLES * self.context.every
         for name, values in joints._asdict().items():
             setattr(command, name, values)
@@ -286,7 +224,7 @@ class HybridExecutor(WristLevel):
         self._moving[:] = motion.velocity
         if (
             reference.holding
-            and watch.task is None
+            and self._task is None
             and self._law.is_at_rest
             and not self._moving.any()
         ):
@@ -306,7 +244,7 @@ class HybridExecutor(WristLevel):
         status.stopped = not self._boards.in_step
         status.due = self.above.message.due
         worst = max(values, key=lambda value: value.error)
-        waiting = self._watch.reason if self._boards.in_step else self._boards.wait_reason
+        waiting = self.force.reason if self._boards.in_step else self._boards.wait_reason
         status.error = worst.error
         status.reason = worst.reason if worst.error else waiting
         if worst.error:

@@ -25,6 +25,7 @@ from pydantic import field_validator
 from rack.backplane.json_text import encode_json
 from rack.levels.errors import LevelError
 from rack.levels.host_program import Bus
+from rack.levels.level import LevelContext
 from rack.levels.systems.force.client import ForceClient
 from rack.levels.systems.force.frames import (
     TICK_AND_TIME,
@@ -78,28 +79,6 @@ def parse_address(text: str) -> tuple[str, int]:
     raise ValueError(f"'{text}' must be an IPv4 address and a port, as in 127.0.0.1:7260")
 
 
-class NetworkServer(ForceClient):
-    """Passes the requests of a client on the network to the bridge, and statuses to the client."""
-
-    params = NetworkParams
-
-    def run(self, bus: Bus) -> None:
-        """Serve clients until one ends its program. Raises `LevelError` if the script fails."""
-        settings = NetworkParams.model_validate(dict(self.context.params))
-        with socket.create_server(parse_address(settings.listen)) as listener:
-            listener.setblocking(False)
-            host, port = listener.getsockname()
-            address = f"{host}:{port}"
-            with _start_client(address, settings.script) as child:
-                if child is None:
-                    print(f"clients connect to {address}", flush=True)
-                service = _Service(self, bus, listener, child)
-                try:
-                    service.serve()
-                finally:
-                    service.drop_client(end=True)
-
-
 @contextmanager
 def _start_client(address: str, script: str) -> Iterator[subprocess.Popen[bytes] | None]:
     """Start a client with a script, and end it at the end. None if there is no script."""
@@ -120,27 +99,16 @@ def _start_client(address: str, script: str) -> Iterator[subprocess.Popen[bytes]
         child.wait()
 
 
-class _Service:
-    """The present client, and what it waits for.
+class NetworkServer(ForceClient):
+    """Passes the requests of a client on the network to the bridge, and statuses to the client."""
 
-    Args:
-        program: Program whose ports are used.
-        bus: Access of the program to the bus.
-        listener: Socket to which clients connect.
-        child: Client that the program has started, if any.
-    """
+    params = NetworkParams
+    _bus: Bus
+    _listener: socket.socket
 
-    def __init__(
-        self,
-        program: NetworkServer,
-        bus: Bus,
-        listener: socket.socket,
-        child: subprocess.Popen[bytes] | None,
-    ) -> None:
-        self._program = program
-        self._bus = bus
-        self._listener = listener
-        self._child = child
+    def __init__(self, context: LevelContext) -> None:
+        super().__init__(context)
+        self._child: subprocess.Popen[bytes] | None = None  # client that the program has started
         self._client: Connection | None = None
         self._had_client = False
         self._heard_s = 0.0  # time at which the client's newest frame arrived
@@ -148,7 +116,23 @@ class _Service:
         self._is_over = False  # the client has ended its program
         self._line = ""  # line that was printed last
 
-    def serve(self) -> None:
+    def run(self, bus: Bus) -> None:
+        """Serve clients until one ends its program. Raises `LevelError` if the script fails."""
+        settings = NetworkParams.model_validate(dict(self.context.params))
+        self._bus = bus
+        with socket.create_server(parse_address(settings.listen)) as self._listener:
+            self._listener.setblocking(False)
+            host, port = self._listener.getsockname()
+            address = f"{host}:{port}"
+            with _start_client(address, settings.script) as self._child:
+                if self._child is None:
+                    print(f"clients connect to {address}", flush=True)
+                try:
+                    self._serve_clients()
+                finally:
+                    self._drop_client(end=True)
+
+    def _serve_clients(self) -> None:
         """Pass frames until a client ends its program or the run is over."""
         bus = self._bus
         while not bus.is_over:
@@ -160,7 +144,7 @@ class _Service:
             if self._client is not None and (is_asked if bus.is_paced else has_arrived):
                 self._send_status(self._client)
 
-    def drop_client(self, reason: str = "", end: bool = False) -> None:
+    def _drop_client(self, reason: str = "", end: bool = False) -> None:
         """Close the connection to the client, if there is one.
 
         Args:
@@ -198,7 +182,7 @@ class _Service:
                 self._heard_s = time.monotonic()
                 if not self._client.receive():
                     self._take_frames()
-                    self.drop_client("the connection is closed")
+                    self._drop_client("the connection is closed")
             # A client that has left makes room for the next one.
             if self._listener in ready:
                 self._accept_client()
@@ -225,7 +209,7 @@ class _Service:
                     new.send(FrameKind.END, b"the server has another client")
                     new.close()
                     return
-                self.drop_client(f"silent for {silent_s:.1f} s, replaced by {new.peer}")
+                self._drop_client(f"silent for {silent_s:.1f} s, replaced by {new.peer}")
             self._client = new
             self._had_client = True
             self._heard_s = time.monotonic()
@@ -234,10 +218,10 @@ class _Service:
 
     def _build_hello(self) -> bytes:
         """Return what a client must know of the rack, as JSON."""
-        context = self._program.context
+        context = self.context
         known = {
             "is_paced": bool(self._bus.is_paced),
-            "sent": self._program.requests.sent,
+            "sent": self.requests.sent,
             "board": context.board,
             "clock_ns": context.clock_ns,
             "robot": context.robot.model_dump(mode="json", by_alias=True),
@@ -251,7 +235,7 @@ class _Service:
         """Send tick, time and the newest status. A client that is slow to read misses some."""
         if not client.flush():
             return
-        reading = self._program.motion.read()
+        reading = self.motion.read()
         head = TICK_AND_TIME.pack(self._bus.tick, self._bus.time_s)
         status = reading.message.record.tobytes() if reading.has_message else b""
         client.send(FrameKind.STATUS, head + status)
@@ -275,7 +259,7 @@ class _Service:
                     self._print(f"client {self._client.peer}: too many requests, they wait")
                     return None
         except FrameError as error:
-            self.drop_client(f"{error}; connection closed")
+            self._drop_client(f"{error}; connection closed")
         return None
 
     def _send_request(self, content: bytes) -> bool:
@@ -284,12 +268,12 @@ class _Service:
         Raises:
             FrameError: The length is wrong.
         """
-        message = self._program.requests.message
+        message = self.requests.message
         size = message.record.nbytes
         if len(content) != size:
             raise FrameError(f"a request of {len(content)} bytes; it must have {size}")
         message.raw[:size] = content
-        return self._program.requests.send()
+        return self.requests.send()
 
     def _take_end(self, reason: str) -> None:
         """End the program if the client's script has succeeded.
@@ -300,7 +284,7 @@ class _Service:
         if not reason:
             self._is_over = True
         elif self._child is None:
-            self.drop_client(f"its script failed: {reason[:MAX_REASON]}")
+            self._drop_client(f"its script failed: {reason[:MAX_REASON]}")
         else:
             raise LevelError(reason)
 

@@ -75,7 +75,8 @@ class ServerWork(RequestWork):
 
     def __init__(self, agenda: Agenda, motion: SampledMotion, tools: MotionTools) -> None:
         super().__init__(agenda, motion, tools)
-        self.contact = Contact()
+        self.contact = Contact.zeros({})
+        self.contact.frame[0] = 1.0
         # Status that answers the contact in force, or None before there is one.
         self.force: ForceStatus | None = None
         self.guarded = 0  # id of the newest request that a guard has ended
@@ -261,7 +262,9 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         if self._heard < 0 or self.requests.is_new:
             self._heard = tick
         super().process(tick)
-        self._work.contact.fill_message(self.compliance)
+        contact = self._work.contact
+        contact.active = contact.is_compliant or bool(contact.guard.any())
+        self.compliance.copy_from(contact)
         self.compliance.operator = self.command.operator
         self._write_server_status(self.status)
 
@@ -276,7 +279,7 @@ class ForceServer(WristLevel, TrajectoryExecutor):
         """Continue from the last messages after a restart, including the contact."""
         super()._restore_state()
         if self.last_compliance.has_message and self.last_status.has_message:
-            self._work.contact.restore_contact(self.last_compliance.message)
+            self._work.contact.copy_from(self.last_compliance.message)
             status = self.last_status.message
             self._work.guarded = status.guarded
             self._work.axis = status.axis

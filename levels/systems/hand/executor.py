@@ -14,6 +14,7 @@ from rack.levels.arm import substeps
 from rack.levels.arm.commands_above import CommandsAbove
 from rack.levels.fault_steps import TendonStep
 from rack.levels.level import (
+    OPERATOR,
     Executor,
     Fault,
     Finding,
@@ -25,7 +26,7 @@ from rack.levels.level import (
     Reading,
 )
 from rack.levels.messages import ArmState, Error
-from rack.levels.operator import HOLD_COMMANDS, OperatorCommand, Orders
+from rack.levels.operator import HOLD_COMMANDS
 from rack.levels.robot.cell import build_level_cell
 from rack.levels.robot.hand import Hand
 from rack.levels.robot.limits import MotorPatience
@@ -52,7 +53,7 @@ class HandExecutor(Executor):
 
     tensions = Inputs(TensionCommand, "above.command")
     before = Input(ArmState, "own.state")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     status = Output(HandStatus)
     state = Output(ArmState)
     scene = SCENES
@@ -69,7 +70,6 @@ class HandExecutor(Executor):
             cell, context.scene, context.clock_ns, context.every, context.seed
         )
         self.wanted_tensions = Tensions(context, cell.hand, cell.patience)
-        self.orders = Orders(self.commands)
         self._started = False  # whether the first cycle has begun
         # Tick of the first status with closed valves. None while they are open.
         self._closed_at: int | None = 0
@@ -79,16 +79,8 @@ class HandExecutor(Executor):
         self._torn: dict[int, bool] = {}  # injected faults that tore a tendon, as in `acted`
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
-        """Report a missing `[robot.hand]` and joints not driven by exactly one board above.
-
-        Args:
-            context: Context of this board.
-            above: Contexts of the boards above it.
-            below: Contexts of the boards below it.
-        """
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
+        """Report a missing `[robot.hand]` and joints not driven by exactly one board above."""
         hand = context.robot.hand
         if hand is None:
             yield (
@@ -100,14 +92,14 @@ class HandExecutor(Executor):
         owners = {joint: finger.name for finger in hand.finger for joint in finger.joints}
         for joint in context.robot.joints:
             boards = [
-                other.board
-                for other in above
-                if other.params.get("finger", owners[joint]) == owners[joint]
+                board
+                for board, pace in context.above.items()
+                if pace.params.get("finger", owners[joint]) == owners[joint]
             ]
             if len(boards) != 1:
                 by = ", ".join(f"'{board}'" for board in boards) or "none"
                 why = f"joint '{joint}' must be commanded by one board; it is commanded by {by}"
-                yield "above", [other.board for other in above], why
+                yield "above", [*context.above], why
 
     def inject(self, faults: Sequence[Fault]) -> None:
         """Tear the tendons in `faults` and mend all others. Unknown joints are ignored."""
@@ -135,13 +127,13 @@ class HandExecutor(Executor):
         # The hand closes its valves by itself if no tensions arrive in time.
         if self.hand.braked and self._closed_at is None:
             self._closed_at = tick
-        self.orders.take_commands(self.operator)
+        self._orders.take_commands(self.operator)
         sample = hand.sense()
         self.findings += self._slack.check_tensions(sample.tension, hand.commanded_tensions)
         self.acted |= self._torn
         self._command_valves(tick)
         self._fill_status(self.status, sample, tick)
-        self.orders.fill_status(self.status, self.wanted_tensions.rests_on)
+        self._orders.fill_status(self.status, self.wanted_tensions.rests_on)
         hand.save(self.state)
         if SCENES.is_due(tick, self.context.every, self.context.phase):
             hand.look(self.scene)
@@ -155,7 +147,7 @@ class HandExecutor(Executor):
             finding, self._waiting = self.wanted_tensions.limit_tensions()
             if finding is not None:
                 self.hand.refuse_command(finding)
-        held = self.orders.is_holding
+        held = self._orders.is_holding
         if held and not self._waiting:
             self._waiting = HELD
         if self.demand is not Demand.NONE:
@@ -165,7 +157,7 @@ class HandExecutor(Executor):
                 self._closed_at = tick
             self.hand.close_valves()
             if held:
-                self.orders.report_done()
+                self._orders.report_done()
         else:
             self._closed_at = None
             self._opened = True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import mujoco
 import numpy as np
@@ -10,9 +10,18 @@ import numpy as np
 from rack.backplane.message import State
 from rack.levels.algebra import Array
 from rack.levels.errors import Refused
-from rack.levels.level import Executor, Input, Inputs, LevelContext, Mismatches, Output, Reading
+from rack.levels.level import (
+    OPERATOR,
+    Executor,
+    Input,
+    Inputs,
+    LevelContext,
+    Mismatches,
+    Output,
+    Reading,
+)
 from rack.levels.messages import Error, WorldState
-from rack.levels.operator import HOLD_COMMANDS, OperatorCommand, Orders
+from rack.levels.operator import HOLD_COMMANDS
 from rack.levels.planning.pose import Pose
 from rack.levels.robot.cell import build_level_cell
 from rack.levels.systems.hand.grasp_program import (
@@ -34,7 +43,6 @@ from rack.levels.systems.hand.messages import (
     GraspStatus,
     GraspTarget,
 )
-from rack.levels.tables import read_params
 
 PLANNED = "planned"
 """Name of the posture that a plan defines."""
@@ -57,11 +65,12 @@ class GraspExecutor(Executor):
     plan = Inputs(GraspPlan, "above.plan", optional=True)
     last_command = Input(GraspTarget, "own.command")
     last_status = Input(GraspStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(GraspTarget, rests_on=fingers)
     status = Output(GraspStatus, rests_on=fingers)
     commands = HOLD_COMMANDS
     params = GraspParams
+    settings: GraspParams
     program = GraspProgram
 
     def __init__(self, context: LevelContext) -> None:
@@ -71,9 +80,8 @@ class GraspExecutor(Executor):
         self._program = GraspProgram.model_validate(dict(context.task))
         kinematics = FingerKinematics(cell, cell.hand)
         self._from_world = kinematics.palm.inverse()  # pose of the world in the frame of the palm
-        self._orders = Orders(self.commands)
         names = cell.hand.names
-        params = read_params(GraspParams, context.params)
+        params = self.settings
         self._opposing = names.index(self._program.opposing)
         self._grasp = Grasp(
             params=params,
@@ -97,23 +105,19 @@ class GraspExecutor(Executor):
         self._started = False  # whether the first cycle has begun
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
-        """Report a missing hand, fingers not driven by exactly one board, or a missing planner.
-
-        Args:
-            context: Context of this board.
-            above: Contexts of the boards above it.
-            below: Contexts of the boards below it.
-        """
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
+        """Report a missing hand, fingers not driven by exactly one board, or a missing planner."""
         hand = context.robot.hand
         if hand is None:
             yield "executor", cls.__name__, "it drives a hand, but there is no [robot.hand]"
             return
         names = [finger.name for finger in hand.finger]
         for name in names:
-            boards = [board.board for board in below if board.params.get("finger", name) == name]
+            boards = [
+                board
+                for board, pace in context.below.items()
+                if pace.params.get("finger", name) == name
+            ]
             if len(boards) != 1:
                 by = ", ".join(f"'{board}'" for board in boards) or "none"
                 yield (
@@ -122,7 +126,9 @@ class GraspExecutor(Executor):
                     f"finger '{name}' needs one board that drives it; it has: {by}",
                 )
         steps = GraspProgram.model_validate(dict(context.task)).step
-        if not above and any(isinstance(step, CloseStep) and not step.points for step in steps):
+        if not context.above and any(
+            isinstance(step, CloseStep) and not step.points for step in steps
+        ):
             yield "above", [], "a step 'close' without points needs a planner of grasps there"
 
     def process(self, tick: int) -> None:
@@ -145,9 +151,9 @@ class GraspExecutor(Executor):
         # Fail if the program has been suspended for too long.
         is_over = self._done == len(self._program.step) or self._orders.is_holding
         self._waited_s = self._waited_s + self.context.period_s if waits and not is_over else 0.0
-        if self._waited_s > self._grasp.params.stalled and not self._failed.code:
+        if self._waited_s > self.settings.stalled and not self._failed.code:
             self._failed = Refused(
-                Error.STALLED, f"waited for {self._grasp.params.stalled:g} s: {waits}"
+                Error.STALLED, f"waited for {self.settings.stalled:g} s: {waits}"
             )
         if not waits and not self._failed.code and self._done < len(self._program.step):
             self._run_step()

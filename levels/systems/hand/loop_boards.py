@@ -8,18 +8,16 @@ and the tendon loop converts torques to tensions.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
 
 import numpy as np
 
 from rack.backplane.message import State
 from rack.levels.algebra import Mask
-from rack.levels.level import Executor, Input, LevelContext, Mismatches, Output, Reading
+from rack.levels.level import OPERATOR, Executor, Input, LevelContext, Mismatches, Output, Reading
 from rack.levels.operator import (
     BELOW_LOST,
     HOLD_COMMANDS,
     OperatorCommand,
-    Orders,
     RelayedCommand,
 )
 from rack.levels.robot import dynamics
@@ -75,7 +73,6 @@ class HandLoop(Executor):
         self.cell = build_level_cell(context)
         assert self.cell.hand is not None, "`find_mismatches` refuses a robot without a hand"
         self.hand_model: Hand = self.cell.hand
-        self.orders = Orders(self.commands)
         command = self.inputs["above"].message
         self.followed = command.zeros(context.sizes)
         # Names of the fields that must be finite.
@@ -94,19 +91,11 @@ class HandLoop(Executor):
         self._met = False  # whether a status of the hand has arrived
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
-        """Report a missing `[robot.hand]` and a missing board above or below.
-
-        Args:
-            context: Context of this board.
-            above: Contexts of the boards above it.
-            below: Contexts of the boards below it.
-        """
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
+        """Report a missing `[robot.hand]` and a missing board above or below."""
         if context.robot.hand is None:
             yield "executor", cls.__name__, "it drives a hand, but there is no [robot.hand]"
-        for place, boards in (("above", above), ("below", below)):
+        for place, boards in (("above", context.above), ("below", context.below)):
             if not boards:
                 yield place, [], "it needs a board in this place"
 
@@ -126,7 +115,7 @@ class HandLoop(Executor):
     def process(self, tick: int) -> None:
         """Follow the newest command and fill the status."""
         hand = self.hand
-        self.orders.take_commands(self.operator)
+        self._orders.take_commands(self.operator)
         if not self._met:
             if not hand.has_message:
                 status = self.status
@@ -142,9 +131,9 @@ class HandLoop(Executor):
         hold_reason = self._find_holding_reason(tick)
         self.follow_command(hand.message, tick)
         self.command.id += 1
-        self.command.operator = self.orders.find_basis(self.followed.operator)
+        self.command.operator = self._orders.find_basis(self.followed.operator)
         self._fill_status(self.status, hold_reason)
-        self.orders.fill_status(self.status, self.followed.operator)
+        self._orders.fill_status(self.status, self.followed.operator)
 
     def compute_sample_age_s(self, hand: HandStatus, tick: int) -> float:
         """Return the age of a hand sample, in s, when the command of this cycle takes effect."""
@@ -162,13 +151,13 @@ class HandLoop(Executor):
     def _take_command(self, command: Reading[RelayedCommand], tick: int) -> None:
         """Copy a new, finite command to `followed`. During a hold, zero its velocities instead."""
         released = self._held
-        self._held = self.orders.is_holding
+        self._held = self._orders.is_holding
         if self._held:
             for name in self._numbers:
                 # Keep following the command, but at zero velocity.
                 if name.endswith("velocity"):
                     setattr(self.followed, name, 0.0)
-            self.orders.report_done()
+            self._orders.report_done()
         elif command.is_new or (released and command.has_message):
             wrong = [
                 name
@@ -196,7 +185,7 @@ class HandLoop(Executor):
                 return BELOW_LOST
             if below.message.stopped:
                 return below.message.reason
-        return self.orders.format_reason(self.context.board)
+        return self._orders.format_reason(self.context.board)
 
     def _fill_status(self, status: LoopStatus | FingerStatus, hold_reason: str) -> None:
         """Fill the status. `hold_reason` is empty if the hand follows the level above."""
@@ -229,19 +218,21 @@ class FingertipLoop(HandLoop):
     above = Input(GraspTarget, "above.command")
     hand = Input(HandStatus, "hand.status")
     below = Input(LoopStatus, "below.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     last = Input(FingerTarget, "own.command")
     command = Output(FingerTarget, rests_on=above)
     status = Output(FingerStatus)
     followed: GraspTarget
     params = FingertipGains
+    settings: FingertipGains
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.driven = np.full(len(self.hand_model.names), True)
         kinematics = FingerKinematics(self.cell, self.hand_model)
-        gains = read_params(FingertipGains, context.params)
-        self._law = FingertipLaw(kinematics, range(len(self.driven)), gains, context.period_s)
+        self._law = FingertipLaw(
+            kinematics, range(len(self.driven)), self.settings, context.period_s
+        )
 
     def start_from(self, hand: HandStatus) -> None:
         """Start at the last targets after a restart, otherwise at the current joint positions."""
@@ -263,17 +254,18 @@ class JointLoop(HandLoop):
     above = Input(FingerTarget, "above.command")
     hand = Input(HandStatus, "hand.status")
     below = Input(LoopStatus, "below.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(TendonTorque, rests_on=above)
     status = Output(LoopStatus)
     followed: FingerTarget
     params = JointGains
+    settings: JointGains
     preloads = (dynamics, laws)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.driven = np.full(len(context.robot.joints), True)
-        self._law = JointLaw(self.cell, self.driven, read_params(JointGains, context.params))
+        self._law = JointLaw(self.cell, self.driven, self.settings)
 
     def start_from(self, hand: HandStatus) -> None:
         """Hold the joints in their current positions until targets arrive."""
@@ -302,18 +294,18 @@ class TendonLoop(HandLoop):
 
     above = Input(TendonTorque, "above.command")
     hand = Input(HandStatus, "below.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(TensionCommand, rests_on=above)
     status = Output(LoopStatus)
     followed: TendonTorque
     params = TendonGains
+    settings: TendonGains
     preloads = (laws,)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self.driven = np.full(len(context.robot.joints), True)
-        gains = read_params(TendonGains, context.params)
-        self._law = TendonLaw(self.hand_model, self.driven, gains, context)
+        self._law = TendonLaw(self.hand_model, self.driven, self.settings, context)
 
     def start_from(self, hand: HandStatus) -> None:
         """Start with the current tensions."""
@@ -344,16 +336,17 @@ class FingerExecutor(HandLoop):
 
     above = Input(GraspTarget, "above.command")
     hand = Input(HandStatus, "below.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(TensionCommand, rests_on=above)
     status = Output(FingerStatus)
     followed: GraspTarget
     params = FingerParams
+    settings: FingerParams
     preloads = (dynamics, laws)
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params = read_params(FingerParams, context.params)
+        params = self.settings
         hand = self.hand_model
         finger = hand.names.index(params.finger)
         self.driven = np.arange(len(hand.names)) == finger
@@ -367,17 +360,9 @@ class FingerExecutor(HandLoop):
         self._torque = np.zeros(len(self._joints))
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
-        """Report a finger that the hand does not have, and the mistakes that `HandLoop` reports.
-
-        Args:
-            context: Context of this board.
-            above: Contexts of the boards above it.
-            below: Contexts of the boards below it.
-        """
-        yield from super().find_mismatches(context, above, below)
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
+        """Report a finger that the hand does not have, and the mistakes that `HandLoop` reports."""
+        yield from super().find_mismatches(context)
         hand = context.robot.hand
         name = read_params(FingerParams, context.params).finger
         if hand is not None and name not in (names := [finger.name for finger in hand.finger]):

@@ -9,9 +9,9 @@ import numpy as np
 from rack.levels.algebra import Array
 from rack.levels.arm import Sensed
 from rack.levels.arm.commands_above import CommandsAbove
-from rack.levels.level import Input, Inputs, LevelContext, Mismatches, Output, Reading
+from rack.levels.level import OPERATOR, Input, Inputs, LevelContext, Mismatches, Output, Reading
 from rack.levels.messages import ArmState
-from rack.levels.operator import DRIVE_OPERATIONS, HOLD_COMMANDS, OperatorCommand, Orders
+from rack.levels.operator import DRIVE_OPERATIONS, HOLD_COMMANDS, OperatorCommand
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.dynamics import Payload
 from rack.levels.servo.arm_report import SetPointStatus, view_numbers
@@ -80,7 +80,7 @@ class ArmExecutor(ArmDriver):
 
     joint_torques = Inputs(JointTorque, "above.command")
     before = Input(ArmState, "own.state")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     status = Output(ArmStatus)
     state = Output(ArmState)
     scene = SCENES
@@ -90,7 +90,6 @@ class ArmExecutor(ArmDriver):
         super().__init__(context)
         limits = self.cell.limits
         self.joints = JointTorques(context, self.cell)
-        self.orders = Orders(self.commands)
         rest_s = float(np.max(limits.velocity / limits.acceleration))
         self._rest_ticks = round(rest_s / context.tick_s) + max(self.joints.oldest.values())
         self._defied = False  # the boards above have not brought the arm to rest in time
@@ -102,16 +101,16 @@ class ArmExecutor(ArmDriver):
         self._waiting = ""  # why the boards above do not drive the arm
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
         """Yield a mismatch if a joint or the gripper is not driven by exactly one board above.
 
         Also yield the mismatches of `ArmDriver`.
         """
-        yield from super().find_mismatches(context, above, below)
+        yield from super().find_mismatches(context)
         everything = context.robot.joints
-        wanted = {other.board: other.params.get("joints", everything) for other in above}
+        wanted = {
+            board: pace.params.get("joints", everything) for board, pace in context.above.items()
+        }
         for joint in everything:
             boards = [board for board, joints in wanted.items() if joint in joints]
             if len(boards) != 1:
@@ -121,7 +120,9 @@ class ArmExecutor(ArmDriver):
                     f"joint '{joint}' must be commanded by one board; "
                     f"{_describe_commanders(boards)}",
                 )
-        grips = [other.board for other in above if other.params.get("gripper", False)]
+        grips = [
+            board for board, pace in context.above.items() if pace.params.get("gripper", False)
+        ]
         if len(grips) != (context.robot.gripper is not None):
             text = "the gripper must be commanded by one board"
             if context.robot.gripper is None:
@@ -136,19 +137,19 @@ class ArmExecutor(ArmDriver):
     def take_messages(self) -> None:
         """Read the torques of the boards above and the commands of the operator."""
         self._torques = self.joint_torques
-        self.orders.take_commands(self.operator, self._process_command)
+        self._orders.take_commands(self.operator, self._process_command)
 
     def _process_command(self, command: OperatorCommand) -> None:
         """Carry out or refuse a command to the drives. Ignore other commands."""
         if command.what in DRIVE_OPERATIONS and (refusal := self.obey_drive_command(command)):
-            self.orders.refuse_newest(refusal)
+            self._orders.refuse_newest(refusal)
 
     def next_motion(self, reaction: Reaction, missed: bool, tick: int) -> Motion | None:
         """Return the motion commanded by the boards above, or None if the arm must be braked."""
         if self.arm.braked and self._braked_at is None:
             self._waiting = "braked until the boards above have seen it"
             return None
-        stops = reaction > 0 or self.orders.is_holding
+        stops = reaction > 0 or self._orders.is_holding
         self._defied = self._defied and stops
         if self._defied or (reaction is Reaction.STOP and self.abandoned):
             return None
@@ -156,6 +157,8 @@ class ArmExecutor(ArmDriver):
         if self._waiting:
             return None
         self.joints.sum_commands(self._torques)
+        self.payload = self.joints.payload
+        self.holds_part = self.payload.mass > 0.0
         self.rests_on = self.joints.rests_on
         if self.abandoned and self._is_astray():
             return None
@@ -164,8 +167,8 @@ class ArmExecutor(ArmDriver):
             self._waiting = "braked: the boards above did not bring it to rest"
             return None
         self._braked_at = None
-        if self.orders.is_holding and not self.joints.moves:
-            self.orders.report_done()
+        if self._orders.is_holding and not self.joints.moves:
+            self._orders.report_done()
         return self.joints.wanted
 
     def _is_astray(self) -> bool:
@@ -208,19 +211,9 @@ class ArmExecutor(ArmDriver):
         """Return the torques of the boards above in N m, and their grip force in N."""
         return self.joints.torque, self.joints.grip_force
 
-    @property
-    def payload(self) -> Payload:
-        """Payload in the gripper according to the boards above."""
-        return self.joints.payload
-
-    @property
-    def holds_part(self) -> bool:
-        """True if the gripper holds a part according to the boards above."""
-        return self.payload.mass > 0.0
-
     def report_set_points(self, reaction: Reaction) -> SetPointStatus:
         """Return the section of the status that reports the set points of the boards above."""
-        is_held = self.orders.is_holding
+        is_held = self._orders.is_holding
         reason = self.stopping.reason or self._waiting
         if is_held and not reason:
             reason = HELD

@@ -69,7 +69,6 @@ class JointGateway(Executor):
         self._up: Link = deque()
         self._newest = JointReference.zeros(context.sizes)  # newest reference that has arrived
         self._merged = JointStatus.zeros(context.sizes)  # status of the boards below as one
-        self._due = 0  # tick at which the last reference passed down is due, or 0
         self._frozen = False  # too many references are missing
 
     def process(self, tick: int) -> None:
@@ -77,11 +76,11 @@ class JointGateway(Executor):
         self._take_reference(self.above, tick)
         newest = self._newest
         due = newest.due + self.latency if newest.due else 0
-        if not due or due > max(self._due, tick):
+        if not due or due > max(self.command.due, tick):
             self.command.raw[:] = newest.raw
-            self._due = self.command.due = due
+            self.command.due = due
             self._frozen = False
-        elif self._due and tick + LEAD_CYCLES * self.context.every > self._due:
+        elif self.command.due and tick + LEAD_CYCLES * self.context.every > self.command.due:
             self._extrapolate_reference(self.command)
         # Send the status of the boards below over the delayed link, and write the status that has
         # arrived.
@@ -98,14 +97,13 @@ class JointGateway(Executor):
     def _extrapolate_reference(self, command: JointReference) -> None:
         """Extrapolate the next reference, or pass none down if too many are missing."""
         newest = self._newest
-        ahead_ticks = self._due + self._period - self.latency - newest.due
+        ahead_ticks = command.due + self._period - self.latency - newest.due
         if ahead_ticks > self._missing * self._period:
-            self._due = command.due = 0
+            command.due = 0
             self._frozen = True
             return
-        self._due += self._period
+        command.due += self._period
         ahead_s = ahead_ticks * self.context.tick_s
-        command.due = self._due
         command.id = newest.id
         command.position[:] = newest.position + ahead_s * newest.velocity
         command.velocity[:] = newest.velocity
@@ -231,7 +229,7 @@ class NetworkGateway(JointGateway):
             ahead_s: Newest time of the other rack minus the time of this one.
         """
         apart_s = ahead_s - self._their_s
-        if not self._due:
+        if not self.command.due:
             self._their_s = ahead_s
         elif abs(apart_s) > SLACK_S:
             step_s = self.context.tick_s / STATUS_CYCLES

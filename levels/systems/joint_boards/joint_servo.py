@@ -10,7 +10,7 @@ import numpy as np
 
 from rack.backplane.message import State
 from rack.levels.algebra import Array
-from rack.levels.level import Executor, Input, LevelContext, Mismatches, Output
+from rack.levels.level import OPERATOR, Executor, Input, LevelContext, Mismatches, Output
 from rack.levels.messages import Error
 from rack.levels.operator import HOLD_COMMANDS, Goal, Operation, OperatorCommand
 from rack.levels.robot import dynamics
@@ -24,7 +24,7 @@ from rack.levels.servo.modification import (
     find_unsuitable_modifications,
     list_names,
 )
-from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
+from rack.levels.servo.modified_law import ModifiedLaw
 from rack.levels.servo.operator_control import OperatorControl
 from rack.levels.servo.reference import Reference
 from rack.levels.systems.joint_boards import joint_control
@@ -59,7 +59,7 @@ class JointServo(Executor):
 
     above = Input(JointReference, "above.command")
     below = Input(ArmStatus, "below.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(JointTorque, rests_on=above)
     status = Output(JointStatus, rests_on=below)
     commands = {
@@ -89,7 +89,7 @@ class JointServo(Executor):
         self._servo = partial(servo_joints.load_machine_code(), constants, self.loads.table)
         self._modified = ModifiedLaw(context, params, cell.bounds.torque, self.findings)
         self.operator_control = OperatorControl(
-            self.commands, robot.joints, cell.limits.position, self._driven, obey=self._obey_command
+            self._orders, robot.joints, cell.limits.position, self._driven, obey=self._obey_command
         )
         # Output of the law when modifications call it.
         self._unmodified: Array = np.zeros(7 * len(robot.joints))
@@ -101,7 +101,7 @@ class JointServo(Executor):
         self._sample: Array  # positions and velocities in the status of the arm
         self._shown_numbers: tuple[Array, ...] = ()  # numbers of the messages to write
         self._offered: JointReference | None = None  # reference whose loads are not used yet
-        self._command = self._rests_on = self._due = 0
+        self._rests_on = 0
         self._refused = ""  # why the newest reference was refused
         self._met = False  # a status of the arm has arrived
 
@@ -111,9 +111,7 @@ class JointServo(Executor):
         return list_names(params)
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
         """Yield a mismatch for each invalid joint and modification, or if nothing is driven."""
         params = read_params(JointServoParams, context.params)
         known = context.robot.joints
@@ -134,7 +132,7 @@ class JointServo(Executor):
     def process(self, tick: int) -> None:
         """Run one cycle: compute the torques that act from the next cycle on."""
         arm = self.below.message
-        if not self._met and not self._initialize_from_status(self.below.has_message, arm):
+        if not self._met and not self._initialize_from_status(arm):
             return
         self._take_messages()
         sampled = arm.tick
@@ -146,20 +144,15 @@ class JointServo(Executor):
         if is_silent or (stopped and arm.braked):
             reference.start(arm.position, arm.velocity, tick)
             self._modified.forget_torque()
-        if stopped:
-            wanted = reference.ramp_to_rest(tick)
-        else:
-            wanted = (
-                operator.compute_motion(reference, tick)
-                if operator.is_in_control
-                else reference.compute_motion(tick)
-            )
+        wanted = (
+            reference.ramp_to_rest(tick) if stopped else operator.compute_motion(reference, tick)
+        )
         # Use the inertia and the load of the reference that is followed, else compute them.
         if stopped or operator.is_in_control or reference.holding:
             self.loads.compute_at_rest(arm.position)
         elif self._offered is not None:
             self.loads.take_reference(self._offered, tick)
-            self._due = self._offered.due
+            self.status.due = self._offered.due
             self._offered = None
         tick_s = self.context.tick_s
         age_s = min(tick + every - sampled, self._oldest + every) * tick_s
@@ -211,25 +204,19 @@ class JointServo(Executor):
             return torque[:joints]
 
         inertia, load = table[AT] + times[0] * (table[DUE] - table[AT])
-        inputs = LawInputs(wanted, self._sample.reshape(2, joints), inertia, load, tick)
-        modified = self._modified.compute_torque(compute_unmodified, inputs)
+        state = self._sample.reshape(2, joints)
+        modified = self._modified.compute_torque(
+            compute_unmodified, wanted, state, inertia, load, tick
+        )
         np.copyto(command[:joints], modified, where=self._driven)
         np.copyto(shown_status[3 * joints :], modified, where=self._driven)
 
-    def _initialize_from_status(self, has_status: bool, arm: ArmStatus) -> bool:
-        """Initialise from the first status of the arm.
-
-        Args:
-            has_status: True if a status of the arm has arrived.
-            arm: Status of the arm.
-
-        Returns:
-            False if no status has arrived yet.
-        """
+    def _initialize_from_status(self, arm: ArmStatus) -> bool:
+        """Initialise from the first status of the arm. Return False if none has arrived yet."""
         status = self.status
         torque = self.command
-        self._met = has_status
-        if not has_status:
+        self._met = self.below.has_message
+        if not self._met:
             torque.sampled = -1
             status.driven = self._driven
             status.holding = True
@@ -250,7 +237,7 @@ class JointServo(Executor):
             self.operator_control.take_commands(self.operator, self.below.message.position)
         if self.above.is_new:
             command = self.above.message
-            self._command = command.id
+            self.status.echo = command.id
             self._rests_on = command.operator
             self._refused = ""
             if misfit := self.loads.find_invalid_field(command):
@@ -287,14 +274,12 @@ class JointServo(Executor):
             if arm.state == State.ERROR:
                 error = Error(arm.error)
         status.driven = self._driven
-        status.echo = self._command
         status.holding = holding
         status.stopped = stopped or operator.is_in_control
-        status.due = self._due
         status.reason = reason or self._refused or self._modified.reason
         status.error = error
         if error:
             status.state = State.ERROR
         else:
             resting = State.IDLE if holding else State.EXECUTING
-            status.state = State.HOLDING if reason and self._command else resting
+            status.state = State.HOLDING if reason and status.echo else resting

@@ -12,8 +12,8 @@ from typing import Annotated, Any
 from pydantic import Field, StringConstraints
 
 from rack.backplane.message import Command, State, Status, field
-from rack.levels.level import Executor, Input, Inputs, LevelContext, Output
-from rack.levels.operator import AnsweringStatus, Goal, Operation, OperatorCommand, Orders
+from rack.levels.level import OPERATOR, Executor, Input, Inputs, LevelContext, Output
+from rack.levels.operator import AnsweringStatus, Goal, Operation, OperatorCommand
 from rack.levels.systems.joint_boards.joint_servo import JointServo
 from rack.levels.tables import Table
 
@@ -63,7 +63,7 @@ class ModificationSender(Executor):
     """
 
     modified = Inputs(ModifiedAnswer, "lan.modified")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(Modifications)
     status = Output(ModifierStatus)
     commands = {Operation.MODIFY: (Goal.ON, Goal.OFF)}
@@ -74,7 +74,6 @@ class ModificationSender(Executor):
         super().__init__(context)
         self._known = self.settings.known
         self._wanted: set[str] = set()
-        self._orders = Orders(self.commands)
         self._pending: list[int] = []  # serials of commands that not all boards have answered
 
     @classmethod
@@ -94,7 +93,7 @@ class ModificationSender(Executor):
         silent = [box for box, answer in self.modified.items() if answer.is_lost]
         if not reasons and all(answer.message.echo == self._orders.serial for answer in answers):
             for serial in self._pending:
-                self._orders.report_drives_done(serial)
+                self._orders.report_completed(serial)
             self._pending.clear()
         status.echo = self._orders.serial
         status.reason = "; ".join([*reasons, *(f"no answer in {box}" for box in silent)])

@@ -9,7 +9,6 @@ from a box leaves at most as many boxes as the row has conditions.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import combinations
 
 from rack.levels.systems.state_table.table import (
     SAME,
@@ -164,7 +163,6 @@ def _find_case_flaws(
             yield f"{row_name}: never fires in '{state}': the rows above it take every case of it"
         uncovered = rest
         boxes[number] = box
-    uncovered = merge_boxes(uncovered)
     for box in uncovered[:MAX_REPORTED_HOLES]:
         yield f"hole: no row of '{state}' takes {_format_cases(box, vocabulary)}"
     if len(uncovered) > MAX_REPORTED_HOLES:
@@ -187,23 +185,6 @@ def subtract_box(box: Box, removed: Box) -> Sequence[Box]:
             pieces.append({**rest, condition: outside})
         rest[condition] = inside
     return pieces
-
-
-def merge_boxes(boxes: Sequence[Box]) -> list[Box]:
-    """Return the same cases in fewer boxes.
-
-    Two boxes that differ in a single condition are merged until no such pair is left.
-    """
-    merged = [*boxes]
-    while pair := next((p for p in combinations(merged, 2) if _differ_in_one_condition(*p)), None):
-        first, second = pair
-        merged[merged.index(first)] = {name: first[name] | second[name] for name in first}
-        merged.remove(second)
-    return merged
-
-
-def _differ_in_one_condition(first: Box, second: Box) -> bool:
-    return sum(first[name] != second[name] for name in first) == 1
 
 
 def _format_cases(box: Box, vocabulary: Vocabulary) -> str:

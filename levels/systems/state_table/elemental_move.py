@@ -14,9 +14,8 @@ from pydantic import Field as Key
 
 from rack.backplane.message import field, integer_field
 from rack.levels.algebra import Array, norm
-from rack.levels.level import Input, Inputs, LevelContext, Output
+from rack.levels.level import OPERATOR, Input, Inputs, LevelContext, Output
 from rack.levels.messages import WorldState
-from rack.levels.operator import OperatorCommand
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.planning.pose import Pose, build_pointing_quaternion, compute_yaw
 from rack.levels.robot.cell import build_level_cell
@@ -79,7 +78,7 @@ class MoveTable(StateTableExecutor):
     world = Input(WorldState, "world.model")
     last_command = Input(JointMove, "own.command")
     last_status = Input(MoveTableStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(JointMove, rests_on=above)
     status = Output(MoveTableStatus, rests_on=below)
     vocabulary = build_vocabulary(
@@ -119,11 +118,6 @@ class MoveTable(StateTableExecutor):
         super().__init__(context)
         self._cell = build_level_cell(context)
         self._ik = InverseKinematics(self._cell, context.seed)
-        # Newest command sent down. It aims at a place if `object` is -1.
-        self._command = JointMove.zeros(context.sizes)
-        self._command.joints = self._cell.home
-        self._command.speed = 1.0
-        self._command.object = -1
         self._reached = True
         self._put_row = -1  # row of the object put down last, -1 if there is none
 
@@ -135,10 +129,14 @@ class MoveTable(StateTableExecutor):
     def restore_state(self) -> None:
         """Restore the newest command to the level below after a restart."""
         super().restore_state()
+        # It aims at a place if `object` is -1.
+        self.command.joints = self._cell.home
+        self.command.speed = 1.0
+        self.command.object = -1
         if self.last_status.has_message and self.last_command.has_message:
             last = self.last_status.message
-            self._command.copy_from(self.last_command.message)
-            self._command.id = last.sent
+            self.command.copy_from(self.last_command.message)
+            self.command.id = last.sent
             self._reached = last.reached
             self._put_row = last.put
 
@@ -152,10 +150,10 @@ class MoveTable(StateTableExecutor):
         target = "moving"
         is_elsewhere = False
         if is_seen:
-            target = self._classify_target(self._command.object)
+            target = self._classify_target(self.command.object)
             is_elsewhere = self._put_row >= 0 and not self._is_at_aim(self._put_row)
         return {
-            "below": classify_answer(self.below, self._command.id),
+            "below": classify_answer(self.below, self.command.id),
             "world": ("unseen", "seen")[is_seen],
             "target": target,
             "support": ("there", "elsewhere")[is_elsewhere],
@@ -177,14 +175,14 @@ class MoveTable(StateTableExecutor):
 
     def _is_at_aim(self, row: int) -> bool:
         """Return True if an object is within `plan.moved` of the aim of the newest motion."""
-        distance = norm(self._world.position[row] - self._command.aim)
+        distance = norm(self._world.position[row] - self.command.aim)
         return bool(distance <= self.table.plan.moved)
 
     def do_move(self, pose: str) -> None:
         """Send the arm to a taught pose, or home."""
         if pose == HOME:
             self._send_command("move", self._cell.home, self.table.plan.home_speed)
-            self._command.object = -1
+            self.command.object = -1
             return
         taught = self.table.plan.pose[pose]
         goal = self._find_tool_goal(taught.height)
@@ -196,11 +194,11 @@ class MoveTable(StateTableExecutor):
     def do_open(self) -> None:
         """Open the gripper."""
         self._put_row = self._below_status.object if self._below_status.held else -1
-        self._send_command("open", self._command.joints, 1.0)
+        self._send_command("open", self.command.joints, 1.0)
 
     def do_close(self) -> None:
         """Close the gripper."""
-        self._send_command("close", self._command.joints, 1.0)
+        self._send_command("close", self.command.joints, 1.0)
 
     def _find_tool_goal(self, height: float) -> Pose | None:
         """Return the tool's goal pose for the current command, with the tool pointing down.
@@ -214,7 +212,7 @@ class MoveTable(StateTableExecutor):
         if len(self.words) < 2:
             return None
         verb, name = self.words
-        command = self._command
+        command = self.command
         if verb == "place":
             command.object = -1
             command.aim = self.table.plan.place[name]
@@ -241,28 +239,25 @@ class MoveTable(StateTableExecutor):
         Positions near the arm's current configuration are preferred. At most three searches are
         made.
         """
-        joints = self._ik.find_nearby(goal, self._command.joints)
+        joints = self._ik.find_nearby(goal, self.command.joints)
         if joints is None:
             joints = self._ik.find_configuration(goal, self._cell.home)
         return (
-            joints
-            if joints is not None
-            else self._ik.find_configuration(goal, self._command.joints)
+            joints if joints is not None else self._ik.find_configuration(goal, self.command.joints)
         )
 
     def _send_command(self, words: str, joints: Array, speed: float) -> None:
         """Fill the command for the level below and give it a new serial."""
-        self._command.id += 1
-        self._command.words = words
-        self._command.speed = speed
-        self._command.joints = joints
+        self.command.id += 1
+        self.command.words = words
+        self.command.speed = speed
+        self.command.joints = joints
 
     def write_outputs(self, tick: int) -> None:
         """Write the command, and the status fields that a restarted board needs."""
         status = self.status
-        self._command.hold = self.is_held
-        self.command.copy_from(self._command)
-        status.sent = self._command.id
+        self.command.hold = self.is_held
+        status.sent = self.command.id
         status.reached = self._reached
         status.resting = self.resting
         status.put = self._put_row

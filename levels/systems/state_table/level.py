@@ -16,7 +16,16 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 from pydantic import Field as Key
 
 from rack.backplane.message import State, field, integer_field
-from rack.levels.level import Executor, Input, Inputs, LevelContext, Mismatches, Output, Reading
+from rack.levels.level import (
+    OPERATOR,
+    Executor,
+    Input,
+    Inputs,
+    LevelContext,
+    Mismatches,
+    Output,
+    Reading,
+)
 from rack.levels.messages import Error
 from rack.levels.operator import (
     ABOVE_LOST,
@@ -26,7 +35,6 @@ from rack.levels.operator import (
     Commands,
     Operation,
     OperatorCommand,
-    Orders,
     RelayedCommand,
     find_answered_serial,
 )
@@ -144,17 +152,19 @@ class StateTableExecutor(Executor):
     commands: ClassVar[Commands] = {**OPERATIONS, Operation.DO: ()}
     above = Inputs(TableCommand, "above.command", optional=True)
     last_status = Input(TableStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     status = Output(TableStatus)
     command: RelayedCommand
     """Command to the level below, if there is one."""
     params = StateTableParams
+    settings: StateTableParams
     vocabulary: ClassVar[Vocabulary]
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params = read_params(StateTableParams, context.params)
-        self.tables = {name: self.read(path, context.scene) for name, path in params.tables.items()}
+        self.tables = {
+            name: self.read(path, context.scene) for name, path in self.settings.tables.items()
+        }
         if flaws := [
             f"{name}: {flaw}"
             for name, flaw in self._find_unequal_commands(self.tables, context.scene)
@@ -164,7 +174,6 @@ class StateTableExecutor(Executor):
         # Tick at which the state began. None if it begins in this cycle.
         self._state_since_tick: int | None = None
         self.use_table(next(iter(self.tables)))
-        self.orders = Orders(self.commands)
         self.detail = ""  # reason given by the level below, appended to a row's reason
         self.resting = True  # no motion commanded by this level is under way
         self._newest = WordCommand(False, 0, "")
@@ -198,16 +207,8 @@ class StateTableExecutor(Executor):
         return []
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
-        """Yield every mistake in every table, and the commands that only some of the tables accept.
-
-        Args:
-            context: Context of this level.
-            above: Contexts of the levels above, unused.
-            below: Contexts of the levels below, unused.
-        """
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
+        """Yield every mistake in the tables, and the commands that only some of them accept."""
         files = read_params(StateTableParams, context.params).tables
         tables = {}
         for name, path in files.items():
@@ -343,7 +344,7 @@ class StateTableExecutor(Executor):
 
     def _take_commands(self) -> None:
         """Read the commands of operator and level above, and update the reason for holding."""
-        orders = self.orders
+        orders = self._orders
         orders.take_commands(self.operator, self._accept_operator_command)
         self._hold_reason = ""
         self._rests_on = orders.find_basis(0)
@@ -360,8 +361,8 @@ class StateTableExecutor(Executor):
     def _take_command_from_above(self, above: Reading[TableCommand]) -> None:
         """Take the command of the level above, unless an operator commands the level."""
         command = above.message
-        self._rests_on = self.orders.find_basis(command.operator)
-        if self.orders.standing is Operation.DO:
+        self._rests_on = self._orders.find_basis(command.operator)
+        if self._orders.standing is Operation.DO:
             return
         if command.id == self._done_serial:
             self._newest = self._taken
@@ -382,14 +383,14 @@ class StateTableExecutor(Executor):
         """Execute or refuse a TABLE or DO command of an operator."""
         if order.what == Operation.TABLE:
             if order.name not in self.tables:
-                self.orders.refuse_newest(
+                self._orders.refuse_newest(
                     f"no table '{order.name}'; tables: {', '.join(self.tables)}"
                 )
             elif order.id > self._answered_before_restart:
                 self.use_table(order.name)
         elif order.what == Operation.DO:
             if why := self._find_command_error(order.name):
-                self.orders.refuse_newest(why)
+                self._orders.refuse_newest(why)
             else:
                 self._newest = WordCommand(True, order.id, order.name)
 
@@ -401,7 +402,7 @@ class StateTableExecutor(Executor):
             row: The row that fired.
         """
         status = self.status
-        orders = self.orders
+        orders = self._orders
         state = STATES[row.status]
         reason = row.reason
         if self._hold_reason and state is State.EXECUTING:

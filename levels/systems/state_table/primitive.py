@@ -11,9 +11,8 @@ import numpy as np
 from rack.backplane.message import field, integer_field
 from rack.levels.algebra import Array
 from rack.levels.errors import RobotError
-from rack.levels.level import Input, Inputs, LevelContext, Output
+from rack.levels.level import OPERATOR, Input, Inputs, LevelContext, Output
 from rack.levels.messages import joint_field
-from rack.levels.operator import OperatorCommand
 from rack.levels.robot.cell import build_level_cell
 from rack.levels.robot.dynamics import Dynamics, Payload
 from rack.levels.servo import curves
@@ -87,7 +86,7 @@ class PrimitiveTable(StateTableExecutor):
     arm = Input(ArmStatus, "arm.status")
     last_command = Input(JointReference, "own.command")
     last_status = Input(JointMoveStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(JointReference, rests_on=above)
     status = Output(JointMoveStatus, rests_on=statuses)
     commands = OPERATIONS

@@ -5,14 +5,14 @@ Its plan is a static list of steps, each with an object and the place for it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from pydantic import Field as Key
 
 from rack.backplane.message import integer_field
-from rack.levels.level import Input, LevelContext, Mismatches, Output
-from rack.levels.operator import Operation, OperatorCommand
+from rack.levels.level import OPERATOR, Input, LevelContext, Mismatches, Output
+from rack.levels.operator import Operation
 from rack.levels.systems.state_table.elemental_move import MoveTable, MoveTableStatus
 from rack.levels.systems.state_table.level import (
     BELOW,
@@ -64,7 +64,7 @@ class TaskTable(StateTableExecutor):
     below = Input(MoveTableStatus, "below.status")
     last_command = Input(TableCommand, "own.command")
     last_status = Input(TaskTableStatus, "own.status")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(TableCommand)
     status = Output(TaskTableStatus, rests_on=below)
     commands = OPERATIONS
@@ -85,7 +85,6 @@ class TaskTable(StateTableExecutor):
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._steps_done = 0
-        self._newest_command = TableCommand.zeros({})  # sent down last
 
     @classmethod
     def find_plan_flaws(cls, scene: SceneConfig, plan: Any) -> list[str]:
@@ -98,28 +97,24 @@ class TaskTable(StateTableExecutor):
         ]
 
     @classmethod
-    def find_mismatches(
-        cls, context: LevelContext, above: Sequence[LevelContext], below: Sequence[LevelContext]
-    ) -> Mismatches:
+    def find_mismatches(cls, context: LevelContext) -> Mismatches:
         """Yield every mistake in every table, and steps whose place the level below lacks.
 
-        Args:
-            context: Context of this level.
-            above: Contexts of the levels above.
-            below: Contexts of the levels below, whose tables name the places.
+        The tables of the level below name the places.
         """
-        own_mismatches = [*super().find_mismatches(context, above, below)]
+        own_mismatches = [*super().find_mismatches(context)]
         yield from own_mismatches
         tables = read_params(StateTableParams, context.params).tables
-        for other in below:
-            if own_mismatches or [*MoveTable.find_mismatches(other, (), ())]:
+        for other, pace in context.below.items():
+            params = pace.params
+            if own_mismatches or [*MoveTable.find_mismatches(replace(context, params=params))]:
                 continue
-            commands = MoveTable.list_operation_names(Operation.DO, other.params, context.scene)
+            commands = MoveTable.list_operation_names(Operation.DO, params, context.scene)
             for name, path in tables.items():
                 for index, step in enumerate(cls.read(path, context.scene).plan.step):
                     if f"place {step.place}" not in commands:
                         why = (
-                            f"plan.step[{index}].place: unknown '{step.place}'; '{other.board}'"
+                            f"plan.step[{index}].place: unknown '{step.place}'; '{other}'"
                             f" knows: {', '.join(commands)}"
                         )
                         yield f"params.tables.{name}", path.name, why
@@ -129,8 +124,8 @@ class TaskTable(StateTableExecutor):
         super().restore_state()
         if self.last_status.has_message and self.last_command.has_message:
             self._steps_done = self.last_status.message.action
-            self._newest_command.copy_from(self.last_command.message)
-            self._newest_command.id = self.last_status.message.sent
+            self.command.copy_from(self.last_command.message)
+            self.command.id = self.last_status.message.sent
 
     def evaluate_conditions(self, tick: int) -> dict[str, str]:
         """Return the values of the conditions `below` and `step`."""
@@ -138,7 +133,7 @@ class TaskTable(StateTableExecutor):
         self.resting = self.below.message.resting
         is_left = self._steps_done < len(self.table.plan.step)
         return {
-            "below": classify_answer(self.below, self._newest_command.id),
+            "below": classify_answer(self.below, self.command.id),
             "step": ("none", "more")[is_left],
         }
 
@@ -147,8 +142,8 @@ class TaskTable(StateTableExecutor):
         steps = self.table.plan.step
         step = steps[min(self._steps_done, len(steps) - 1)]
         words = {"pick": f"pick {step.object}", "place": f"place {step.place}", "home": "home"}
-        self._newest_command.id += 1
-        self._newest_command.words = words[verb]
+        self.command.id += 1
+        self.command.words = words[verb]
 
     def do_next(self) -> None:
         """Advance to the next step."""
@@ -156,12 +151,11 @@ class TaskTable(StateTableExecutor):
 
     def write_outputs(self, tick: int) -> None:
         """Write the command for the level below and the number of completed steps."""
-        self._newest_command.hold = self.is_held
-        self.command.copy_from(self._newest_command)
+        self.command.hold = self.is_held
         status = self.status
         steps = len(self.table.plan.step)
         status.action = min(self._steps_done, steps)
         status.actions = steps
-        status.sent = self._newest_command.id
+        status.sent = self.command.id
         status.moves = steps * COMMANDS_PER_STEP
         status.moves_done = status.action * COMMANDS_PER_STEP

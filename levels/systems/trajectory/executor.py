@@ -13,9 +13,9 @@ import numpy as np
 
 from rack.backplane.message import State
 from rack.levels.algebra import Array
-from rack.levels.level import Executor, Input, Inputs, LevelContext, Output, Reading
+from rack.levels.level import OPERATOR, Executor, Input, Inputs, LevelContext, Output, Reading
 from rack.levels.messages import WorldState
-from rack.levels.operator import HOLD_COMMANDS, OperatorCommand, Orders
+from rack.levels.operator import HOLD_COMMANDS
 from rack.levels.planning.ik import InverseKinematics
 from rack.levels.robot import dynamics
 from rack.levels.robot.cell import build_level_cell
@@ -32,7 +32,6 @@ from rack.levels.systems.trajectory.messages import (
 from rack.levels.systems.trajectory.motion import SampledMotion
 from rack.levels.systems.trajectory.request_work import MotionTools, RequestWork, TrajectoryParams
 from rack.levels.systems.trajectory.requests import Agenda
-from rack.levels.tables import read_params
 
 LEAD_CYCLES = 2
 """Cycles from the release that computes a set point to the tick at which it is due.
@@ -59,19 +58,20 @@ class TrajectoryExecutor(Executor):
     last_command = Input(JointReference, "own.command")
     last_status = Input(MotionStatus, "own.status")
     last_state = Input(MotionState, "own.state")
-    operator = Input(OperatorCommand, "own.operator")
+    operator = OPERATOR
     command = Output(JointReference)
     status = Output(MotionStatus, rests_on=boards)
     state = Output(MotionState)
     commands = HOLD_COMMANDS
     params: ClassVar[type[TrajectoryParams]] = TrajectoryParams
+    settings: TrajectoryParams
     preloads = (dynamics,)
     work_class: ClassVar[type[RequestWork]] = RequestWork
     """Class that begins, blends and ends the requests."""
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
-        params = read_params(self.params, context.params)
+        params = self.settings
         robot = context.robot
         cell = build_level_cell(context)
         self._ik = InverseKinematics(cell, context.seed)
@@ -82,7 +82,6 @@ class TrajectoryExecutor(Executor):
         self._work = self.work_class(self._agenda, self._motion, tools)
         self._boards = JointBoards(robot.joints, cell.bounds.position, params.handover)
         self._guard = TouchGuard(context.period_s)
-        self._orders = Orders(self.commands)
         self._dynamics = Dynamics(cell)
         if robot.gripper is not None:
             self._work.grip = robot.gripper.open, robot.gripper.force

@@ -43,7 +43,6 @@ from rack.levels.tables import (
     SceneConfig,
     Table,
     Vector,
-    read_params,
 )
 
 MAX_REQUESTS = 200
@@ -248,12 +247,12 @@ class RequestPlanner(Planner):
     world = Input(WorldState, "world.model")
     output = QueuedOutput(MotionRequest)
     params = PlanningParams
+    settings: PlanningParams
     program = MotionProgram
 
     def __init__(self, context: LevelContext) -> None:
         super().__init__(context)
         self._steps = self.program.read(context.task, context.robot, context.scene).step
-        self._max_open_requests = read_params(PlanningParams, context.params).ahead
         cell = build_level_cell(context)
         self._ik = InverseKinematics(cell, context.seed)
         self._home = cell.home
@@ -309,7 +308,7 @@ class RequestPlanner(Planner):
             tick: Current tick, for the delay of a cancel step.
         """
         sent = self._sent
-        if sent >= len(self._steps) or sent - done >= self._max_open_requests:
+        if sent >= len(self._steps) or sent - done >= self.settings.ahead:
             return False
         step = self._steps[sent]
         if not isinstance(step, CancelStep):

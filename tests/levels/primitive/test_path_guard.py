@@ -87,7 +87,7 @@ class Watched:
     def __init__(self, waypoints: np.ndarray, held: int = -1) -> None:
         _, scene = arms.config(CROSSING)
         self.cell: Cell = arms.cell(CROSSING)
-        self.guard = PathGuard(self.cell, scene, lookahead_s=2.0, delay_s=0.0)
+        self.guard = PathGuard(self.cell, scene, lookahead_s=2.0, delay_s=0.0, blind_ticks=80)
         self.world = WorldState.zeros({"bodies": len(self.cell.bodies)})
         start = self.cell.build_start_data()
         for row, body in enumerate(self.cell.bodies):

@@ -116,9 +116,7 @@ WRONG_CONFIGS = {
         {"joints": ("shoulder", "wrist")},
         "no joint 'wrist' in the model; it has: shoulder, elbow",
     ),
-    "twice": ({"joints": ("elbow", "elbow")}, "'elbow' is named 2 times"),
     "tool": ({"tool": "tcp"}, "robot.tool: no site 'tcp' in the model; it has: tip"),
-    "length": ({"velocity": (1.0,)}, "robot.velocity: has 1 values but needs 2, one per joint"),
     "home outside": (
         {"home": (0.0, 2.5)},
         "joint 'elbow' is at 2.5 rad; it must be -1.995 to 1.995",

@@ -97,7 +97,7 @@ def test_the_palm_belongs_to_the_hand_and_may_touch_what_it_holds() -> None:
         (TENDON, TENDON.replace("-.012", ".012"), "on joint 'index0' are -0.012 to 0.012 m"),
         (EXTENSOR, EXTENSOR.replace(".012", "-.012"), "on joint 'index0' are -0.012 to 0.012 m"),
         (EXTENSOR, EXTENSOR.replace(".012", ".010"), "on joint 'index0' are 0.01 to 0.012 m"),
-        (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "tendon of joint 'index0' also turns joint 'index1'"),
+        (TENDON, TENDON.replace("</fixed>", '<joint joint="index1" coef=".01"/></fixed>'), "on joint 'index0' are 0.012 to 0.012 m, and on others up to 0.01 m"),
     ],
 )  # fmt: skip
 def test_a_tendon_that_is_not_part_of_a_pair_is_refused(

@@ -10,7 +10,6 @@ import pytest
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import Arm, SimulatedArm
-from rack.levels.errors import RobotError
 from rack.levels.messages import Error
 from rack.levels.robot.cell import build_cell, replace_encoders
 from rack.levels.servo.sensor_monitor import compute_tolerance
@@ -83,13 +82,6 @@ def test_the_tolerance_follows_from_the_encoders(tmp_path: Path) -> None:
     robot = pendulum(tmp_path)
     cell = build_cell(robot, SceneConfig(), CLOCK_NS)
     exact = compute_tolerance(cell)
-    with pytest.raises(
-        RobotError,
-        match=r"robot.sensors.noise: has 3 values but needs one for all joints, or one per joint",
-    ):
-        build_cell(
-            pendulum(tmp_path, sensors=SensorConfig(noise=(0.1, 0.1, 0.1))), SceneConfig(), CLOCK_NS
-        )
     own = compute_tolerance(replace_encoders(cell, robot, Arm.sensors))
     assert exact.position.tolist() == [2.5e-5, 2.5e-5]
     assert own.position == pytest.approx([3.75e-4, 3.75e-4])

@@ -22,7 +22,7 @@ from rack.levels.servo.modification import (
     ModifiableParams,
     Modification,
 )
-from rack.levels.servo.modified_law import LawInputs, ModifiedLaw
+from rack.levels.servo.modified_law import ModifiedLaw
 from tests.levels.arms import cell, config
 
 TICK_NS = 1_000_000
@@ -137,9 +137,7 @@ class Bench:
             motion = Motion(np.zeros((3, JOINTS)))
             motion.position[:] = wanted(self.tick)
             found.append(
-                self.law.compute_torque(
-                    self._law, LawInputs(motion, STATE, INERTIA, LOAD, self.tick)
-                )[2]
+                self.law.compute_torque(self._law, motion, STATE, INERTIA, LOAD, self.tick)[2]
             )
             self.tick += 1
         return np.array(found)

@@ -47,7 +47,7 @@ class PlayedArm:
     refuses: frozenset[int] = frozenset()
     fails: frozenset[int] = frozenset()
     keeps_s: float = 0.0  # how long it keeps a promise; 0: for good
-    taken: TakenOrder = field(default_factory=TakenOrder)
+    taken: TakenOrder = field(init=False)
     done: Counter[int] = field(default_factory=Counter)
     stopped: int = 0
     moved: int = 0
@@ -55,6 +55,7 @@ class PlayedArm:
 
     def __post_init__(self) -> None:
         self.report = CellReport.zeros({})
+        self.taken = TakenOrder(self.report)
 
     def cycle(self, order: tuple[int, OrderVerb, str], now_s: float) -> Reading:
         """Take up what is said; return the report."""
@@ -270,7 +271,7 @@ def test_expired_promise_is_requested_a_limited_number_of_times(
     "said", [[OrderVerb.DO], [OrderVerb.ASK, OrderVerb.DO]], ids=["never", "not yet"]
 )
 def test_order_that_was_not_promised_fails(said: list[OrderVerb]) -> None:
-    taken = TakenOrder()
+    taken = TakenOrder(CellReport.zeros({}))
     for what in said:
         taken.process_order(PROGRAM, 3000, what)
     assert (taken.response, taken.error) == (Response.FAILED, Error.GIVEN_UP)

@@ -8,7 +8,7 @@ import pytest
 from rack.backplane.message import State
 from rack.backplane.watch.alarms import Alarm
 from rack.boards.faults.kinds import KINDS
-from rack.levels.level import Demand, Fault, LevelContext
+from rack.levels.level import Demand, Fault, LevelContext, Pace
 from rack.levels.messages import Error
 from rack.levels.systems.hand.executor import HandExecutor
 from rack.levels.systems.hand.messages import EXTENSOR
@@ -161,25 +161,13 @@ def test_torn_tendon_is_found_within_its_bound_and_the_others_pull_on() -> None:
     assert_follows(rig)
 
 
-def context(above: dict[str, str | None], hand: bool = True) -> list[LevelContext]:
-    """Return the context of a hand's board, then those of the boards `above` with the fingers that
-    they drive."""
-    robot, scene = config("utah_mit" if hand else "puma560")
-    return [
-        LevelContext(
-            name,
-            EVERY,
-            1,
-            CLOCK_NS,
-            0,
-            robot,
-            scene,
-            {},
-            {},
-            params={"finger": finger} if finger else {},
-        )
-        for name, finger in (("hand", None), *above.items())
-    ]
+def context(above: dict[str, str | None]) -> LevelContext:
+    """Return the context of a hand's board below boards with the fingers that they drive."""
+    robot, scene = config("utah_mit")
+    paces = {
+        name: Pace(EVERY, 1, {"finger": finger} if finger else {}) for name, finger in above.items()
+    }
+    return LevelContext("hand", EVERY, 1, CLOCK_NS, 0, robot, scene, {}, {}, above=paces)
 
 
 @pytest.mark.parametrize(
@@ -200,7 +188,6 @@ def context(above: dict[str, str | None], hand: bool = True) -> list[LevelContex
 def test_every_joint_must_be_driven_by_one_board(
     above: dict[str, str | None], why: str | None
 ) -> None:
-    own, *others = context(above)
-    found = [misfit[2] for misfit in HandExecutor.find_mismatches(own, others, [])]
+    found = [misfit[2] for misfit in HandExecutor.find_mismatches(context(above))]
     assert found[:1] == ([] if why is None else [why])
     assert len(found) in (0, 4)

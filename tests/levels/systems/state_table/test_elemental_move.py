@@ -110,6 +110,7 @@ class Arm:
         assert isinstance(level, MoveTable)
         task = VirtualControlLoop(bench.segment, wiring, level)
         task.inputs.read(50)
+        level.restore_state()
         self.level = level
         self.world = WorldState(level.world.message.record.dtype)
         self.below = JointMoveStatus(level.below.message.record.dtype)
@@ -140,8 +141,8 @@ def test_the_world_is_seen_once_it_has_been_sensed(arm: Arm) -> None:
 
 def test_a_target_is_there_while_it_rests_where_it_was(arm: Arm) -> None:
     assert arm.look()["target"] == "there"
-    arm.level._command.object = 0
-    arm.level._command.aim = arm.place
+    arm.level.command.object = 0
+    arm.level.command.aim = arm.place
     moved = arm.level.table.plan.moved
     for offset, speed, seen in (
         (0.0, 0.0, "there"),
@@ -159,14 +160,14 @@ def test_a_pose_without_an_object_is_not_reached_and_does_not_end_the_board(
     arm: Arm, words: str
 ) -> None:
     arm.level._taken = WordCommand(False, 3, words)
-    sent = arm.level._command.id
+    sent = arm.level.command.id
     pose = next(iter(arm.level.table.plan.pose))
     arm.level.do_move(pose)
     assert not arm.level._reached
-    assert arm.level._command.id == sent
+    assert arm.level.command.id == sent
     # A pose out of reach is not reached either.
     arm.world.position[0] = (9.0, 0.0, 0.0)
     arm.look()
     arm.level._taken = WordCommand(False, 1, f"pick {arm.level.context.scene.objects[0]}")
     arm.level.do_move(pose)
-    assert (arm.level._command.id, arm.look()["reach"]) == (sent, "no")
+    assert (arm.level.command.id, arm.look()["reach"]) == (sent, "no")

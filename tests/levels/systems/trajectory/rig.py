@@ -147,7 +147,7 @@ class TrajectoryRig:
     def others(self) -> dict[str, Reading]:
         return {}
 
-    def _last(self, source: InputPort[Any]) -> Reading[Any]:
+    def _last(self, source: InputPort[Any, Any]) -> Reading[Any]:
         name = source.source.partition(".")[2]
         there = self.tick > 0 and name in self.level.outputs
         message = self.message(source.message)
