@@ -68,10 +68,8 @@ def held(folder: Path, inside: str = "", outside: str = "") -> mujoco.MjModel:
     """Return a model in which everything except its arm was fixed."""
     text = MODEL.format(inside=inside, outside=outside)
     spec = load_spec(written(folder, text, "given.xml"))
-    spec.compile()
-    path = written(folder, spec.to_xml(), "held.xml")
-    assert sorted(fix_joints(path, ["j"])) == ["cube", "hand"]
-    return load_spec(path).compile()
+    assert sorted(fix_joints(spec, ["j"])) == ["cube", "hand"]
+    return load_spec(written(folder, spec.to_xml(), "held.xml")).compile()
 
 
 @pytest.mark.parametrize("case", GONE)
