@@ -2,14 +2,13 @@
 
 from rack.levels import compiled
 from rack.levels.arm import drives, sensors, substeps
-from rack.levels.arm.arm import Arm
-from rack.levels.arm.drivable import DrivableArm, DriveState, JointTarget, Sensed, find_arm
+from rack.levels.arm.arm import Arm, find_arm
+from rack.levels.arm.link import DriveState, JointTarget, Sensed
 from rack.levels.arm.simulated import SimulatedArm
 from rack.levels.robot import dynamics
 
 __all__ = [
     "Arm",
-    "DrivableArm",
     "DriveState",
     "JointTarget",
     "Sensed",

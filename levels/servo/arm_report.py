@@ -10,7 +10,7 @@ import numpy as np
 from rack.backplane.message import Message, State
 from rack.backplane.words import Demand
 from rack.levels.algebra import Array
-from rack.levels.arm import DrivableArm, Sensed
+from rack.levels.arm import Arm, Sensed
 from rack.levels.messages import ArmState, DrivenArm, Error
 from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import Stopping
@@ -38,7 +38,7 @@ class ArmReport:
 
     status: DrivenArm
     state: ArmState
-    arm: DrivableArm
+    arm: Arm
     sensors: SensorMonitor
     stopping: Stopping
     slow: str  # reason shown while the speed of the arm is reduced

@@ -20,8 +20,8 @@ import numpy as np
 from rack.backplane.watch.alarms import BRAKED_BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
-from rack.levels.arm import DrivableArm, DriveState, Sensed, find_arm, preload
-from rack.levels.arm.drivable import Link
+from rack.levels.arm import Arm, DriveState, Sensed, find_arm, preload
+from rack.levels.arm.link import Link
 from rack.levels.fault_steps import ARM_STEPS
 from rack.levels.level import (
     Executor,
@@ -93,7 +93,7 @@ class ArmDriver(Executor):
         kind = find_arm(params.arm)
         cell = replace_encoders(build_level_cell(context), robot, kind.sensors)
         self.cell = cell
-        self.arm: DrivableArm = kind(cell, context.scene, context.clock_ns, every, context.seed)
+        self.arm: Arm = kind(cell, context.scene, context.clock_ns, every, context.seed)
         self.speed_scale = robot.bring_up or 1.0  # reduced until the operator's release
         self._path = self.arm.connect(
             context.tick_s, self.speed_scale, self.acted, lambda: self.holds_part

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from rack.levels.arm import DrivableArm, DriveState, Sensed
+from rack.levels.arm import Arm, DriveState, Sensed
 from rack.levels.level import LevelContext, Reading
 from rack.levels.messages import ArmState
 from rack.levels.operator import Operation, OperatorCommand
@@ -21,7 +21,7 @@ class Enabling:
     change the state of the drives.
     """
 
-    def __init__(self, arm: DrivableArm, context: LevelContext) -> None:
+    def __init__(self, arm: Arm, context: LevelContext) -> None:
         robot = context.robot
         self._arm = arm
         self._at_start = robot.enable == "at-start" or (robot.enable is None and arm.keeps_limits)
@@ -113,7 +113,7 @@ class Takeover:
     therefore compared with earlier ones only after the arm was enabled and its pose adopted.
     """
 
-    arm: DrivableArm
+    arm: Arm
     sensors: SensorMonitor
     stopping: Stopping
     enabling: Enabling
