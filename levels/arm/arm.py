@@ -22,7 +22,7 @@ from rack.levels.arm.link import Link
 from rack.levels.errors import RobotError
 from rack.levels.messages import Scene
 from rack.levels.robot.cell import Cell
-from rack.levels.tables import SensorConfig, validate_class
+from rack.levels.tables import SensorConfig
 
 
 class ArmLinks(NamedTuple):
@@ -106,12 +106,3 @@ class Arm(BrakedArm):
         position = self.sense().position
         self._data.qpos[self.cell.qpos] = position if offset is None else position + offset
         self._fill_scene(scene)
-
-
-def find_arm(reference: str) -> type[Arm]:
-    """Return the class of an arm, given a reference "package.module:Class".
-
-    Raises:
-        ValueError: The class is missing, abstract, or not the class of an arm.
-    """
-    return validate_class(reference, Arm)
