@@ -130,6 +130,9 @@ def fix_joints(spec: mujoco.MjSpec, moving_joints: Iterable[str]) -> list[str]:
     moving = {*moving_joints}
     free_bodies = []
     bodies = list(spec.worldbody.bodies)
+    # MuJoCo deletes what refers to a body or its contents together with the body, but not what
+    # refers to a single joint. Replace each joint to be fixed by one of the same name in this body.
+    fixed = spec.worldbody.add_body()
     for body in bodies:
         is_free = any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
         if (is_free or body.mocap) and moving.isdisjoint(j.name for j in body.find_all("joint")):
@@ -137,10 +140,12 @@ def fix_joints(spec: mujoco.MjSpec, moving_joints: Iterable[str]) -> list[str]:
             spec.delete(body)
             continue
         for joint in body.joints:
-            if joint.name not in moving:
+            if (name := joint.name) not in moving:
                 spec.delete(joint)
+                fixed.add_joint(name=name)
         bodies += body.bodies
-    # MuJoCo deletes everything that refers to a deleted element, except cameras and lights.
+    spec.delete(fixed)
+    # Cameras and lights whose target was deleted remain, and are invalid.
     remaining = {"", *(body.name for body in spec.bodies)}
     aimed = [each for each in [*spec.cameras, *spec.lights] if each.targetbody not in remaining]
     for element in [*aimed, *spec.keys]:
