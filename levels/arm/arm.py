@@ -12,25 +12,33 @@ instead.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 from rack.levels.arm.braked_arm import BrakedArm
-from rack.levels.arm.drivable import ArmLinks
 from rack.levels.arm.faulty import FaultyLink
 from rack.levels.arm.guard import GuardedArm, narrow_bounds_by_errors
 from rack.levels.arm.latency_compensation import build_present_link
+from rack.levels.arm.link import Link
 from rack.levels.errors import RobotError
 from rack.levels.messages import Scene
 from rack.levels.robot.cell import Cell
 from rack.levels.tables import SensorConfig
 
 
+class ArmLinks(NamedTuple):
+    """Links between the servo level and an arm, without and with injected faults."""
+
+    faultless: Link
+    faulty: FaultyLink
+
+
 class Arm(BrakedArm):
     """Base class of every arm. A guard protects the arm, unless its drives enforce the limits.
 
     Subclasses write `sense`, `brake`, `step`, and `drive` or `follow`, depending on whether the
-    drives take torques or set points. They keep the attributes of `DrivableArm` up to date. All
-    other methods have defaults, which suit an arm without contact sensors whose state survives a
-    restart of its board.
+    drives take torques or set points. They keep the attributes of `BrakedArm` and `Plant` up to
+    date. All other methods have defaults, which suit an arm without contact sensors whose state
+    survives a restart of its board.
     """
 
     keeps_limits = False
@@ -53,7 +61,18 @@ class Arm(BrakedArm):
         acted: dict[int, bool],
         holds: Callable[[], bool],
     ) -> ArmLinks:
-        """Return the links between servo level and arm; see `DrivableArm.connect`."""
+        """Return the links through which the servo level drives the arm.
+
+        Args:
+            tick_s: Duration of a tick, s.
+            speed_fraction: Fraction of the velocity limits that is permitted.
+            acted: Receives the faults that have an effect, for `Executor.acted`.
+            holds: Function that returns True if, as far as the level knows, the gripper may hold an
+                object.
+
+        Raises:
+            RobotError: The encoders are too coarse to detect a violated limit.
+        """
         link = build_present_link(self, tick_s)
         if not self.keeps_limits:
             link = self._guard = GuardedArm(self, tick_s, link, speed_fraction)

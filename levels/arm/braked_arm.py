@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 
 import numpy as np
 
 from rack.backplane.watch.alarms import BRAKED_AT_START, BRAKED_WITHOUT_TORQUE, Alarm
 from rack.levels.algebra import Array
-from rack.levels.arm.drivable import DrivableArm, DriveState, JointTarget, Sensed
+from rack.levels.arm.link import DriveState, JointTarget, LimitViolation, Sensed
 from rack.levels.arm.plant import Plant
 from rack.levels.level import Finding
 from rack.levels.messages import ArmState, Error
@@ -23,8 +23,20 @@ The servo level keeps the limits itself; the margin is for rounding.
 """
 
 
-class BrakedArm(Plant, DrivableArm):
-    """An arm that refuses torques beyond the limits and reports its brakes. Implements `Link`."""
+class BrakedArm(Plant, ABC):
+    """An arm that refuses torques beyond the limits and reports its brakes. Implements `Link`.
+
+    Its joints have drives and brakes, and its gripper is controlled by force.
+    """
+
+    reports_torque = False
+    """True if `torque` is the torque of the motors for the coming cycle after `follow`.
+
+    Otherwise it is the predicted torque, and only the following error shows that a motor has
+    failed.
+    """
+    exceeded: LimitViolation | None = None
+    """Limit that the newest sample exceeds. None if it exceeds none or the link checks none."""
 
     def __init__(
         self, cell: Cell, scene: SceneConfig, clock_ns: int, every: int = 1, seed: int = 0
@@ -55,6 +67,21 @@ class BrakedArm(Plant, DrivableArm):
     @abstractmethod
     def sense(self) -> Sensed:
         """Return the newest sample; see `Link.sense`."""
+
+    @abstractmethod
+    def brake(self) -> None:
+        """Engage the brakes, which stop and hold the joints.
+
+        The motors apply no torque, and the gripper keeps its force.
+        """
+
+    @abstractmethod
+    def step(self, ticks: int) -> None:
+        """Advance `tick` and `waited` by `ticks`, and brake once `waited` reaches `patience`.
+
+        A simulation also simulates these ticks. After missed cycles, `ticks` is more than one cycle
+        of the level. It may be 0.
+        """
 
     def drive(self, torque: Array, grip_force: float) -> Finding | None:
         """Release the brakes and apply torques in N m and a grip force in N; see `Link.drive`.

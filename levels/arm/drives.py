@@ -10,7 +10,7 @@ import numpy as np
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array, mat_vec, solve
 from rack.levels.arm.braked_arm import BrakedArm
-from rack.levels.arm.drivable import JointTarget
+from rack.levels.arm.link import JointTarget
 from rack.levels.compiled import compiled, compiled_for
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import FRICTION_SPEED, INERTIA_ROW, Dynamics

@@ -11,7 +11,7 @@ import numpy as np
 
 from rack.levels.algebra import Array, Mask
 from rack.levels.arm.braked_arm import BrakedArm
-from rack.levels.arm.drivable import JointTarget, Link, Sensed
+from rack.levels.arm.link import JointTarget, Link, Sensed
 from rack.levels.fault_steps import ActiveFault, CommandStep, Key, MotorStep, SensorStep
 from rack.levels.level import Fault, Finding
 from rack.levels.robot.dynamics import FRICTION_SPEED

@@ -7,9 +7,9 @@ import numpy as np
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.algebra import Array
 from rack.levels.arm.braked_arm import BrakedArm
-from rack.levels.arm.drivable import DriveState, JointTarget, LimitViolation, Link, Sensed
 from rack.levels.arm.drives import LimitGate, SetPointGate
 from rack.levels.arm.latency_compensation import PresentLink
+from rack.levels.arm.link import DriveState, JointTarget, LimitViolation, Link, Sensed
 from rack.levels.errors import RobotError
 from rack.levels.level import Finding
 from rack.levels.messages import Error

@@ -13,7 +13,7 @@ import numpy as np
 
 from rack.levels.algebra import Array, solve
 from rack.levels.arm.braked_arm import BrakedArm
-from rack.levels.arm.drivable import JointTarget, Link, Sensed, copy_sample
+from rack.levels.arm.link import JointTarget, Link, Sensed, copy_sample
 from rack.levels.level import Finding
 from rack.levels.robot.dynamics import Dynamics
 

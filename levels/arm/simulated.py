@@ -10,8 +10,8 @@ import numpy as np
 
 from rack.levels.algebra import Array, mat_vec
 from rack.levels.arm.arm import Arm
-from rack.levels.arm.drivable import JointTarget, Sensed, copy_sample
 from rack.levels.arm.drives import LimitGate, SetPointGate
+from rack.levels.arm.link import JointTarget, Sensed, copy_sample
 from rack.levels.arm.sensors import CoarseSensors, WristSensor
 from rack.levels.arm.simulation import Simulation
 from rack.levels.level import Finding

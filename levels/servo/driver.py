@@ -13,15 +13,15 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from rack.backplane.watch.alarms import BRAKED_BY_DEMAND, Alarm
 from rack.levels import compiled
 from rack.levels.algebra import Array
-from rack.levels.arm import DrivableArm, DriveState, Sensed, find_arm, preload
-from rack.levels.arm.drivable import Link
+from rack.levels.arm import DriveState, Sensed, find_arm, preload
+from rack.levels.arm.link import Link
 from rack.levels.fault_steps import ARM_STEPS
 from rack.levels.level import (
     Executor,
@@ -45,6 +45,9 @@ from rack.levels.servo.enabling import Enabling
 from rack.levels.servo.sensor_monitor import SensorMonitor
 from rack.levels.servo.stopping import Cause, Reaction, Stopping
 from rack.levels.tables import read_params
+
+if TYPE_CHECKING:
+    from rack.levels.arm import Arm
 
 SCENES = Output(Scene, cycles=8)
 """A scene in every eighth cycle: at 400 Hz, one for each cycle of the levels that read it."""
@@ -95,7 +98,7 @@ class ArmDriver(Executor):
         kind = find_arm(params.arm)
         cell = replace_encoders(build_level_cell(context), robot, kind.sensors)
         self.cell = cell
-        self.arm: DrivableArm = kind(cell, context.scene, context.clock_ns, every, context.seed)
+        self.arm: Arm = kind(cell, context.scene, context.clock_ns, every, context.seed)
         self.speed_scale = robot.bring_up or 1.0  # reduced until the operator's release
         self._path = self.arm.connect(
             context.tick_s, self.speed_scale, self.acted, lambda: self.holds_part

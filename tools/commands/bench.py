@@ -137,9 +137,8 @@ def lockstep(
     """Measure the speed of nasrem, k1607 and fig4 in lockstep.
 
     The runs alternate with a lower bound: the same levels execute the same plans and cycles in one
-    process without a rack. Their messages must equal the rack's bit for bit. Ratios refer to the
-    checkout TREE if --against names one, otherwise to this bound. TREE runs in its environment
-    TREE/.venv.
+    process without a rack. Ratios refer to the checkout TREE if --against names one, otherwise to
+    this bound. TREE runs in its environment TREE/.venv.
     """
     from rack.tools.lab.benches.lockstep import RACKS, measure_lockstep
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -29,16 +27,6 @@ MAX_FINGER_JOINTS = 4
 """Branches of about equal length with at most this many joints are the fingers of a hand."""
 MIN_BASE_JOINTS = 3
 """Least number of joints before a branch for it to be a hand."""
-
-
-REFERRING_SECTIONS = ("tendon", "equality", "actuator", "contact", "deformable", "sensor", "custom")
-"""Sections of an MJCF file that refer to others."""
-REFERENCE_KINDS = {
-    "jointinparent": "joint",
-    **dict.fromkeys(("node", "subtree", "target", "xbody"), "body"),
-    **dict.fromkeys(("refsite", "sidesite", "cranksite", "slidersite"), "site"),
-}
-"""Kind of element that an attribute refers to, unless its name is the kind, as in `body1`."""
 
 
 @dataclass(frozen=True)
@@ -126,70 +114,43 @@ def find_driven_joints(model: mujoco.MjModel) -> set[int]:
     return set(driven.tolist()).union(*(find_coupled_joints(model, k) for k in range(model.neq)))
 
 
-def fix_joints(path: Path, moving_joints: Iterable[str]) -> list[str]:
-    """Fix all joints of an MJCF file except `moving_joints`, and remove free bodies.
+def fix_joints(spec: mujoco.MjSpec, moving_joints: Iterable[str]) -> list[str]:
+    """Fix all joints of a model except `moving_joints`, and remove free bodies and keyframes.
 
     Bodies moved from outside (mocap) and everything that refers to a removed element are removed as
     well.
 
     Args:
-        path: The file, which MuJoCo has written. It is overwritten.
+        spec: The model, which is changed.
         moving_joints: Names of the joints that remain movable.
 
     Returns:
         Names of the removed bodies.
     """
-    tree = ElementTree.parse(path)
-    root = tree.getroot()
-    moving = {("joint", name) for name in moving_joints}
-    removed = set[tuple[str, str]]()
+    moving = {*moving_joints}
     free_bodies = []
-    world = root.find("worldbody")
-    assert world is not None, "MuJoCo writes one"
-    parents = [parent for parent in world.iter() if parent.tag in ("worldbody", "body", "frame")]
-    for parent in parents:
-        for body in parent.findall("body"):
-            names = {(inner.tag, inner.get("name", "")) for inner in body.iter()}
-            is_free = (
-                body.find("freejoint") is not None or body.find("joint[@type='free']") is not None
-            )
-            if not names & moving and (is_free or "mocap" in body.attrib):
-                parent.remove(body)
-                removed |= names
-                free_bodies.append(body.get("name", ""))
-        for joint in [*parent.findall("joint"), *parent.findall("freejoint")]:
-            if ("joint", joint.get("name", "")) not in moving:
-                parent.remove(joint)
-                removed.add(("joint", joint.get("name", "")))
-    for keys in root.findall("keyframe"):
-        root.remove(keys)
-    sections = [section for section in root if section.tag in REFERRING_SECTIONS]
-    # Repeat, because other elements may refer to the ones just removed.
-    while referring := [
-        (section, element)
-        for section in parents + sections
-        for element in section
-        if (section in sections or element.tag in ("camera", "light"))
-        and _refers_to_removed(element, removed)
-    ]:
-        for section, element in referring:
-            section.remove(element)
-            is_mixed = section in parents or section.tag in ("custom", "deformable")
-            removed.add((element.tag if is_mixed else section.tag, element.get("name", "")))
-    tree.write(path)
+    bodies = list(spec.worldbody.bodies)
+    # MuJoCo deletes what refers to a body or its contents together with the body, but not what
+    # refers to a single joint. Replace each joint to be fixed by one of the same name in this body.
+    fixed = spec.worldbody.add_body()
+    for body in bodies:
+        is_free = any(joint.type == mujoco.mjtJoint.mjJNT_FREE for joint in body.joints)
+        if (is_free or body.mocap) and moving.isdisjoint(j.name for j in body.find_all("joint")):
+            free_bodies.append(body.name)
+            spec.delete(body)
+            continue
+        for joint in body.joints:
+            if (name := joint.name) not in moving:
+                spec.delete(joint)
+                fixed.add_joint(name=name)
+        bodies += body.bodies
+    spec.delete(fixed)
+    # Cameras and lights whose target was deleted remain, and are invalid.
+    remaining = {"", *(body.name for body in spec.bodies)}
+    aimed = [each for each in [*spec.cameras, *spec.lights] if each.targetbody not in remaining]
+    for element in [*aimed, *spec.keys]:
+        spec.delete(element)
     return free_bodies
-
-
-def _refers_to_removed(element: ElementTree.Element, removed: set[tuple[str, str]]) -> bool:
-    """Return True if an element, or one inside it, refers to a removed element."""
-    for inner in element.iter():
-        for key, value in inner.items():
-            is_typed = key in ("objname", "refname")
-            kind = (inner.get(f"{key[:3]}type", "") if is_typed else key).rstrip("12")
-            names = value.split() if inner.tag == "flex" else [value]
-            if any((REFERENCE_KINDS.get(kind, kind), name) in removed for name in names):
-                return True
-    return False
 
 
 def _find_longest_arm(

@@ -243,22 +243,22 @@ def _run_steps(source: Source, options: ArmOptions, folder: Path, name: str) -> 
     path = folder / f"{name}.xml"
     copy_model(source, path)
     springs = [joint for joint in arm.passive if model.joint(joint).stiffness > 0.0]
-    left_out = fix_joints(path, (*arm.joints, *fingers, *springs))
-    notes = [*source.notes, *_describe_omissions(model, arm, left_out)]
     spec = load_spec(path)
+    left_out = fix_joints(spec, (*arm.joints, *fingers, *springs))
+    notes = [*source.notes, *_describe_omissions(model, arm, left_out)]
     limits = _read_limits(source, model, spec, arm.joints, options.torque)
     tool = ToolFrame(options.tool or _find_mount(compile_spec(spec, path), arm.tip))
     home = HomePose([0.0] * len(arm.joints))
     result = Draft(path, spec, options, arm, keyframes, notes, limits, tool, home)
+    result.write_model()
     if fingers:
         try:
             result.gripper = _fit_gripper(result)
             notes += result.gripper.notes
         except RobotError as error:
             notes.append(f"no gripper: {error}")
+            fix_joints(spec, arm.joints)
             result.write_model()
-            fix_joints(path, arm.joints)
-            result.spec = load_spec(path)
     if not options.tool:
         result.tool = _choose_tool(result)
     result.exclude = _find_overlaps(result.build_cell())

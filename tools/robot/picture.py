@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from copy import copy
-from itertools import product
 from pathlib import Path
 
 import mujoco
@@ -23,8 +22,6 @@ SHOWN_GROUPS = 3
 """Number of geom groups that MuJoCo's own viewer shows. Others contain collision shapes."""
 AZIMUTH_DEG = 135.0
 ELEVATION_DEG = -22.0
-MARGIN = 1.1
-"""Distance of the camera, relative to the distance at which everything just fits."""
 FLOOR_BELOW_M = 0.005
 """Distance from the lowest point to an added floor, so that a fixed box can be a floor, too."""
 FLOOR_COLOUR = (0.6, 0.62, 0.65, 1.0)
@@ -69,16 +66,14 @@ def draw_arm(cell: Cell, path: Path, data: mujoco.MjData | None = None) -> str:
     is_drawn = model.geom_group < SHOWN_GROUPS
     if not is_drawn[cell.geoms.arm].any():
         option.geomgroup[:] = is_drawn[:] = True
-    joints = data.xanchor[model.dof_jntid[cell.dof]]
-    points = np.vstack((joints, data.site_xpos[cell.tool], list_corners(cell, data, is_drawn)))
-    camera = build_camera(points, model.vis.global_.fovy)
+    camera = build_camera(cell, data, is_drawn)
     scene = mujoco.MjvScene(model, MAX_SHAPES)
     categories = mujoco.mjtCatBit.mjCAT_ALL
     mujoco.mjv_updateScene(model, data, option, None, camera, categories, scene)
     if not (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).any():
         floor = scene.geoms[scene.ngeom]
         size = 2.5 * camera.distance
-        place = np.array([*camera.lookat[:2], points[:, 2].min() - FLOOR_BELOW_M])
+        place = np.array([*camera.lookat[:2], find_lowest_z(data, model.geom_aabb) - FLOOR_BELOW_M])
         mujoco.mjv_initGeom(
             floor,
             mujoco.mjtGeom.mjGEOM_PLANE,
@@ -109,55 +104,38 @@ def draw_arm(cell: Cell, path: Path, data: mujoco.MjData | None = None) -> str:
     return str(path)
 
 
-def list_corners(cell: Cell, data: mujoco.MjData, is_drawn: Array) -> Array:
-    """Return the corners of the boxes around all drawn geoms except floors and walls.
+def build_camera(cell: Cell, data: mujoco.MjData, is_drawn: Array) -> mujoco.MjvCamera:
+    """Return a camera that shows all drawn geoms except floors and walls.
 
     Args:
         cell: The cell.
         data: Poses of its geoms.
         is_drawn: True for each drawn geom, shape (geoms,).
-
-    Returns:
-        The corners in m, shape (n, 3).
     """
     model = cell.model
     # A fixed geom that is much larger than the arm is a floor or a wall.
     size = np.linalg.norm(np.ptp(data.geom_xpos[cell.geoms.arm], axis=0))
     is_large = (model.body_weldid[model.geom_bodyid] == 0) & (model.geom_rbound > 1.5 * size)
-    is_plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
-    is_drawn = is_drawn & ~is_large & ~is_plane
-    centre, half = np.split(model.geom_aabb[is_drawn], 2, axis=1)
-    signs = np.array([*product((-1, 1), repeat=3)])
-    local = centre[:, None] + half[:, None] * signs
-    rotation = data.geom_xmat[is_drawn].reshape(-1, 1, 3, 3)
-    corners = data.geom_xpos[is_drawn, None] + (rotation @ local[..., None])[..., 0]
-    return np.asarray(corners.reshape(-1, 3))
-
-
-def build_camera(points: Array, height_deg: float) -> mujoco.MjvCamera:
-    """Return a camera that shows all points, shape (n, 3), and is as close as possible.
-
-    Args:
-        points: The points in m, shape (n, 3).
-        height_deg: Angle between the lower and the upper edge of the picture.
-    """
-    right, up, forward = compute_axes()
+    is_shown = is_drawn & ~is_large & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
+    centres = data.geom_xpos[is_shown]
+    radii = model.geom_rbound[is_shown, None]
     camera = mujoco.MjvCamera()
     camera.azimuth = AZIMUTH_DEG
     camera.elevation = ELEVATION_DEG
-    camera.lookat = (points.min(axis=0) + points.max(axis=0)) / 2
-    tangent = np.tan(np.radians(height_deg) / 2)
-    offsets = points - camera.lookat
-    across = np.abs(offsets @ right) / (tangent * WIDTH / HEIGHT)
-    along = np.abs(offsets @ up) / tangent
-    camera.distance = MARGIN * float((np.maximum(across, along) - offsets @ forward).max())
+    camera.lookat = ((centres - radii).min(axis=0) + (centres + radii).max(axis=0)) / 2
+    # The cone of view touches the sphere around everything.
+    radius = (np.linalg.norm(centres - camera.lookat, axis=1) + radii[:, 0]).max()
+    camera.distance = radius / np.sin(np.radians(model.vis.global_.fovy) / 2)
     return camera
 
 
-def compute_axes() -> Array:
-    """Return the directions to the right, up and forward as seen by the camera, shape (3, 3)."""
-    azimuth, elevation = np.radians((AZIMUTH_DEG, ELEVATION_DEG))
-    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    forward = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
-    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
-    return np.array([right, np.cross(right, forward), forward])
+def find_lowest_z(data: mujoco.MjData, boxes: Array) -> float:
+    """Return the smallest z of the boxes around all geoms, in m.
+
+    Args:
+        data: Poses of the geoms.
+        boxes: Centre and half size of each box in the frame of its geom, m, shape (geoms, 6).
+    """
+    vertical = data.geom_xmat.reshape(-1, 3, 3)[:, 2]
+    lows = (vertical * boxes[:, :3] - np.abs(vertical * boxes[:, 3:])).sum(axis=1)
+    return float((data.geom_xpos[:, 2] + lows).min())

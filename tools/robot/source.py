@@ -131,74 +131,50 @@ def _check_tree(path: Path, root: ElementTree.Element) -> None:
 
 
 def _prepare_shapes(path: Path, root: ElementTree.Element) -> list[str]:
-    """Prepare the collision shapes of a URDF. A link without any gets its visible shapes.
+    """Find the meshes of a URDF. A link without collision shapes gets its visible shapes as such.
 
-    Returns notes for the user. Raises `RobotError` if no link has a shape that can be read.
+    Returns notes for the user. Raises `RobotError` if a mesh of a collision shape cannot be read,
+    or if no link has a shape that can be read.
     """
     compiler = root.find("mujoco/compiler")
     folder = "." if compiler is None else compiler.get("meshdir", ".")
-    links = {link.get("name", ""): link for link in root.findall("link")}
-    visible = [name for name, link in links.items() if _is_only_visible(link)]
-    unreadable = {
-        name: problem
-        for name, link in links.items()
-        if (problem := _prepare_link_shapes(path, link, folder)) is not None
-    }
+    children = {child.get("link", "") for child in root.findall("joint/child")}
+    visible: list[str] = []
+    unreadable: dict[str, RobotError] = {}
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        is_only_visible = link.find("collision") is None and link.find("visual") is not None
+        for visual in link.findall("visual"):
+            if is_only_visible:
+                visual.tag = "collision"
+            else:
+                link.remove(visual)
+        try:
+            for mesh in link.iter("mesh"):
+                mesh.set("filename", str(_find_mesh(path, mesh.get("filename", ""), folder)))
+            if is_only_visible:
+                visible.append(name)
+        except RobotError as problem:
+            if not is_only_visible:
+                raise
+            unreadable[name] = problem
+            for shape in link.findall("collision"):
+                link.remove(shape)
     if unreadable and root.find("link/collision") is None:
         raise next(iter(unreadable.values()))
-    children = {child.get("link", "") for child in root.findall("joint/child")}
+    massless = [
+        link.get("name", "")
+        for link in root.findall("link[collision]")
+        if link.get("name") in children and link.find("inertial") is None
+    ]
     notes = {
-        "no <collision>, so planning uses the visible shapes": [
-            n for n in visible if n not in unreadable
-        ],
+        "no <collision>, so planning uses the visible shapes": visible,
         "no <collision> and no mesh that can be read, so no shape in planning": [*unreadable],
-        "no <inertial>, so the mass is computed from the shapes with the density of water": [
-            name
-            for name, link in links.items()
-            if name in children
-            and link.find("collision") is not None
-            and link.find("inertial") is None
-        ],
+        "no <inertial>, so the mass is computed from the shapes with the density of water": (
+            massless
+        ),
     }
     return [f"{why}: {format_names(names)}" for why, names in notes.items() if names]
-
-
-def _is_only_visible(link: ElementTree.Element) -> bool:
-    """Return True if a link has visible shapes but no collision shapes."""
-    return link.find("collision") is None and link.find("visual") is not None
-
-
-def _prepare_link_shapes(path: Path, link: ElementTree.Element, folder: str) -> RobotError | None:
-    """Keep the collision shapes of a link, or else turn its visible shapes into collision shapes.
-
-    Args:
-        path: File of the model.
-        link: The link, which is changed.
-        folder: Folder of the meshes, as the model states it.
-
-    Returns:
-        The reason why a visible link has no usable shape. None if it has one or is not visible.
-
-    Raises:
-        RobotError: A mesh of its collision shapes cannot be read.
-    """
-    is_only_visible = _is_only_visible(link)
-    visuals = link.findall("visual")
-    if not is_only_visible:
-        for visual in visuals:
-            link.remove(visual)
-    try:
-        for mesh in link.iter("mesh"):
-            mesh.set("filename", str(_find_mesh(path, mesh.get("filename", ""), folder)))
-    except RobotError as problem:
-        if not is_only_visible:
-            raise
-        for visual in visuals:
-            link.remove(visual)
-        return problem
-    for visual in visuals:
-        visual.tag = "collision"
-    return None
 
 
 def _find_mesh(path: Path, name: str, meshes: str) -> Path:

@@ -12,9 +12,9 @@ import pytest
 from rack.backplane.message import Message
 from rack.backplane.watch.alarms import Alarm
 from rack.levels.arm import Sensed, SimulatedArm
-from rack.levels.arm.drivable import copy_sample
 from rack.levels.arm.guard import GuardedArm
 from rack.levels.arm.latency_compensation import PresentLink
+from rack.levels.arm.link import copy_sample
 from rack.levels.messages import Error
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.tables import RobotConfig, SceneConfig

@@ -113,7 +113,7 @@ def test_a_restarted_board_restores_the_arm(rig: ServoRig) -> None:
         ),
         (
             "rack.levels.arm:Sensed",
-            "module 'rack.levels.arm' has no DrivableArm named 'Sensed'; it has: ",
+            "module 'rack.levels.arm' has no Arm named 'Sensed'; it has: ",
         ),
         (
             "tests.levels.arm.test_own_arm:HalfAnArm",

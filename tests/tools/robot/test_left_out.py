@@ -56,6 +56,15 @@ GONE = {
         "</deformable>"
     ),
 }
+GONE_WITH_A_JOINT = {
+    "equality": '<equality><joint joint1="wrist" joint2="j"/></equality>',
+    "leader": '<equality><joint joint1="j" joint2="wrist"/></equality>',
+    "motor": '<actuator><motor name="m" joint="wrist"/></actuator>'
+    '<sensor><actuatorfrc actuator="m"/></sensor>',
+    "tendon": '<tendon><fixed name="t"><joint joint="j" coef="1"/><joint joint="wrist" coef="1"/>'
+    '</fixed></tendon><actuator><motor tendon="t"/></actuator>',
+    "sensor": '<sensor><jointpos joint="wrist"/></sensor>',
+}
 KEPT = (
     '<tendon><fixed name="cube"><joint joint="j" coef="1"/></fixed></tendon>'
     '<actuator><motor name="hinge" tendon="cube"/></actuator>'
@@ -68,10 +77,8 @@ def held(folder: Path, inside: str = "", outside: str = "") -> mujoco.MjModel:
     """Return a model in which everything except its arm was fixed."""
     text = MODEL.format(inside=inside, outside=outside)
     spec = load_spec(written(folder, text, "given.xml"))
-    spec.compile()
-    path = written(folder, spec.to_xml(), "held.xml")
-    assert sorted(fix_joints(path, ["j"])) == ["cube", "hand"]
-    return load_spec(path).compile()
+    assert sorted(fix_joints(spec, ["j"])) == ["cube", "hand"]
+    return load_spec(written(folder, spec.to_xml(), "held.xml")).compile()
 
 
 @pytest.mark.parametrize("case", GONE)
@@ -82,6 +89,17 @@ def test_elements_that_refer_to_a_removed_body_are_removed(tmp_path: Path, case:
     counts = ("njnt", "ncam", "nlight", "npair", "nexclude", "neq", "ntendon", "nu", "nsensor")
     found = {name: int(getattr(model, name)) for name in (*counts, "ntuple", "nskin")}
     assert found == dict.fromkeys(found, 0) | {"njnt": 1}
+
+
+@pytest.mark.parametrize("case", GONE_WITH_A_JOINT)
+def test_elements_that_refer_to_a_fixed_joint_are_removed(tmp_path: Path, case: str) -> None:
+    wrist = '<body name="link"><joint name="wrist"/><geom size="1"/></body>'
+    model = held(tmp_path, wrist, GONE_WITH_A_JOINT[case])
+    found = {
+        name: int(getattr(model, name)) for name in ("njnt", "neq", "ntendon", "nu", "nsensor")
+    }
+    assert found == dict.fromkeys(found, 0) | {"njnt": 1}
+    assert model.body("link").id > 0
 
 
 def test_an_element_with_the_name_of_a_removed_one_of_another_kind_stays(tmp_path: Path) -> None:

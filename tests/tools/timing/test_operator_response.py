@@ -12,7 +12,7 @@ import pytest
 from rack.boards.config import load
 from rack.boards.config.schema import CommandConfig, RackConfig
 from rack.tools.console.tables import render_text
-from rack.tools.lab.benches.observed import add_commands, record_rack
+from rack.tools.lab.benches.observed import record_rack
 from rack.tools.timing.operator_response import OperatorResponse, measure_response, plot_response
 from tests.boards.commanded_racks import COMMANDED
 
@@ -27,7 +27,9 @@ def config(rack_name: str, tmp_path: Path) -> MakeConfig:
 
 
 def run_and_measure(config: RackConfig, folder: Path, *given: CommandConfig) -> OperatorResponse:
-    response = measure_response(record_rack(add_commands(config, given), 1.0, folder).recording)
+    response = measure_response(
+        record_rack(config.model_copy(update={"command": given}), 1.0, folder).recording
+    )
     assert response is not None
     return response
 

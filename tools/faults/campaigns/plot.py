@@ -6,8 +6,6 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from matplotlib.ticker import NullFormatter
-
 from rack.boards.faults.kind import KINDS
 from rack.tools.console.pictures import open_figure
 from rack.tools.faults.ending import EXTERNAL
@@ -20,9 +18,7 @@ if TYPE_CHECKING:
 
 WIDTH_IN = 11.0
 ROW_IN = 0.27
-"""Height of a row of the upper charts."""
-SIZES_IN = 2.6
-"""Height of the lower chart."""
+"""Height of a row of the charts."""
 DOT = "#4477aa"
 BOUND = "#cc3311"
 """Colours that are distinguishable with any kind of colour vision (Paul Tol)."""
@@ -34,20 +30,16 @@ MAX_FRACTION = 1.5
 
 
 def plot_campaign(report: CampaignReport, path: Path) -> None:
-    """Draw the charts of a campaign into one image: delays, recovery times, effects of size."""
-    rows_in = ROW_IN * (len(report.by_kind) + 1)
-    heights = (rows_in + 1.7, SIZES_IN) if report.curves else (rows_in + 1.7,)
-    with open_figure([path], WIDTH_IN, sum(heights)) as figure:
-        upper, *lower = figure.subfigures(len(heights), height_ratios=heights, squeeze=False)[:, 0]
-        upper.suptitle(
+    """Draw the charts of a campaign into one image: delays and recovery times."""
+    height_in = ROW_IN * (len(report.by_kind) + 1) + 1.7
+    with open_figure([path], WIDTH_IN, height_in) as figure:
+        figure.suptitle(
             f"Faults injected into the rack {report.order.name}: {report.trials_text}", fontsize=13
         )
-        delays, recoveries = upper.subplots(1, 2, sharey=True, width_ratios=(3, 2))
+        delays, recoveries = figure.subplots(1, 2, sharey=True, width_ratios=(3, 2))
         _draw_delays(delays, report)
         _draw_recoveries(recoveries, report)
-        upper.legend(loc="outside lower center", ncols=4)
-        for subfigure in lower:
-            _draw_sizes(subfigure.subplots(), report)
+        figure.legend(loc="outside lower center", ncols=4)
 
 
 def _draw_delays(axes: Axes, report: CampaignReport) -> None:
@@ -100,48 +92,6 @@ def _compute_fraction(fault: Judgement) -> float | None:
     if fault.bound == 0 and fault.bound_ms is None:
         return 0.0 if fault.delay == 0 else 2 * MAX_FRACTION
     return fault.fraction_of_bound
-
-
-def _draw_sizes(axes: Axes, report: CampaignReport) -> None:
-    """Draw the detection delay of sensor errors as a function of their size."""
-    edge = axes.get_xaxis_transform()
-    longest = 10 * report.clock_ms
-    for (kind, size_curve), marker in zip(report.curves.items(), "os", strict=False):
-        sizes = [point.size for point in size_curve.curve if point.delay_ms is not None]
-        delays = [point.delay_ms for point in size_curve.curve if point.delay_ms is not None]
-        unseen = [point.size for point in size_curve.curve if point.delay_ms is None]
-        longest = max([longest, *delays])
-        label = KINDS[kind].means
-        (line,) = axes.plot(sizes, delays, marker, markersize=6, alpha=0.6, label=label)
-        color = line.get_color()
-        absent = "not detected" if unseen else None
-        axes.plot(
-            unseen,
-            [1.0] * len(unseen),
-            "x",
-            color=color,
-            transform=edge,
-            clip_on=False,
-            label=absent,
-        )
-        axes.axvline(
-            size_curve.judged_from,
-            color=color,
-            linewidth=1.2,
-            linestyle=":",
-            label="smallest size that must be detected",
-        )
-    axes.set_xscale("log")
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    # Use a linear scale up to one tick, because most delays are 0.
-    axes.set_yscale("symlog", linthresh=report.clock_ms)
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.set_ylim(-0.5 * report.clock_ms, 1.5 * longest)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
-    axes.set_title("Time to detection of wrong joint positions")
-    axes.set_xlabel("size of the error, rad")
-    axes.set_ylabel("time to detection, ms")
 
 
 def _draw_recoveries(axes: Axes, report: CampaignReport) -> None:

@@ -40,13 +40,11 @@ STILL_S = 120.0
 STUCK_S = 20.0
 """Maximum real time in s that a run may take to end after a request to stop."""
 LOOK_S = 0.001
-"""Interval at which the tick is checked in lockstep, which has no grid on which to sleep."""
+"""Shortest interval at which the tick is checked, and the interval in lockstep."""
 HELD_S = 0.004
 """Interval at which a rack that may be held is checked."""
 RERUN_S = 2.0
 """Simulated time of the run after a refused launch, in which each task has some cycles."""
-RETRY_S = 0.02
-"""Time after which a kill is tried again if its board is being restarted."""
 
 
 class Killer:
@@ -60,41 +58,26 @@ class Killer:
         self._segment = segment
         self._words = segment.words
         self._waiting = list(kills)
-        self._retry_at = 0.0
         self.done: list[Strike] = []
 
     def compute_wait_s(self) -> float:
         """Return the time in s until the next kill is due, at most 0.5."""
         if not self._waiting:
             return 0.5
-        if self._words[System.LOCKSTEP]:
-            return LOOK_S
-        kill_s = max(self._compute_instant_ns() * 1e-9, self._retry_at)
-        return min(0.5, max(0.0, kill_s - time.monotonic()))
+        words = self._words
+        left_s = (self._waiting[0].tick - words[System.TICK]) * words[System.PERIOD_NS] * 1e-9
+        return LOOK_S if words[System.LOCKSTEP] else min(0.5, max(LOOK_S, left_s))
 
     def kill_due_board(self) -> None:
-        """Kill the next board if its kill is due. If it is not running, try again later."""
-        words = self._words
-        if not self._waiting or time.monotonic() < self._retry_at:
-            return
-        kill = self._waiting[0]
-        if words[System.TICK] < kill.tick:
-            return
-        wait_ns = self._compute_instant_ns() - time.monotonic_ns()
-        if words[System.LOCKSTEP]:
-            # In lockstep the phase only varies what the board is doing when it is killed.
-            wait_ns = round(kill.phase * words[System.PERIOD_NS])
-        time.sleep(max(0, wait_ns) * 1e-9)
-        if self._kill_board(kill.board):
-            self._waiting.pop(0)
-        else:
-            self._retry_at = time.monotonic() + RETRY_S
+        """Kill the next board if its kill is due. If it is not running, the next call tries again.
 
-    def _compute_instant_ns(self) -> int:
-        """Return the CLOCK_MONOTONIC time in ns at which the next kill is due."""
-        kill = self._waiting[0]
-        words = self._words
-        return words[System.EPOCH_NS] + round((kill.tick + kill.phase) * words[System.PERIOD_NS])
+        The phase varies what the board is doing when it is killed.
+        """
+        if self._waiting and self._words[System.TICK] >= self._waiting[0].tick:
+            kill = self._waiting[0]
+            time.sleep(kill.phase * self._words[System.PERIOD_NS] * 1e-9)
+            if self._kill_board(kill.board):
+                self._waiting.pop(0)
 
     def _kill_board(self, board: str) -> bool:
         """Kill a board and record the kill. Return False if the board is not running."""
@@ -139,7 +122,7 @@ def build_external_kill(layout: Layout, board: str, tick: int, time_ns: int) -> 
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class Trial:
     """A trial that was run.
 
@@ -161,14 +144,14 @@ class Trial:
     """
 
     plan: Plan
-    run: Circumstances | None
-    outcome: Outcome | None
-    refused: str
-    events: tuple[Event, ...]
-    strikes: tuple[Strike, ...]
-    arm: ArmEnd
-    left: tuple[str, ...]
-    wall_s: float
+    run: Circumstances | None = None
+    outcome: Outcome | None = None
+    refused: str = ""
+    events: tuple[Event, ...] = ()
+    strikes: tuple[Strike, ...] = ()
+    arm: ArmEnd = field(default_factory=ArmEnd)
+    left: tuple[str, ...] = ()
+    wall_s: float = 0.0
     levels: str = ""
     is_late: bool = False
     again: Outcome | None = None
@@ -204,15 +187,10 @@ def run_trial(
         ConfigError: The plan does not fit the config.
     """
     start = Start(whole="as asked") if base is None else base.find_start(plan, crate, seconds)
+    trial = Trial(plan)
     pids_before = list_living_descendants()
     started = time.monotonic()
     rack = Rack(plan.to_config(config, rack_name), crate=crate, continues=start.continues)
-    refused = ""
-    is_cut = False
-    levels = ""
-    has_late_level = False
-    arm = ArmEnd()
-    strikes_seen: tuple[Strike, ...] = ()
     try:
         with rack:
             start = start.resolve_snapshot(rack.begins_at)
@@ -223,38 +201,26 @@ def run_trial(
             if start.continues is not None and not plan.kills:
                 certainty = EarlyEnd(rack, joints, _collect_circumstances(rack, plan))
             _watch_run(rack, killer, ticks, seconds, certainty)
-            is_cut = certainty is not None and certainty.is_reached
-            strikes_seen = (*list_strikes(rack.segment, joints), *killer.done)
-            arm = read_arm(rack.segment)
-            levels = format_levels(rack.segment)
-            has_late_level = is_late(rack.segment)
+            trial.is_cut = certainty is not None and certainty.is_reached
+            trial.strikes = (*list_strikes(rack.segment, joints), *killer.done)
+            trial.arm = read_arm(rack.segment)
+            trial.levels = format_levels(rack.segment)
+            trial.is_late = is_late(rack.segment)
     except ConfigError:
         raise
     except (BackplaneError, BoardError) as error:
-        refused = str(error)
-    rerun_outcome = None
-    run = None
-    if not refused:
-        run = _collect_circumstances(rack, plan)
+        trial.refused = str(error)
+    if not trial.refused:
+        trial.run = _collect_circumstances(rack, plan)
     elif plan.faults:
         faultless = replace(plan, faults=())
-        rerun_outcome = run_trial(config, faultless, rack_name, ticks, RERUN_S, crate=crate).outcome
-    return Trial(
-        plan=plan,
-        run=run,
-        outcome=rack.outcome,
-        refused=refused,
-        events=tuple(sorted(rack.events, key=lambda event: event.tick)),
-        strikes=strikes_seen,
-        arm=arm,
-        left=tuple(find_leftovers(rack_name, pids_before)),
-        wall_s=time.monotonic() - started,
-        levels=levels,
-        is_late=has_late_level,
-        again=rerun_outcome,
-        start=start,
-        is_cut=is_cut,
-    )
+        trial.again = run_trial(config, faultless, rack_name, ticks, RERUN_S, crate=crate).outcome
+    trial.start = start
+    trial.outcome = rack.outcome
+    trial.events = tuple(sorted(rack.events, key=lambda event: event.tick))
+    trial.left = tuple(find_leftovers(rack_name, pids_before))
+    trial.wall_s = time.monotonic() - started
+    return trial
 
 
 def format_levels(segment: Segment) -> str:

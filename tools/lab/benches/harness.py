@@ -13,10 +13,8 @@ that is not installed is reported as `Absent`, and the others are still measured
 
 from __future__ import annotations
 
-import os
 import subprocess
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from importlib import import_module
@@ -25,7 +23,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from rack.backplane.process import pin_to_core, set_priority
 from rack.tools.console.answer import Failure, print_json
 from rack.tools.console.tables import Blocks, Cell, TextTable, format_decimal, print_blocks
 
@@ -156,22 +153,6 @@ def run_program(
         if process.poll() is None:
             _end_program(process)
     return subprocess.CompletedProcess(argv, process.returncode, stdout, stderr)
-
-
-@contextmanager
-def stay_on_core(core: int, priority: int = 0) -> Iterator[None]:
-    """Keep the calling process on a core while the context lasts.
-
-    The process also gets the real-time priority if this is permitted.
-    """
-    cores = os.sched_getaffinity(0)
-    try:
-        pin_to_core(core)
-        set_priority(priority)
-        yield
-    finally:
-        set_priority(0)
-        os.sched_setaffinity(0, cores)
 
 
 def _end_program(process: subprocess.Popen[str]) -> None:

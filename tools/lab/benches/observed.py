@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from rack.boards.config.schema import CommandConfig, RackConfig
+from rack.boards.config.schema import RackConfig
 from rack.boards.timing.trace_times import compute_lateness_ns, count_skipped_releases
 from rack.tools.launch.launch import RunResult, run_rack
 from rack.tools.monitor.display import Display
@@ -63,11 +63,6 @@ def remove_run_end(config: RackConfig) -> RackConfig:
         name: board.model_copy(update={"ends_run": False}) for name, board in config.board.items()
     }
     return config.model_copy(update={"board": boards})
-
-
-def add_commands(config: RackConfig, commands: Sequence[CommandConfig]) -> RackConfig:
-    """Return a config with additional operator commands, which follow the existing ones."""
-    return config.model_copy(update={"command": (*config.command, *commands)})
 
 
 def compute_lateness_us(recording: Recording, task: str) -> np.ndarray:

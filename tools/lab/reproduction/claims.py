@@ -118,7 +118,7 @@ SECTIONS = (
                 "... and flexibility for testing alternative control strategies via different"
                 " partitioning.",
                 "The same task was done along the same path in every partition.",
-                (partition.TASKS,),
+                (partition.PARTITION,),
                 rules.judge_flexibility,
             ),
             PaperClaim(

@@ -514,7 +514,6 @@ def judge_predictable(run: ResponseRun) -> ClaimVerdict:
     return rule_on(
         *check_none(
             lockstep_off_predicted_tick=len(run.lockstep.mispredicted_commands),
-            lockstep_torque_off_predicted_tick=run.differs != run.predicted,
             realtime_beyond_grid=len(realtime.commands_beyond_bound),
         ),
         *upper_checks,

@@ -263,7 +263,6 @@ def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sharing, "SECONDS", 0.7)
     monkeypatch.setattr(partition, "SECONDS", 2.5)
     monkeypatch.setattr(response, "HOLDS", response.HOLDS[:2])
-    monkeypatch.setattr(response, "MOVING_HOLD_TICK", response.HOLDS[1][1])
     monkeypatch.setattr(switch, "WAKES", 200)
 
 

@@ -72,14 +72,14 @@ class Workshop:
     @property
     def rack(self) -> str:
         """Name in shared memory of all racks of the experiments, which run one at a time."""
-        return f"{RACK_PREFIX}-{os.getpid()}"
+        return f"{RACK_PREFIX}_{os.getpid()}"
 
     def prepare(self) -> None:
         """Create the folders, and remove racks that a killed command left in shared memory."""
         for name in (RESULTS_FOLDER, RUNS_FOLDER):
             (self.folder / name).mkdir(parents=True, exist_ok=True)
         for rack in list_racks():
-            if rack.startswith(f"{RACK_PREFIX}-"):
+            if rack.startswith(f"{RACK_PREFIX}_"):
                 # The rack of a running command is in use and cannot be removed.
                 with suppress(SegmentError):
                     remove_dead_rack(rack)

@@ -10,20 +10,15 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass
-from multiprocessing.synchronize import Barrier, Semaphore
-from threading import BrokenBarrierError
 from time import monotonic_ns
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from rack.backplane.process import die_with_parent, pin_to_core, set_priority
 from rack.boards.timing.trace_times import Distribution, compute_distribution
 from rack.tools.console.answer import Failure
-from rack.tools.lab.benches.harness import stay_on_core
 from rack.tools.lab.reproduction.experiments.experiment import Experiment, Workshop
 
 NAME = "nasrem"
@@ -69,81 +64,56 @@ SWITCH = Experiment(
 )
 
 
-class _Shared(NamedTuple):
-    """Data shared by both processes. `gaps` and `awake` contain two times per wake-up, ns."""
-
-    parent: int
-    core: int
-    wakes: int
-    gaps: Any
-    awake: Any
-    start: Barrier
-
-
 def measure_switch() -> Distribution:
-    """Measure the switch on the last core of this machine, with wake-ups from the first core.
+    """Measure the switch on the last core of this machine. This process is the planner.
 
     Raises:
-        Failure: If the processes cannot run at real-time priorities.
+        Failure: If the executor cannot run at its real-time priority.
     """
-    cores = sorted(os.sched_getaffinity(0))
+    cores = os.sched_getaffinity(0)
+    core = max(cores)
     spawn = multiprocessing.get_context("spawn")
-    gaps, awake = spawn.RawArray("q", 2 * WAKES), spawn.RawArray("q", 2 * WAKES)
-    shared = _Shared(os.getpid(), cores[-1], WAKES, gaps, awake, spawn.Barrier(3))
-    wake, work = spawn.Semaphore(0), spawn.Semaphore(0)
-    with ExitStack() as stack:
-        processes = []
-        for loop, semaphore in ((_run_executor, wake), (_run_planner, work)):
-            process = spawn.Process(target=_start_loop, args=(loop, semaphore, shared), daemon=True)
-            process.start()
-            stack.callback(process.join)
-            stack.callback(process.kill)
-            processes.append(process)
-        # Keep this process off the measured core.
-        stack.enter_context(stay_on_core(cores[0]))
-        try:
-            shared.start.wait(READY_TIMEOUT_S)
-        except BrokenBarrierError:
-            raise Failure(
-                "a process of the measurement did not start, or SCHED_FIFO is refused"
-            ) from None
-        for _ in range(WAKES):
-            work.release()
-            time.sleep(HEAD_START_S)
-            wake.release()
-            time.sleep(PERIOD_S - HEAD_START_S)
-        for process in processes:
-            process.join(READY_TIMEOUT_S)
-    return compute_switch_times_us(np.reshape(gaps, (-1, 2)), np.reshape(awake, (-1, 2)))
+    # Two times per wake-up, ns.
+    awake = spawn.RawArray("q", 2 * WAKES)
+    executor = spawn.Process(target=_run_executor, args=(os.getpid(), core, awake), daemon=True)
+    executor.start()
+    try:
+        deadline = time.monotonic() + READY_TIMEOUT_S
+        while not awake[1]:
+            if not executor.is_alive() or time.monotonic() > deadline:
+                raise Failure("the executor did not start, or SCHED_FIFO is refused")
+            time.sleep(PERIOD_S)
+        pin_to_core(core)
+        set_priority(PLANNER_PRIORITY)
+        gaps = _run_planner(awake)
+    finally:
+        set_priority(0)
+        os.sched_setaffinity(0, cores)
+        executor.kill()
+        executor.join()
+    return compute_switch_times_us(gaps, np.reshape(awake, (-1, 2)))
 
 
-def _start_loop(
-    loop: Callable[[Semaphore, _Shared], None], semaphore: Semaphore, shared: _Shared
-) -> None:
-    """Pin this process, set its priority, wait for the other one, and run its loop."""
-    die_with_parent(shared.parent)
-    pin_to_core(shared.core)
-    if not set_priority(EXECUTOR_PRIORITY if loop is _run_executor else PLANNER_PRIORITY):
-        shared.start.abort()
-    shared.start.wait(READY_TIMEOUT_S)
-    loop(semaphore, shared)
+def _run_executor(parent: int, core: int, awake: Any) -> None:
+    """Run the executor, which repeatedly sleeps, wakes up and records the time."""
+    die_with_parent(parent)
+    pin_to_core(core)
+    if not set_priority(EXECUTOR_PRIORITY):
+        return
+    for begin_index in range(0, len(awake), 2):
+        time.sleep(PERIOD_S)
+        awake[begin_index] = monotonic_ns()
+        awake[begin_index + 1] = monotonic_ns()
 
 
-def _run_executor(semaphore: Semaphore, shared: _Shared) -> None:
-    """Run the executor, which repeatedly waits, wakes up and records the time."""
-    awake = shared.awake
-    for number in range(shared.wakes):
-        semaphore.acquire()
-        awake[2 * number] = monotonic_ns()
-        awake[2 * number + 1] = monotonic_ns()
+def _run_planner(awake: Any) -> np.ndarray:
+    """For each wake-up of the executor, read the clock in a loop and record the longest gap.
 
-
-def _run_planner(semaphore: Semaphore, shared: _Shared) -> None:
-    """Run the planner: for each wake-up, read the clock in a loop and record the longest gap."""
-    gaps = shared.gaps
-    awake = shared.awake
-    for number in range(shared.wakes):
-        semaphore.acquire()
+    Returns:
+        Start and end of the gaps, ns, shape (n, 2).
+    """
+    gaps = np.zeros((WAKES, 2), dtype=np.int64)
+    for number in range(WAKES):
         begin_ns = last_ns = monotonic_ns()
         longest_ns = 0
         end_index = 2 * number + 1
@@ -155,10 +125,12 @@ def _run_planner(semaphore: Semaphore, shared: _Shared) -> None:
             now_ns = monotonic_ns()
             if now_ns - last_ns > longest_ns:
                 longest_ns = now_ns - last_ns
-                gaps[2 * number] = last_ns
-                gaps[end_index] = now_ns
+                gaps[number] = last_ns, now_ns
                 now_ns = monotonic_ns()
             last_ns = now_ns
+        # Leave the core to others until shortly before the next wake-up.
+        time.sleep(PERIOD_S - HEAD_START_S)
+    return gaps
 
 
 def compute_switch_times_us(gaps: np.ndarray, awake: np.ndarray) -> Distribution:

@@ -5,6 +5,7 @@ Each system is one rack, except Brown's, which consists of two racks joined by a
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Mapping, Sequence
 from contextlib import chdir
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from rack.boards.config import CONFIGS, RackConfig, load
+from rack.boards.config import CONFIGS, RackConfig, load, load_text
 from rack.tools.console.answer import Failure
 from rack.tools.lab.benches.observed import UNVIEWED_SETTINGS, count_cycles
 from rack.tools.lab.reproduction.experiments.experiment import RUNS_FOLDER, Experiment, Workshop
@@ -280,13 +281,10 @@ def _record_two_racks(
     label = f"task-{BROWN}-{later_ms}-{attempt}"
     path = workshop.folder / f"{label}-servo.toml"
     path.write_text(_build_servo_config(workshop, later_ms).to_toml_text(), encoding="utf-8")
-    lan_settings = (
-        f'adapter.lan.connect=["{_format_socket(workshop)}"]',
-        f'adapter.lan.launch=["{path}"]',
-    )
+    general_config = _load_renamed(workshop, BROWN, [f'adapter.lan.launch=["{path}"]'])
     with chdir(workshop.folder):
         # The rack that is launched by this one records its run below the working folder.
-        result, general = workshop.run(label, _load_renamed(workshop, BROWN, lan_settings))
+        result, general = workshop.run(label, general_config)
     (launched,) = result.others
     assert launched.folder is not None, "it is recorded, as the other is"
     folder = workshop.folder / RUNS_FOLDER / f"{label}-servo"
@@ -296,11 +294,7 @@ def _record_two_racks(
 
 def _build_servo_config(workshop: Workshop, later_ms: int) -> RackConfig:
     """Build the config of the servo rack, which receives messages `later_ms` later than normal."""
-    peer = f"lan.peer_{workshop.rack.replace('-', '_')}"
-    added = [
-        f'adapter.lan.listen=["{_format_socket(workshop)}"]',
-        f'board.supervisor.reads.peer="{peer}"',
-    ]
+    settings = []
     if later_ms:
         config = load(SERVO)
         assert config.adapter.lan is not None
@@ -310,31 +304,14 @@ def _build_servo_config(workshop: Workshop, later_ms: int) -> RackConfig:
             for box in DELAYED_MAILBOXES
         ]
         delay_s = config.board["supervisor"].params["delay"] + 1e-3 * later_ms
-        added += [f"board.supervisor.params.delay={delay_s}", f"fault=[{', '.join(faults)}]"]
-    return _load_renamed(workshop, SERVO, added)
+        settings = [f"board.supervisor.params.delay={delay_s}", f"fault=[{', '.join(faults)}]"]
+    return _load_renamed(workshop, SERVO, settings)
 
 
-def _format_socket(workshop: Workshop) -> str:
-    """Return the address at which the servo rack listens."""
-    return f"unix/{workshop.rack}-servo"
-
-
-def _load_renamed(workshop: Workshop, name: str, added: Sequence[str]) -> RackConfig:
-    """Load one of the two racks with added settings, under a unique name.
-
-    The other rack uses this name in its imports.
-    """
-    config = load(name)
-    assert config.adapter.lan is not None
-    names = {BROWN: workshop.rack, f"{BROWN}-servo": f"{workshop.rack}-servo"}
-    imports = [
-        f'adapter.lan.import.{port}.from="{names[entry.rack]}/{entry.mailbox}"'
-        for port, entry in config.adapter.lan.imports.items()
-    ]
-    return load(
-        workshop.find_source(name),
-        [*imports, *added, *UNVIEWED_SETTINGS, f"name={names[config.name]}"],
-    )
+def _load_renamed(workshop: Workshop, name: str, settings: Sequence[str]) -> RackConfig:
+    """Load one of the two racks with settings, and give unique names to both in its config."""
+    text = load(workshop.find_source(name), [*settings, *UNVIEWED_SETTINGS]).to_toml_text()
+    return load_text(re.sub(f'(?<=["_]){BROWN}(?=["/-])|(?<=unix/){BROWN}', workshop.rack, text))
 
 
 def _compute_response_ms(general: Recording, servo: Recording) -> float | None:
