@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -10,7 +10,7 @@ from math import gcd, prod
 from typing import Any, NamedTuple
 
 from rack.backplane.layout import TickGrid
-from rack.boards.timing.chains import ParallelChains
+from rack.boards.timing.chains import ParallelChains, list_chains
 from rack.boards.timing.interrupts import InboxTiming
 from rack.boards.timing.level import BoardTiming, LevelTiming
 from rack.boards.timing.response_time import TaskResponse, compute_loads, compute_task_responses
@@ -69,16 +69,7 @@ class RackTiming:
 
         A rack with one board per joint has a chain for each joint.
         """
-        lowest = [board.name for board in self.boards.values() if board.above and not board.below]
-        return tuple(chain for name in lowest for chain in self._list_chains((name,)))
-
-    def _list_chains(self, lower_end: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-        """Yield every chain from a highest level down to and including `lower_end`."""
-        above = self.boards[lower_end[0]].above
-        if not above:
-            yield lower_end
-        for name in above:
-            yield from self._list_chains((name, *lower_end))
+        return list_chains({name: board.above for name, board in self.boards.items()})
 
     @cached_property
     def chain_groups(self) -> tuple[ParallelChains, ...]:
