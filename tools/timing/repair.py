@@ -30,7 +30,6 @@ MAX_PRIORITY = 99
 """Highest SCHED_FIFO priority."""
 
 
-
 @dataclass(frozen=True)
 class Fix:
     """Changes that make a rack fit, each of which builds on the previous one."""

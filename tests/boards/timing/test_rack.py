@@ -68,9 +68,7 @@ def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
 
 
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
-    timing = rack(
-        board("top", 40), board("a", 4, "top"), board("b", 60, "top"), board("alone", 7)
-    )
+    timing = rack(board("top", 40), board("a", 4, "top"), board("b", 60, "top"), board("alone", 7))
     assert timing.chains == (("top", "a"), ("top", "b"))
     assert timing.hierarchy.chains == (("top", "b"),)
     assert timing.longest_cycles == {"top": 60, "a": 60, "b": 60, "alone": 7}
