@@ -15,7 +15,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Self
 
 import numpy as np
@@ -34,17 +33,11 @@ from rack.boards.errors import NO_SNAPSHOTS_PREFIX
 from rack.boards.wiring import Continuation, RecordedEntries, SnapshotPolicy
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.launch.launch import Beginning, run_rack
-from rack.tools.monitor.display import Display
-from rack.tools.recording.divergence import (
-    find_other_run,
-    find_row,
-    find_tick_range,
-    list_divergent_messages,
-)
+from rack.tools.launch.launch import Beginning
+from rack.tools.recording.divergence import find_other_run, find_tick_range
 from rack.tools.recording.entries import load_commands_from, load_entries, load_operator_commands
 from rack.tools.recording.file_names import CONFIG
-from rack.tools.recording.origin import Origin, check_code_state, find_continuation_tick
+from rack.tools.recording.origin import Origin, check_code_state
 from rack.tools.recording.recording import Recording
 
 DIFFERENCE_CAUSES = (
@@ -88,7 +81,8 @@ class RepeatedRun:
             Preload(list_class_names(ran), tuple(sys.path), build_cell_config(ran))
         )
         self._has_begun = False
-        self._branched_at = find_continuation_tick(recording)
+        origin = Origin.read_from(recording)
+        self._branched_at = None if origin is None else origin.tick
 
     def __enter__(self) -> Self:
         return self
@@ -129,7 +123,11 @@ class RepeatedRun:
             return
         with self.run_rack_to(tick, SnapshotPolicy(at=tick)) as rack:
             if differing := list_differing_mailboxes(self.recording, rack.segment, tick):
-                self._report_differences(differing, tick)
+                print(
+                    f"{self._error_prefix}: {', '.join(differing)} are not as recorded:"
+                    f" {DIFFERENCE_CAUSES}",
+                    file=sys.stderr,
+                )
             notes = [
                 e.text
                 for e in rack.events
@@ -152,7 +150,10 @@ class RepeatedRun:
             snapshots: Which snapshots to keep. None for none.
         """
         begins = self._find_beginning(tick)
-        config = self._unique_config(f"at-{tick}")
+        # The rack gets a unique name, because its own name may be in use.
+        config = load_branch_config(self.recording)
+        name = f"{config.name[:16]}-at-{tick}-{os.getpid()}"
+        config = config.model_copy(update={"name": name})
         with (
             INTERRUPT.raise_interrupted(),
             Rack(
@@ -169,15 +170,12 @@ class RepeatedRun:
             self._has_begun = True
             yield rack
 
-    def _unique_config(self, ending: str) -> RackConfig:
-        """Return the run's config under a unique name, because its own name may be in use."""
-        config = load_branch_config(self.recording)
-        return config.model_copy(update={"name": f"{config.name[:16]}-{ending}-{os.getpid()}"})
-
     def continue_at(self, tick: int) -> Beginning:
         """Return the state from which a rack can continue at `tick`."""
         self.reach_tick(tick)
-        return replace(self._find_beginning(tick), origin=Origin.from_run(self.recording, tick))
+        run = self.recording
+        origin = Origin(str(run.folder), tick, run.launch.created_ns)
+        return replace(self._find_beginning(tick), origin=origin)
 
     def read_levels(self, tick: int) -> dict[str, Document]:
         """Return a dictionary from task to the attributes of its level's object before `tick`."""
@@ -221,39 +219,6 @@ class RepeatedRun:
     def _nearest_snapshot_tick(self, tick: int) -> int:
         """Return the tick of the newest snapshot at or before `tick`."""
         return self.crate.read_attributes(tick, "").tick
-
-    def _report_differences(self, mailboxes: Sequence[str], tick: int) -> None:
-        """Report on stderr which mailboxes differ from the recording, and the first difference."""
-        names = ", ".join(mailboxes)
-        first = ""
-        with suppress(Failure), TemporaryDirectory(prefix="rack-") as folder:
-            first = f"{self._describe_first_difference(Path(folder) / 'again', tick)}: "
-        print(
-            f"{self._error_prefix}: {names} are not as recorded: {first}{DIFFERENCE_CAUSES}",
-            file=sys.stderr,
-        )
-
-    def _describe_first_difference(self, folder: Path, tick: int) -> str:
-        """Describe the first message up to `tick` that differs from the recording.
-
-        The rack runs again for this, and is recorded into `folder`.
-        """
-        config = self._unique_config("again")
-        begins = self._find_beginning(self._branched_at or 0)
-        run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), beginning=begins)
-        again = Recording(folder)
-        first = list_divergent_messages(self.recording, again)[0]
-        box = again.layout.find_mailbox(first.mailbox)
-        recorded, repeated = (find_row(run, box, first.serial) for run in (self.recording, again))
-        where = f"first {box.name} at tick {first.tick}"
-        if recorded is None or repeated is None:
-            return f"{where}, which is missing in one of the two runs"
-        recorded, repeated = recorded["message"], repeated["message"]
-        names = [field.name for field in box.fields]
-        differing = [name for name in names if not np.array_equal(recorded[name], repeated[name])]
-        return ", ".join(
-            (where, *(f"{name} was {recorded[name]}, is {repeated[name]}" for name in differing))
-        )
 
 
 def find_run_config(origin: str) -> Path:

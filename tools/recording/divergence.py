@@ -68,7 +68,8 @@ def find_other_run(run: Path, named: Path, asked: str = "") -> Path:
         raise Failure(f"{asked} does not continue another run; name one with --against RUN", 2)
     origin_folder = Path(origin.folder)
     for folder in (origin_folder, run.resolve().parent / origin_folder.name):
-        if (folder / CONFIG).is_file() and origin.is_same_run(Recording(folder)):
+        is_run = (folder / CONFIG).is_file()
+        if is_run and Recording(folder).launch.created_ns == origin.launched_ns:
             return folder
     raise Failure(f"{asked} continues {origin_folder}, but that run no longer exists", 2)
 

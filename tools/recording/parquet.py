@@ -111,7 +111,7 @@ class CyclesFile:
         self._write_block()
         metadata = {
             "lost": encode_json(lost),
-            "cores": cores.to_json(),
+            "cores": encode_json(asdict(cores)),
             "gaps": encode_json(gaps),
             "kept": encode_json(kept),
         }

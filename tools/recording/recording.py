@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pydantic import TypeAdapter
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.mailbox.history import build_row_dtype
@@ -94,9 +95,10 @@ class Recording:
         with _convert_read_errors(folder):
             is_flight = (folder / STRETCHES).is_dir()
             if rebuild_files(folder) and not is_flight:
-                _print_note(
+                print(
                     f"{folder}: its recorder was killed; the rows it had taken are now in"
-                    " cycles.parquet and signals"
+                    " cycles.parquet and signals",
+                    file=sys.stderr,
                 )
         self._require_file(CHECKSUMS)
         self.checksums = Checksums(folder)
@@ -108,7 +110,7 @@ class Recording:
             metadata = self._cycles.metadata.metadata
             self.layout = restore_layout(json.loads(metadata[b"layout"]))
             self.launch = Launch(*json.loads(metadata[b"launch"]))
-            self.cores = CoreRecord.from_json(metadata[b"cores"])
+            self.cores = TypeAdapter(CoreRecord).validate_json(metadata[b"cores"])
             kept = [tuple(ends) for ends in json.loads(metadata[b"kept"])]
             self.kept: list[tuple[int, int]] = [] if len(kept) == 1 and kept[0][0] == 0 else kept
             self._gaps = json.loads(metadata[b"gaps"])
@@ -189,7 +191,7 @@ class Recording:
         *lines, last = self._read_text(EVENTS).split("\n")
         if last and is_cut_off(last):
             # A killed run can leave an incomplete last line.
-            _print_note(f"{path}: line {len(lines) + 1} is cut off, and left out")
+            print(f"{path}: line {len(lines) + 1} is cut off, and left out", file=sys.stderr)
         elif last:
             lines.append(last)
         events = (
@@ -418,8 +420,3 @@ def _parse_event(line: str, place: str) -> Document:
     except (ValueError, TypeError, KeyError) as error:
         raise Failure(f"{place}: not an event of a run: {error or error!r}", 2) from None
     return dict(event)
-
-
-def _print_note(text: str) -> None:
-    """Print a note for the user on stderr."""
-    print(text, file=sys.stderr)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rack.levels.peer import DRIFT_PPM, PeerPresence, Presence, format_peer_port
 from rack.tools.console.answer import Failure
 from rack.tools.recording.divergence import list_divergent_messages
-from rack.tools.recording.origin import find_continuation_tick
+from rack.tools.recording.origin import Origin
 from rack.tools.recording.recording import Recording
 
 Ints = NDArray[np.int64]
@@ -241,7 +241,6 @@ def align_runs(recordings: Sequence[Recording]) -> list[RackAlignment]:
     if len(recordings) != 2 or folders[0] == folders[1]:
         raise Failure("--against needs two runs of the same rack, in different folders", 2)
     differences = list_divergent_messages(*recordings)
-    other = recordings[1]
     grids = [RackGrid(recording) for recording in recordings]
     names = [folder.name for folder in folders]
     if names[0] == names[1]:
@@ -249,8 +248,8 @@ def align_runs(recordings: Sequence[Recording]) -> list[RackAlignment]:
     for grid, name in zip(grids, names, strict=True):
         grid.rack = name
     marks = []
-    if (tick := find_continuation_tick(other)) is not None:
-        marks.append(TimeLineNote(tick, f"{names[1]} branches off"))
+    if (origin := Origin.read_from(recordings[1])) is not None:
+        marks.append(TimeLineNote(origin.tick, f"{names[1]} branches off"))
     if differences:
         first = differences[0]
         marks.append(
@@ -293,11 +292,12 @@ def _find_offsets(grid: RackGrid, other: RackGrid) -> tuple[TimeShift, ...] | No
         neither rack communicated with the other.
     """
     if grid.is_lockstep:
-        have_met = [
-            _has_communicated(observer, observed)
-            for observer, observed in ((grid, other), (other, grid))
-        ]
-        return () if any(have_met) else None
+        for observer, observed in ((grid, other), (other, grid)):
+            mailbox = _find_peer_mailbox(observer, observed)
+            presence = observer.recording.read_signal(mailbox, "presence") if mailbox else ()
+            if Presence.THERE in presence:
+                return ()
+        return None
     measured = _read_offset(other, grid), _read_offset(grid, other)
     offsets = [
         shift
@@ -360,56 +360,3 @@ def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
     longest_gap_ns = int(np.diff(np.sort(np.concatenate((at_ns, ends)))).max())
     worst_ns = round(float(uncertainty[is_measured][is_this].max()) * 1e9)
     return TimeShift(at_ns, by_ns, worst_ns + longest_gap_ns * DRIFT_PPM // 1_000_000)
-
-
-def _has_communicated(observer: RackGrid, peer: RackGrid) -> bool:
-    """Return True if `observer`, in lockstep, communicated with `peer`.
-
-    Raises:
-        Failure: `observer` communicated with a different launch of the peer.
-    """
-    mailbox = _find_peer_mailbox(observer, peer)
-    if (
-        mailbox is None
-        or not (observer.recording.read_signal(mailbox, "presence") == Presence.THERE).any()
-    ):
-        return False
-    lan = observer.recording.rack_config.adapter.lan
-    for port, entry in () if lan is None else lan.imports.items():
-        if entry.rack == peer.rack:
-            _check_import(observer, f"{mailbox.partition('.')[0]}.{port}", peer, entry.mailbox)
-    return True
-
-
-def _check_import(
-    importer: RackGrid, import_mailbox: str, peer: RackGrid, source_mailbox: str
-) -> None:
-    """Raise `Failure` if imported messages differ from the messages that the peer wrote.
-
-    Args:
-        importer: The rack that imported them.
-        import_mailbox: Mailbox with the imported messages.
-        peer: The rack that wrote them.
-        source_mailbox: Mailbox of the peer from which they were exported.
-    """
-    if (
-        import_mailbox not in importer.recording.mailboxes
-        or source_mailbox not in peer.recording.mailboxes
-    ):
-        return
-    imported = importer.recording.read_rows(import_mailbox)
-    sent = peer.recording.read_rows(source_mailbox)
-    at_ns = sent["tick"] * peer.clock_ns
-    content = [row.tobytes() for row in sent["message"]]
-    for row in imported:
-        # `basis` is the time of sending in ticks of the importer. Such a tick may cover several
-        # ticks of the sender, so compare with every message sent in it.
-        since_ns = int(row["basis"]) * importer.clock_ns
-        first, end = np.searchsorted(at_ns, (since_ns, since_ns + importer.clock_ns))
-        if first < end and row["message"].tobytes() not in content[first:end]:
-            raise Failure(
-                f"{importer.recording.folder} and {peer.recording.folder} are not of the same run:"
-                f" the message that '{importer.rack}' imported into {import_mailbox} at"
-                f" {since_ns * 1e-9:.4f} s is not one that '{peer.rack}' wrote to {source_mailbox}",
-                2,
-            )

@@ -18,57 +18,47 @@ from rack.boards.timing.verdicts import SYSTEM
 from rack.tools.console.answer import Document
 from rack.tools.monitor.network import STATUS
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.chain_response import (
-    NOT_MEASURED,
-    Origins,
-    build_direction,
-    measure_chain,
-)
-
-PathGroup = tuple[JoinedPath, ...]
-"""Paths with equal bounds through boards of the same levels."""
+from rack.tools.timing.chain_response import NOT_MEASURED, Chain, Origins, measure_direction
 
 
-def group_joined_paths(paths: Sequence[JoinedPath]) -> list[PathGroup]:
-    """Group parallel paths, such as those through one board per joint."""
+def measure_joined_responses(
+    recording: Recording, paths: Sequence[JoinedPath]
+) -> Iterator[Document]:
+    """Yield the response along each group of parallel paths from another rack as plain data.
+
+    Parallel paths, such as those through one board per joint, have equal bounds and lead through
+    boards of the same levels. An entry has the form of the response along the chains of one rack,
+    with only one direction. Paths are left out if their messages do not carry the origin of the
+    information to the last board.
+    """
     groups: dict[object, list[JoinedPath]] = {}
     for path in paths:
         ends = path.stations[0], path.stations[-1]
         key = path.direction, path.port, ends, len(path.stations), path.response_ms
         groups.setdefault(key, []).append(path)
-    return [tuple(group) for group in groups.values()]
-
-
-def measure_joined_response(recording: Recording, group: PathGroup) -> Document | None:
-    """Return the response along parallel paths from another rack as plain data.
-
-    It has the form of the response along the chains of one rack, with only one direction. None if
-    the messages do not carry the origin of the information to the last board.
-    """
-    path = group[0]
-    levels = [*format_joined_levels([each.stations for each in group])]
-    boxes = [find_path_mailboxes(recording.layout, (LAN, *each.boards)) for each in group]
-    measurements = [
-        measure_chain(
-            recording, (LAN, *each.boards), row, path.response_ms, find_origins(recording, each)
-        )
-        for each, row in zip(group, boxes, strict=True)
-        if len(row) == len(each.boards)
-        and row[0].name == f"{LAN}.{each.port}"
-        and {STATUS, *(box.name for box in row)} <= set(recording.mailboxes)
-    ]
-    if not measurements:
-        return None
-    measured = build_direction(levels, path.response_ms, measurements)
-    directions = {"command": NOT_MEASURED, "status": NOT_MEASURED, path.direction: measured}
-    downward = levels if path.direction == "command" else levels[::-1]
-    return {
-        "subject": f"{SYSTEM}, {' > '.join(downward)}",
-        "levels": downward,
-        "bound_eq_3_2_ms": path.bound_eq_3_2_ms,
-        "sum_eq_3_3_ms": path.sum_eq_3_3_ms,
-        **directions,
-    }
+    for group in groups.values():
+        boxes = [find_path_mailboxes(recording.layout, (LAN, *each.boards)) for each in group]
+        chains = [
+            Chain((LAN, *each.boards), row, find_origins(recording, each))
+            for each, row in zip(group, boxes, strict=True)
+            if len(row) == len(each.boards)
+            and row[0].name == f"{LAN}.{each.port}"
+            and {STATUS, *(box.name for box in row)} <= {*recording.mailboxes}
+        ]
+        if not chains:
+            continue
+        path = group[0]
+        levels = [*format_joined_levels([each.stations for each in group])]
+        measured = measure_direction(recording, levels, path.response_ms, chains)
+        directions = {"command": NOT_MEASURED, "status": NOT_MEASURED, path.direction: measured}
+        downward = levels if path.direction == "command" else levels[::-1]
+        yield {
+            "subject": f"{SYSTEM}, {' > '.join(downward)}",
+            "levels": downward,
+            "bound_eq_3_2_ms": path.bound_eq_3_2_ms,
+            "sum_eq_3_3_ms": path.sum_eq_3_3_ms,
+            **directions,
+        }
 
 
 def find_origins(recording: Recording, path: JoinedPath) -> Origins:

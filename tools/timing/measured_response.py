@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rack.backplane.layout import MailboxSpec
 from rack.boards.config import build_rack_timing
 from rack.boards.timing.chains import ParallelChains
 from rack.boards.timing.rack import RackTiming
@@ -19,8 +18,8 @@ from rack.tools.console.answer import Document
 from rack.tools.monitor.network import ADAPTER, read_entries
 from rack.tools.recording.joined import read_joined_paths
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.chain_response import NOT_MEASURED, build_direction, measure_chain
-from rack.tools.timing.joined_response import group_joined_paths, measure_joined_response
+from rack.tools.timing.chain_response import NOT_MEASURED, Chain, measure_direction
+from rack.tools.timing.joined_response import measure_joined_responses
 
 
 def measure_system_response(recording: Recording) -> Document | None:
@@ -44,11 +43,7 @@ def measure_system_response(recording: Recording) -> Document | None:
         _measure_response(recording, rack, chains)
         for chains in sorted(rack.chain_groups, key=lambda chains: chains != rack.hierarchy)
     ]
-    documents += [
-        document
-        for group in group_joined_paths(paths or ())
-        if (document := measure_joined_response(recording, group)) is not None
-    ]
+    documents += measure_joined_responses(recording, paths or ())
     if not documents:
         return None
     # Without measurements, a response needs no place beside others.
@@ -89,7 +84,9 @@ def _measure_direction(
     """
     layout = recording.layout
     paths = [(boards, find_path_mailboxes(layout, boards)) for boards in chains]
-    if any(_comes_from_another_rack(recording, boxes) for _, boxes in paths):
+    entries = read_entries(recording.config)
+    imported = {f"{ADAPTER}.{port}" for port in entries.imports} if entries else set[str]()
+    if any(boxes and not imported.isdisjoint(boxes[0].rests_on) for _, boxes in paths):
         return NOT_MEASURED
     hop_count = min(len(mailboxes) for _, mailboxes in paths)
     start = len(levels) - hop_count - 1 if hop_count else len(levels)
@@ -98,16 +95,5 @@ def _measure_direction(
         * layout.clock_ns
         * 1e-6
     )
-    measurements = [
-        measure_chain(recording, boards[start:], boxes[-hop_count:], bound_ms)
-        for boards, boxes in paths
-        if hop_count and {box.name for box in boxes} <= set(recording.mailboxes)
-    ]
-    return build_direction(levels[start:], bound_ms, measurements)
-
-
-def _comes_from_another_rack(recording: Recording, boxes: Sequence[MailboxSpec]) -> bool:
-    """Return True if the first of these mailboxes depends on a message of another rack."""
-    imported = read_entries(recording.config)
-    names = () if imported is None else (f"{ADAPTER}.{port}" for port in imported.imports)
-    return bool(boxes) and not {*names}.isdisjoint(boxes[0].rests_on)
+    measured = [Chain(boards[start:], boxes[-hop_count:]) for boards, boxes in paths if hop_count]
+    return measure_direction(recording, levels[start:], bound_ms, measured)

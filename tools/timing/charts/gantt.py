@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -99,7 +99,6 @@ class Gantt(NamedTuple):
 def build_gantt(
     subject: Subject,
     options: WindowOptions,
-    process_ns: Mapping[str, Sequence[int]],
     progress: Callable[[float], None],
 ) -> Gantt:
     """Build the chart of a subject.
@@ -107,8 +106,6 @@ def build_gantt(
     Args:
         subject: Config or run.
         options: Window that the user asked for.
-        process_ns: Dictionary from boards to their times of X, ns, in successive cycles of the
-            schedule.
         progress: Receives the fraction of a run that has been read.
 
     Raises:
@@ -119,11 +116,7 @@ def build_gantt(
     run = subject.run
     panels: list[Panel] = []
     notes: list[str] = []
-    schedule = (
-        Schedule(subject.config, subject.layout, process_ns)
-        if read_budgets(subject.config)
-        else None
-    )
+    schedule = Schedule(subject.config, subject.layout) if read_budgets(subject.config) else None
     if run is not None and not run.is_lockstep:
         task = choose_task(run.tasks)
         start, end = options.choose_window(task, run.end_ns, run.find_middle_ns(task))

@@ -8,7 +8,6 @@ from typing import NamedTuple
 from rack.boards.timing.tasks import TimedTask
 from rack.tools.console.answer import Failure
 from rack.tools.console.tables import format_ms
-from rack.tools.timing.charts.panel import NS_PER_MS
 
 DEFAULT_SLICES = 2
 """Number of plans in a default chart."""
@@ -79,31 +78,6 @@ def choose_task(tasks: Sequence[TimedTask]) -> TimedTask:
         tight or shown or [min(tasks, key=lambda task: task.period_ns)],
         key=lambda task: task.period_ns,
     )
-
-
-def parse_process_times(process: Sequence[str]) -> dict[str, list[int]]:
-    """Parse texts such as "level=3,2", which give times of X of a level in successive cycles, ms.
-
-    Returns:
-        Dictionary from levels to times, ns.
-
-    Raises:
-        Failure: If a text does not have this form, or contains a negative time.
-    """
-    process_ns = {}
-    for text in process:
-        level, _, times = text.partition("=")
-        try:
-            process_ns[level] = [round(float(time) * NS_PER_MS) for time in times.split(",")]
-        except (ValueError, OverflowError):
-            process_ns[level] = [-1]
-        if min(process_ns[level]) < 0:
-            raise Failure(
-                f"--process {text}: give a level and its times of X, ms, cycle by cycle, as in"
-                " level=3,2",
-                2,
-            )
-    return process_ns
 
 
 def _format_window(start_ns: int, end_ns: int) -> str:
