@@ -52,7 +52,7 @@ class RackGrid:
         config = recording.rack_config
         self.recording = recording
         self.rack = recording.layout.rack
-        self.is_lockstep = config.clock.mode == "lockstep"
+        self.is_lockstep = config.is_lockstep
         self.clock_ns = recording.layout.clock_ns
         self.period_ns = config.tick_ns
         self.launch = recording.launch

@@ -105,10 +105,6 @@ class JudgedConfig:
         cores = {f"core {core}" for core in self.timing.find_cores(board)}
         return own or {v.key for v in self.failures if v.equation == LOAD and v.subject in cores}
 
-    def repairs_board(self, board: str, before: JudgedConfig) -> bool:
-        """Return True if all failures of `board` in `before` are gone and none was added."""
-        return self.failing < before.failing and not self.failing & before.find_failures(board)
-
     def is_acceptable_change(self, changed: RackTiming, board: str) -> bool:
         """Return True if a changed board meets its timing equations and the system gets no worse.
 
@@ -192,16 +188,7 @@ class Change:
             yield f"R_s {responses[0]:g} -> {responses[1]:g} ms"
         if new.slice_ns is not None and new.slice_ns != old.slice_ns:
             yield f"a plan every {new.slice_ns * 1e-6:g} ms"
-        if self.settings.get("coupling") == "loose" and not new.exchange_ns:
-            yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
-        for core in {
-            self.settings[key] for key in ("planner_core", "core") if key in self.settings
-        }:
-            others = [
-                task
-                for task, task_core in self.after.timing.cores.items()
-                if task_core == core and task.partition(".")[0] != self.board
-            ]
-            yield f"core {core} shared with {', '.join(others) or 'no other'}"
+        for key in ("planner_core", "core"):
+            core = self.settings.get(key, 0)
             if (obtained := find_core(core)) != core:
                 yield f"this machine has no core {core}, uses core {obtained}"

@@ -208,7 +208,7 @@ def measure_response(recording: Recording) -> OperatorResponse | None:
     }
     if not paths:
         return None
-    lockstep = config.clock.mode == "lockstep"
+    lockstep = config.is_lockstep
     answered = [
         command
         for level, path in paths.items()

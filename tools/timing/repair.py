@@ -233,7 +233,8 @@ def _list_other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
 def _try_change(rack: JudgedConfig, board: str, settings: Settings) -> Change | None:
     """Return the change of a board if it removes all failures of the board, else None."""
     change = rack.try_change(board, settings)
-    return change if change is not None and change.after.repairs_board(board, rack) else None
+    failing = rack.failing if change is None else change.after.failing
+    return change if failing < rack.failing and not failing & rack.find_failures(board) else None
 
 
 def _try_each(rack: JudgedConfig, board: str, tried: Iterable[Settings]) -> Change | None:

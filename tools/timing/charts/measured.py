@@ -57,14 +57,6 @@ class TracedRun:
             replace(t, core=layout.find_task(t.name).core) for t in known if t.role != "clock"
         )
 
-    @property
-    def is_lockstep(self) -> bool:
-        """Whether the run was in lockstep.
-
-        Such a run has no chart, because simulated time does not advance during cycles.
-        """
-        return self.config.clock.mode == "lockstep"
-
     def build_panel(self, start_ns: int, end_ns: int, progress: Callable[[float], None]) -> Panel:
         """Build the panel of a window.
 
