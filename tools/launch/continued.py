@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Self
 
 import numpy as np
@@ -33,8 +34,14 @@ from rack.boards.errors import NO_SNAPSHOTS_PREFIX
 from rack.boards.wiring import Continuation, RecordedEntries, SnapshotPolicy
 from rack.tools.console.answer import Document, Failure
 from rack.tools.console.interrupt import INTERRUPT
-from rack.tools.launch.launch import Beginning
-from rack.tools.recording.divergence import find_other_run, find_tick_range
+from rack.tools.launch.launch import Beginning, run_rack
+from rack.tools.monitor.display import Display
+from rack.tools.recording.divergence import (
+    find_other_run,
+    find_row,
+    find_tick_range,
+    list_divergent_messages,
+)
 from rack.tools.recording.entries import load_commands_from, load_entries, load_operator_commands
 from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.origin import Origin, check_code_state
@@ -125,7 +132,7 @@ class RepeatedRun:
             if differing := list_differing_mailboxes(self.recording, rack.segment, tick):
                 print(
                     f"{self._error_prefix}: {', '.join(differing)} are not as recorded:"
-                    f" {DIFFERENCE_CAUSES}",
+                    f" {self._find_first_difference(tick)}{DIFFERENCE_CAUSES}",
                     file=sys.stderr,
                 )
             notes = [
@@ -150,10 +157,7 @@ class RepeatedRun:
             snapshots: Which snapshots to keep. None for none.
         """
         begins = self._find_beginning(tick)
-        # The rack gets a unique name, because its own name may be in use.
-        config = load_branch_config(self.recording)
-        name = f"{config.name[:16]}-at-{tick}-{os.getpid()}"
-        config = config.model_copy(update={"name": name})
+        config = self._unique_config(f"at-{tick}")
         with (
             INTERRUPT.raise_interrupted(),
             Rack(
@@ -169,6 +173,11 @@ class RepeatedRun:
             rack.run(tick * config.clock_ns * 1e-9)
             self._has_begun = True
             yield rack
+
+    def _unique_config(self, ending: str) -> RackConfig:
+        """Return the run's config under a unique name, because its own name may be in use."""
+        config = load_branch_config(self.recording)
+        return config.model_copy(update={"name": f"{config.name[:16]}-{ending}-{os.getpid()}"})
 
     def continue_at(self, tick: int) -> Beginning:
         """Return the state from which a rack can continue at `tick`."""
@@ -219,6 +228,30 @@ class RepeatedRun:
     def _nearest_snapshot_tick(self, tick: int) -> int:
         """Return the tick of the newest snapshot at or before `tick`."""
         return self.crate.read_attributes(tick, "").tick
+
+    def _find_first_difference(self, tick: int) -> str:
+        """Repeat the run up to `tick`, and describe its first message that differs.
+
+        Returns:
+            A clause. Empty if the run cannot be recorded again.
+        """
+        config = self._unique_config("again")
+        begins = self._find_beginning(self._branched_at or 0)
+        with suppress(Failure), TemporaryDirectory(prefix="rack-") as name:
+            folder = Path(name) / "again"
+            run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), beginning=begins)
+            runs = self.recording, Recording(folder)
+            first = list_divergent_messages(*runs)[0]
+            box = self.recording.layout.find_mailbox(first.mailbox)
+            recorded, repeated = (find_row(run, box, first.serial) for run in runs)
+            where = f"first {box.name} at tick {first.tick}"
+            if recorded is None or repeated is None:
+                return f"{where}, which is missing in one of the two runs: "
+            names = [field.name for field in box.fields]
+            pairs = [(n, recorded["message"][n], repeated["message"][n]) for n in names]
+            fields = [f"{n} was {a}, is {b}" for n, a, b in pairs if not np.array_equal(a, b)]
+            return f"{', '.join((where, *fields))}: "
+        return ""
 
 
 def find_run_config(origin: str) -> Path:

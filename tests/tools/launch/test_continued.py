@@ -141,7 +141,8 @@ def test_a_state_that_differs_from_the_recording_is_noted(
     assert f"since it was recorded, these have changed: {levels}; --anyway" in refused.stderr
     done = rack(*again, "--anyway")
     assert f"these have changed: {levels}; digests may differ" in done.stderr
-    why = "upper.command, .* are not as recorded: the code of a level has changed since"
+    first = r"first upper\.command at tick 0, goal was 1, is 2"
+    why = f"upper.command, .* are not as recorded: {first}: the code of a level has changed since"
     assert re.search(why, done.stderr), done.stderr
 
 
