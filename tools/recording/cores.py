@@ -53,14 +53,6 @@ class CoreRecord:
     stolen: tuple[Stolen, ...] | None = None
     mhz: tuple[tuple[int, float, float], ...] = ()
 
-    def sum_stolen_ms(self) -> dict[int, int]:
-        """Return a dictionary from core to stolen time in ms. Cores without steal are left out."""
-        spans = self.stolen or ()
-        return {
-            core: sum(s.ms for s in spans if s.core == core)
-            for core in sorted({s.core for s in spans})
-        }
-
 
 UNMEASURED = CoreRecord()
 """Record of a run in which nothing was measured."""

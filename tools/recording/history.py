@@ -106,7 +106,11 @@ def summarize_steal(recording: Recording) -> Document:
         is False if the run was in lockstep or the kernel does not count steal.
     """
     record = recording.cores
-    stolen_ms = {str(core): ms for core, ms in record.sum_stolen_ms().items()}
+    spans = record.stolen or ()
+    stolen_ms = {
+        str(core): sum(span.ms for span in spans if span.core == core)
+        for core in sorted({span.core for span in spans})
+    }
     percent = {core: round(1e8 * ms / record.lasted_ns, 3) for core, ms in stolen_ms.items()}
     return {"measured": record.stolen is not None, "ms": stolen_ms, "percent": percent}
 

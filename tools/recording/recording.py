@@ -145,13 +145,14 @@ class Recording:
 
     def _open_table(self, mailbox: str) -> list[pq.ParquetFile]:
         """Open the parts of a mailbox's table, oldest first."""
-        path = self._require_file(f"{SIGNALS}/{TABLE_NAME.format(mailbox)}")
-        with _convert_read_errors(path):
-            count = max(len([*path.iterdir()]), 1)
-        parts = [path / PART_NAME.format(number) for number in range(1, count + 1)]
-        if missing := [part.name for part in parts if not part.exists()]:
-            raise Failure(f"{path}: {missing[0]} is missing", 2)
-        return [self._open_parquet(part, (*HEAD_COLUMNS, *self._shapes[mailbox])) for part in parts]
+        # Every table has a first part.
+        folder = f"{SIGNALS}/{TABLE_NAME.format(mailbox)}/"
+        stored = {name for name in self.checksums.stored if name.startswith(folder)}
+        columns = (*HEAD_COLUMNS, *self._shapes[mailbox])
+        return [
+            self._open_parquet(self.folder / name, columns)
+            for name in sorted({*stored, folder + PART_NAME.format(1)})
+        ]
 
     def _open_parquet(self, path: Path, columns: Iterable[str]) -> pq.ParquetFile:
         """Open a parquet file.

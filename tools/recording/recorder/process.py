@@ -13,6 +13,7 @@ import time
 from contextlib import suppress
 from math import inf
 from pathlib import Path
+from typing import Any
 
 from rack.backplane.json_text import encode_json
 from rack.backplane.process import STOPPED_STATES, read_processor_ns, read_state, wait_readable
@@ -104,7 +105,7 @@ class RecorderProcess:
         # stderr goes to a file in memory, because nobody would empty a pipe.
         self._complaints = os.memfd_create("recorder")
         self._request = b""
-        self._words: memoryview | None = None
+        self._words: Any = {}
         self._restarts = 0
         self._result: str | None = None
         self._start()
@@ -145,7 +146,7 @@ class RecorderProcess:
             True if the recorder has attached within `ATTACH_S`.
         """
         self._request = encode_json([rack, str(self.folder), port]).encode() + b"\n"
-        self._words = words
+        self._words = {} if words is None else words
         self._send_request()
         return self.wait_until_attached(ATTACH_S)
 
@@ -165,7 +166,7 @@ class RecorderProcess:
         """Send the name of the rack, the folder and the viewer's port to the recorder."""
         # Make the clock wait for the recorder before it attaches, so that no row in the rings is
         # overwritten before the recorder reads it.
-        self._set_follower(self.pid)
+        self._words[System.FOLLOWER_PID] = self.pid
         with suppress(OSError):
             self._line.sendall(self._request)
 
@@ -208,7 +209,7 @@ class RecorderProcess:
         ended = self._describe_end()
         if self._restarts == MAX_RESTARTS:
             self._is_gone = True
-            self._set_follower(0)
+            self._words[System.FOLLOWER_PID] = 0
             return f"{ended}; the run continues without a recording"
         self._restarts += 1
         self._line.close()
@@ -229,11 +230,6 @@ class RecorderProcess:
         if status == UNWRITABLE:
             raise Failure(next((line for line in reversed(lines) if END_CLAUSE in line), text))
         return ": ".join((f"the recorder ended with status {status}", *lines[-1:]))
-
-    def _set_follower(self, pid: int) -> None:
-        """Set the process that the clock waits for in lockstep. 0 means no process."""
-        if self._words is not None:
-            self._words[System.FOLLOWER_PID] = pid
 
     def finish(self, in_a_hurry: bool = False) -> str:
         """Let the recorder read the remaining rows and finish its files, and wait for its end.
