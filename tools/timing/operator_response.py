@@ -342,7 +342,7 @@ def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
     )
     values = [(c.ticks or 0) * tick_ms if c.wall_ms is None else c.wall_ms for c in own]
     end_ms = max(lines[2][0] * tick_ms, *values)
-    axis.hist(values, HISTOGRAM_BARS, (0.0, end_ms), color=MEASURED, label="measured")
+    axis.hist(values, HISTOGRAM_BARS, range=(0.0, end_ms), color=MEASURED, label="measured")
     for at, colour, style, label in lines:
         axis.axvline(at * tick_ms, color=colour, linestyle=style, label=label)
     axis.set_xlim(0.0, 1.04 * end_ms)

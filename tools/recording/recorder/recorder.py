@@ -120,32 +120,6 @@ class SafeSink:
         self._patience_s = OPENING_TIMEOUT_S
         self._why_late = "the viewer's library has not opened it"
 
-    @classmethod
-    def open_for(
-        cls,
-        segment: Segment,
-        port: int | None,
-        opened: Callable[[], Sink],
-        tell: Callable[[str], None],
-    ) -> Self | None:
-        """Open the sink for the viewer's file, or for a viewer on a port.
-
-        Args:
-            segment: Segment of the rack.
-            port: Port of the viewer, or None.
-            opened: Function that opens and returns the sink.
-            tell: Function that prints a message to the user.
-
-        Returns:
-            The sink. None for a flight recorder without a port: `rack replay` makes the viewer's
-            file later, from the stretches that were kept.
-        """
-        if port is None and Retention.from_config(segment) is not None:
-            return None
-        # The viewer's libraries may take long to load, or hang on a full disk, so a run does not
-        # wait for them, unless the user wants to watch from the start.
-        return cls(opened, tell, port is None)
-
     def add(self, ring: str, rows: np.ndarray) -> None:
         """Queue rows for the sink."""
         self._waiting.append(lambda sink: sink.add(ring, rows))
