@@ -58,8 +58,6 @@ def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxS
         layout: Layout of the rack.
         boards: Names of the boards, in the order in which the information flows.
     """
-    if len(boards) < 2:
-        return ()
     sampled = [
         box for box in layout.mailboxes if box.protocol != "queue" and not is_position_mailbox(box)
     ]

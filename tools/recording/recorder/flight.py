@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import deque
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -19,18 +18,6 @@ from rack.tools.recording.spool import Spool, StretchHead
 
 STRETCH_S = 1.0
 """Simulated duration of a stretch."""
-
-
-class FinishedStretch(NamedTuple):
-    """A finished stretch that is not near any occasion found so far.
-
-    Attributes:
-        path: File of the stretch.
-        last: Last tick of the stretch.
-    """
-
-    path: Path
-    last: int
 
 
 class FlightRecorder:
@@ -49,7 +36,8 @@ class FlightRecorder:
         self._words = segment.words
         self._occasions = Occasions(segment)
         self._length = round(STRETCH_S * 1e9 / segment.layout.clock_ns)
-        self._sealed: deque[FinishedStretch] = deque()
+        # Finished stretches that are not near any occasion found so far, with their last ticks.
+        self._sealed: deque[tuple[Path, int]] = deque()
         self._kept_until = -1
         self._began = 0
         if tally.stretch_number:
@@ -85,11 +73,11 @@ class FlightRecorder:
         next_tick = self._words[System.TICK] + 1
         path = self._begin_stretch(next_tick, tick)
         if self._began > self._kept_until:
-            self._sealed.append(FinishedStretch(self._path, next_tick))
+            self._sealed.append((self._path, next_tick))
         self._path = path
         self._began = tick
-        while self._sealed and self._sealed[0].last < tick - self._retention.keep:
-            self._sealed.popleft().path.unlink(missing_ok=True)
+        while self._sealed and self._sealed[0][1] < tick - self._retention.keep:
+            self._sealed.popleft()[0].unlink(missing_ok=True)
 
     def close(self) -> None:
         """Finish the last stretch, and add an empty one whose head contains the final counts."""
@@ -116,5 +104,5 @@ class FlightRecorder:
         """Protect the stretches around an occasion at `tick` from deletion."""
         window = self._retention.find_window(tick)
         self._kept_until = max(self._kept_until, window.last)
-        while self._sealed and self._sealed[-1].last >= window.first:
+        while self._sealed and self._sealed[-1][1] >= window.first:
             self._sealed.pop()
