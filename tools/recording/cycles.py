@@ -172,14 +172,12 @@ def compute_budgets(cycles_by_task: Mapping[str, Cycles], percentile: float) -> 
     Returns:
         Dictionary from board to budget.
     """
-    executors = {
-        name: cycles for name, cycles in cycles_by_task.items() if cycles.task.role == "executor"
-    }
     return {
         cycles.task.board: _compute_budget(
             cycles, cycles_by_task.get(f"{name}.planner"), percentile
         )
-        for name, cycles in executors.items()
+        for name, cycles in cycles_by_task.items()
+        if cycles.task.role == "executor"
     }
 
 

@@ -328,9 +328,6 @@ def _read_offset(observer: RackGrid, mailbox: str, peer: RackGrid) -> TimeShift 
         )
     at_ns = at_ns[is_this]
     by_ns = by_ns[is_this]
-    order = np.argsort(at_ns, kind="stable")
-    at_ns = at_ns[order]
-    by_ns = by_ns[order]
     # The clocks may drift between two measurements, before the first and after the last.
     ends = peer.convert_ticks(np.array(peer.ticks))
     longest_gap_ns = int(np.diff(np.sort(np.concatenate((at_ns, ends)))).max())

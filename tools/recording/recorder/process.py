@@ -116,8 +116,8 @@ class RecorderProcess:
         with far_end:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "rack.tools.recording.recorder", VIEW_CLASS],
-                stdin=far_end,
-                stdout=far_end,
+                stdin=far_end.fileno(),
+                stdout=far_end.fileno(),
                 stderr=self._complaints,
                 env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
             )

@@ -298,7 +298,9 @@ class Recorder:
             self._spool.flush(now=True)
             self._files.close(UNMEASURED if self._cores is None else self._cores.build_record())
             Checksums(self._folder).store(*TABLE_PATTERNS)
-            self._spool.remove()
+            # The parquet files are complete.
+            self._spool.path.unlink()
+            self._spool.close()
         if self._view is not None:
             self._view.close(self._words[System.TICK] + 1, self._tally.lost)
             Checksums(self._folder).store("*.rrd")
