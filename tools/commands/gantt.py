@@ -10,9 +10,8 @@ from rack.tools.console.parameters import Json, Settings, argument, option
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.progress import create_reading_progress
 from rack.tools.timing.charts import figure5
-from rack.tools.timing.charts.gantt import Subject, build_gantt, find_subject
+from rack.tools.timing.charts.gantt import Subject, WindowOptions, build_gantt, find_subject
 from rack.tools.timing.charts.panel import NS_PER_MS
-from rack.tools.timing.charts.window import WindowOptions
 
 LATEST_MS = 1e10
 MANY_SPANS = 10_000

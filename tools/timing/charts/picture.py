@@ -31,14 +31,6 @@ UNIT_COLOURS = {
     Unit.UPDATE: "#FFAABB",
 }
 """Light colours for black letters, which colour-blind readers can distinguish (Paul Tol)."""
-UNIT_NAMES = {
-    Unit.EXCHANGE: "C  exchange with the planner",
-    Unit.READ: "R  read",
-    Unit.PROCESS: "X  executor",
-    Unit.WRITE: "W  write",
-    Unit.PLAN: "P  planner",
-    Unit.UPDATE: "U  update of the plan",
-}
 EDGE_PT = 0.2
 LATE_COLOUR = "#CC3311"
 GRID_COLOUR = "#555555"
@@ -83,7 +75,7 @@ def save_picture(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
         rows[-1, 0].set_xlabel("time, ms")
         used = {span.unit for panel in panels for span in panel.chart.spans}
         handles: list[Artist] = [
-            Patch(facecolor=UNIT_COLOURS[unit], label=UNIT_NAMES[unit])
+            Patch(facecolor=UNIT_COLOURS[unit], label=f"{unit.value}  {unit.name.lower()}")
             for unit in Unit
             if unit in used
         ]

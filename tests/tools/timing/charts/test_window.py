@@ -6,7 +6,7 @@ import pytest
 
 from rack.boards.timing.tasks import TimedTask
 from rack.tools.console.answer import Failure
-from rack.tools.timing.charts.window import WindowOptions, choose_task
+from rack.tools.timing.charts.gantt import WindowOptions, choose_task
 
 MS = 1_000_000
 
