@@ -25,8 +25,7 @@ from rack.tools.console.answer import write_file
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreMeter
 from rack.tools.recording.file_names import PUBLISHED
-from rack.tools.recording.occasions import Retention
-from rack.tools.recording.recorder.flight import FlightRecorder
+from rack.tools.recording.occasions import FlightRecorder, Retention
 from rack.tools.recording.recorder.process import CHECK_PERIOD_S, IdleCounter
 from rack.tools.recording.run_files import TABLE_PATTERNS, RunFiles, Tally
 from rack.tools.recording.spool import Spool, open_rings
