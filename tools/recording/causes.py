@@ -242,7 +242,7 @@ class Divergence:
         Each clue follows its key: kind, board, subject and text. Two events with equal keys count
         as the same event in both runs.
         """
-        clues = []
+        clues: list[tuple[tuple[str, ...], Clue]] = []
         for event in run.events:
             kind = CLUES_BY_EVENT.get(event.get("code")) or CLUES_BY_EVENT.get(event["kind"])
             if kind is not None and event["tick"] >= self._begin:
