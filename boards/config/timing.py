@@ -118,7 +118,6 @@ def _build_board_timing(
     return BoardTiming(
         name=name,
         above=tuple(upper for upper, lower in config.list_links() if lower == name),
-        below=tuple(lower for upper, lower in config.list_links() if upper == name),
         coupling=board.coupling,
         every=layout.find_task(name).every,
         within_cycles=board.within_cycles,

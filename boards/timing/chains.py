@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
+
+T = TypeVar("T", bound=Hashable)
 
 
 def format_names(names: Sequence[str]) -> str:
@@ -22,6 +25,26 @@ def _increment_number(name: str) -> str:
     """Return the name with its last number increased by 1. Empty if the name has no number."""
     match = re.fullmatch(r"(.*?)(\d+)(\D*)", name)
     return f"{match[1]}{int(match[2]) + 1}{match[3]}" if match else ""
+
+
+def list_chains(above: Mapping[T, Sequence[T]]) -> tuple[tuple[T, ...], ...]:
+    """Return every chain from a highest to a lowest level.
+
+    Args:
+        above: Boards directly above each board. A board without neighbours forms no chain.
+    """
+
+    def extend_upward(lower_end: tuple[T, ...]) -> Iterator[tuple[T, ...]]:
+        """Yield every chain from a highest level down to and including `lower_end`."""
+        uppers = [upper for upper in above[lower_end[0]] if upper not in lower_end]
+        if not uppers:
+            yield lower_end
+        for upper in uppers:
+            yield from extend_upward((upper, *lower_end))
+
+    with_lower = {upper for uppers in above.values() for upper in uppers}
+    lowest = [board for board, uppers in above.items() if uppers and board not in with_lower]
+    return tuple(chain for board in lowest for chain in extend_upward((board,)))
 
 
 @dataclass(frozen=True)

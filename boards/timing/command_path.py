@@ -55,15 +55,6 @@ class CommandPath:
             release = read.find_tick(release + cycle)
         return release
 
-    def compute_response(self, given: int, acts: int) -> int:
-        """Return the time in ticks from a command to the end of the cycle that acts on the command.
-
-        Args:
-            given: Tick at which the command is issued.
-            acts: Release of the lowest level's cycle that acts on the command.
-        """
-        return acts + self.cycles[-1] - given
-
     @property
     def bound_eq_3_2(self) -> int:
         """Bound of eq. 3.2 in ticks: the number of levels times the longest cycle.

@@ -7,14 +7,14 @@ simulated time, because each rack has its own ticks.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple
 
 from rack.backplane.layout import Layout, TickGrid
-from rack.boards.timing.chains import format_names
+from rack.boards.timing.chains import format_names, list_chains
 from rack.boards.timing.rack import RackTiming, compute_grid_wait
 from rack.boards.timing.system_response import find_mailbox_row
 
@@ -142,15 +142,28 @@ class JoinedRacks:
     links: tuple[RackLink, ...]
 
     @cached_property
+    def crossings(self) -> dict[tuple[Station, Station], RackLink]:
+        """Link between each pair of a board and another rack's board that reads its messages."""
+        return {
+            (link.source, Station(link.rack, reader)): link
+            for link in reversed(self.links)
+            for reader in link.readers
+        }
+
+    @cached_property
     def chains(self) -> tuple[tuple[Station, ...], ...]:
         """Every chain of boards, from a highest to a lowest level, that crosses a link."""
-        lowest = [
-            station
-            for station in self._list_stations()
-            if self._list_above(station) and not self._has_below(station)
-        ]
-        chains = (chain for station in lowest for chain in self._list_chains((station,)))
-        return tuple(chain for chain in chains if len({station.rack for station in chain}) > 1)
+        above = {
+            Station(name, board.name): [Station(name, upper) for upper in board.above]
+            for name, rack in self.racks.items()
+            for board in rack.boards.values()
+        }
+        for (source, reader), link in self.crossings.items():
+            if link.is_command and reader in above:
+                above[reader].append(source)
+        return tuple(
+            chain for chain in list_chains(above) if len({station.rack for station in chain}) > 1
+        )
 
     @property
     def unbudgeted_links(self) -> tuple[RackLink, ...]:
@@ -179,11 +192,9 @@ class JoinedRacks:
         It is measured from a release that the imported messages state. If they depend on messages
         of a third rack, they state the release of that rack's last board.
         """
-        last = chain[-1].rack
         near = _find_beginning(chain)
-        link = self.find_link(*chain[near - 1 : near + 1])
-        assert link is not None, "the caller has checked it"
         writer = chain[near - 1]
+        link = self.crossings[writer, chain[near]]
         first = _find_beginning(chain[:near])
         boards = [station.board for station in chain[first:near]]
         row = find_mailbox_row(self.layouts[writer.rack], boards, [link.mailbox])
@@ -191,32 +202,17 @@ class JoinedRacks:
         if start == first and first > 0:
             start -= 1
         stations, far = chain[start:], chain[start:near]
-        is_lockstep = self.racks[last].is_lockstep
-        writer_ns = self.find_cycle_ns(writer)
-        taken_ns = link.compute_taken_ns(self._find_releases(writer), is_lockstep)
+        written = self.find_grid(writer)
+        taken_ns = link.compute_taken_ns(written, self.racks[chain[-1].rack].is_lockstep)
         times_ns = (
-            self.find_cycle_ns(stations[0]),
-            max(link.exported.every, writer_ns),
-            self.compute_response_ns(far) - writer_ns,
-            writer_ns + taken_ns,
+            self.find_grid(stations[0]).every,
+            max(link.exported.every, written.every),
+            self.compute_response_ns(far) - written.every,
+            written.every + taken_ns,
             self.compute_response_ns(stations),
-            self.compute_bound_ns(stations),
-            self.compute_sum_ns(stations),
+            *self.compute_bounds_ns(stations),
         )
         return JoinedPath(direction, stations, link.port, *(ns * 1e-6 for ns in times_ns))
-
-    def find_link(self, source: Station, reader: Station) -> RackLink | None:
-        """Return the link that carries messages from one board to another, or None."""
-        return next(
-            (
-                link
-                for link in self.links
-                if link.source == source
-                and link.rack == reader.rack
-                and reader.board in link.readers
-            ),
-            None,
-        )
 
     def list_chain_links(self, stations: Sequence[Station]) -> list[RackLink] | None:
         """Return the links that information crosses on its way along `stations`.
@@ -224,8 +220,8 @@ class JoinedRacks:
         Returns:
             The links, or None if information cannot pass between two consecutive racks.
         """
-        pairs = [(one, other) for one, other in pairwise(stations) if one.rack != other.rack]
-        links = [link for pair in pairs if (link := self.find_link(*pair)) is not None]
+        pairs = [pair for pair in pairwise(stations) if pair[0].rack != pair[1].rack]
+        links = [self.crossings[pair] for pair in pairs if pair in self.crossings]
         return links if len(links) == len(pairs) else None
 
     def compute_response_ns(self, stations: Sequence[Station]) -> int:
@@ -234,71 +230,30 @@ class JoinedRacks:
         As in `RackTiming.compute_response_ticks`, it lasts from the release of the first board to
         the end of the cycle in which the last board acts.
         """
-        response_ns = sum(self.find_cycle_ns(station) for station in stations)
+        response_ns = sum(self.find_grid(station).every for station in stations)
         for sender, receiver in pairwise(stations):
-            here = self.racks[receiver.rack]
-            board = here.boards[receiver.board]
-            written = self._find_releases(sender)
-            if sender.rack == receiver.rack:
-                read = _to_ns(board.reads.get(sender.board, board.releases), here.clock_ns)
-                response_ns += compute_grid_wait(written, read)
-            elif (link := self.find_link(sender, receiver)) is not None:
-                read = _to_ns(board.reads.get(LINK_BOARD, board.releases), here.clock_ns)
-                response_ns += link.compute_taken_ns(written, here.is_lockstep)
-                response_ns += link.compute_shown_ns(read)
+            written = self.find_grid(sender)
+            if (link := self.crossings.get((sender, receiver))) is None:
+                response_ns += compute_grid_wait(written, self.find_grid(receiver, sender.board))
+            else:
+                is_lockstep = self.racks[receiver.rack].is_lockstep
+                response_ns += link.compute_taken_ns(written, is_lockstep)
+                response_ns += link.compute_shown_ns(self.find_grid(receiver, LINK_BOARD))
         return response_ns
 
-    def compute_bound_ns(self, stations: Sequence[Station]) -> int:
-        """Return the bound of eq. 3.2, n R_max, in ns. Each link is treated as a level."""
-        cycles = self._list_cycles_ns(stations)
-        return len(cycles) * max(cycles)
-
-    def compute_sum_ns(self, stations: Sequence[Station]) -> int:
-        """Return the sum of eq. 3.3, in ns. Each link is treated as a level."""
-        return sum(self._list_cycles_ns(stations))
-
-    def find_cycle_ns(self, station: Station) -> int:
-        """Return the cycle of a board in ns."""
-        rack = self.racks[station.rack]
-        return rack.boards[station.board].every * rack.clock_ns
-
-    def _list_cycles_ns(self, stations: Sequence[Station]) -> list[int]:
-        """Return the cycles in ns of all boards and links along a chain."""
+    def compute_bounds_ns(self, stations: Sequence[Station]) -> tuple[int, int]:
+        """Return the bound n R_max of eq. 3.2 and the sum of eq. 3.3, with each link as a level."""
         links = self.list_chain_links(stations) or []
-        return [*map(self.find_cycle_ns, stations), *(link.cycle_ns for link in links)]
+        cycles = [self.find_grid(station).every for station in stations]
+        cycles += [link.cycle_ns for link in links]
+        return len(cycles) * max(cycles), sum(cycles)
 
-    def _find_releases(self, station: Station) -> TickGrid:
-        """Return the times at which the cycles of a board begin."""
+    def find_grid(self, station: Station, writer: str = "") -> TickGrid:
+        """Return the times in ns at which a board begins its cycles, or reads from `writer`."""
         rack = self.racks[station.rack]
-        return _to_ns(rack.boards[station.board].releases, rack.clock_ns)
-
-    def _list_stations(self) -> Iterator[Station]:
-        """Yield all boards of all racks."""
-        for name, rack in self.racks.items():
-            yield from (Station(name, board) for board in rack.boards)
-
-    def _list_above(self, station: Station) -> list[Station]:
-        """Return the boards directly above a board, in its rack and in others."""
-        above = self.racks[station.rack].boards[station.board].above
-        remote = (
-            link.source
-            for link in self.links
-            if link.is_command and link.rack == station.rack and station.board in link.readers
-        )
-        return [*(Station(station.rack, name) for name in above), *remote]
-
-    def _has_below(self, station: Station) -> bool:
-        """Return True if a board has another one below it, in its rack or in others."""
-        is_source = any(link.is_command and link.source == station for link in self.links)
-        return is_source or bool(self.racks[station.rack].boards[station.board].below)
-
-    def _list_chains(self, lower_end: tuple[Station, ...]) -> Iterator[tuple[Station, ...]]:
-        """Yield every chain from a highest level down to and including `lower_end`."""
-        above = [station for station in self._list_above(lower_end[0]) if station not in lower_end]
-        if not above:
-            yield lower_end
-        for station in above:
-            yield from self._list_chains((station, *lower_end))
+        board = rack.boards[station.board]
+        grid = board.reads.get(writer, board.releases)
+        return TickGrid(grid.every * rack.clock_ns, grid.phase * rack.clock_ns)
 
 
 def format_joined_levels(chains: Sequence[Sequence[tuple[str, str]]]) -> tuple[str, ...]:
@@ -319,8 +274,3 @@ def _find_beginning(stations: Sequence[Station]) -> int:
     return next(
         at + 1 for at in range(len(stations) - 2, -2, -1) if at < 0 or stations[at].rack != last
     )
-
-
-def _to_ns(grid: TickGrid, clock_ns: int) -> TickGrid:
-    """Convert a grid of ticks to one in ns."""
-    return TickGrid(grid.every * clock_ns, grid.phase * clock_ns)

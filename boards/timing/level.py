@@ -18,8 +18,7 @@ class BoardTiming:
 
     Attributes:
         name: Name of the board.
-        above: Boards directly above it.
-        below: Boards directly below it. The relation holds if either board names the other.
+        above: Boards directly above it. The relation holds if either board names the other.
         coupling: How executor and planner share processors.
         every: Period of the executor in ticks.
         within_cycles: Cycles that a plan may take.
@@ -40,7 +39,6 @@ class BoardTiming:
 
     name: str
     above: tuple[str, ...]
-    below: tuple[str, ...]
     coupling: Coupling
     every: int
     within_cycles: int

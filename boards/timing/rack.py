@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -10,7 +10,7 @@ from math import gcd, prod
 from typing import Any, NamedTuple
 
 from rack.backplane.layout import TickGrid
-from rack.boards.timing.chains import ParallelChains
+from rack.boards.timing.chains import ParallelChains, list_chains
 from rack.boards.timing.interrupts import InboxTiming
 from rack.boards.timing.level import BoardTiming, LevelTiming
 from rack.boards.timing.response_time import TaskResponse, compute_loads, compute_task_responses
@@ -69,16 +69,7 @@ class RackTiming:
 
         A rack with one board per joint has a chain for each joint.
         """
-        lowest = [board.name for board in self.boards.values() if board.above and not board.below]
-        return tuple(chain for name in lowest for chain in self._list_chains((name,)))
-
-    def _list_chains(self, lower_end: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
-        """Yield every chain from a highest level down to and including `lower_end`."""
-        above = self.boards[lower_end[0]].above
-        if not above:
-            yield lower_end
-        for name in above:
-            yield from self._list_chains((name, *lower_end))
+        return list_chains({name: board.above for name, board in self.boards.items()})
 
     @cached_property
     def chain_groups(self) -> tuple[ParallelChains, ...]:
@@ -101,16 +92,19 @@ class RackTiming:
     def hierarchy(self) -> ParallelChains:
         """Group of chains with the longest response to a command. Empty if there are no chains."""
         return max(
-            self.chain_groups, key=self.compute_command_ticks, default=ParallelChains((), ())
+            self.chain_groups, key=self.compute_longest_ticks, default=ParallelChains((), ())
         )
 
-    def compute_command_ticks(self, chains: ParallelChains) -> int:
-        """Return the longest response in ticks of a command along any of these chains."""
-        return max((self.compute_response_ticks(chain) for chain in chains.chains), default=0)
+    def compute_longest_ticks(self, chains: ParallelChains, step: int = 1) -> int:
+        """Return the longest response in ticks along any of these chains.
 
-    def compute_status_ticks(self, chains: ParallelChains) -> int:
-        """Return the longest response in ticks of a status along any of these chains."""
-        return max((self.compute_response_ticks(chain[::-1]) for chain in chains.chains), default=0)
+        Args:
+            chains: The chains.
+            step: 1 for commands, which pass down, or -1 for statuses, which pass up.
+        """
+        return max(
+            (self.compute_response_ticks(chain[::step]) for chain in chains.chains), default=0
+        )
 
     def compute_response_ticks(self, boards: Sequence[str]) -> int:
         """Return the longest response, in ticks, along a sequence of boards.
@@ -189,19 +183,14 @@ class RackTiming:
 
         It is 0 if the task does not serve an inbox.
         """
-        inbox = self.inboxes.get(task)
-        return (
-            0
-            if inbox is None
-            else inbox.compute_cost_ns(self.find_slice_ticks(task) * self.clock_ns)
-        )
+        if task not in self.inboxes:
+            return 0
+        return self.inboxes[task].compute_cost_ns(self.find_slice_ticks(task) * self.clock_ns)
 
     def find_slice_ticks(self, task: str) -> int:
         """Return the cycle of an executor, or the time slice of a planner's plan, in ticks."""
         board = self.boards[task.removesuffix(".planner")]
-        if task == board.name:
-            return board.every
-        return board.every * board.within_cycles
+        return board.every * (1 if task == board.name else board.within_cycles)
 
     @cached_property
     def levels(self) -> dict[str, LevelTiming]:

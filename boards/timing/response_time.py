@@ -184,20 +184,17 @@ def compute_task_responses(
         exact |= _compute_scheduled_responses(
             [task for task in busy if task.core == core], context_switch_ns
         )
+    demands = {t.name: (compute_job_ns(t, context_switch_ns), t.period_ns) for t in busy}
     responses = []
     for task in busy:
         others = [other for other in busy if other.core == task.core and other is not task]
-        shares = [other for other in others if not task.priority and not other.priority]
-        above = [
-            other for other in others if other.priority >= task.priority and other not in shares
-        ]
-        job = compute_job_ns(task, context_switch_ns)
+        job, _ = demands[task.name]
         blocking = compute_blocking_ns(task, others)
         bound = compute_response_time(
             job,
-            [_compute_demand(other, context_switch_ns) for other in above],
+            [demands[o.name] for o in others if o.priority >= max(task.priority, 1)],
             blocking,
-            sharing=[_compute_demand(other, context_switch_ns) for other in shares],
+            sharing=[demands[o.name] for o in others if not task.priority and not o.priority],
             horizon=MAX_DEADLINES * task.period_ns,
         )
         responses.append(
@@ -237,15 +234,8 @@ def compute_blocking_ns(task: TimedTask, tasks: Iterable[TimedTask]) -> int:
 
 def compute_loads(tasks: Iterable[TimedTask], context_switch_ns: int) -> dict[int, float]:
     """Return the load of each core, including context switches. Above 1 a core is overloaded."""
-    loads: dict[int, float] = {}
+    loads = defaultdict[int, float](float)
     for task in tasks:
         if task.cost_ns:
-            loads[task.core] = (
-                loads.get(task.core, 0.0) + compute_job_ns(task, context_switch_ns) / task.period_ns
-            )
+            loads[task.core] += compute_job_ns(task, context_switch_ns) / task.period_ns
     return dict(sorted(loads.items()))
-
-
-def _compute_demand(task: TimedTask, context_switch_ns: int) -> Load:
-    """Return the cost of a task's job, including context switches, and the task's period."""
-    return compute_job_ns(task, context_switch_ns), task.period_ns

@@ -41,8 +41,8 @@ def predict_response(rack: RackTiming) -> Prediction:
         levels=hierarchy.levels,
         bound_eq_3_2_ms=hierarchy.bound * tick_ms,
         sum_eq_3_3_ms=sum(hierarchy.cycles) * tick_ms,
-        command_ms=rack.compute_command_ticks(hierarchy) * tick_ms,
-        status_ms=rack.compute_status_ticks(hierarchy) * tick_ms,
+        command_ms=rack.compute_longest_ticks(hierarchy) * tick_ms,
+        status_ms=rack.compute_longest_ticks(hierarchy, -1) * tick_ms,
         plan_ms={board.name: board.every * board.within_cycles * tick_ms for board in planned},
     )
 
@@ -58,8 +58,6 @@ def find_path_mailboxes(layout: Layout, boards: Sequence[str]) -> tuple[MailboxS
         layout: Layout of the rack.
         boards: Names of the boards, in the order in which the information flows.
     """
-    if len(boards) < 2:
-        return ()
     sampled = [
         box for box in layout.mailboxes if box.protocol != "queue" and not is_position_mailbox(box)
     ]

@@ -146,10 +146,8 @@ def _check_chains(
         limit = "n R_max"
     total = sum(chains.cycles) * rack.tick_ns
     yield EquationVerdict("3.3", subject, total, "<=", bound, f"R_s = sum of R_i <= {limit}")
-    for direction, ticks in (
-        ("command", rack.compute_command_ticks(chains)),
-        ("status", rack.compute_status_ticks(chains)),
-    ):
+    for direction, step in (("command", 1), ("status", -1)):
+        ticks = rack.compute_longest_ticks(chains, step)
         meaning = f"R_s of a {direction} with its waits for the grid <= {limit}"
         yield EquationVerdict("3.2", subject, ticks * rack.tick_ns, "<=", bound, meaning)
 

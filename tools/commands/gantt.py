@@ -10,9 +10,8 @@ from rack.tools.console.parameters import Json, Settings, argument, option
 from rack.tools.console.pictures import NO_PICTURES, can_draw
 from rack.tools.console.progress import create_reading_progress
 from rack.tools.timing.charts import figure5
-from rack.tools.timing.charts.gantt import Subject, build_gantt, find_subject
+from rack.tools.timing.charts.gantt import Subject, WindowOptions, build_gantt, find_subject
 from rack.tools.timing.charts.panel import NS_PER_MS
-from rack.tools.timing.charts.window import WindowOptions, parse_process_times
 
 LATEST_MS = 1e10
 MANY_SPANS = 10_000
@@ -27,11 +26,6 @@ def gantt(
         "--from-ms MS", "start of the window, ms", min=0.0, max=LATEST_MS
     ),
     to_ms: float | None = option("--to-ms MS", "end of the window, ms", min=0.0, max=LATEST_MS),
-    process: list[str] = option(
-        "--process LEVEL=MS,MS",
-        "durations of X in the schedule of a level, one for each cycle in turn; repeatable",
-        [],
-    ),
     figure: int | None = option(
         "--figure 5", "instead: the paper's figure 5 with the levels of this rack"
     ),
@@ -61,9 +55,8 @@ def gantt(
         _draw_figure_5(drawn_subject, figure, as_json)
         return
     from_ns, to_ns = (None if ms is None else round(ms * NS_PER_MS) for ms in (from_ms, to_ms))
-    window = WindowOptions(from_ns, to_ns)
     chart = build_gantt(
-        drawn_subject, window, parse_process_times(process), create_reading_progress(silent=as_json)
+        drawn_subject, WindowOptions(from_ns, to_ns), create_reading_progress(silent=as_json)
     )
     if chart.span_count > MANY_SPANS and not as_json:
         print(f"drawing {chart.span_count} spans", file=sys.stderr, flush=True)

@@ -43,7 +43,7 @@ from rack.tools.recording.divergence import (
 )
 from rack.tools.recording.entries import load_commands_from, load_entries, load_operator_commands
 from rack.tools.recording.file_names import CONFIG
-from rack.tools.recording.origin import Origin, check_code_state, find_continuation_tick
+from rack.tools.recording.origin import Origin, check_code_state
 from rack.tools.recording.recording import Recording
 
 DIFFERENCE_CAUSES = (
@@ -87,7 +87,8 @@ class RepeatedRun:
             Preload(list_class_names(ran), tuple(sys.path), build_cell_config(ran))
         )
         self._has_begun = False
-        self._branched_at = find_continuation_tick(recording)
+        origin = Origin.read_from(recording)
+        self._branched_at = None if origin is None else origin.tick
 
     def __enter__(self) -> Self:
         return self
@@ -128,7 +129,11 @@ class RepeatedRun:
             return
         with self.run_rack_to(tick, SnapshotPolicy(at=tick)) as rack:
             if differing := list_differing_mailboxes(self.recording, rack.segment, tick):
-                self._report_differences(differing, tick)
+                print(
+                    f"{self._error_prefix}: {', '.join(differing)} are not as recorded:"
+                    f" {self._find_first_difference(tick)}{DIFFERENCE_CAUSES}",
+                    file=sys.stderr,
+                )
             notes = [
                 e.text
                 for e in rack.events
@@ -176,7 +181,9 @@ class RepeatedRun:
     def continue_at(self, tick: int) -> Beginning:
         """Return the state from which a rack can continue at `tick`."""
         self.reach_tick(tick)
-        return replace(self._find_beginning(tick), origin=Origin.from_run(self.recording, tick))
+        run = self.recording
+        origin = Origin(str(run.folder), tick, run.launch.created_ns)
+        return replace(self._find_beginning(tick), origin=origin)
 
     def read_levels(self, tick: int) -> dict[str, Document]:
         """Return a dictionary from task to the attributes of its level's object before `tick`."""
@@ -221,38 +228,29 @@ class RepeatedRun:
         """Return the tick of the newest snapshot at or before `tick`."""
         return self.crate.read_attributes(tick, "").tick
 
-    def _report_differences(self, mailboxes: Sequence[str], tick: int) -> None:
-        """Report on stderr which mailboxes differ from the recording, and the first difference."""
-        names = ", ".join(mailboxes)
-        first = ""
-        with suppress(Failure), TemporaryDirectory(prefix="rack-") as folder:
-            first = f"{self._describe_first_difference(Path(folder) / 'again', tick)}: "
-        print(
-            f"{self._error_prefix}: {names} are not as recorded: {first}{DIFFERENCE_CAUSES}",
-            file=sys.stderr,
-        )
+    def _find_first_difference(self, tick: int) -> str:
+        """Repeat the run up to `tick`, and describe its first message that differs.
 
-    def _describe_first_difference(self, folder: Path, tick: int) -> str:
-        """Describe the first message up to `tick` that differs from the recording.
-
-        The rack runs again for this, and is recorded into `folder`.
+        Returns:
+            A clause. Empty if the run cannot be recorded again.
         """
         config = self._unique_config("again")
         begins = self._find_beginning(self._branched_at or 0)
-        run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), beginning=begins)
-        again = Recording(folder)
-        first = list_divergent_messages(self.recording, again)[0]
-        box = again.layout.find_mailbox(first.mailbox)
-        recorded, repeated = (find_row(run, box, first.serial) for run in (self.recording, again))
-        where = f"first {box.name} at tick {first.tick}"
-        if recorded is None or repeated is None:
-            return f"{where}, which is missing in one of the two runs"
-        recorded, repeated = recorded["message"], repeated["message"]
-        names = [field.name for field in box.fields]
-        differing = [name for name in names if not np.array_equal(recorded[name], repeated[name])]
-        return ", ".join(
-            (where, *(f"{name} was {recorded[name]}, is {repeated[name]}" for name in differing))
-        )
+        with suppress(Failure), TemporaryDirectory(prefix="rack-") as name:
+            folder = Path(name) / "again"
+            run_rack(config, tick * config.clock_ns * 1e-9, folder, Display(), beginning=begins)
+            runs = self.recording, Recording(folder)
+            first = list_divergent_messages(*runs)[0]
+            box = self.recording.layout.find_mailbox(first.mailbox)
+            recorded, repeated = (find_row(run, box, first.serial) for run in runs)
+            where = f"first {box.name} at tick {first.tick}"
+            if recorded is None or repeated is None:
+                return f"{where}, which is missing in one of the two runs: "
+            names = [field.name for field in box.fields]
+            pairs = [(n, recorded["message"][n], repeated["message"][n]) for n in names]
+            fields = [f"{n} was {a}, is {b}" for n, a, b in pairs if not np.array_equal(a, b)]
+            return f"{', '.join((where, *fields))}: "
+        return ""
 
 
 def find_run_config(origin: str) -> Path:

@@ -57,7 +57,7 @@ class OtherRacks:
             is_recorded: False to record none of them.
         """
         options = ["--json", "--share", f"--speed={config.clock.speed}"]
-        options += ["--lockstep"] if config.clock.mode == "lockstep" else []
+        options += ["--lockstep"] if config.is_lockstep else []
         options += [] if seconds is None else [f"--seconds={seconds}"]
         options += [] if is_recorded else ["--no-record"]
         self._is_stopped = False

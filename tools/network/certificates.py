@@ -11,6 +11,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import NamedTuple
@@ -180,11 +181,8 @@ def write_credentials(folder: Path, files: Mapping[str, bytes]) -> None:
     """
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     for name, content in files.items():
-        # Create the file with its final mode, and do not follow an existing link.
-        fd = os.open(
-            folder / name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, OWNER_ONLY
-        )
-        with os.fdopen(fd, "wb") as file:
+        # An existing file or link is never opened.
+        with open(folder / name, "xb", opener=partial(os.open, mode=OWNER_ONLY)) as file:
             file.write(content)
 
 

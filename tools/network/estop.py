@@ -27,9 +27,7 @@ from rack.tools.console.address import Operator, RackAddress
 from rack.tools.console.answer import Failure
 
 CONNECT_S = 3.0
-"""Maximum wait in s for a connection and for the first rack at its other end."""
-OTHERS_S = 0.3
-"""Maximum wait in s for further racks at the other end once one was seen."""
+"""Maximum wait in s for a connection and for the rack at its other end."""
 ANSWER_S = 1.0
 """Maximum wait for an answer. After that the request is repeated."""
 PATIENCE_S = 4.0
@@ -95,8 +93,7 @@ class EstopSession:
             Failure: The rack does not appear in time. The message names the racks that are present.
         """
         rack = self._address.rack
-        self._wait_until(lambda: self._launches, CONNECT_S)
-        self._wait_until(lambda: rack in self._launches, OTHERS_S)
+        self._wait_until(lambda: rack in self._launches, CONNECT_S)
         if rack in self._launches:
             return self._launches[rack]
         present = ", ".join(sorted(self._launches))

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -78,20 +78,6 @@ class Clue:
     run: str = ""
     tick: int = -1
     values: ValueDifference | None = None
-
-
-class EventClue(NamedTuple):
-    """A recorded event, as a clue and with the data needed to find the same event in another run.
-
-    Attributes:
-        key: Identity of the event. Two events with equal keys count as the same event in both runs.
-        about: Boards, tasks and mailboxes that the event concerns.
-        clue: The clue.
-    """
-
-    key: tuple[str, ...]
-    about: tuple[str, ...]
-    clue: Clue
 
 
 @dataclass(frozen=True)
@@ -232,7 +218,7 @@ class Divergence:
         """
         boards = {name.partition(".")[0] for name in (box.writer, box.name)}
         about = {CLOCK, box.writer, box.name, *boards}
-        event_clues = [list(self._list_event_clues(run)) for run in self.runs]
+        event_clues = [self._list_event_clues(run) for run in self.runs]
         for this_run, other_run, run in zip(
             event_clues, reversed(event_clues), self.runs, strict=True
         ):
@@ -240,26 +226,31 @@ class Divergence:
             # A death is reported only after messages are already missing. Accept deaths up to the
             # tick at which the run wrote this serial, or up to its end if it never did.
             written = NEVER if row is None else int(row["tick"])
-            unmatched = Counter(event.key for event in other_run)
-            for event in this_run:
+            unmatched = Counter(key for key, _ in other_run)
+            for key, clue in this_run:
                 # A level reads commands as messages, so they are already compared as its inputs.
-                if event.clue.kind == "command" and box.writer != CLOCK:
+                if clue.kind == "command" and box.writer != CLOCK:
                     continue
-                unmatched[event.key] -= 1
-                until = written if event.clue.kind == "died" else message.tick
-                if unmatched[event.key] < 0 and about & {*event.about} and event.clue.tick <= until:
-                    yield event.clue
+                unmatched[key] -= 1
+                until = written if clue.kind == "died" else message.tick
+                if unmatched[key] < 0 and not about.isdisjoint(key[1:3]) and clue.tick <= until:
+                    yield clue
 
-    def _list_event_clues(self, run: Recording) -> Iterator[EventClue]:
-        """Yield a clue for each death, fault, command or demand since the first common tick."""
+    def _list_event_clues(self, run: Recording) -> list[tuple[tuple[str, ...], Clue]]:
+        """Return a clue for each death, fault, command or demand since the first common tick.
+
+        Each clue follows its key: kind, board, subject and text. Two events with equal keys count
+        as the same event in both runs.
+        """
+        clues: list[tuple[tuple[str, ...], Clue]] = []
         for event in run.events:
             kind = CLUES_BY_EVENT.get(event.get("code")) or CLUES_BY_EVENT.get(event["kind"])
             if kind is not None and event["tick"] >= self._begin:
-                about = event["board"], event["subject"]
                 # The text of a death contains a process id, which always differs.
                 text = "" if kind == "died" else f"{event['tick']} {event['text']}"
                 clue = Clue(kind, event["text"], str(run.folder), event["tick"])
-                yield EventClue((kind, *about, text), about, clue)
+                clues.append(((kind, event["board"], event["subject"], text), clue))
+        return clues
 
     def _find_miss_clues(self, task: TaskSpec, tick: int) -> Iterator[Clue]:
         """Yield a clue if the task missed or skipped its cycle at `tick` in only one run."""

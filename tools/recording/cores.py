@@ -1,8 +1,7 @@
 """Measures stolen time and frequency of the machine's cores during a run.
 
 Steal is time for which the hypervisor withheld a core that this machine needed; /proc/stat counts
-it for each core. A core at a lower frequency computes more slowly; cpufreq shows the frequency, or
-/proc/cpuinfo where it has the field.
+it for each core. A core at a lower frequency computes more slowly; /proc/cpuinfo shows it.
 """
 
 from __future__ import annotations
@@ -12,17 +11,12 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Self
-
-from pydantic import TypeAdapter
-
-from rack.backplane.json_text import encode_json
+from typing import NamedTuple
 
 STAT = Path("/proc/stat")
 CPUINFO = Path("/proc/cpuinfo")
-CPUFREQ = Path("/sys/devices/system/cpu")
 STEAL_COLUMN = 8
 """Column of the steal count in a core's line of /proc/stat."""
 FREQUENCY_S = 0.5
@@ -58,23 +52,6 @@ class CoreRecord:
     lasted_ns: int = 0
     stolen: tuple[Stolen, ...] | None = None
     mhz: tuple[tuple[int, float, float], ...] = ()
-
-    def to_json(self) -> str:
-        """Return the record as JSON."""
-        return encode_json(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str | bytes) -> Self:
-        """Parse a record from JSON. Raises `ValueError` if the text is not a record."""
-        return TypeAdapter(cls).validate_json(text)
-
-    def sum_stolen_ms(self) -> dict[int, int]:
-        """Return a dictionary from core to stolen time in ms. Cores without steal are left out."""
-        spans = self.stolen or ()
-        return {
-            core: sum(s.ms for s in spans if s.core == core)
-            for core in sorted({s.core for s in spans})
-        }
 
 
 UNMEASURED = CoreRecord()
@@ -130,12 +107,7 @@ def _read_steal() -> dict[int, int]:
 
 def _read_frequencies() -> Iterator[tuple[int, float]]:
     """Yield (core, MHz) for every core whose frequency the kernel reports."""
-    frequency_files = sorted(CPUFREQ.glob("cpu[0-9]*/cpufreq/scaling_cur_freq"))
-    # An offline core has no readable frequency.
-    for path in frequency_files:
-        with suppress(OSError, ValueError):
-            yield int(path.parts[-3].removeprefix("cpu")), int(path.read_text()) / 1000
-    for block in () if frequency_files else CPUINFO.read_text().split("\n\n"):
+    for block in CPUINFO.read_text().split("\n\n"):
         fields = {
             name.strip(): value
             for name, _, value in (line.partition(":") for line in block.splitlines())

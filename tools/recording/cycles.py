@@ -78,25 +78,25 @@ class Cycles:
 
 def read_cycles(recording: Recording) -> dict[str, Cycles]:
     """Return a dictionary from task to its cycles. Tasks without recorded cycles are left out."""
-    tasks = [task for task in recording.layout.tasks if len(recording.cycles.get(task.name, ()))]
-    places = {task.name: recording.find_core_and_priority(task) for task in tasks}
     _, absent = analyze_stalls(recording)
+    tasks = [task for task in recording.layout.tasks if len(recording.read_trace(task.name))]
+    places = {task.name: recording.find_core_and_priority(task) for task in tasks}
     spans = {task.name: Occupation.from_records(recording.cycles[task.name]) for task in tasks}
-    with_planner = {task.name for task in recording.layout.tasks if task.role == "planner"}
+    with_planner = {task.board for task in recording.layout.tasks if task.role == "planner"}
     by_task = {}
     for task in tasks:
         core, priority = places[task.name]
         higher_priority = [
-            name
+            spans[name]
             for name, (other_core, other_priority) in places.items()
             if other_core == core and other_priority > priority
         ]
         rows = recording.cycles[task.name]
         rows = select_plans(rows) if task.role == "planner" else rows
         if len(rows):
-            preempted_by = Occupation.merge([spans[name] for name in higher_priority])
+            preempted_by = Occupation.merge(higher_priority)
             exchange_ns, read_ns, process_ns, write_ns = compute_unit_times(rows, preempted_by).T
-            if task.role == "executor" and f"{task.name}.planner" not in with_planner:
+            if task.board not in with_planner:
                 # Without a planner, the check for a new plan counts as reading.
                 read_ns = read_ns + exchange_ns
                 exchange_ns = np.zeros_like(read_ns)
@@ -172,14 +172,12 @@ def compute_budgets(cycles_by_task: Mapping[str, Cycles], percentile: float) -> 
     Returns:
         Dictionary from board to budget.
     """
-    executors = {
-        name: cycles for name, cycles in cycles_by_task.items() if cycles.task.role == "executor"
-    }
     return {
         cycles.task.board: _compute_budget(
             cycles, cycles_by_task.get(f"{name}.planner"), percentile
         )
-        for name, cycles in executors.items()
+        for name, cycles in cycles_by_task.items()
+        if cycles.task.role == "executor"
     }
 
 

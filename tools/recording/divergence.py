@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,17 +9,11 @@ from typing import Any
 import numpy as np
 
 from rack.backplane.layout import MailboxSpec
+from rack.backplane.mailbox.slots import CHECKED_FROM
 from rack.tools.console.answer import Failure
 from rack.tools.recording.file_names import CONFIG
 from rack.tools.recording.origin import Origin
 from rack.tools.recording.recording import Recording
-
-COMPARED_COLUMNS = ("serial", "tick", "visible_at", "chain")
-"""Columns that are compared.
-
-The chain of a message is the chained checksum of all messages written before it.
-"""
-Heads = Mapping[str, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -75,7 +68,8 @@ def find_other_run(run: Path, named: Path, asked: str = "") -> Path:
         raise Failure(f"{asked} does not continue another run; name one with --against RUN", 2)
     origin_folder = Path(origin.folder)
     for folder in (origin_folder, run.resolve().parent / origin_folder.name):
-        if (folder / CONFIG).is_file() and origin.is_same_run(Recording(folder)):
+        is_run = (folder / CONFIG).is_file()
+        if is_run and Recording(folder).launch.created_ns == origin.launched_ns:
             return folder
     raise Failure(f"{asked} continues {origin_folder}, but that run no longer exists", 2)
 
@@ -166,10 +160,6 @@ def _find_divergent_message(
 ) -> DivergentMessage | None:
     """Return the first differing message of a mailbox, or None if no message differs.
 
-    Serials and chains are compared. Damaged messages are not recorded, so they leave gaps in the
-    serials. A chain covers only earlier messages, so a message whose content differs is the one
-    before the first differing chain.
-
     Args:
         first_run: One run.
         second_run: The other run.
@@ -177,53 +167,26 @@ def _find_divergent_message(
         begin: First tick that is compared.
         end: Tick before which the comparison ends.
     """
-    heads = [_read_heads(run, box.name, begin) for run in (first_run, second_run)]
-    length = min(len(head["serial"]) for head in heads)
-    first_serial_difference, first_chain_difference = (
-        next(iter(np.flatnonzero(here[:length] != there[:length]).tolist()), length)
-        for here, there in ((heads[0][name], heads[1][name]) for name in ("serial", "chain"))
+    recorded = (run.read_rows(box.name) for run in (first_run, second_run))
+    # Take slices, because a selection by a mask does not copy the padding between fields.
+    both = [rows[np.searchsorted(rows["tick"], begin) :] for rows in recorded]
+    length = min(map(len, both))
+    here, there = (
+        rows[:length].view(np.uint8).reshape(length, rows.itemsize)[:, CHECKED_FROM:]
+        for rows in both
     )
-
-    first = (
-        first_serial_difference
-        if first_serial_difference <= first_chain_difference
-        else max(first_chain_difference - 1, 0)
-    )
-    if first == length > 0 and not _is_last_equal(first_run, second_run, box, heads):
-        first -= 1
-    positions = [
-        tuple(int(head[name][first]) for name in COMPARED_COLUMNS[:-1])
-        for head in heads
-        if first < len(head["serial"])
-    ]
-    if not positions:
+    # If the common rows are equal, the difference is the first row of the longer run.
+    first = next(iter(np.flatnonzero((here != there).any(axis=1)).tolist()), length)
+    messages = [rows[first] for rows in both if first < len(rows)]
+    if not messages:
         return None
-    serial, tick, visible_at = (min(numbers) for numbers in zip(*positions, strict=True))
+    serial, tick, visible_at = (
+        min(int(message[name]) for message in messages) for name in ("serial", "tick", "visible_at")
+    )
     # If the other run ended before the message became visible, the message is not expected there.
-    if len(positions) == 1 and visible_at >= end:
+    if len(messages) == 1 and visible_at >= end:
         return None
     return DivergentMessage(box.name, serial, tick, visible_at)
-
-
-def _read_heads(run: Recording, mailbox: str, begin: int) -> Heads:
-    """Return `COMPARED_COLUMNS` of all messages written at or after tick `begin`."""
-    columns = {name: run.read_signal(mailbox, name) for name in COMPARED_COLUMNS}
-    is_later = columns["tick"] >= begin
-    return {name: values[is_later] for name, values in columns.items()}
-
-
-def _is_last_equal(
-    first_run: Recording, second_run: Recording, box: MailboxSpec, heads: list[Heads]
-) -> bool:
-    """Return True if the last message that both runs contain is equal in both.
-
-    Its content is compared, because no later message has a chain that covers it.
-    """
-    last = min(len(head["serial"]) for head in heads) - 1
-    if any(heads[0][name][last] != heads[1][name][last] for name in COMPARED_COLUMNS):
-        return False
-    rows = (find_row(run, box, int(heads[0]["serial"][last])) for run in (first_run, second_run))
-    return len({row["message"].tobytes() for row in rows}) == 1
 
 
 def find_row(run: Recording, box: MailboxSpec, serial: int) -> Any:

@@ -44,12 +44,12 @@ def load_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Re
     layout = plan.layout
     recording = Recording(run)
     run_config = recording.rack_config
-    if run_config.adapter.lan is not None and run_config.clock.mode != "lockstep":
+    if run_config.adapter.lan is not None and not run_config.is_lockstep:
         raise Failure(
             f"{asked}: it ran in real time on a network, but only lockstep runs can be repeated",
             2,
         )
-    recorded_boxes = {mailbox.name: mailbox for mailbox in recording.layout.mailboxes}
+    recorded = {box.name: _format_type(box) for box in recording.layout.mailboxes}
     entries: dict[str, RecordedEntries] = {}
     for task in plan.tasks:
         adapter_class = find_class(task.target, object)
@@ -63,13 +63,9 @@ def load_entries(config: RackConfig, run: Path, asked: str = "") -> dict[str, Re
         boxes = {port: layout.find_mailbox(f"{task.task}.{port}") for port in ports}
         for box in boxes.values():
             needed = _format_type(box)
-            recorded_type = (
-                _format_type(recorded_boxes[box.name])
-                if box.name in recorded_boxes
-                else "no such mailbox"
-            )
-            if recorded_type != needed:
-                raise Failure(f"{asked}: {box.name}: {recorded_type}; needed: {needed}", 2)
+            found = recorded.get(box.name, "no such mailbox")
+            if found != needed:
+                raise Failure(f"{asked}: {box.name}: {found}; needed: {needed}", 2)
             if recording.kept:
                 raise Failure(f"{asked}: {recording.kept_text}", 2)
             _check_complete(box, recording, asked)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from heapq import merge
 from pathlib import Path
-from typing import NamedTuple
 
 from mcap.writer import Writer
 
@@ -33,14 +32,10 @@ BLOCK_MESSAGES = 1024
 """Number of messages of a mailbox that are converted to JSON in one step."""
 
 
-class ChannelMessage(NamedTuple):
-    """A message of a channel. Its log time comes first, so that messages sort by it."""
-
-    log_ns: int  # simulated, since the start of the run
-    channel: int
-    sequence: int
-    publish_ns: int  # on the wall clock
-    data: bytes
+ChannelMessage = tuple[int, int, int, int, bytes]
+"""A message of a channel: its log time in ns of simulated time since the start of the run, channel,
+sequence number, publication time in ns of the wall clock, and data. It sorts by its log time.
+"""
 
 
 def export_recording(
@@ -73,10 +68,10 @@ def export_recording(
             for pair in zip(boxes_recorded, channels, strict=True)
         ]
         events = _register_channel(writer, EVENTS, "event", EVENT_SCHEMA)
-        for sample in merge(_encode_events(recording, events), *streams):
-            writer.add_message(
-                sample.channel, sample.log_ns, sample.data, sample.publish_ns, sample.sequence
-            )
+        for log_ns, channel, sequence, publish_ns, data in merge(
+            _encode_events(recording, events), *streams
+        ):
+            writer.add_message(channel, log_ns, data, publish_ns, sequence)
             count += 1
             if count % BLOCK_MESSAGES == 0:
                 show_progress(count / total)
@@ -127,7 +122,7 @@ def _encode_messages(
             serial, tick = values[:2]
             data = encode_json(dict(zip(names, values, strict=True))).encode()
             sequence = serial & 0xFFFFFFFF
-            yield ChannelMessage(tick * clock_ns, channel, sequence, stamp_ns + wall_ns, data)
+            yield tick * clock_ns, channel, sequence, stamp_ns + wall_ns, data
 
 
 def _encode_events(recording: Recording, channel: int) -> Iterator[ChannelMessage]:
@@ -136,4 +131,4 @@ def _encode_events(recording: Recording, channel: int) -> Iterator[ChannelMessag
     clock_ns = recording.layout.clock_ns
     for number, event in enumerate(ticked):
         data = encode_json(event).encode()
-        yield ChannelMessage(event["tick"] * clock_ns, channel, number, event["time_ns"], data)
+        yield event["tick"] * clock_ns, channel, number, event["time_ns"], data

@@ -106,7 +106,11 @@ def summarize_steal(recording: Recording) -> Document:
         is False if the run was in lockstep or the kernel does not count steal.
     """
     record = recording.cores
-    stolen_ms = {str(core): ms for core, ms in record.sum_stolen_ms().items()}
+    spans = record.stolen or ()
+    stolen_ms = {
+        str(core): sum(span.ms for span in spans if span.core == core)
+        for core in sorted({span.core for span in spans})
+    }
     percent = {core: round(1e8 * ms / record.lasted_ns, 3) for core, ms in stolen_ms.items()}
     return {"measured": record.stolen is not None, "ms": stolen_ms, "percent": percent}
 
@@ -128,13 +132,9 @@ def list_holds(recording: Recording) -> list[Document]:
         itself began the hold, `by` is "holding" and `why` is the last reason in its status.
         `until_s` is None if the hold lasted until the end of the run.
     """
-    levels = [
-        mailbox.removesuffix(".status")
-        for mailbox in recording.mailboxes
-        if mailbox.endswith(".status")
-    ]
-    hold_entries = [hold for level in levels for hold in _list_level_holds(recording, level)]
-    return sorted(hold_entries, key=lambda hold: (hold["since_s"], hold["level"]))
+    statuses = [mailbox for mailbox in recording.mailboxes if mailbox.endswith(".status")]
+    holds = [hold for mailbox in statuses for hold in _list_level_holds(recording, mailbox)]
+    return sorted(holds, key=lambda hold: (hold["since_s"], hold["level"]))
 
 
 def list_fired_rows(recording: Recording) -> dict[str, list[Document]]:
@@ -149,10 +149,8 @@ def list_fired_rows(recording: Recording) -> dict[str, list[Document]]:
     for mailbox in recording.mailboxes:
         if not {"table", "row", "fired"} <= recording.list_fields(mailbox):
             continue
-        columns = ("table", "row", "fired")
-        rows = [
-            *zip(*(recording.read_signal(mailbox, name).tolist() for name in columns), strict=True)
-        ]
+        columns = [recording.read_signal(mailbox, name) for name in ("table", "row", "fired")]
+        rows = [*zip(*(column.tolist() for column in columns), strict=True)]
         times_s = recording.read_signal(mailbox, "tick") * recording.layout.clock_ns * 1e-9
         # Iterate backwards, so that the dictionary keeps the earliest time of each row.
         first_s = dict(zip(reversed(rows), reversed(times_s.tolist()), strict=True))
@@ -170,9 +168,8 @@ def list_fired_rows(recording: Recording) -> dict[str, list[Document]]:
     return by_level
 
 
-def _list_level_holds(recording: Recording, level: str) -> Iterator[Document]:
-    """Yield the holds of one level, as derived from its recorded statuses."""
-    mailbox = f"{level}.status"
+def _list_level_holds(recording: Recording, mailbox: str) -> Iterator[Document]:
+    """Yield the holds of the level that writes its statuses to this mailbox."""
     tick_s = recording.layout.clock_ns * 1e-9
     fields = recording.list_fields(mailbox)
     if "state" not in fields:
@@ -195,7 +192,7 @@ def _list_level_holds(recording: Recording, level: str) -> Iterator[Document]:
         )
         since, until = ticks[[first, min(end, len(ticks) - 1)]].tolist()
         yield {
-            "level": level,
+            "level": mailbox.removesuffix(".status"),
             "by": "operator" if is_operators else BY_LEVEL,
             "why": why,
             "since_s": round(since * tick_s, 6),

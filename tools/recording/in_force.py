@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from rack.tools.recording.recording import Recording
@@ -15,8 +17,7 @@ class VisibleMessages:
     """
 
     def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-        self._rows: dict[str, np.ndarray] = {}
+        self._load_rows = cache(recording.read_rows)
 
     def find_row(self, mailbox: str, tick: int) -> np.ndarray | None:
         """Return the newest row of a mailbox that is visible at `tick`, or None."""
@@ -36,9 +37,3 @@ class VisibleMessages:
         held_before = np.concatenate((np.zeros(1, bool), holds[:-1]))
         ticks: np.ndarray = np.unique(rows["visible_at"][holds & ~held_before])
         return ticks
-
-    def _load_rows(self, mailbox: str) -> np.ndarray:
-        """Return all rows of a mailbox. They are read from the files only once."""
-        if mailbox not in self._rows:
-            self._rows[mailbox] = self._recording.read_rows(mailbox)
-        return self._rows[mailbox]

@@ -6,11 +6,12 @@ stores them at its launch.
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from pydantic import TypeAdapter
 
 from rack.backplane.json_text import encode_json
 from rack.boards.config.schema import RackConfig
@@ -46,7 +47,4 @@ def read_joined_paths(recording: Recording) -> list[JoinedPath] | None:
     if not path.exists():
         return None
     recording.checksums.verify(JOINED)
-    return [
-        JoinedPath(**{**entry, "stations": tuple(map(tuple, entry["stations"]))})
-        for entry in json.loads(path.read_text())
-    ]
+    return TypeAdapter(list[JoinedPath]).validate_json(path.read_text())

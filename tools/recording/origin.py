@@ -19,7 +19,6 @@ from xxhash import xxh3_128
 
 from rack.backplane.json_text import encode_json
 from rack.boards.config.schema import RackConfig
-from rack.boards.events import CONTINUATION_CODE
 from rack.tools.console.answer import Document, Failure
 from rack.tools.recording.checksums import read_file
 from rack.tools.recording.file_names import CODE, ORIGIN
@@ -118,11 +117,6 @@ class Origin:
     launched_ns: int
 
     @classmethod
-    def from_run(cls, run: Recording, tick: int) -> Self:
-        """Return the origin of a continuation of `run` that begins at `tick`."""
-        return cls(str(run.folder), tick, run.launch.created_ns)
-
-    @classmethod
     def read_from(cls, recording: Recording) -> Self | None:
         """Read the origin of a recorded run from its origin.json.
 
@@ -138,10 +132,6 @@ class Origin:
         recording.checksums.verify(ORIGIN)
         return cls(**json.loads(read_file(path)))
 
-    def is_same_run(self, run: Recording) -> bool:
-        """Return True if `run` is the original run, not another run with the same folder name."""
-        return run.launch.created_ns == self.launched_ns
-
     def write(self, folder: Path) -> None:
         """Write origin.json into the folder of the continuation. Raises `OSError`."""
         (folder / ORIGIN).write_text(encode_json(asdict(self)) + "\n")
@@ -149,9 +139,3 @@ class Origin:
     def to_document(self, clock_ns: int) -> Document:
         """Return the origin as plain data, with the simulated time of its tick in s."""
         return {**asdict(self), "time_s": round(self.tick * clock_ns * 1e-9, 9)}
-
-
-def find_continuation_tick(recording: Recording) -> int | None:
-    """Return the first tick of a run that continues another one, or None if it does not."""
-    ticks = (event["tick"] for event in recording.events if event.get("code") == CONTINUATION_CODE)
-    return next(ticks, None)

@@ -56,7 +56,6 @@ class CyclesFile:
 
     def __init__(self, path: Path, layout: Layout, launch: Launch) -> None:
         self._waiting: list[tuple[str, np.ndarray]] = []
-        self._rows = 0
         metadata = {
             "layout": encode_json(asdict(layout)),
             "launch": encode_json(launch),
@@ -74,8 +73,7 @@ class CyclesFile:
         """Add trace records of a task, shape (rows,)."""
         if len(rows):
             self._waiting.append((task, rows))
-            self._rows += len(rows)
-        if self._rows >= TRACE_ROWS:
+        if sum(len(block) for _, block in self._waiting) >= TRACE_ROWS:
             self._write_block()
 
     def _write_block(self) -> None:
@@ -91,7 +89,6 @@ class CyclesFile:
             pa.record_batch(arrays, schema=self._schema), row_group_size=len(rows)
         )
         self._waiting = []
-        self._rows = 0
 
     def close(
         self,
@@ -111,7 +108,7 @@ class CyclesFile:
         self._write_block()
         metadata = {
             "lost": encode_json(lost),
-            "cores": cores.to_json(),
+            "cores": encode_json(asdict(cores)),
             "gaps": encode_json(gaps),
             "kept": encode_json(kept),
         }

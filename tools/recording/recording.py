@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import cached_property
 from itertools import pairwise
@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from pydantic import TypeAdapter
 
 from rack.backplane.layout import TaskSpec
 from rack.backplane.mailbox.history import build_row_dtype
@@ -94,9 +95,10 @@ class Recording:
         with _convert_read_errors(folder):
             is_flight = (folder / STRETCHES).is_dir()
             if rebuild_files(folder) and not is_flight:
-                _print_note(
+                print(
                     f"{folder}: its recorder was killed; the rows it had taken are now in"
-                    " cycles.parquet and signals"
+                    " cycles.parquet and signals",
+                    file=sys.stderr,
                 )
         self._require_file(CHECKSUMS)
         self.checksums = Checksums(folder)
@@ -108,7 +110,7 @@ class Recording:
             metadata = self._cycles.metadata.metadata
             self.layout = restore_layout(json.loads(metadata[b"layout"]))
             self.launch = Launch(*json.loads(metadata[b"launch"]))
-            self.cores = CoreRecord.from_json(metadata[b"cores"])
+            self.cores = TypeAdapter(CoreRecord).validate_json(metadata[b"cores"])
             kept = [tuple(ends) for ends in json.loads(metadata[b"kept"])]
             self.kept: list[tuple[int, int]] = [] if len(kept) == 1 and kept[0][0] == 0 else kept
             self._gaps = json.loads(metadata[b"gaps"])
@@ -143,13 +145,14 @@ class Recording:
 
     def _open_table(self, mailbox: str) -> list[pq.ParquetFile]:
         """Open the parts of a mailbox's table, oldest first."""
-        path = self._require_file(f"{SIGNALS}/{TABLE_NAME.format(mailbox)}")
-        with _convert_read_errors(path):
-            count = max(len([*path.iterdir()]), 1)
-        parts = [path / PART_NAME.format(number) for number in range(1, count + 1)]
-        if missing := [part.name for part in parts if not part.exists()]:
-            raise Failure(f"{path}: {missing[0]} is missing", 2)
-        return [self._open_parquet(part, (*HEAD_COLUMNS, *self._shapes[mailbox])) for part in parts]
+        # Every table has a first part.
+        folder = f"{SIGNALS}/{TABLE_NAME.format(mailbox)}/"
+        stored = {name for name in self.checksums.stored if name.startswith(folder)}
+        columns = (*HEAD_COLUMNS, *self._shapes[mailbox])
+        return [
+            self._open_parquet(self.folder / name, columns)
+            for name in sorted({*stored, folder + PART_NAME.format(1)})
+        ]
 
     def _open_parquet(self, path: Path, columns: Iterable[str]) -> pq.ParquetFile:
         """Open a parquet file.
@@ -189,7 +192,7 @@ class Recording:
         *lines, last = self._read_text(EVENTS).split("\n")
         if last and is_cut_off(last):
             # A killed run can leave an incomplete last line.
-            _print_note(f"{path}: line {len(lines) + 1} is cut off, and left out")
+            print(f"{path}: line {len(lines) + 1} is cut off, and left out", file=sys.stderr)
         elif last:
             lines.append(last)
         events = (
@@ -237,22 +240,15 @@ class Recording:
         text = " and ".join([*spans[:MAX_SHOWN_STRETCHES], *more])
         return f"kept {text}; the rest was not kept, as [record] keep says" if text else ""
 
-    def find_gaps(
-        self, lost: Mapping[str, int] | None = None, ticks: int | None = None
-    ) -> list[Gap]:
+    def find_gaps(self) -> list[Gap]:
         """Find the ranges of ticks in which rows are missing. Overlapping ranges are merged.
 
-        Args:
-            lost: Number of lost rows of each task and mailbox. Defaults to the counts at the end of
-                the run.
-            ticks: Length of the run in ticks. Defaults to its recorded length. If `lost` counts
-                more rows of a ring than the files report, the additional rows are assumed to be
-                missing between the last recorded row of the ring and this tick.
+        If the end of the run counts more lost rows of a ring than the files report, the additional
+        rows are assumed to be missing between the ring's last recorded row and the end of the run.
         """
-        lost = self.lost_rows if lost is None else lost
-        ticks = self.end_counts.get("outcome", {}).get("ticks", 0) if ticks is None else ticks
+        ticks = self.end_counts.get("outcome", {}).get("ticks", 0)
         gaps = list(self._gaps)
-        for name, count in lost.items():
+        for name, count in self.lost_rows.items():
             if count > self._lost_before_end.get(name, 0):
                 gaps.append((name, self._find_last_tick(name) + 1, ticks - 1))
         merged: list[Gap] = []
@@ -418,8 +414,3 @@ def _parse_event(line: str, place: str) -> Document:
     except (ValueError, TypeError, KeyError) as error:
         raise Failure(f"{place}: not an event of a run: {error or error!r}", 2) from None
     return dict(event)
-
-
-def _print_note(text: str) -> None:
-    """Print a note for the user on stderr."""
-    print(text, file=sys.stderr)

@@ -146,24 +146,14 @@ class Tally:
             rows: The rows, shape (rows,).
             lost: Number of rows lost before these rows.
         """
-        self.count_rows(name, len(rows), lost)
+        self.lost[name] += lost
+        self.rows[name] += len(rows)
+        self.taken[name] += lost + len(rows)
         if len(rows):
             self._newest = int(rows["tick"][-1])
             if name not in self.tasks:
                 # The recorder skips damaged messages, so the serial may exceed the count of rows.
                 self.taken[name] = int(rows["serial"][-1])
-
-    def count_rows(self, name: str, rows: int, lost: int) -> None:
-        """Increase the counts of a ring.
-
-        Args:
-            name: Name of the ring.
-            rows: Number of rows read.
-            lost: Number of rows lost before these rows.
-        """
-        self.lost[name] += lost
-        self.rows[name] += rows
-        self.taken[name] += lost + rows
 
     def end_stretch(self, tick: int = OPEN_END) -> None:
         """End the last stretch.
@@ -267,7 +257,7 @@ def rebuild_files(folder: Path) -> bool:
 
 
 def count_spool(folder: Path) -> Tally | None:
-    """Count the rows in a flight recorder's spool, without decompressing them.
+    """Count the rows in a flight recorder's spool.
 
     Returns:
         The counts, or None if the folder contains no spool of a flight recorder.
@@ -282,11 +272,7 @@ def count_spool(folder: Path) -> Tally | None:
         layout, _ = read_head(file, path)
         counted = Tally(layout)
         for part in read_spool(file, folder):
-            if isinstance(part, Frame):
-                for counts in part.counts:
-                    counted.count_rows(*counts)
-            else:
-                counted.count_part(part)
+            counted.count_part(part)
     counted.end_stretch()
     return counted
 

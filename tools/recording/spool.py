@@ -235,11 +235,6 @@ class Spool:
             _write_part(self._out, Frame(counts, packed))
         return True
 
-    def remove(self) -> None:
-        """Delete the spool. Call this only when the parquet files are complete."""
-        self.path.unlink()
-        self.close()
-
     def close(self, end: int = OPEN_END) -> None:
         """Close the spool, so that another recorder can continue it.
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from rack.levels.peer import DRIFT_PPM, PeerPresence, Presence, format_peer_port
 from rack.tools.console.answer import Failure
 from rack.tools.recording.divergence import list_divergent_messages
-from rack.tools.recording.origin import find_continuation_tick
+from rack.tools.recording.origin import Origin
 from rack.tools.recording.recording import Recording
 
 Ints = NDArray[np.int64]
@@ -52,7 +52,7 @@ class RackGrid:
         config = recording.rack_config
         self.recording = recording
         self.rack = recording.layout.rack
-        self.is_lockstep = config.clock.mode == "lockstep"
+        self.is_lockstep = config.is_lockstep
         self.clock_ns = recording.layout.clock_ns
         self.period_ns = config.tick_ns
         self.launch = recording.launch
@@ -126,23 +126,22 @@ class RackAlignment:
     Attributes:
         grid: Grid of the rack.
         reference_grid: Grid of the first rack.
-        offsets: Clock offsets that are applied in order to convert from the rack's machine to the
-            first rack's machine. Empty if both racks have the same ticks, as in lockstep, and for
-            the first rack itself.
+        shift: Clock offset between the rack's machine and the first rack's machine. None if both
+            racks have the same ticks, as in lockstep, and for the first rack itself.
         is_tick_aligned: True if two runs of the same rack are aligned tick by tick.
         marks: Notes to show to the user on the time line. Empty for the first rack.
     """
 
     grid: RackGrid
     reference_grid: RackGrid
-    offsets: tuple[TimeShift, ...] = ()
+    shift: TimeShift | None = None
     is_tick_aligned: bool = False
     marks: tuple[TimeLineNote, ...] = ()
 
     @property
     def uncertainty_ns(self) -> int:
         """Largest error of the rack's time stamps after conversion to the first rack's machine."""
-        return sum(shift.uncertainty_ns for shift in self.offsets)
+        return 0 if self.shift is None else self.shift.uncertainty_ns
 
     @property
     def note(self) -> str:
@@ -150,27 +149,16 @@ class RackAlignment:
         text = f"rack '{self.grid.rack}' is on the time line of '{self.reference_grid.rack}'"
         if self.grid.is_lockstep:
             return f"{text}: both ran in lockstep, tick by tick"
-        begin = (
-            self.reference_grid.convert_stamps(self.convert_stamps(np.array([self.grid.epoch_ns])))[
-                0
-            ]
-            * 1e-9
-        )
-        uncertain_ms = (
-            self.uncertainty_ns
-            * self.reference_grid.clock_ns
-            / self.reference_grid.period_ns
-            * 1e-6
-        )
+        line = self.reference_grid
+        begin = line.convert_stamps(self.convert_stamps(np.array([self.grid.epoch_ns])))[0] * 1e-9
+        uncertain_ms = self.uncertainty_ns * line.clock_ns / line.period_ns * 1e-6
         return (
             f"{text}: it begins at {begin:+.6f} s; its times are uncertain by {uncertain_ms:.3f} ms"
         )
 
     def convert_stamps(self, stamps_ns: Ints) -> Ints:
         """Convert time stamps of the rack's machine to the clock of the first rack's machine."""
-        for shift in self.offsets:
-            stamps_ns = shift.convert_stamps(stamps_ns)
-        return stamps_ns
+        return stamps_ns if self.shift is None else self.shift.convert_stamps(stamps_ns)
 
     def convert_ticks(self, ticks: Ints, within_ns: Ints | int) -> Ints:
         """Convert ticks of the rack to simulated time of the first rack.
@@ -179,7 +167,7 @@ class RackAlignment:
             ticks: The ticks, shape (n,).
             within_ns: Simulated time of the rack to add to each tick.
         """
-        if not self.offsets:
+        if self.shift is None:
             return ticks * self.grid.clock_ns + within_ns
         return self.reference_grid.convert_stamps(
             self.convert_stamps(self.grid.convert_ticks(ticks, within_ns))
@@ -188,9 +176,9 @@ class RackAlignment:
     def convert_to_wall_clock(self, stamps_ns: Ints) -> Ints:
         """Convert time stamps of the rack's machine to the wall clock of the first rack's machine.
 
-        Without offsets they are converted to the wall clock of the rack's own machine.
+        Without a shift they are converted to the wall clock of the rack's own machine.
         """
-        launch = self.reference_grid.launch if self.offsets else self.grid.launch
+        launch = self.grid.launch if self.shift is None else self.reference_grid.launch
         return self.convert_stamps(stamps_ns) + launch.wall_offset_ns
 
 
@@ -206,27 +194,12 @@ def align_racks(recordings: Sequence[Recording]) -> list[RackAlignment]:
     grids = [RackGrid(recording) for recording in recordings]
     for index, grid in enumerate(grids):
         _check_compatible(grid, grids[:index])
-    placed = {0: RackAlignment(grids[0], grids[0])}
-    while len(placed) < len(grids):
-        connections = (
-            (near, far, offsets)
-            for near in placed
-            for far in range(len(grids))
-            if far not in placed and (offsets := _find_offsets(grids[far], grids[near])) is not None
-        )
-        if (connection := next(connections, None)) is None:
-            unplaced = next(grid for index, grid in enumerate(grids) if index not in placed)
-            placed_names = ", ".join(f"'{grids[index].rack}'" for index in placed)
-            raise Failure(
-                f"{unplaced.recording.folder}: rack '{unplaced.rack}' and {placed_names} never met:"
-                " no recording holds a comparison of their clocks; each rack must be a peer of"
-                " another one",
-                2,
-            )
-        near, far, shifts = connection
-        place = RackAlignment(grids[far], grids[0], (*shifts, *placed[near].offsets))
-        placed[far] = replace(place, marks=(TimeLineNote(0, place.note),))
-    return [placed[index] for index in range(len(grids))]
+    line = grids[0]
+    places = [RackAlignment(line, line)]
+    for grid in grids[1:]:
+        place = RackAlignment(grid, line, _find_shift(grid, line))
+        places.append(replace(place, marks=(TimeLineNote(0, place.note),)))
+    return places
 
 
 def align_runs(recordings: Sequence[Recording]) -> list[RackAlignment]:
@@ -241,7 +214,6 @@ def align_runs(recordings: Sequence[Recording]) -> list[RackAlignment]:
     if len(recordings) != 2 or folders[0] == folders[1]:
         raise Failure("--against needs two runs of the same rack, in different folders", 2)
     differences = list_divergent_messages(*recordings)
-    other = recordings[1]
     grids = [RackGrid(recording) for recording in recordings]
     names = [folder.name for folder in folders]
     if names[0] == names[1]:
@@ -249,8 +221,8 @@ def align_runs(recordings: Sequence[Recording]) -> list[RackAlignment]:
     for grid, name in zip(grids, names, strict=True):
         grid.rack = name
     marks = []
-    if (tick := find_continuation_tick(other)) is not None:
-        marks.append(TimeLineNote(tick, f"{names[1]} branches off"))
+    if (origin := Origin.read_from(recordings[1])) is not None:
+        marks.append(TimeLineNote(origin.tick, f"{names[1]} branches off"))
     if differences:
         first = differences[0]
         marks.append(
@@ -285,26 +257,32 @@ def _check_compatible(grid: RackGrid, others: Sequence[RackGrid]) -> None:
             raise Failure(f"{where}: they have no time in common", 2)
 
 
-def _find_offsets(grid: RackGrid, other: RackGrid) -> tuple[TimeShift, ...] | None:
-    """Return the clock offsets that convert times of `grid` to times of `other`.
+def _find_shift(grid: RackGrid, line: RackGrid) -> TimeShift | None:
+    """Return the clock offset that converts times of `grid` to times of `line`.
 
     Returns:
-        A tuple with one offset, or () for racks in lockstep, which share their ticks. None if
-        neither rack communicated with the other.
+        The offset with the smallest error, or None for racks in lockstep, which share their ticks.
+
+    Raises:
+        Failure: Neither rack communicated with the other.
     """
-    if grid.is_lockstep:
-        have_met = [
-            _has_communicated(observer, observed)
-            for observer, observed in ((grid, other), (other, grid))
-        ]
-        return () if any(have_met) else None
-    measured = _read_offset(other, grid), _read_offset(grid, other)
-    offsets = [
-        shift
-        for shift in (measured[0], measured[1] and measured[1].swap_machines())
-        if shift is not None
-    ]
-    return (min(offsets, key=lambda shift: shift.uncertainty_ns),) if offsets else None
+    shifts: list[TimeShift] = []
+    for observer, peer in ((line, grid), (grid, line)):
+        mailbox = _find_peer_mailbox(observer, peer)
+        if mailbox is None:
+            continue
+        if not grid.is_lockstep:
+            if (shift := _read_offset(observer, mailbox, peer)) is not None:
+                shifts.append(shift if observer is line else shift.swap_machines())
+        elif Presence.THERE in observer.recording.read_signal(mailbox, "presence"):
+            return None
+    if not shifts:
+        raise Failure(
+            f"{grid.recording.folder}: rack '{grid.rack}' and '{line.rack}' never met: no recording"
+            " holds a comparison of their clocks; first give a rack that is a peer of all others",
+            2,
+        )
+    return min(shifts, key=lambda shift: shift.uncertainty_ns)
 
 
 def _find_peer_mailbox(observer: RackGrid, peer: RackGrid) -> str | None:
@@ -319,7 +297,7 @@ def _find_peer_mailbox(observer: RackGrid, peer: RackGrid) -> str | None:
     return next((name for name in names if name in observer.recording.mailboxes), None)
 
 
-def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
+def _read_offset(observer: RackGrid, mailbox: str, peer: RackGrid) -> TimeShift | None:
     """Return the offset of the peer's clock that `observer` measured and recorded.
 
     Returns:
@@ -328,8 +306,6 @@ def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
     Raises:
         Failure: `observer` measured only the clocks of other launches of the peer.
     """
-    if (mailbox := _find_peer_mailbox(observer, peer)) is None:
-        return None
     read = observer.recording.read_signal
     uncertainty = read(mailbox, "uncertainty")
     is_measured = uncertainty >= 0.0
@@ -352,64 +328,8 @@ def _read_offset(observer: RackGrid, peer: RackGrid) -> TimeShift | None:
         )
     at_ns = at_ns[is_this]
     by_ns = by_ns[is_this]
-    order = np.argsort(at_ns, kind="stable")
-    at_ns = at_ns[order]
-    by_ns = by_ns[order]
     # The clocks may drift between two measurements, before the first and after the last.
     ends = peer.convert_ticks(np.array(peer.ticks))
     longest_gap_ns = int(np.diff(np.sort(np.concatenate((at_ns, ends)))).max())
     worst_ns = round(float(uncertainty[is_measured][is_this].max()) * 1e9)
     return TimeShift(at_ns, by_ns, worst_ns + longest_gap_ns * DRIFT_PPM // 1_000_000)
-
-
-def _has_communicated(observer: RackGrid, peer: RackGrid) -> bool:
-    """Return True if `observer`, in lockstep, communicated with `peer`.
-
-    Raises:
-        Failure: `observer` communicated with a different launch of the peer.
-    """
-    mailbox = _find_peer_mailbox(observer, peer)
-    if (
-        mailbox is None
-        or not (observer.recording.read_signal(mailbox, "presence") == Presence.THERE).any()
-    ):
-        return False
-    lan = observer.recording.rack_config.adapter.lan
-    for port, entry in () if lan is None else lan.imports.items():
-        if entry.rack == peer.rack:
-            _check_import(observer, f"{mailbox.partition('.')[0]}.{port}", peer, entry.mailbox)
-    return True
-
-
-def _check_import(
-    importer: RackGrid, import_mailbox: str, peer: RackGrid, source_mailbox: str
-) -> None:
-    """Raise `Failure` if imported messages differ from the messages that the peer wrote.
-
-    Args:
-        importer: The rack that imported them.
-        import_mailbox: Mailbox with the imported messages.
-        peer: The rack that wrote them.
-        source_mailbox: Mailbox of the peer from which they were exported.
-    """
-    if (
-        import_mailbox not in importer.recording.mailboxes
-        or source_mailbox not in peer.recording.mailboxes
-    ):
-        return
-    imported = importer.recording.read_rows(import_mailbox)
-    sent = peer.recording.read_rows(source_mailbox)
-    at_ns = sent["tick"] * peer.clock_ns
-    content = [row.tobytes() for row in sent["message"]]
-    for row in imported:
-        # `basis` is the time of sending in ticks of the importer. Such a tick may cover several
-        # ticks of the sender, so compare with every message sent in it.
-        since_ns = int(row["basis"]) * importer.clock_ns
-        first, end = np.searchsorted(at_ns, (since_ns, since_ns + importer.clock_ns))
-        if first < end and row["message"].tobytes() not in content[first:end]:
-            raise Failure(
-                f"{importer.recording.folder} and {peer.recording.folder} are not of the same run:"
-                f" the message that '{importer.rack}' imported into {import_mailbox} at"
-                f" {since_ns * 1e-9:.4f} s is not one that '{peer.rack}' wrote to {source_mailbox}",
-                2,
-            )

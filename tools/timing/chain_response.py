@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -35,39 +35,62 @@ class Origins(NamedTuple):
     list_delays: Callable[[float, float], Iterator[str]]
 
 
-class ChainResponses(NamedTuple):
-    """Responses along one chain.
+class Chain(NamedTuple):
+    """A chain of boards.
 
     Attributes:
-        ms: The measured responses.
-        beyond: Entries for the responses that exceed the bound.
-        unseen: Number of responses that could not be measured.
+        boards: The boards.
+        boxes: Mailboxes between them.
+        origins: Origins of the information, if it comes from another rack.
     """
 
-    ms: np.ndarray
-    beyond: list[Document]
-    unseen: int
+    boards: Sequence[str]
+    boxes: Sequence[MailboxSpec]
+    origins: Origins | None = None
 
 
-def measure_chain(
-    recording: Recording,
-    boards: Sequence[str],
-    boxes: Sequence[MailboxSpec],
-    bound_ms: float,
-    origins: Origins | None = None,
-) -> ChainResponses:
+def measure_direction(
+    recording: Recording, levels: Sequence[str], bound_ms: float, chains: Iterable[Chain]
+) -> Document:
+    """Return the responses along parallel chains in one direction as plain data.
+
+    Args:
+        recording: Recording of the run.
+        levels: Boards of each level as text.
+        bound_ms: Bound of the response, ms.
+        chains: The chains. Those with a mailbox that was not recorded are left out.
+    """
+    recorded = {*recording.mailboxes}
+    measured = [
+        _measure_chain(recording, chain, bound_ms)
+        for chain in chains
+        if recorded.issuperset(box.name for box in chain.boxes)
+    ]
+    responses_ms = np.concatenate([np.zeros(0), *(ms for ms, _, _ in measured)])
+    beyond = [excess for _, excesses, _ in measured for excess in excesses]
+    return {
+        "levels": list(levels),
+        "measured_ms": compute_distribution(responses_ms),
+        "bound_ms": bound_ms,
+        "holds": not beyond if len(responses_ms) else None,
+        "beyond": beyond,
+        "unseen": sum(unseen for _, _, unseen in measured),
+    }
+
+
+def _measure_chain(
+    recording: Recording, chain: Chain, bound_ms: float
+) -> tuple[np.ndarray, list[Document], int]:
     """Measure the responses along one chain.
 
     The worst case is information that arrives just after a release whose message passed the whole
     chain. It has to wait for the next such release.
 
-    Args:
-        recording: Recording of the run.
-        boards: Boards of the chain.
-        boxes: Mailboxes between them.
-        bound_ms: Bound of the response, ms.
-        origins: Origins of the information, if it comes from another rack.
+    Returns:
+        The measured responses in ms, entries for those that exceed the bound, and the number of
+        responses that could not be measured.
     """
+    boards, boxes, origins = chain
     layout = recording.layout
     mailbox = boxes[-1].name
     first: float = layout.find_task(boards[0]).every
@@ -105,7 +128,7 @@ def measure_chain(
         }
         for k in np.flatnonzero(is_seen & (ms > bound_ms + tick_ms / 2))
     ]
-    return ChainResponses(ms[is_seen], beyond, int(np.count_nonzero(~is_seen)))
+    return ms[is_seen], beyond, int(np.count_nonzero(~is_seen))
 
 
 def _list_delays(
@@ -140,27 +163,12 @@ def _list_delays(
             yield f"{name}: {missed} missed, {skipped} skipped"
 
 
-def build_direction(
-    levels: Sequence[str], bound_ms: float | None, measurements: Sequence[ChainResponses]
-) -> Document:
-    """Return the responses along parallel chains in one direction as plain data.
-
-    Args:
-        levels: Levels of the chains, in the direction of the information.
-        bound_ms: Bound of the response. None without measurements.
-        measurements: Responses along each chain.
-    """
-    responses_ms = np.concatenate([np.zeros(0), *(one.ms for one in measurements)])
-    beyond = [each for one in measurements for each in one.beyond]
-    return {
-        "levels": list(levels),
-        "measured_ms": compute_distribution(responses_ms),
-        "bound_ms": bound_ms,
-        "holds": not beyond if len(responses_ms) else None,
-        "beyond": beyond,
-        "unseen": sum(one.unseen for one in measurements),
-    }
-
-
-NOT_MEASURED = build_direction((), None, ())
+NOT_MEASURED: Document = {
+    "levels": [],
+    "measured_ms": None,
+    "bound_ms": None,
+    "holds": None,
+    "beyond": [],
+    "unseen": 0,
+}
 """Response in a direction that is not measured along these boards."""

@@ -66,14 +66,15 @@ def _judge_chains(joined: JoinedRacks, chains: Sequence[tuple[Station, ...]]) ->
     chain = chains[0]
     goal_ns = joined.racks[chain[0].rack].response_goal_ns
     upward = chain[::-1]
+    bound_ns, sum_ns = joined.compute_bounds_ns(chain)
     has_status = joined.list_chain_links(upward) is not None
     return JoinedVerdict(
         levels=format_joined_levels(chains),
         command_ms=joined.compute_response_ns(chain) * 1e-6,
         status_ms=joined.compute_response_ns(upward) * 1e-6 if has_status else None,
-        limit_ms=(joined.compute_bound_ns(chain) if goal_ns is None else goal_ns) * 1e-6,
+        limit_ms=(bound_ns if goal_ns is None else goal_ns) * 1e-6,
         limit="n R_max, eq. 3.2" if goal_ns is None else "timing.response_ms",
-        sum_eq_3_3_ms=joined.compute_sum_ns(chain) * 1e-6,
+        sum_eq_3_3_ms=sum_ns * 1e-6,
     )
 
 

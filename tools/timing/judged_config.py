@@ -24,6 +24,8 @@ from rack.boards.timing.verdicts import (
 )
 from rack.tools.console.answer import Document
 
+VerdictKey = tuple[str, str, str]
+"""See `EquationVerdict.key`."""
 Settings = Mapping[str, Any]
 """Keys of a board's table with their new values. None removes a key."""
 
@@ -88,7 +90,12 @@ class JudgedConfig:
         """Verdicts on equations and bounds that do not hold."""
         return tuple(verdict for verdict in self.verdicts if not verdict.holds)
 
-    def find_failures(self, board: str) -> set[tuple[str, str, str]]:
+    @property
+    def failing(self) -> set[VerdictKey]:
+        """Keys of `failures`."""
+        return {verdict.key for verdict in self.failures}
+
+    def find_failures(self, board: str) -> set[VerdictKey]:
         """Return the keys of the failures of a board's tasks.
 
         If no task fails, return the keys of the overloads of the board's cores.
@@ -98,19 +105,13 @@ class JudgedConfig:
         cores = {f"core {core}" for core in self.timing.find_cores(board)}
         return own or {v.key for v in self.failures if v.equation == LOAD and v.subject in cores}
 
-    def repairs_board(self, board: str, before: JudgedConfig) -> bool:
-        """Return True if all failures of `board` in `before` are gone and none was added."""
-        failing = {verdict.key for verdict in self.failures}
-        old = {verdict.key for verdict in before.failures}
-        return failing < old and not failing & before.find_failures(board)
-
     def is_acceptable_change(self, changed: RackTiming, board: str) -> bool:
         """Return True if a changed board meets its timing equations and the system gets no worse.
 
         This check is quick and ignores the effect on other tasks of the core.
         """
-        old = {verdict.key for verdict in self.failures}
-        system = (verdict for verdict in evaluate_response(changed) if verdict.key not in old)
+        response = evaluate_response(changed)
+        system = (verdict for verdict in response if verdict.key not in self.failing)
         return all(
             verdict.holds
             for verdict in chain(evaluate_level(changed, changed.build_level(board)), system)
@@ -187,16 +188,7 @@ class Change:
             yield f"R_s {responses[0]:g} -> {responses[1]:g} ms"
         if new.slice_ns is not None and new.slice_ns != old.slice_ns:
             yield f"a plan every {new.slice_ns * 1e-6:g} ms"
-        if self.settings.get("coupling") == "loose" and not new.exchange_ns:
-            yield "reading the plan over the bus is not counted: budget.exchange_ms is 0"
-        for core in {
-            self.settings[key] for key in ("planner_core", "core") if key in self.settings
-        }:
-            others = [
-                task
-                for task, task_core in self.after.timing.cores.items()
-                if task_core == core and task.partition(".")[0] != self.board
-            ]
-            yield f"core {core} shared with {', '.join(others) or 'no other'}"
+        for key in ("planner_core", "core"):
+            core = self.settings.get(key, 0)
             if (obtained := find_core(core)) != core:
                 yield f"this machine has no core {core}, uses core {obtained}"

@@ -3,24 +3,30 @@
 Every message carries the tick of the oldest information on which it depends. A command can
 therefore be followed from the release of the highest level to the cycle of the lowest level that
 acts on it, and a status back up.
+
+Along boards of several racks, a response is measured as far as one run of the last rack shows it.
+The status of the network adapter records when the information of each imported message arrived at
+the first board of the other rack, in ticks of this rack. In real time that tick is early by at most
+the uncertainty of the clock comparison, so no response is measured too short.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-from rack.backplane.layout import MailboxSpec
+import numpy as np
+
 from rack.boards.config import build_rack_timing
 from rack.boards.timing.chains import ParallelChains
+from rack.boards.timing.joined import JoinedPath, format_joined_levels
 from rack.boards.timing.rack import RackTiming
 from rack.boards.timing.system_response import find_path_mailboxes
-from rack.boards.timing.verdicts import name_response_subject
+from rack.boards.timing.verdicts import SYSTEM, name_response_subject
 from rack.tools.console.answer import Document
-from rack.tools.monitor.network import ADAPTER, read_entries
+from rack.tools.monitor.network import ADAPTER, STATUS, read_entries
 from rack.tools.recording.joined import read_joined_paths
 from rack.tools.recording.recording import Recording
-from rack.tools.timing.chain_response import NOT_MEASURED, build_direction, measure_chain
-from rack.tools.timing.joined_response import group_joined_paths, measure_joined_response
+from rack.tools.timing.chain_response import NOT_MEASURED, Chain, Origins, measure_direction
 
 
 def measure_system_response(recording: Recording) -> Document | None:
@@ -44,11 +50,7 @@ def measure_system_response(recording: Recording) -> Document | None:
         _measure_response(recording, rack, chains)
         for chains in sorted(rack.chain_groups, key=lambda chains: chains != rack.hierarchy)
     ]
-    documents += [
-        document
-        for group in group_joined_paths(paths or ())
-        if (document := measure_joined_response(recording, group)) is not None
-    ]
+    documents += _measure_joined_responses(recording, paths or ())
     if not documents:
         return None
     # Without measurements, a response needs no place beside others.
@@ -89,7 +91,9 @@ def _measure_direction(
     """
     layout = recording.layout
     paths = [(boards, find_path_mailboxes(layout, boards)) for boards in chains]
-    if any(_comes_from_another_rack(recording, boxes) for _, boxes in paths):
+    entries = read_entries(recording.config)
+    imported = {f"{ADAPTER}.{port}" for port in entries.imports} if entries else set[str]()
+    if any(boxes and not imported.isdisjoint(boxes[0].rests_on) for _, boxes in paths):
         return NOT_MEASURED
     hop_count = min(len(mailboxes) for _, mailboxes in paths)
     start = len(levels) - hop_count - 1 if hop_count else len(levels)
@@ -98,16 +102,87 @@ def _measure_direction(
         * layout.clock_ns
         * 1e-6
     )
-    measurements = [
-        measure_chain(recording, boards[start:], boxes[-hop_count:], bound_ms)
-        for boards, boxes in paths
-        if hop_count and {box.name for box in boxes} <= set(recording.mailboxes)
-    ]
-    return build_direction(levels[start:], bound_ms, measurements)
+    measured = [Chain(boards[start:], boxes[-hop_count:]) for boards, boxes in paths if hop_count]
+    return measure_direction(recording, levels[start:], bound_ms, measured)
 
 
-def _comes_from_another_rack(recording: Recording, boxes: Sequence[MailboxSpec]) -> bool:
-    """Return True if the first of these mailboxes depends on a message of another rack."""
-    imported = read_entries(recording.config)
-    names = () if imported is None else (f"{ADAPTER}.{port}" for port in imported.imports)
-    return bool(boxes) and not {*names}.isdisjoint(boxes[0].rests_on)
+def _measure_joined_responses(
+    recording: Recording, paths: Sequence[JoinedPath]
+) -> Iterator[Document]:
+    """Yield the response along each group of parallel paths from another rack as plain data.
+
+    Parallel paths, such as those through one board per joint, have equal bounds and lead through
+    boards of the same levels. An entry has the form of the response along the chains of one rack,
+    with only one direction. Paths are left out if their messages do not carry the origin of the
+    information to the last board.
+    """
+    groups: dict[object, list[JoinedPath]] = {}
+    for path in paths:
+        ends = path.stations[0], path.stations[-1]
+        key = path.direction, path.port, ends, len(path.stations), path.response_ms
+        groups.setdefault(key, []).append(path)
+    for group in groups.values():
+        boxes = [find_path_mailboxes(recording.layout, (ADAPTER, *each.boards)) for each in group]
+        chains = [
+            Chain((ADAPTER, *each.boards), row, _find_origins(recording, each))
+            for each, row in zip(group, boxes, strict=True)
+            if len(row) == len(each.boards)
+            and row[0].name == f"{ADAPTER}.{each.port}"
+            and {STATUS, *(box.name for box in row)} <= {*recording.mailboxes}
+        ]
+        if not chains:
+            continue
+        path = group[0]
+        levels = [*format_joined_levels([each.stations for each in group])]
+        measured = measure_direction(recording, levels, path.response_ms, chains)
+        directions = {"command": NOT_MEASURED, "status": NOT_MEASURED, path.direction: measured}
+        downward = levels if path.direction == "command" else levels[::-1]
+        yield {
+            "subject": f"{SYSTEM}, {' > '.join(downward)}",
+            "levels": downward,
+            "bound_eq_3_2_ms": path.bound_eq_3_2_ms,
+            "sum_eq_3_3_ms": path.sum_eq_3_3_ms,
+            **directions,
+        }
+
+
+def _find_origins(recording: Recording, path: JoinedPath) -> Origins:
+    """Return when the information in the imported messages of a path arrived at its first board."""
+    entry = f"import_{path.port}"
+    ticks, ages, origin_s, lost = (
+        recording.read_signal(STATUS, field)
+        for field in ("tick", f"{entry}.age", f"{entry}.origin_s", f"{entry}.missing")
+    )
+    basis = np.maximum(ticks - ages, 0)
+    # The first status with a message belongs to the cycle that took it over.
+    taken = np.flatnonzero((ages >= 0) & (np.diff(basis, prepend=-1) != 0))
+    tick_ms = recording.layout.clock_ns * 1e-6
+    arrived = origin_s * 1e3 / tick_ms
+    rack, board = path.stations[-1 - len(path.boards)]
+
+    def list_delays(earlier: float, tick: float) -> Iterator[str]:
+        """Yield a text for each cause of delay before the message with this origin was taken."""
+        row = taken[np.flatnonzero(arrived[taken] == tick)[0]]
+        gap_ms = (tick - earlier) * tick_ms
+        far_ms = (basis[row] - arrived[row]) * tick_ms
+        link_ms = (ticks[row] - basis[row]) * tick_ms
+        if far_ms > path.far_ms + tick_ms:
+            yield (
+                f"in rack '{rack}' it took {far_ms:g} ms until '{board}' wrote;"
+                f" bound {path.far_ms:g} ms"
+            )
+        if link_ms > path.link_ms + tick_ms:
+            yield (
+                f"the link took {link_ms:g} ms from '{rack}/{board}'; bound {path.link_ms:g} ms"
+                f" with adapter.lan.import.{path.port}.delay_ms"
+            )
+        if missing := int(lost[row] - lost[max(row - 1, 0)]):
+            yield f"{missing} messages of '{rack}/{board}' were lost before it"
+        elif gap_ms > path.exchange_ms + tick_ms:
+            yield (
+                f"'{rack}/{board}' sent nothing new for {gap_ms:g} ms; it should every"
+                f" {path.exchange_ms:g} ms"
+            )
+
+    order = taken[np.argsort(basis[taken], kind="stable")]
+    return Origins(basis[order], arrived[order], path.first_cycle_ms / tick_ms, list_delays)

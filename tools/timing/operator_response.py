@@ -42,9 +42,8 @@ TABLE_COLUMNS = {
     "eq. 3.2": "bound_eq_3_2_ms",
 }
 """Columns of the table, and the figure of a level that each of them shows."""
-HISTOGRAM_BARS = 20
-"""Number of histogram bars up to the longest response on the grid."""
-ROUNDING = 1e-9
+HISTOGRAM_BARS = 40
+"""Number of histogram bars up to the longest response and the bounds."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +207,7 @@ def measure_response(recording: Recording) -> OperatorResponse | None:
     }
     if not paths:
         return None
-    lockstep = config.clock.mode == "lockstep"
+    lockstep = config.is_lockstep
     answered = [
         command
         for level, path in paths.items()
@@ -264,7 +263,7 @@ def _find_answers(
             acts=acts,
             fate=fate,
             wall_ms=None if lockstep else wall_ms,
-            ticks=None if acts is None else path.compute_response(int(tick), acts),
+            ticks=None if acts is None else acts + path.cycles[-1] - int(tick),
         )
 
 
@@ -343,11 +342,7 @@ def _plot_level(axis: Axes, response: OperatorResponse, level: str) -> None:
     )
     values = [(c.ticks or 0) * tick_ms if c.wall_ms is None else c.wall_ms for c in own]
     end_ms = max(lines[2][0] * tick_ms, *values)
-    # A value equal to `path.longest` must fall into the bin to the left of its line, even if it is
-    # rounded up.
-    width_ms = path.longest * tick_ms / HISTOGRAM_BARS
-    edges = np.arange(0.0, end_ms + width_ms, width_ms) * (1.0 + ROUNDING)
-    axis.hist(values, bins=edges.tolist(), color=MEASURED, label="measured")
+    axis.hist(values, HISTOGRAM_BARS, range=(0.0, end_ms), color=MEASURED, label="measured")
     for at, colour, style, label in lines:
         axis.axvline(at * tick_ms, color=colour, linestyle=style, label=label)
     axis.set_xlim(0.0, 1.04 * end_ms)

@@ -6,9 +6,10 @@ The paper names two kinds: another processor for the planner, and a longer respo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
 from rack.boards.config.schema import CLOCK_SLOT, LAST_SLOT, LONGEST_EVERY
 from rack.boards.timing.level import LevelTiming
@@ -25,13 +26,8 @@ A longer cycle would make it another level.
 """
 MAX_CYCLES_TRIED = 400
 """Number of longer cycles that are tried for one board. A long cycle skips some ticks."""
-MAX_OTHERS = 3
-"""Number of other boards on the same core that are changed, beginning with the highest load."""
 MAX_PRIORITY = 99
 """Highest SCHED_FIFO priority."""
-
-T = TypeVar("T")
-R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -128,38 +124,24 @@ def find_changes(rack: JudgedConfig, board: str) -> list[Change]:
     """Return the smallest change of each kind that makes a board fit, sorted by `Change.cost`.
 
     Other priorities and moves to cores already in use cost least. New slots and cores cost more.
-    Longer cycles and older plans cost most, depending on their factor. A change may also apply to
-    another board on the same core. If no single change is enough, the planner is coupled loosely on
-    another core and the cycle becomes longer.
+    Longer cycles and older plans cost most, depending on their factor. If no single change is
+    enough, the planner is coupled loosely on another core, which leaves the rest to the next step.
     """
-    changes = [*_find_own_changes(rack, board), *_find_changes_of_others(rack, board)]
-    if not changes:
-        combined = (
-            _search_first(rack, board, _list_longer_cycles(rack, board, place))
-            for place in _list_loose_couplings(rack, board)
-        )
-        changes = [change for change in combined if change is not None][:1]
-    return sorted(changes, key=lambda change: change.cost)
-
-
-def _find_own_changes(rack: JudgedConfig, board: str) -> Iterator[Change]:
-    """Yield the smallest sufficient change of each kind to the board's own settings."""
-    older = [{"within_cycles": d} for d in _list_plan_cycles(rack.timing.build_level(board))]
     cores = [{"core": core} for core in _list_other_cores(rack, rack.config.board[board].core)]
     places = list(_list_loose_couplings(rack, board))
-    planner = _try_each(rack, board, places)
-    if planner is None:
-        # Moving the planner is not enough. Try it with more cycles for a plan.
-        moves = (_search_first(rack, board, [{**d, **place} for d in older]) for place in places)
-        planner = _find_cheapest(moves)
+    older = [{"within_cycles": d} for d in _list_plan_cycles(rack.timing.build_level(board))]
     kinds = (
         _try_each(rack, board, _list_priorities(rack, board)),
         _try_each(rack, board, cores),
-        planner,
+        _try_each(rack, board, places),
         _search_first(rack, board, older),
         _search_first(rack, board, _list_longer_cycles(rack, board)),
     )
-    yield from (change for change in kinds if change is not None)
+    changes = [change for change in kinds if change is not None]
+    if not changes:
+        loosened = (rack.try_change(board, place) for place in places)
+        changes = [c for c in loosened if c is not None and c.after.failing < rack.failing][:1]
+    return sorted(changes, key=lambda change: change.cost)
 
 
 def _list_priorities(rack: JudgedConfig, board: str) -> Iterator[Settings]:
@@ -180,53 +162,13 @@ def _list_priorities(rack: JudgedConfig, board: str) -> Iterator[Settings]:
         yield from ({key: priority} for priority in sorted(higher) if present < priority < limit)
 
 
-def _find_changes_of_others(rack: JudgedConfig, board: str) -> Iterator[Change]:
-    """Yield the cheapest change of each board that shares a core with this one.
-
-    The change is another core, for the board or only for its loose planner, or a longer cycle.
-    """
-    timing = rack.timing
-    cores = timing.find_cores(board)
-    loads = {task.board: 0.0 for task in timing.tasks}
-    for task in timing.tasks:
-        loads[task.board] += task.cost_ns / task.period_ns if task.core in cores else 0.0
-    others = [name for name in timing.boards if loads.get(name) and name != board]
-    for other in sorted(others, key=lambda name: -loads[name])[:MAX_OTHERS]:
-        table = rack.config.board[other]
-        keys = ["core"] if table.planner_core is None else ["planner_core", "core"]
-        moves = (
-            {key: core} for key in keys for core in _list_other_cores(rack, getattr(table, key))
-        )
-        change = _find_cheapest(
-            (
-                _try_each(rack, other, moves, board),
-                _search_first(rack, other, _list_longer_cycles(rack, other), board),
-            )
-        )
-        if change is not None:
-            yield change
-
-
-def _find_cheapest(changes: Iterable[Change | None]) -> Change | None:
-    """Return the change with the lowest cost. None if there is none."""
-    candidates = (change for change in changes if change is not None)
-    return min(candidates, key=lambda change: change.cost, default=None)
-
-
-def _list_longer_cycles(
-    rack: JudgedConfig, board: str, place: Settings | None = None
-) -> list[Settings]:
+def _list_longer_cycles(rack: JudgedConfig, board: str) -> list[Settings]:
     """Return settings with longer cycles for a board.
 
     If the age of plans is limited, a longer cycle may leave fewer cycles for a plan.
-
-    Args:
-        rack: Rack to change.
-        board: Board to change.
-        place: Settings that move its planner. None to leave it where it is.
     """
-    every = rack.timing.boards[board].every
-    timing = rack.timing if place is None else rack.timing.replace_board(board, coupling="loose")
+    timing = rack.timing
+    every = timing.boards[board].every
     level = timing.build_level(board)
     step = max(1, every * (MAX_FACTOR - 1) // MAX_CYCLES_TRIED)
     longest_every = min(MAX_FACTOR * every, LONGEST_EVERY)
@@ -242,7 +184,7 @@ def _list_longer_cycles(
         if rack.is_acceptable_change(
             timing.replace_board(board, every=longer, within_cycles=cycles), board
         ):
-            longer_settings.append({**changed, **(place or {}), "every": longer, "rate_hz": None})
+            longer_settings.append({**changed, "every": longer, "rate_hz": None})
     return longer_settings
 
 
@@ -288,57 +230,23 @@ def _list_other_cores(rack: JudgedConfig, core: int) -> Iterator[int]:
     yield next(free for free in range(len(used) + 1) if free not in used)
 
 
-def _try_change(
-    rack: JudgedConfig, board: str, settings: Settings, target: str | None
-) -> Change | None:
-    """Return the change of a board if it removes all failures of the board `target`, else None.
-
-    If `target` is None, it must remove the failures of the changed board itself.
-    """
+def _try_change(rack: JudgedConfig, board: str, settings: Settings) -> Change | None:
+    """Return the change of a board if it removes all failures of the board, else None."""
     change = rack.try_change(board, settings)
-    return (
-        change if change is not None and change.after.repairs_board(target or board, rack) else None
-    )
+    failing = rack.failing if change is None else change.after.failing
+    return change if failing < rack.failing and not failing & rack.find_failures(board) else None
 
 
-def _try_each(
-    rack: JudgedConfig, board: str, tried: Iterable[Settings], target: str | None = None
-) -> Change | None:
+def _try_each(rack: JudgedConfig, board: str, tried: Iterable[Settings]) -> Change | None:
     """Return the first change that `_try_change` accepts, or None."""
-    return next(
-        (c for settings in tried if (c := _try_change(rack, board, settings, target)) is not None),
-        None,
-    )
+    changes = (_try_change(rack, board, settings) for settings in tried)
+    return next((change for change in changes if change is not None), None)
 
 
-def _search_first(
-    rack: JudgedConfig, board: str, tried: Sequence[Settings], target: str | None = None
-) -> Change | None:
-    """Return the first change that `_try_change` accepts, found with `search_first`, or None."""
-    return search_first(tried, lambda settings: _try_change(rack, board, settings, target))
+def _search_first(rack: JudgedConfig, board: str, tried: Sequence[Settings]) -> Change | None:
+    """Return the first change that `_try_change` accepts, or None.
 
-
-def search_first(items: Sequence[T], attempt: Callable[[T], R | None]) -> R | None:
-    """Return the result of `attempt` for the first item that works.
-
-    The search needs few attempts. It requires that all items after one that works also work.
-
-    Args:
-        items: Items to try.
-        attempt: Returns a result, or None if the item does not work.
-
-    Returns:
-        The result. None if no item works.
+    The search by bisection requires that all settings after acceptable ones are also acceptable.
     """
-    # Doubling steps find an item that works, then halving steps find the first one.
-    low = -1
-    high = 0
-    result = None
-    while high < len(items) and (result := attempt(items[high])) is None:
-        low = high
-        high = min(2 * high + 1, max(len(items) - 1, high + 1))
-    while result is not None and high - low > 1:
-        middle = (low + high) // 2
-        other = attempt(items[middle])
-        low, high, result = (middle, high, result) if other is None else (low, middle, other)
-    return result
+    at = bisect_left(tried, True, key=lambda one: _try_change(rack, board, one) is not None)
+    return _try_each(rack, board, tried[at : at + 1])

@@ -64,7 +64,7 @@ def format_fixes(fixes: Sequence[Fix], remaining: Sequence[EquationVerdict]) -> 
         names = dict.fromkeys(f"{verdict.equation} of {verdict.subject}" for verdict in remaining)
         yield (
             f"no change helps with {', '.join(names)}; tried: other priorities and cores, cycles"
-            f" and plans up to {MAX_FACTOR} times as long, also for others"
+            f" and plans up to {MAX_FACTOR} times as long"
         )
     for fix in fixes:
         yield "  " + shlex.join(word for text in fix.settings for word in ("--set", text))

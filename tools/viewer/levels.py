@@ -175,7 +175,7 @@ class Hierarchy:
         self._shown = dict(self._states)  # the states that the graph shows
         self._positions = compute_positions(layout, rack)
         self._changes: list[tuple[Moment, str, str]] = []
-        downward = [(board.name, below) for board in rack.boards.values() for below in board.below]
+        downward = [(upper, board.name) for board in rack.boards.values() for upper in board.above]
         plans = [(task.name, task.board) for task in layout.tasks if task.role == "planner"]
         stream.log_static((HIERARCHY,), rr.GraphEdges(downward + plans, graph_type="directed"))
         self._write_graph(stream.times.estimate_moment(0))

@@ -19,7 +19,6 @@ CLOCK = TimedTask("clock", "clock", "clock", 0, 90, 2 * MS, ())
 FIGURE_3 = BoardTiming(
     name="level",
     above=(),
-    below=(),
     coupling="tight",
     every=3,
     within_cycles=3,
@@ -52,9 +51,8 @@ def rack(*boards: BoardTiming, goal_ns: float | None = None) -> RackTiming:
     )
 
 
-def board(name: str, every: int, above: str = "", below: str = "") -> BoardTiming:
-    above_, below_ = tuple(above.split()), tuple(below.split())
-    return replace(FIGURE_3, name=name, every=every, above=above_, below=below_, budget=None)
+def board(name: str, every: int, above: str = "") -> BoardTiming:
+    return replace(FIGURE_3, name=name, every=every, above=tuple(above.split()), budget=None)
 
 
 def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
@@ -70,9 +68,7 @@ def test_figure_3_fails_as_in_the_paper_from_plain_data() -> None:
 
 
 def test_every_chain_runs_from_a_highest_board_to_a_lowest() -> None:
-    timing = rack(
-        board("top", 40, below="a"), board("a", 4, "top"), board("b", 60, "top"), board("alone", 7)
-    )
+    timing = rack(board("top", 40), board("a", 4, "top"), board("b", 60, "top"), board("alone", 7))
     assert timing.chains == (("top", "a"), ("top", "b"))
     assert timing.hierarchy.chains == (("top", "b"),)
     assert timing.longest_cycles == {"top": 60, "a": 60, "b": 60, "alone": 7}
@@ -102,11 +98,11 @@ def arm_of(*joints: str) -> RackTiming:
     board of the arm."""
     names = " ".join(joints)
     boards = [
-        board("plan", 200, below="path"),
-        board("path", 20, "plan", names),
+        board("plan", 200),
+        board("path", 20, "plan"),
         board("arm", 2, names),
     ]
-    return rack(*boards, *(board(name, 4, "path", "arm") for name in joints), board("alone", 500))
+    return rack(*boards, *(board(name, 4, "path") for name in joints), board("alone", 500))
 
 
 def test_one_board_per_joint_forms_one_group_of_parallel_chains() -> None:
@@ -139,7 +135,7 @@ def test_a_forecast_names_the_planners_that_it_cannot_judge() -> None:
     assert {why for name, why in found.items() if name != CLOCK.name} == {NO_BUDGET}
     assert not Forecast.from_rack(rack(FIGURE_3, plain)).uncounted.keys() - {CLOCK.name}
     # Without any budget only the system is judged.
-    forecast = Forecast.from_rack(rack(board("top", 40, below="a"), board("a", 4, "top")))
+    forecast = Forecast.from_rack(rack(board("top", 40), board("a", 4, "top")))
     assert {verdict.subject for verdict in forecast.verdicts} == {"system"}
     assert {"top", "a"} <= forecast.uncounted.keys()
 

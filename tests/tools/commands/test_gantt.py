@@ -62,15 +62,6 @@ def test_the_rows_of_a_large_rack_are_not_wrapped_in_a_pipe(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_times_that_change_from_cycle_to_cycle_give_the_papers_figure_2_to_the_ms(
-    tmp_path: Path,
-) -> None:
-    shown = rack("gantt", "fig2", "--process", "level=3,2", "--to-ms", 16, "--out", tmp_path)
-    assert "RXXXWPPPRXXWPPPU\n" in shown.stdout
-    assert "R X W P | R X W P U: 10 of 10 plans" in shown.stdout
-
-
-@pytest.mark.slow
 def test_times_of_a_picture_are_written_in_full_and_far_enough_apart(tmp_path: Path) -> None:
     rack("gantt", "nasrem", "--from-ms", 100_000, "--to-ms", 100_040, "--out", tmp_path)
     # matplotlib draws letters as shapes, and names each text in a comment.
@@ -139,10 +130,6 @@ def test_figure_5_is_printed_and_drawn(tmp_path: Path) -> None:
         (["configs/tasks"], "configs/tasks: not a run: it has no config.toml"),
         (["crossing", "--set", "board.servo.slot=3"], "slot"),
         (["fig2", "--figure", "3"], "--figure 3: must be 5"),
-        (
-            ["fig2", "--process", "arm=3"],
-            "--process arm: no board of that name has a budget; boards: level",
-        ),
         (["fig2", "--out", "README.md"], "--out README.md: cannot create the folder: File exists"),
     ],
 )

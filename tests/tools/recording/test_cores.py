@@ -27,7 +27,6 @@ def machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A machine of two cores, as its files in a folder; it shows no frequencies yet."""
     monkeypatch.setattr(cores, "STAT", tmp_path / "stat")
     monkeypatch.setattr(cores, "CPUINFO", tmp_path / "cpuinfo")
-    monkeypatch.setattr(cores, "CPUFREQ", tmp_path)
     monkeypatch.setattr(cores, "FREQUENCY_S", 0.0)
     (tmp_path / "cpuinfo").write_text(
         "processor\t: 0\nflags\t: fpu\n\nprocessor\t: 1\nflags\t: fpu\n"
@@ -54,10 +53,9 @@ def test_a_rise_of_steal_is_recorded_with_its_core_and_time_span(machine: Path) 
     assert (stolen.core, stolen.ms) == (1, 20)
     assert stolen.from_ns < stolen.to_ns
     assert record.lasted_ns > 0
-    assert CoreRecord.from_json(record.to_json()) == record
 
 
-def test_frequencies_come_from_cpuinfo_without_cpufreq(machine: Path) -> None:
+def test_the_range_of_each_cores_frequency_is_measured(machine: Path) -> None:
     found = CoreMeter()
     for mhz in ("2600.000", "1200.5"):
         (machine / "cpuinfo").write_text(
@@ -65,13 +63,6 @@ def test_frequencies_come_from_cpuinfo_without_cpufreq(machine: Path) -> None:
         )
         found.read_counters()
     assert found.build_record().mhz == ((0, 1200.5, 2600.0), (1, 900.0, 900.0))
-    # One core has a frequency file, another core is offline.
-    for core, text in ((0, "3100000\n"), (1, "")):
-        path = machine / f"cpu{core}" / "cpufreq" / "scaling_cur_freq"
-        path.parent.mkdir(parents=True)
-        path.write_text(text)
-    found.read_counters()
-    assert found.build_record().mhz == ((0, 1200.5, 3100.0), (1, 900.0, 900.0))
 
 
 def run(folder: Path, config: Path, record: CoreRecord) -> Recording:

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rack.boards import Rack
-from rack.boards.config import load
 from rack.tools.recording.recorder.recorder import SafeSink
 
 WATCHDOG_S = 30.0
@@ -126,16 +123,3 @@ def test_a_recorder_does_not_wait_for_ever_for_a_sink_whose_opening_hangs(
     assert bound != "OPENING_TIMEOUT_S" or note.endswith(
         "the viewer's library has not opened it; 'rack replay' makes it"
     )
-
-
-def test_neither_mode_waits_for_the_library_of_the_viewer(
-    small: Path, rack_name: str, tmp_path: Path
-) -> None:
-    opening = Opening()
-    for mode in ("lockstep", "realtime"):
-        config = load(small, [f"name={rack_name}", f"clock.mode={mode}"])
-        with Rack(config) as running:
-            safe = SafeSink.open_for(running.segment, None, opening, pytest.fail)
-            assert safe is not None
-            assert safe._opening.is_alive()
-    opening.may.set()

@@ -33,7 +33,9 @@ def check_place(place: RackAlignment, own: Machine, line: Machine) -> None:
     apart_ns = np.abs(found - np.array(true) * line.speed)
     assert apart_ns.max() <= place.uncertainty_ns * line.speed + MS // 1000
     # The uncertainty covers only the error of a comparison and the drift between comparisons.
-    assert place.uncertainty_ns <= (ERROR_NS + 7 * S * DRIFT_PPM // 1_000_000) * len(place.offsets)
+    assert place.uncertainty_ns <= (ERROR_NS + 7 * S * DRIFT_PPM // 1_000_000) * (
+        place.shift is not None
+    )
 
 
 @pytest.mark.parametrize("seen_by", ["first", "second", "both"])
@@ -55,15 +57,14 @@ def test_a_rack_is_on_the_line_of_another_within_the_stated_uncertainty(
     )
 
 
-def test_racks_that_never_met_are_placed_through_a_common_peer(tmp_path: Path) -> None:
+def test_racks_that_never_met_the_first_one_are_refused(tmp_path: Path) -> None:
     a, b = recorded(A, [], tmp_path / "a"), recorded(B, [A, C], tmp_path / "b")
     c = recorded(C, [], tmp_path / "c")
-    places = align_racks([c, a, b])
-    check_place(places[1], A, C)
-    check_place(places[2], B, C)
-    assert len(places[1].offsets) == 2
+    places = align_racks([b, a, c])
+    check_place(places[1], A, B)
+    check_place(places[2], C, B)
     with pytest.raises(Failure, match=r"rack 'c' and 'a' never met: no recording holds"):
-        align_racks([a, c])
+        align_racks([a, b, c])
 
 
 def test_another_launch_of_a_rack_is_refused(tmp_path: Path) -> None:
@@ -84,13 +85,3 @@ def test_one_rack_twice_and_two_modes_are_refused(tmp_path: Path) -> None:
     stepped = recorded(replace(B, mode="lockstep"), [A], tmp_path / "b")
     with pytest.raises(Failure, match=r"b ran in lockstep, .*a in real time"):
         align_racks([one, stepped])
-
-
-def test_in_lockstep_imported_messages_must_equal_the_senders_messages(tmp_path: Path) -> None:
-    a, b = replace(A, mode="lockstep"), replace(B, mode="lockstep")
-    one, other = recorded(a, [b], tmp_path / "a"), recorded(b, [], tmp_path / "b", counts_from=1)
-    with pytest.raises(
-        Failure,
-        match=r"message that 'a' imported into lan\.other at 0\.0000 s is not one that 'b' wrote",
-    ):
-        align_racks([one, other])

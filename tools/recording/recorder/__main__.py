@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from threading import Thread
 from typing import TYPE_CHECKING
@@ -45,6 +46,7 @@ def main() -> None:
     launcher = os.getppid()
     from rack.backplane.segment import Segment
     from rack.backplane.words import System
+    from rack.tools.recording.occasions import Retention
     from rack.tools.recording.recorder.process import UNWRITABLE, format_write_failure
     from rack.tools.recording.recorder.recorder import Recorder, SafeSink
 
@@ -55,9 +57,14 @@ def main() -> None:
         return
     name, folder, port = json.loads(line)
     segment = Segment.attach(name)
-    view = SafeSink.open_for(
-        segment, port, lambda: _open_view(segment, Path(folder), port), _print_message
-    )
+    view = None
+    # A flight recorder writes no file for the viewer: `rack replay` makes it later, from the
+    # stretches that were kept.
+    if port is not None or Retention.from_config(segment) is None:
+        # The viewer's libraries may take long to load, or hang on a full disk, so a run does not
+        # wait for them, unless the user wants to watch from the start.
+        opened = partial(_open_view, segment, Path(folder), port)
+        view = SafeSink(opened, _print_message, in_background=port is None)
     try:
         with Recorder(segment, Path(folder), view) as recorder:
             _print_message("recording")

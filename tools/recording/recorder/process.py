@@ -6,12 +6,14 @@ The recorder is spawned, never forked, so that no board inherits its threads.
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import time
 from contextlib import suppress
 from math import inf
 from pathlib import Path
+from typing import Any
 
 from rack.backplane.json_text import encode_json
 from rack.backplane.process import STOPPED_STATES, read_processor_ns, read_state, wait_readable
@@ -103,20 +105,22 @@ class RecorderProcess:
         # stderr goes to a file in memory, because nobody would empty a pipe.
         self._complaints = os.memfd_create("recorder")
         self._request = b""
-        self._words: memoryview | None = None
+        self._words: Any = {}
         self._restarts = 0
         self._result: str | None = None
         self._start()
 
     def _start(self) -> None:
         """Spawn a recorder process and reset everything known about the previous one."""
-        self._process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "rack.tools.recording.recorder", VIEW_CLASS],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._complaints,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        )
+        self._line, far_end = socket.socketpair()
+        with far_end:
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "rack.tools.recording.recorder", VIEW_CLASS],
+                stdin=far_end.fileno(),
+                stdout=far_end.fileno(),
+                stderr=self._complaints,
+                env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+            )
         self._unread = b""
         self._lines: list[str] = []
         self._has_begun = False
@@ -142,7 +146,7 @@ class RecorderProcess:
             True if the recorder has attached within `ATTACH_S`.
         """
         self._request = encode_json([rack, str(self.folder), port]).encode() + b"\n"
-        self._words = words
+        self._words = {} if words is None else words
         self._send_request()
         return self.wait_until_attached(ATTACH_S)
 
@@ -160,13 +164,11 @@ class RecorderProcess:
 
     def _send_request(self) -> None:
         """Send the name of the rack, the folder and the viewer's port to the recorder."""
-        assert self._process.stdin is not None, "it is a pipe"
         # Make the clock wait for the recorder before it attaches, so that no row in the rings is
         # overwritten before the recorder reads it.
-        self._set_follower(self.pid)
-        with suppress(BrokenPipeError):
-            self._process.stdin.write(self._request)
-            self._process.stdin.flush()
+        self._words[System.FOLLOWER_PID] = self.pid
+        with suppress(OSError):
+            self._line.sendall(self._request)
 
     def read_notices(self) -> list[str]:
         """Return new messages for the user, and restart the recorder if it died.
@@ -207,10 +209,10 @@ class RecorderProcess:
         ended = self._describe_end()
         if self._restarts == MAX_RESTARTS:
             self._is_gone = True
-            self._set_follower(0)
+            self._words[System.FOLLOWER_PID] = 0
             return f"{ended}; the run continues without a recording"
         self._restarts += 1
-        self._close_pipes()
+        self._line.close()
         self._start()
         self._send_request()
         return f"{ended}; restarted, {self._restarts} of at most {MAX_RESTARTS} times"
@@ -229,11 +231,6 @@ class RecorderProcess:
             raise Failure(next((line for line in reversed(lines) if END_CLAUSE in line), text))
         return ": ".join((f"the recorder ended with status {status}", *lines[-1:]))
 
-    def _set_follower(self, pid: int) -> None:
-        """Set the process that the clock waits for in lockstep. 0 means no process."""
-        if self._words is not None:
-            self._words[System.FOLLOWER_PID] = pid
-
     def finish(self, in_a_hurry: bool = False) -> str:
         """Let the recorder read the remaining rows and finish its files, and wait for its end.
 
@@ -250,10 +247,9 @@ class RecorderProcess:
         """
         if self._result is None:
             self._result = ""
-            if self._process.stdin is not None:
-                with suppress(BrokenPipeError):
-                    self._process.stdin.write(b"hurry\n" if in_a_hurry else b"")
-                    self._process.stdin.close()
+            with suppress(OSError):
+                self._line.sendall(b"hurry\n" if in_a_hurry else b"")
+                self._line.shutdown(socket.SHUT_WR)
             while self._process.poll() is None:
                 with suppress(subprocess.TimeoutExpired):
                     self._process.wait(CHECK_PERIOD_S)
@@ -262,7 +258,7 @@ class RecorderProcess:
                 continue
             was_reported = self._is_gone
             self._is_gone = True
-            self._close_pipes()
+            self._line.close()
             try:
                 self._result = self._describe_end()
             finally:
@@ -272,23 +268,17 @@ class RecorderProcess:
                 self._lines.append(f"{self._result}; run.rrd may lack its end")
         return self._result
 
-    def _close_pipes(self) -> None:
-        """Close the pipes to the recorder."""
-        for pipe in (self._process.stdin, self._process.stdout):
-            if pipe is not None:
-                with suppress(BrokenPipeError):
-                    pipe.close()
-
     def _read_output(self, timeout_s: float) -> bool:
         """Read what the recorder has printed on stdout, waiting for it up to `timeout_s`.
 
         Returns:
             True if something was read. False after the time-out, or if the output has ended.
         """
-        stdout = self._process.stdout
-        if stdout is None or not wait_readable(stdout.fileno(), timeout_s):
-            return False
-        block = os.read(stdout.fileno(), 1 << 16)
+        block = b""
+        if wait_readable(self._line.fileno(), timeout_s):
+            # A recorder that was killed before it read its request resets the connection.
+            with suppress(ConnectionResetError):
+                block = self._line.recv(1 << 16)
         *lines, self._unread = (self._unread + block).split(b"\n")
         texts = [line.decode(errors="replace") for line in lines]
         self._has_begun |= ATTACHED_LINE in texts

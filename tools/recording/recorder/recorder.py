@@ -25,8 +25,7 @@ from rack.tools.console.answer import write_file
 from rack.tools.recording.checksums import Checksums
 from rack.tools.recording.cores import UNMEASURED, CoreMeter
 from rack.tools.recording.file_names import PUBLISHED
-from rack.tools.recording.occasions import Retention
-from rack.tools.recording.recorder.flight import FlightRecorder
+from rack.tools.recording.occasions import FlightRecorder, Retention
 from rack.tools.recording.recorder.process import CHECK_PERIOD_S, IdleCounter
 from rack.tools.recording.run_files import TABLE_PATTERNS, RunFiles, Tally
 from rack.tools.recording.spool import Spool, open_rings
@@ -119,32 +118,6 @@ class SafeSink:
             self._opening.join()
         self._patience_s = OPENING_TIMEOUT_S
         self._why_late = "the viewer's library has not opened it"
-
-    @classmethod
-    def open_for(
-        cls,
-        segment: Segment,
-        port: int | None,
-        opened: Callable[[], Sink],
-        tell: Callable[[str], None],
-    ) -> Self | None:
-        """Open the sink for the viewer's file, or for a viewer on a port.
-
-        Args:
-            segment: Segment of the rack.
-            port: Port of the viewer, or None.
-            opened: Function that opens and returns the sink.
-            tell: Function that prints a message to the user.
-
-        Returns:
-            The sink. None for a flight recorder without a port: `rack replay` makes the viewer's
-            file later, from the stretches that were kept.
-        """
-        if port is None and Retention.from_config(segment) is not None:
-            return None
-        # The viewer's libraries may take long to load, or hang on a full disk, so a run does not
-        # wait for them, unless the user wants to watch from the start.
-        return cls(opened, tell, port is None)
 
     def add(self, ring: str, rows: np.ndarray) -> None:
         """Queue rows for the sink."""
@@ -324,7 +297,9 @@ class Recorder:
             self._spool.flush(now=True)
             self._files.close(UNMEASURED if self._cores is None else self._cores.build_record())
             Checksums(self._folder).store(*TABLE_PATTERNS)
-            self._spool.remove()
+            # The parquet files are complete.
+            self._spool.path.unlink()
+            self._spool.close()
         if self._view is not None:
             self._view.close(self._words[System.TICK] + 1, self._tally.lost)
             Checksums(self._folder).store("*.rrd")

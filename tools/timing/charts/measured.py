@@ -5,7 +5,7 @@ Spans of unit functions are cut where a task of higher priority had the core.
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -57,14 +57,6 @@ class TracedRun:
             replace(t, core=layout.find_task(t.name).core) for t in known if t.role != "clock"
         )
 
-    @property
-    def is_lockstep(self) -> bool:
-        """Whether the run was in lockstep.
-
-        Such a run has no chart, because simulated time does not advance during cycles.
-        """
-        return self.config.clock.mode == "lockstep"
-
     def build_panel(self, start_ns: int, end_ns: int, progress: Callable[[float], None]) -> Panel:
         """Build the panel of a window.
 
@@ -78,7 +70,7 @@ class TracedRun:
             lane.name: PatternDetail.from_medians(lane, self._compute_medians(lane))
             for lane in lanes
         }
-        counted = {lane.name: Patterns.build_empty() for lane in lanes}
+        counted = {lane.name: Patterns(Counter(), Counter()) for lane in lanes}
         counts = {task.name: JobCount() for task in self.tasks}
         longest_period = max(task.period_ns for task in self.tasks)
         block_length = max(BLOCK_NS, 2 * longest_period)
@@ -86,9 +78,9 @@ class TracedRun:
             end = min(start + block_length, self.end_ns)
             chart = self.build_chart(start, end + longest_period)
             for lane in lanes:
-                counted[lane.name].add_counts(
-                    count_patterns(chart, lane, (start, end), details[lane.name])
-                )
+                found = count_patterns(chart, lane, (start, end), details[lane.name])
+                counted[lane.name].plans.update(found.plans)
+                counted[lane.name].cycles.update(found.cycles)
             for task, count in counts.items():
                 counts[task] = count + JobCount.count_jobs(chart, task, start, end)
             progress(end / self.end_ns)

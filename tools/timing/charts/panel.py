@@ -92,13 +92,6 @@ class Panel:
             key=lambda job: job.deadline_ns,
         )
 
-    def list_idle_stretches(self, lane: Lane) -> Iterator[Stretch]:
-        """Yield the stretches of the window in which the core of a lane was idle."""
-        busy = merge_stretches(
-            (span.start_ns, span.end_ns) for span in self.chart.spans if span.core == lane.core
-        )
-        yield from subtract_stretches((self.chart.start_ns, self.chart.end_ns), busy)
-
     def to_document(self) -> Document:
         """Convert the panel to plain data, with times in ms."""
         late = {job for lane in self.lanes for job in self.list_late_jobs(lane)}

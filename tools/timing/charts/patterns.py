@@ -117,16 +117,6 @@ class Patterns(NamedTuple):
     plans: Counter[str]
     cycles: Counter[str]
 
-    @classmethod
-    def build_empty(cls) -> Patterns:
-        """Return empty counts."""
-        return cls(Counter(), Counter())
-
-    def add_counts(self, other: Patterns) -> None:
-        """Add the counts of another stretch of time."""
-        self.plans.update(other.plans)
-        self.cycles.update(other.cycles)
-
 
 @dataclass(frozen=True)
 class PatternDetail:
@@ -165,7 +155,7 @@ def count_patterns(chart: Chart, lane: Lane, within: Stretch, detail: PatternDet
         within: Start and end of the stretch, ns.
         detail: Limits up to which stretches are left out.
     """
-    counted = Patterns.build_empty()
+    counted = Patterns(Counter(), Counter())
     spans = [span for span in chart.spans if span.core == lane.core]
     starts = [span.start_ns for span in spans]
     # The running maximum sorts the ends, which may be unsorted under ordinary scheduling.

@@ -15,7 +15,6 @@ from rack.tools.console.pictures import list_picture_paths, open_figure
 from rack.tools.console.tables import format_ms
 from rack.tools.timing.charts.letters import MAX_COLUMNS, choose_frame_labels, choose_label_times
 from rack.tools.timing.charts.panel import Panel
-from rack.tools.timing.charts.patterns import IDLE
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -32,14 +31,6 @@ UNIT_COLOURS = {
     Unit.UPDATE: "#FFAABB",
 }
 """Light colours for black letters, which colour-blind readers can distinguish (Paul Tol)."""
-UNIT_NAMES = {
-    Unit.EXCHANGE: "C  exchange with the planner",
-    Unit.READ: "R  read",
-    Unit.PROCESS: "X  executor",
-    Unit.WRITE: "W  write",
-    Unit.PLAN: "P  planner",
-    Unit.UPDATE: "U  update of the plan",
-}
 EDGE_PT = 0.2
 LATE_COLOUR = "#CC3311"
 GRID_COLOUR = "#555555"
@@ -84,11 +75,10 @@ def save_picture(panels: Sequence[Panel], title: str, stem: Path) -> list[Path]:
         rows[-1, 0].set_xlabel("time, ms")
         used = {span.unit for panel in panels for span in panel.chart.spans}
         handles: list[Artist] = [
-            Patch(facecolor=UNIT_COLOURS[unit], label=UNIT_NAMES[unit])
+            Patch(facecolor=UNIT_COLOURS[unit], label=f"{unit.value}  {unit.name.lower()}")
             for unit in Unit
             if unit in used
         ]
-        handles.append(Patch(facecolor="none", label=f"{IDLE}  idle core"))
         if any(panel.list_late_jobs(lane) for panel in panels for lane in panel.lanes):
             handles.append(Line2D([], [], marker="v", color=LATE_COLOUR, label="missed deadline"))
         figure.legend(
@@ -131,7 +121,7 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
 
 
 def _draw_lane(axes: Axes, panel: Panel, lane: Lane, row: int) -> None:
-    """Draw the spans, idle stretches, cycle starts and late jobs of a lane in a row."""
+    """Draw the spans, cycle starts and late jobs of a lane in a row."""
     chart = panel.chart
     low = row - BAR_HEIGHT / 2
     window_ns = chart.end_ns - chart.start_ns
@@ -140,13 +130,11 @@ def _draw_lane(axes: Axes, panel: Panel, lane: Lane, row: int) -> None:
     for unit in Unit:
         bars = [(s.start_ns, s.end_ns - s.start_ns) for s in lane_spans if s.unit is unit]
         axes.broken_barh(bars, (low, BAR_HEIGHT), color=UNIT_COLOURS[unit], linewidth=EDGE_PT)
-    letters = [(span.unit.value, (span.start_ns, span.end_ns)) for span in lane_spans]
-    letters += [(IDLE, idle) for idle in panel.list_idle_stretches(lane)]
-    for letter, (begin, end) in letters:
-        size = min((end - begin) / window_ns / LETTER_POINT_FRACTION, LETTER_PT)
-        # Small dashes would look like a dotted line.
-        if size >= (LETTER_PT if letter == IDLE else MIN_LETTER_PT):
-            axes.text((begin + end) / 2, row, letter, ha="center", va="center", fontsize=size)
+    for span in lane_spans:
+        size = min((span.end_ns - span.start_ns) / window_ns / LETTER_POINT_FRACTION, LETTER_PT)
+        if size >= MIN_LETTER_PT:
+            middle_ns = (span.start_ns + span.end_ns) / 2
+            axes.text(middle_ns, row, span.unit.value, ha="center", va="center", fontsize=size)
     if lane.cycle_ns >= MIN_CYCLE_FRACTION * window_ns:
         starts = range(lane.find_cycle_start(chart.start_ns), chart.end_ns + 1, lane.cycle_ns)
         axes.vlines(

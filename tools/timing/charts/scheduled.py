@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import lcm
 from typing import Any
@@ -11,7 +10,6 @@ from rack.backplane.layout import Layout
 from rack.boards.config import RackConfig, build_rack_timing
 from rack.boards.timing.frames import compute_core_frames
 from rack.boards.timing.schedule import simulate_schedule
-from rack.boards.timing.tasks import Part, Unit
 from rack.tools.console.answer import Failure
 from rack.tools.timing.charts.panel import JobCount, Panel
 from rack.tools.timing.charts.patterns import PatternDetail, build_lanes, count_patterns
@@ -35,20 +33,7 @@ class Schedule:
         switch_ns: Time of a context switch, ns.
     """
 
-    def __init__(
-        self, config: RackConfig, layout: Layout, process_ns: Mapping[str, Sequence[int]]
-    ) -> None:
-        """Model the tasks of a config.
-
-        Args:
-            config: Config of the rack.
-            layout: Layout of its segment.
-            process_ns: Times of X by board, ns, which are repeated cycle by cycle. Other boards
-                take the time of the budget.
-
-        Raises:
-            Failure: If a board in `process_ns` has no budget.
-        """
+    def __init__(self, config: RackConfig, layout: Layout) -> None:
         timing = build_rack_timing(config, layout)
         self.tasks = timing.tasks
         self.frame_ns = 0 if timing.schedule is None else timing.schedule.minor * timing.tick_ns
@@ -58,9 +43,6 @@ class Schedule:
             min(max(alike) + 1, MAX_DEFAULT_FRAMES) * self.frame_ns if alike else None
         )
         self.switch_ns = round(config.timing.context_switch_ms * 1e6)
-        self._variants = {
-            name: self._build_variants(name, times) for name, times in process_ns.items()
-        }
 
     def move_to_cores(self, layout: Layout) -> None:
         """Move the tasks to the cores that a run obtained."""
@@ -82,10 +64,7 @@ class Schedule:
         """
         # The schedule repeats after the least common multiple of all slices. If tasks have phases,
         # the first repetition differs.
-        cycles = [
-            len(self._variants.get(task.name, (task.parts,))) * task.every_ns for task in self.tasks
-        ]
-        period_ns = lcm(*cycles, *(task.period_ns for task in self.tasks))
+        period_ns = lcm(*(task.period_ns for task in self.tasks))
         has_phases = any(task.phase_ns for task in self.tasks)
         skipped_ns = max(0, start_ns // period_ns - has_phases) * period_ns
         longest_ns = max(task.period_ns for task in self.tasks)
@@ -98,7 +77,7 @@ class Schedule:
                 f" at most {MAX_SIMULATED_CYCLES} are simulated",
                 2,
             )
-        chart = simulate_schedule(self.tasks, until_ns, self.switch_ns, self._variants)
+        chart = simulate_schedule(self.tasks, until_ns, self.switch_ns)
         shown = chart.cut_window(start_ns - skipped_ns, end_ns - skipped_ns)
         lanes = build_lanes(self.tasks)
         detail = PatternDetail(gap_ns=2 * self.switch_ns)
@@ -119,19 +98,6 @@ class Schedule:
             },
             frame_ns=self.frame_ns,
         )
-
-    def _build_variants(self, board: str, times_ns: Sequence[int]) -> list[tuple[Part, ...]]:
-        """Return the parts of an executor's cycle for each time of X in `times_ns`."""
-        executors = {task.name: task for task in self.tasks if task.role == "executor"}
-        if board not in executors:
-            raise Failure(
-                f"--process {board}: no board of that name has a budget; boards:"
-                f" {', '.join(executors)}",
-                2,
-            )
-        parts = [part for part in executors[board].parts if part.unit is not Unit.PROCESS]
-        index = sum(part.unit is not Unit.WRITE for part in parts)
-        return [(*parts[:index], Part(Unit.PROCESS, time), *parts[index:]) for time in times_ns]
 
 
 def _shift_times(entry: Any, by_ns: int) -> Any:

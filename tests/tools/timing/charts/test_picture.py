@@ -18,7 +18,7 @@ from rack.tools.timing.charts.scheduled import Schedule
 
 def build_panel(rack: str, start_ms: float, end_ms: float) -> Panel:
     config = load(rack)
-    schedule = Schedule(config, resolve_layout(config), {})
+    schedule = Schedule(config, resolve_layout(config))
     return schedule.build_panel(round(start_ms * NS_PER_MS), round(end_ms * NS_PER_MS))
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from rack.boards.timing.tasks import TimedTask
 from rack.tools.console.answer import Failure
-from rack.tools.timing.charts.window import WindowOptions, choose_task, parse_process_times
+from rack.tools.timing.charts.gantt import WindowOptions, choose_task
 
 MS = 1_000_000
 
@@ -72,11 +72,3 @@ def test_a_bad_window_is_refused(
     with pytest.raises(Failure, match=message) as failure:
         build_options(from_ms, to_ms).choose_window(NASREM[0], extent_ms * MS, 0)
     assert failure.value.status == 2
-
-
-@pytest.mark.parametrize(
-    "text", ["level", "level=", "level=a", "level=1,-1", "level=nan", "level=inf", "level=1,,2"]
-)
-def test_bad_times_are_refused(text: str) -> None:
-    with pytest.raises(Failure, match=f"--process {text}: give a level and its times"):
-        parse_process_times([text])

@@ -58,7 +58,7 @@ class FigureRack:
     @cached_property
     def schedule(self) -> Schedule:
         """Schedule computed from the budget."""
-        return Schedule(self.rack, resolve_layout(self.rack), {})
+        return Schedule(self.rack, resolve_layout(self.rack))
 
     @property
     def experiment(self) -> Experiment[FigureRun]:
