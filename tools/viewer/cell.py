@@ -1,4 +1,4 @@
-"""Writes the cell in 3D: geoms, poses of moving bodies, pushes, planned path and goals.
+"""Writes the cell in 3D: geoms, poses of moving bodies, planned path and goals.
 
 The arm is red while its brakes are engaged, and balls mark faults. Each geom is written only once,
 in the frame of its body.
@@ -37,7 +37,7 @@ from rack.tools.viewer.stream import (
     build_change_finder,
     build_row_sampler,
 )
-from rack.tools.viewer.style import CURRENT, FORCE, GOAL, LOST, PLANNED, pack_colours
+from rack.tools.viewer.style import CURRENT, GOAL, LOST, PLANNED, pack_colours
 
 CELL = "cell"
 COLLISION = "collision"
@@ -81,10 +81,6 @@ AXES_BESIDE = np.array([-0.6, -0.45, 0.0])
 The axes are left of the arm.
 """
 AXES_COLOURS = (0xE64646FF, 0x46B45AFF, 0x468CE6FF)
-PUSHES = (CELL, "pushes")
-PUSH_M = 0.02
-PUSH_RADIUS_M = 0.0015
-"""Length of a push's arrow per newton, and its radius."""
 
 
 def name_frame(model: mujoco.MjModel, body: int) -> str:
@@ -164,11 +160,10 @@ def write_geometry(stream: Stream, cell: Cell) -> list[ArmShape]:
 class PoseWriter:
     """Writes the poses of all moving bodies, and the tool's positions, from `ArmState` messages.
 
-    The poses are computed by MuJoCo's kinematics. With `has_pushes`, the forces with which the
-    scene pushes objects are written as arrows.
+    The poses are computed by MuJoCo's kinematics.
     """
 
-    def __init__(self, stream: Stream, cell: Cell, has_pushes: bool) -> None:
+    def __init__(self, stream: Stream, cell: Cell) -> None:
         self._stream = stream
         self._cell = cell
         self._data = cell.build_start_data()
@@ -180,15 +175,11 @@ class PoseWriter:
         ]
         self._frames += [stream.format_frame(contact.frame) for contact in self._contacts]
         self._sampled_rows = build_row_sampler(stream.times.clock_ns)
-        self._has_pushes = has_pushes
-        self._is_pushed = False
         stream.log_static(
             TOOL,
             rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]),
             stream.build_frame(WORLD),
         )
-        if has_pushes:
-            stream.log_static(PUSHES, stream.build_frame(WORLD))
 
     def write(self, block: RowBlock) -> None:
         """Write the poses in a block of messages, at most one per 20 ms of simulated time."""
@@ -207,8 +198,6 @@ class PoseWriter:
             for index, contact in enumerate(self._contacts, len(bodies)):
                 poses[row, index] = contact.compute_pose(data)
             tool[row] = data.site_xpos[self._cell.tool]
-            if self._has_pushes:
-                self._write_pushes(block.find_moment(chosen[row]))
         self._stream.send_columns(
             TOOL, block.build_time_columns(chosen), rr.Points3D.columns(positions=tool)
         )
@@ -222,21 +211,6 @@ class PoseWriter:
         self._stream.send_columns(
             (FRAMES,), block.build_time_columns(np.repeat(chosen, count)), columns
         )
-
-    def _write_pushes(self, when: Moment) -> None:
-        """Write arrows for the pushes on objects at a moment, or clear them after the last push."""
-        objects = self._cell.bodies
-        forces = self._data.xfrc_applied[objects, :3]
-        pushed = forces.any(axis=1)
-        if self._is_pushed or pushed.any():
-            self._is_pushed = bool(pushed.any())
-            arrows = rr.Arrows3D(
-                origins=self._data.xipos[objects][pushed],
-                vectors=PUSH_M * forces[pushed],
-                radii=PUSH_RADIUS_M,
-                colors=[FORCE],
-            )
-            self._stream.log_at(when, PUSHES, arrows)
 
 
 class MarkWriter:

@@ -34,7 +34,7 @@ from rack.tools.viewer.cell import (
     write_geometry,
 )
 from rack.tools.viewer.curves import build_field_curves, build_hand_curves, build_joint_curves
-from rack.tools.viewer.events import EventWriter, build_load_writer, build_loss_writer
+from rack.tools.viewer.events import EventWriter, build_loss_lines
 from rack.tools.viewer.forces import (
     build_contact_arrows,
     build_contact_curves,
@@ -59,7 +59,7 @@ from rack.tools.viewer.timing import (
     AgeWriter,
     CycleLane,
     build_load_curves,
-    build_miss_lane,
+    build_miss_lines,
     choose_task_colours,
 )
 
@@ -157,7 +157,7 @@ class RackWriter:
                 partial(self._hierarchy.write, task.name),
                 cycles[task.name].write,
                 *build_load_curves(stream, task, colours[task.name], tick_ns, lockstep),
-                build_miss_lane(stream, task, names[task.name]),
+                build_miss_lines(stream, task),
             ]
             for task in layout.tasks
         }
@@ -186,7 +186,7 @@ class RackWriter:
                 marks.mark_lost(when, task)
 
         self._events = EventWriter(stream, ran.events, names, mark_lost, marks)
-        self._write_losses = build_loss_writer(stream)
+        self._write_losses = build_loss_lines(stream)
         self._fastest = min(layout.tasks, key=lambda task: task.every).name
 
     def write(
@@ -247,7 +247,6 @@ class ViewSink:
         recording = open_recording(folder.name, run, file, view, port)
         self._stream = Stream(recording, Timelines(layout.clock_ns, launch))
         self._writer = RackWriter(self._stream, ran)
-        self._write_load = build_load_writer(self._stream)
         self._waiting: dict[str, list[np.ndarray]] = defaultdict(list)
         self._block = compute_block_ticks(layout)
         self._written = segment.words[System.TICK]
@@ -271,11 +270,12 @@ class ViewSink:
             RuntimeError: The file cannot be written.
         """
         if tick - self._written >= self._block:
+            # Begin a part only for rows that are written, because no viewer opens an empty file.
+            if self._part_ends is not None and self._written >= self._part_ends:
+                self._part_ends += self._part
+                self._stream.continue_in(find_next_file(self._folder))
             self._write(tick, lost)
             self._stream.flush()
-            if self._part_ends is not None and tick >= self._part_ends:
-                self._part_ends = tick + self._part
-                self._stream.continue_in(find_next_file(self._folder))
 
     def close(self, tick: int, lost: Mapping[str, int]) -> None:
         """Write the remaining rows and finish the file.
@@ -293,14 +293,13 @@ class ViewSink:
         self._stream.close()
 
     def _write(self, tick: int, lost: Mapping[str, int]) -> None:
-        """Write the queued rows as a block that ends at `tick`, and the load of the recorder."""
+        """Write the queued rows as a block that ends at `tick`."""
         self._written = tick
         waiting = self._waiting
         self._waiting = defaultdict(list)
         self._writer.write(
             {ring: np.concatenate(blocks) for ring, blocks in waiting.items()}, tick, lost
         )
-        self._write_load(tick)
 
 
 def compute_block_ticks(layout: Layout) -> int:
@@ -346,7 +345,7 @@ def _build_arm_parts(
     assert robot is not None, "there is an arm"
     match mailbox.message:
         case ArmState.message_type.name:
-            yield PoseWriter(stream, cell, bool(config.scene.push)).write
+            yield PoseWriter(stream, cell).write
         case HandStatus.message_type.name if cell.hand is not None:
             yield from build_hand_curves(stream, robot.joints, cell.hand)
             yield build_contact_arrows(stream, cell, "force")
