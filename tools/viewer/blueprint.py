@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 from rerun.blueprint.components import PlayState
 
 from rack.backplane.layout import Layout, MailboxSpec
-from rack.backplane.message import Message, Status
+from rack.backplane.message import Status
 from rack.boards.config import RackConfig, build_rack_timing
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
@@ -27,6 +27,7 @@ from rack.tools.viewer.curves import (
     GRIPPER,
     HAND,
     JOINTS,
+    NOT_AS_CURVES,
     OPENING,
     QUANTITIES,
     SIGNALS,
@@ -323,21 +324,12 @@ class RackViews:
         )
 
     def _list_own_mailboxes(self) -> list[MailboxSpec]:
-        """Return the mailboxes of the user's levels whose messages this package does not know."""
+        """Return the mailboxes of the user's levels that are shown as signals."""
         own = {
             task.name for task in self._config.list_tasks() if not task.target.startswith("rack.")
         }
-        classes: list[type[Message]] = [Message]
-        for message in classes:
-            classes += message.__subclasses__()  # the loop continues with them
-        known = {
-            message.message_type.name
-            for message in classes
-            if message.__module__.startswith("rack.")
-        }
-        return [
-            box for box in self._layout.mailboxes if box.writer in own and box.message not in known
-        ]
+        boxes = self._layout.mailboxes
+        return [box for box in boxes if box.writer in own and box.message not in NOT_AS_CURVES]
 
     def _build_unit_plots(
         self, name: str, mailboxes: Sequence[MailboxSpec]

@@ -48,8 +48,6 @@ SHOWN_GROUPS = 3
 
 MuJoCo's own viewer shows groups 0, 1 and 2. By convention, higher groups contain collision shapes.
 """
-TOOL = (CELL, "tool")
-TOOL_COLOUR = 0xE63CC8FF
 PATH = (CELL, "planned_path")
 WAYPOINTS = (CELL, "way_points")
 GOALS = (CELL, "goals")
@@ -158,7 +156,7 @@ def write_geometry(stream: Stream, cell: Cell) -> list[ArmShape]:
 
 
 class PoseWriter:
-    """Writes the poses of all moving bodies, and the tool's positions, from `ArmState` messages.
+    """Writes the poses of all moving bodies from `ArmState` messages.
 
     The poses are computed by MuJoCo's kinematics.
     """
@@ -175,11 +173,6 @@ class PoseWriter:
         ]
         self._frames += [stream.format_frame(contact.frame) for contact in self._contacts]
         self._sampled_rows = build_row_sampler(stream.times.clock_ns)
-        stream.log_static(
-            TOOL,
-            rr.Points3D.from_fields(radii=0.003, colors=[TOOL_COLOUR]),
-            stream.build_frame(WORLD),
-        )
 
     def write(self, block: RowBlock) -> None:
         """Write the poses in a block of messages, at most one per 20 ms of simulated time."""
@@ -190,17 +183,12 @@ class PoseWriter:
             return
         count = len(self._frames)
         poses = np.empty((len(chosen), count, 7))
-        tool = np.empty((len(chosen), 3))
         for row, state in enumerate(block.messages["state"][chosen]):
             view_state(self._cell.model, data, state)
             mujoco.mj_kinematics(self._cell.model, data)
             poses[row, : len(bodies)] = np.hstack((data.xpos[bodies], data.xquat[bodies]))
             for index, contact in enumerate(self._contacts, len(bodies)):
                 poses[row, index] = contact.compute_pose(data)
-            tool[row] = data.site_xpos[self._cell.tool]
-        self._stream.send_columns(
-            TOOL, block.build_time_columns(chosen), rr.Points3D.columns(positions=tool)
-        )
         translations, quaternions = np.split(poses.reshape(-1, 7), [3], axis=1)
         columns = rr.Transform3D.columns(
             translation=translations,

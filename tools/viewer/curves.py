@@ -10,9 +10,11 @@ import numpy as np
 
 from rack.backplane.layout import FieldSpec, MailboxSpec
 from rack.levels.algebra import Array, Ints
+from rack.levels.messages import ArmState, Scene, WorldState
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.hand import Hand
-from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR
+from rack.levels.systems.hand.messages import EXTENSOR, FLEXOR, HandStatus
+from rack.levels.systems.joint_boards.messages import DRIVING, JointStatus, JointTorque
 from rack.tools.viewer.stream import RowBlock, Stream, ViewPart
 from rack.tools.viewer.style import (
     COMMANDED,
@@ -25,6 +27,9 @@ from rack.tools.viewer.style import (
     write_legend,
 )
 
+SHOWN_IN_OTHER_VIEWS = (ArmState, Scene, WorldState, JointTorque, JointStatus, HandStatus)
+NOT_AS_CURVES = {*DRIVING, *(message.message_type.name for message in SHOWN_IN_OTHER_VIEWS)}
+"""Message types whose fields are not shown as separate curves."""
 SIGNALS = "signals"
 MAX_CURVES = 16
 """Largest number of curves of a field. Fields with more numbers have no curves."""

@@ -19,11 +19,11 @@ from rack.backplane.layout import Layout, MailboxSpec
 from rack.backplane.segment import Segment
 from rack.backplane.words import System
 from rack.boards.config import RackConfig, build_rack_timing, read_stored
-from rack.levels.messages import ArmState, MovePlan, MoveStatus, Scene, TaskPlan, WorldState
+from rack.levels.messages import ArmState, MovePlan, MoveStatus, TaskPlan
 from rack.levels.robot.cell import Cell, build_cell
 from rack.levels.systems.force.messages import ForceStatus, Wrench
 from rack.levels.systems.hand.messages import HandStatus
-from rack.levels.systems.joint_boards.messages import DRIVING, JointStatus, JointTorque
+from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.tools.recording.occasions import Retention
 from rack.tools.viewer.blueprint import RackViews, build_blueprint, write_document
 from rack.tools.viewer.cell import (
@@ -33,7 +33,12 @@ from rack.tools.viewer.cell import (
     build_path_part,
     write_geometry,
 )
-from rack.tools.viewer.curves import build_field_curves, build_hand_curves, build_joint_curves
+from rack.tools.viewer.curves import (
+    NOT_AS_CURVES,
+    build_field_curves,
+    build_hand_curves,
+    build_joint_curves,
+)
 from rack.tools.viewer.events import EventWriter, build_loss_lines
 from rack.tools.viewer.forces import (
     build_contact_arrows,
@@ -63,9 +68,6 @@ from rack.tools.viewer.timing import (
     choose_task_colours,
 )
 
-SHOWN_IN_OTHER_VIEWS = (ArmState, Scene, WorldState, JointTorque, JointStatus, HandStatus)
-NOT_AS_CURVES = {*DRIVING, *(message.message_type.name for message in SHOWN_IN_OTHER_VIEWS)}
-"""Message types whose fields are not shown as separate curves."""
 BLOCK_S = 1.0
 """Simulated duration of a block. Writing 4 rows takes as long as writing 400."""
 
