@@ -23,22 +23,19 @@ from rack.tools.viewer.cell import CELL, COLLISION, FRAMES, compute_extent, find
 from rack.tools.viewer.curves import (
     BY_FINGER,
     ERROR,
-    GRIP,
     GRIPPER,
     HAND,
     JOINTS,
     NOT_AS_CURVES,
-    OPENING,
     QUANTITIES,
     SIGNALS,
     TENSIONS,
     TIPS,
-    find_gripper_units,
     get_plotted_unit,
     has_curves,
 )
 from rack.tools.viewer.events import EVENTS, RACK_LANE
-from rack.tools.viewer.forces import AXES, CONTACT, CONTACT_UNITS, FORCES, TASK
+from rack.tools.viewer.forces import AXES, CONTACT_UNITS, FORCES
 from rack.tools.viewer.levels import (
     HIERARCHY,
     LEVELS,
@@ -276,17 +273,17 @@ class RackViews:
                     name="queue and moving goal",
                 )
         if cell.wrist is not None:
-            yield self._plot("force along z, wanted and exerted, N", (FORCES, TASK, "z"))
+            yield self._plot("force along z, wanted and exerted, N", (FORCES, "z"))
             for what, unit in CONTACT_UNITS.items():
-                axes = [(FORCES, TASK, axis) for axis in AXES if AXES[axis] == unit]
+                axes = [(FORCES, axis) for axis in AXES if AXES[axis] == unit]
                 yield self._plot(f"{what} wanted and exerted, {unit}", *axes)
-            for what, unit in CONTACT_UNITS.items():
-                title = f"contact: {what}, with its limit, {unit}"
-                yield self._plot(title, (FORCES, CONTACT, what))
         yield self._plot("tracking error, mrad", (ERROR,))
         if cell.gripper is not None:
-            for name, unit in zip((OPENING, GRIP), find_gripper_units(cell), strict=True):
-                yield self._plot(f"gripper's {name}, {unit}", (GRIPPER, name))
+            for box in self._layout.mailboxes:
+                for field in box.fields:
+                    if box.message in DRIVING and field.name in GRIPPER:
+                        title = f"{field.name}, {field.unit}"
+                        yield self._plot(title, (SIGNALS, box.name, field.name))
 
     def _plot(self, title: str, *entities: tuple[str, ...]) -> rrb.View:
         """Return a plot of the curves of some entities of this rack."""

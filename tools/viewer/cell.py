@@ -19,7 +19,6 @@ from rack.levels.algebra import Array, Ints
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import view_state
-from rack.tools.viewer.forces import list_contacts
 from rack.tools.viewer.levels import format_enum
 from rack.tools.viewer.shapes import (
     Shape,
@@ -166,12 +165,10 @@ class PoseWriter:
         self._cell = cell
         self._data = cell.build_start_data()
         self._bodies = find_moving_bodies(cell.model)
-        self._contacts = list_contacts(cell)
         self._world = stream.format_frame(WORLD)
         self._frames = [
             stream.format_frame(name_frame(cell.model, int(body))) for body in self._bodies
         ]
-        self._frames += [stream.format_frame(contact.frame) for contact in self._contacts]
         self._sampled_rows = build_row_sampler(stream.times.clock_ns)
 
     def write(self, block: RowBlock) -> None:
@@ -186,9 +183,7 @@ class PoseWriter:
         for row, state in enumerate(block.messages["state"][chosen]):
             view_state(self._cell.model, data, state)
             mujoco.mj_kinematics(self._cell.model, data)
-            poses[row, : len(bodies)] = np.hstack((data.xpos[bodies], data.xquat[bodies]))
-            for index, contact in enumerate(self._contacts, len(bodies)):
-                poses[row, index] = contact.compute_pose(data)
+            poses[row] = np.hstack((data.xpos[bodies], data.xquat[bodies]))
         translations, quaternions = np.split(poses.reshape(-1, 7), [3], axis=1)
         columns = rr.Transform3D.columns(
             translation=translations,

@@ -21,7 +21,7 @@ from rack.backplane.words import System
 from rack.boards.config import RackConfig, build_rack_timing, read_stored
 from rack.levels.messages import ArmState, MovePlan, MoveStatus, TaskPlan
 from rack.levels.robot.cell import Cell, build_cell
-from rack.levels.systems.force.messages import ForceStatus, Wrench
+from rack.levels.systems.force.messages import ForceStatus
 from rack.levels.systems.hand.messages import HandStatus
 from rack.levels.systems.joint_boards.messages import DRIVING
 from rack.tools.recording.occasions import Retention
@@ -34,17 +34,14 @@ from rack.tools.viewer.cell import (
     write_geometry,
 )
 from rack.tools.viewer.curves import (
+    GRIPPER,
     NOT_AS_CURVES,
     build_field_curves,
     build_hand_curves,
     build_joint_curves,
 )
 from rack.tools.viewer.events import EventWriter, build_loss_lines
-from rack.tools.viewer.forces import (
-    build_contact_arrows,
-    build_contact_curves,
-    build_task_force_curves,
-)
+from rack.tools.viewer.forces import build_task_force_curves
 from rack.tools.viewer.levels import (
     FIRED,
     LEVELS,
@@ -327,7 +324,7 @@ def _build_mailbox_parts(
     if {field.name for field in mailbox.fields}.issuperset(FIRED):
         yield build_fired_lines(stream, mailbox)
     if mailbox.message not in NOT_AS_CURVES:
-        yield from build_field_curves(stream, mailbox)
+        yield from build_field_curves(stream, mailbox.name, mailbox.fields)
 
 
 def _build_arm_parts(
@@ -350,12 +347,11 @@ def _build_arm_parts(
             yield PoseWriter(stream, cell).write
         case HandStatus.message_type.name if cell.hand is not None:
             yield from build_hand_curves(stream, robot.joints, cell.hand)
-            yield build_contact_arrows(stream, cell, "force")
         case driving if driving in DRIVING:
-            yield from build_joint_curves(stream, robot.joints, cell, robot.gripper is not None)
-        case Wrench.message_type.name if cell.wrist is not None:
-            yield build_contact_arrows(stream, cell, "wrench")
-            yield from build_contact_curves(stream, cell.wrist.contact_limits)
+            yield from build_joint_curves(stream, robot.joints, cell)
+            if robot.gripper is not None:
+                fields = [field for field in mailbox.fields if field.name in GRIPPER]
+                yield from build_field_curves(stream, mailbox.name, fields)
         case ForceStatus.message_type.name:
             yield from build_task_force_curves(stream)
         case MovePlan.message_type.name:

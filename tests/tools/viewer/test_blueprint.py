@@ -64,7 +64,19 @@ def plots(name: str | Path, first: bool) -> list[rrb.TimeSeriesView]:
 def test_every_plot_says_its_unit_and_only_signals_have_a_legend_over_their_curves(
     name: str,
 ) -> None:
-    units = ("rad", "rad/s", "N", "N m", "mrad", "mm", "m", "ms", "%", "% of cycle")
+    units = (
+        "rad",
+        "rad/s",
+        "N",
+        "N m",
+        "m or rad",
+        "N or N m",
+        "mrad",
+        "m",
+        "ms",
+        "%",
+        "% of cycle",
+    )
     unitless = {"signals", "taken and done"}
     found = plots(name, first=False)
     own = {field.unit for box in resolve_layout(load(name)).mailboxes for field in box.fields}
@@ -81,7 +93,7 @@ def test_every_plot_says_its_unit_and_only_signals_have_a_legend_over_their_curv
     ("name", "contents"),
     [
         ("rccl", ["/signals/trajectory.status/done", "/signals/trajectory.status/astray"]),
-        ("penn", ["/forces/task_frame/z"]),
+        ("penn", ["/forces/z"]),
         ("hic", ["/signals/grasp.status/load", "/hand/thumb/tensions"]),
         (OWN_LEVEL, ["/signals/power.status/power", "/signals/power.status/energy"]),
     ],
