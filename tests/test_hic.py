@@ -13,8 +13,7 @@ from rack.boards.timing.frames import compute_core_frames
 from rack.tools.launch.launch import run_rack
 from rack.tools.monitor.display import Display
 from rack.tools.recording.recording import Recording
-from rack.tools.report.data_ages import summarize_data_ages
-from rack.tools.report.report import build_report
+from rack.tools.report.report import build_report, summarize_data_ages
 from rack.tools.report.report_markdown import format_markdown
 
 SECONDS = 3.0

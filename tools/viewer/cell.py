@@ -15,7 +15,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from rack.boards.events import Event
-from rack.levels.algebra import Array, Ints
+from rack.levels.algebra import Array
 from rack.levels.messages import SegmentKind, Verb
 from rack.levels.robot.cell import Cell
 from rack.levels.robot.engine import view_state
@@ -34,7 +34,6 @@ from rack.tools.viewer.stream import (
     Stream,
     ViewPart,
     build_change_finder,
-    build_row_sampler,
 )
 from rack.tools.viewer.style import CURRENT, GOAL, LOST, PLANNED, pack_colours
 
@@ -42,6 +41,8 @@ CELL = "cell"
 COLLISION = "collision"
 FRAMES = "frames"
 WORLD = "world"
+SHOWN_S = 0.02
+"""Simulated time between two drawn poses, about the refresh interval of a screen."""
 SHOWN_GROUPS = 3
 """Number of geom groups that are shown.
 
@@ -83,14 +84,6 @@ AXES_COLOURS = (0xE64646FF, 0x46B45AFF, 0x468CE6FF)
 def name_frame(model: mujoco.MjModel, body: int) -> str:
     """Return the name of a body's coordinate frame in the recording."""
     return WORLD if body == 0 else f"body/{model.body(body).name or body}"
-
-
-def find_moving_bodies(model: mujoco.MjModel) -> Ints:
-    """Return the indices of all bodies that can move, shape (n,).
-
-    These are bodies with joints or mocap poses, and all bodies attached to them.
-    """
-    return np.flatnonzero(model.body_weldid)
 
 
 class ArmShape(NamedTuple):
@@ -154,46 +147,44 @@ def write_geometry(stream: Stream, cell: Cell) -> list[ArmShape]:
     return arm
 
 
-class PoseWriter:
-    """Writes the poses of all moving bodies from `ArmState` messages.
+def build_pose_part(stream: Stream, cell: Cell) -> ViewPart:
+    """Return the view part that shows the poses of all moving bodies from `ArmState` messages.
 
-    The poses are computed by MuJoCo's kinematics.
+    The poses are computed by MuJoCo's kinematics, at most once per 20 ms of simulated time.
     """
+    model = cell.model
+    data = cell.build_start_data()
+    # Bodies with joints or mocap poses, and all bodies attached to them.
+    bodies = np.flatnonzero(model.body_weldid)
+    world = stream.format_frame(WORLD)
+    frames = [stream.format_frame(name_frame(model, body)) for body in bodies.tolist()]
+    every = max(1, round(SHOWN_S * 1e9 / stream.times.clock_ns))
+    last = -1
 
-    def __init__(self, stream: Stream, cell: Cell) -> None:
-        self._stream = stream
-        self._cell = cell
-        self._data = cell.build_start_data()
-        self._bodies = find_moving_bodies(cell.model)
-        self._world = stream.format_frame(WORLD)
-        self._frames = [
-            stream.format_frame(name_frame(cell.model, int(body))) for body in self._bodies
-        ]
-        self._sampled_rows = build_row_sampler(stream.times.clock_ns)
-
-    def write(self, block: RowBlock) -> None:
-        """Write the poses in a block of messages, at most one per 20 ms of simulated time."""
-        chosen = self._sampled_rows(block.ticks)
-        data = self._data
-        bodies = self._bodies
+    def write(block: RowBlock) -> None:
+        """Write the poses in the first row of each interval. Intervals may span blocks."""
+        nonlocal last
+        slots, first = np.unique(block.ticks // every, return_index=True)
+        chosen = first[slots > last]
+        last = int(slots[-1])
         if not len(bodies) or not len(chosen):
             return
-        count = len(self._frames)
-        poses = np.empty((len(chosen), count, 7))
+        poses = np.empty((len(chosen), len(bodies), 7))
         for row, state in enumerate(block.messages["state"][chosen]):
-            view_state(self._cell.model, data, state)
-            mujoco.mj_kinematics(self._cell.model, data)
+            view_state(model, data, state)
+            mujoco.mj_kinematics(model, data)
             poses[row] = np.hstack((data.xpos[bodies], data.xquat[bodies]))
         translations, quaternions = np.split(poses.reshape(-1, 7), [3], axis=1)
         columns = rr.Transform3D.columns(
             translation=translations,
             quaternion=convert_to_xyzw(quaternions),
-            parent_frame=[self._world] * len(translations),
-            child_frame=self._frames * len(chosen),
+            parent_frame=[world] * len(translations),
+            child_frame=frames * len(chosen),
         )
-        self._stream.send_columns(
-            (FRAMES,), block.build_time_columns(np.repeat(chosen, count)), columns
-        )
+        times = block.build_time_columns(np.repeat(chosen, len(bodies)))
+        stream.send_columns((FRAMES,), times, columns)
+
+    return write
 
 
 class MarkWriter:

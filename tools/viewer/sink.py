@@ -29,8 +29,8 @@ from rack.tools.viewer.blueprint import RackViews, build_blueprint, write_docume
 from rack.tools.viewer.cell import (
     GoalWriter,
     MarkWriter,
-    PoseWriter,
     build_path_part,
+    build_pose_part,
     write_geometry,
 )
 from rack.tools.viewer.curves import (
@@ -344,7 +344,7 @@ def _build_arm_parts(
     assert robot is not None, "there is an arm"
     match mailbox.message:
         case ArmState.message_type.name:
-            yield PoseWriter(stream, cell).write
+            yield build_pose_part(stream, cell)
         case HandStatus.message_type.name if cell.hand is not None:
             yield from build_hand_curves(stream, robot.joints, cell.hand)
         case driving if driving in DRIVING:
